@@ -35,7 +35,7 @@ def run(mine: dict[str, Any]) -> kerv.Study:
 @pytest.fixture(scope="module")
 def study(mine: dict[str, Any]) -> kerv.Study:
     path = mine["results"].parent / "both.yaml"
-    path.write_text("settings: {ar: method=ar, held: method=hold}\n", encoding="utf-8")
+    path.write_text("settings: {ar: method=ar, hold: method=spec_vla proposer=hold}\n", encoding="utf-8")
     return kerv.sweep(path, **mine)
 
 
@@ -65,15 +65,15 @@ def test_a_rollout_gives_its_episodes_and_is_the_commands_own(run: kerv.Study, m
 
 
 def test_a_grid_has_a_setting_per_value(mine: dict[str, Any]) -> None:
-    both = kerv.rollout(grid=True, method="ar,hold", **mine)
-    assert list(both.to_pandas()["label"]) == ["ar", "hold"]
+    both = kerv.rollout(grid=True, method="ar,jacobi", **mine)
+    assert list(both.to_pandas()["label"]) == ["ar", "jacobi"]
 
 
 def test_a_study_is_run_once_reported_and_loaded(
     study: kerv.Study, mine: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
     table = study.to_pandas()
-    assert list(table["label"]) == ["ar", "held"]
+    assert list(table["label"]) == ["ar", "hold"]
     assert table["episodes"].tolist() == [1, 1]
     again = kerv.sweep(mine["results"].parent / "both.yaml", **mine)
     assert "2 cells are complete already" in capsys.readouterr().err

@@ -40,10 +40,10 @@ STUDY = (
     "method=spec_vla threshold.r=3",
     "method=kerv",
     "method=kerv threshold.k_s=0.3",
-    "method=retrieval_only",
+    "method=spec_vla proposer=retrieval acceptance=sequence",
     "method=heisd skip.s_min=0.9",
     "method=heisd skip.s_min=0.8 boundary=random",
-    "method=kalman_only",
+    "method=spec_vla proposer=kalman",
 )
 
 
@@ -117,8 +117,8 @@ def test_only_what_is_needed_is_read(results: Path) -> None:
     check(settings_of(results, "method=jacobi"))
     for overrides, missing in (
         ("method=spec_vla", "drafter"),
-        ("method=retrieval_only", "datastore"),
-        ("method=kalman_only", "calibration"),
+        ("method=spec_vla proposer=retrieval", "datastore"),
+        ("method=spec_vla proposer=kalman", "calibration"),
         ("method=one_pass", "early"),
     ):
         with pytest.raises(CheckpointError, match=f"no .*{missing}") as refused:
@@ -127,7 +127,7 @@ def test_only_what_is_needed_is_read(results: Path) -> None:
 
 
 def test_a_changed_file_is_another_artifact(results: Path) -> None:
-    asked = settings_of(results, "method=retrieval_only")
+    asked = settings_of(results, "method=spec_vla proposer=retrieval")
     files = Artifacts(asked.results, asked.policy)
     before, store = check(asked), files.load("datastore")
     assert files.load("datastore") is store

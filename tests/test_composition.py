@@ -14,7 +14,6 @@ from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageE
 from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.settings import RolloutSettings, settings_from
 from kerv_cli.lab.policy import check as check_rollout
-from kerv_cli.methods.agreement import WatchSettings
 from kerv_cli.methods.certified import CertifiedSkipSettings, ScopedSettings
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.eagle import DrafterProposerSettings
@@ -56,23 +55,14 @@ ONE_PASS = {
 }
 PRESETS: dict[str, dict[str, Any]] = {  # what differs from AR, spelled out: a default that moves is a preset that moves
     "ar": {},
-    "expert": {},  # a policy, no way of decoding
     "naive_sd": {"proposer": DrafterProposerSettings(depth=5, top_k=1, nodes=5)},
     "spec_vla": {"proposer": CHAIN, "acceptance": RELAXED},
     "jacobi": {"proposer": JacobiProposerSettings(depth=0)},
-    "hold": {"proposer": NoSettings("hold"), "acceptance": RELAXED},
-    "kalman_only": {"proposer": NoSettings("kalman"), "acceptance": RELAXED},
     "kerv": {
         "proposer": CHAIN,
         "acceptance": RELAXED,
         "threshold": K_LEVEL,
         "rectifier": CompensateSettings("compensate", "damped", 1, True, 1, 0, -1),
-    },
-    "kerv_chunk": {
-        "proposer": CHAIN,
-        "acceptance": RELAXED,
-        "threshold": K_LEVEL,
-        "rectifier": CompensateSettings(predictor="draft", steps=4),
     },
     "kerv_paper": {
         "proposer": DrafterProposerSettings(depth=5, top_k=8, nodes=50),
@@ -91,10 +81,6 @@ PRESETS: dict[str, dict[str, Any]] = {  # what differs from AR, spelled out: a d
         "acceptance": HybridAcceptanceSettings(strict_dofs=False, group_limit=30, token_limit=15),
         "boundary": BOUNDARY,
         "skip": SKIP,
-    },
-    "retrieval_only": {
-        "proposer": RetrievalProposerSettings(neighbours=5, nodes=50),
-        "acceptance": SequenceAcceptanceSettings(group_limit=30, token_limit=15),
     },
     "spec_vla_paper": {
         "proposer": DrafterProposerSettings(depth=5, top_k=8, nodes=50),
@@ -122,7 +108,6 @@ PRESETS: dict[str, dict[str, Any]] = {  # what differs from AR, spelled out: a d
         "skip": NoSettings("always"),
     },
     "one_pass": ONE_PASS,
-    "one_pass_skip": {**ONE_PASS, "skip": SKIP},
     "one_pass_streak": {
         "prefill_draft": ONE_PASS["prefill_draft"],
         "proposer": CHAIN,
@@ -131,7 +116,6 @@ PRESETS: dict[str, dict[str, Any]] = {  # what differs from AR, spelled out: a d
     },
     "parallel": {"skip": NoSettings("parallel")},
     "sp_vla": {"skip": SpeedSkipSettings(v_min=0.3, v_max=1000, buffer=6, share=0.5, penalty=1e-4)},
-    "watch": {"skip": WatchSettings(source="early", every=1, tolerance=0.1)},
     "one_pass_strict": {"prefill_draft": NoSettings("early"), "proposer": JacobiProposerSettings(depth=0)},
 }
 
@@ -153,7 +137,6 @@ def test_every_method_has_a_row_here() -> None:
 def test_a_preset_is_the_parts_that_its_name_promises(method: str) -> None:
     asked = composed(f"method={method}")
     assert asked.method == method
-    assert asked.policy.kind == ("expert" if method == "expert" else "model")
     assert asked.parts() == {**AR, **PRESETS[method]}
     assert (asked.chunk, asked.datastore) == (0, NoSettings("exact"))
     Method.of(asked).check(SimpleNamespace(chunk=4, parallel=method == "parallel"))
@@ -240,7 +223,7 @@ def test_a_damaged_stored_setting_gets_one_line(change: Any, error: type[Excepti
         ("skip=always prefill_draft=merged", "skip=always with prefill_draft=merged"),
         ("method=spec_vla proposer.depth=0", "proposer.depth=0"),
         ("method=jacobi proposer.depth=-1", "proposer.depth=-1"),
-        ("method=retrieval_only proposer.neighbours=0", "proposer.neighbours=0"),
+        ("proposer=retrieval proposer.neighbours=0", "proposer.neighbours=0"),
         ("threshold.r=-1", "threshold.r=-1"),
     ],
 )
@@ -268,7 +251,7 @@ def test_only_what_needs_no_states_can_be_chosen_before_the_prefill() -> None:
     [
         ("policy=expert skip=similarity", "policy=expert with skip=similarity: the expert decodes nothing"),
         ("policy=expert method=spec_vla", "policy=expert with proposer=drafter: the expert decodes nothing"),
-        ("method=expert threshold.r=3", "policy=expert with threshold=fixed: the expert"),
+        ("policy=expert threshold.r=3", "policy=expert with threshold=fixed: the expert"),
         ("policy=expert chunk=2", "the expert decodes nothing"),
         ("policy=expert deviation_every=5", "deviation_every=5: the expert has no AR"),
         ("policy.kind=exprt", "unknown policy.kind 'exprt': did you mean expert"),
@@ -301,21 +284,20 @@ def test_an_expert_needs_nothing_else() -> None:
         ("method=kerv threshold.k_s=0.3", ("drafter", "calibration")),
         ("method=kerv threshold.k_s=0.3 rectifier.predictor=linear", ("drafter",)),
         ("method=kerv_paper", ("drafter", "calibration")),
-        ("method=kerv_chunk", ("drafter", "calibration")),
         ("method=heisd", ("drafter", "datastore", "calibration")),
         ("method=heisd_paper", ("drafter", "datastore", "calibration")),
         ("method=heisd boundary=always_retrieval skip=none", ("drafter", "datastore")),
         ("method=heisd boundary=random skip.s_min=0.99", ("drafter", "datastore")),
-        ("method=retrieval_only", ("datastore",)),
+        ("proposer=retrieval", ("datastore",)),
         ("method=jacobi", ()),
-        ("method=hold", ()),
-        ("method=kalman_only", ("calibration",)),
+        ("proposer=hold", ()),
+        ("proposer=kalman", ("calibration",)),
         ("method=one_pass", ("early",)),
         ("method=one_pass prefill_draft.sources=[damped]", ("calibration",)),
         ("method=one_pass prefill_draft.sources=[early] prefill_draft.fallback=[retrieval]", ("early", "datastore")),
         ("method=one_pass prefill_draft=retrieval", ("datastore",)),
-        ("method=one_pass_skip", ("early", "datastore", "calibration")),
-        ("method=one_pass_skip skip.s_min=0.99", ("early", "datastore")),
+        ("method=one_pass skip=similarity", ("early", "datastore", "calibration")),
+        ("method=one_pass skip=similarity skip.s_min=0.99", ("early", "datastore")),
         ("method=one_pass_strict", ("early",)),
         ("method=early_unverified", ("early",)),
         ("method=scout_unverified", ("scout",)),
@@ -324,8 +306,6 @@ def test_an_expert_needs_nothing_else() -> None:
         ("method=retrieval_unverified", ("datastore",)),
         ("method=spec_vla_paper", ("drafter",)),
         ("method=sp_vla", ()),
-        ("method=watch", ("early",)),
-        ("method=watch skip.source=kalman", ("calibration",)),
     ],
 )
 def test_a_method_needs_what_its_parts_read_and_nothing_else(overrides: str, wanted: tuple[str, ...]) -> None:

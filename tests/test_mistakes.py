@@ -86,7 +86,7 @@ ANSWERS = [
     ("calibrate success", "is there, as a part of a shipped policy: policy.certificate=NAME makes one of yours"),
     ("train drafter drafter=early", "is there, as a part of a shipped policy: policy.early=NAME makes one of yours"),
     ("serve method=heisd", "its levels or drafts differ between tasks: name one with task=NAME"),
-    ("serve method=retrieval_only task=rech", "unknown task 'rech': did you mean reach-v3?"),
+    ("serve method=spec_vla proposer=retrieval task=rech", "unknown task 'rech': did you mean reach-v3?"),
     ("serve policy=expert", "policy=expert: it acts in the simulator's worlds and cannot be served"),
     ("demos policy=vision policy.target=nope task=reach", "train it with 'kerv train target name=nope'"),
     ("sweep threshold.r=1,2,3", "of which study? name one, study=NAME: 'kerv sweep' lists them; 'kerv rollout -m'"),

@@ -69,13 +69,13 @@ def rollout(results: Path, *words: str) -> list[str]:
     [
         ("drafter/nano-state/drafter.json", "spec_vla"),
         ("early/nano-state/early.json", "one_pass_strict"),
-        ("datastore/nano-state/manifest.json", "retrieval_only"),
-        ("calibration/nano-state/calibration.json", "kalman_only"),
+        ("datastore/nano-state/manifest.json", "spec_vla proposer=retrieval"),
+        ("calibration/nano-state/calibration.json", "spec_vla proposer=kalman"),
     ],
 )
 def test_a_rollout_refuses_an_artifact_of_other_actions(results: Path, tmp_path: Path, path: str, method: str) -> None:
     copy = Path(shutil.copytree(results, tmp_path / "results"))
-    words = rollout(copy, "task=drawer-close", f"method={method}")
+    words = rollout(copy, "task=drawer-close", *f"method={method}".split())
     assert kerv(*words, "--plan") == (0, [])
     file = copy / "artifacts" / path
     value = json.loads(file.read_text())

@@ -80,17 +80,17 @@ def test_recordings_of_a_grid_have_names_of_their_own(policies: Path, tmp_path: 
 def test_runs_are_viewed_by_their_ids_and_last_is_the_newest_with_recordings(policies: Path, tmp_path: Path) -> None:
     results, other = f"results={tmp_path}/results", f"results={tmp_path}/other"
     words = ["policy=vision", "policy.target=nano-vision", "task=reach-v3", "world.horizon=3", "record_size=32"]
-    for folder, methods in ((results, ("hold", "ar")), (other, ("hold",))):
+    for folder, methods in ((results, ("jacobi", "ar")), (other, ("jacobi",))):
         shutil.copytree(policies / "artifacts", Path(folder.removeprefix("results=")) / "artifacts")
         for method in methods:
             works("rollout", f"method={method}", "episodes=1", *words, folder)
     works("rollout", "method=ar", "episodes=1", *FAST, results)
-    ar, hold = (run["id"] for run in listed(tmp_path / "results", "kind=rollout")[1:])
-    assert (ar.endswith("-ar"), hold.endswith("-hold")) == (True, True)
+    ar, jacobi = (run["id"] for run in listed(tmp_path / "results", "kind=rollout")[1:])
+    assert (ar.endswith("-ar"), jacobi.endswith("-jacobi")) == (True, True)
     assert works("view", "last", "--summary", results) == works("view", ar, "--summary", results)
-    (one,) = (tmp_path / "results/rollouts" / hold).rglob("*.rrd")
-    assert works("view", hold, "--summary", results) == works("view", str(one), "--summary")
-    works("view", "--together", ar, hold, "--summary", results)
+    (one,) = (tmp_path / "results/rollouts" / jacobi).rglob("*.rrd")
+    assert works("view", jacobi, "--summary", results) == works("view", str(one), "--summary")
+    works("view", "--together", ar, jacobi, "--summary", results)
     assert "no recordings in" in kerv("view", "target/nano-state", results).stderr
     assert "unknown run 'nobodys'" in kerv("view", "nobodys", results).stderr
     assert "nobodys/either does not exist" in kerv("view", "nobodys/either", results).stderr

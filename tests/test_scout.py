@@ -308,32 +308,6 @@ def test_the_shipped_studies_of_certificates_pass(policies: Path, words: str) ->
     assert folder_of(resolved) == policies / "artifacts/certificate/mine"
 
 
-def test_the_guard_ends_trust_in_an_episode_that_lasts_longer_than_the_certified_ones(
-    target: CompactTarget, scout: Scout
-) -> None:
-    issued = certificate(target, 1, lengths={TASK: list(range(1, 10))})
-    assert issued.longest(TASK, 0.1) == 9
-    assert issued.longest(TASK, 0.05) == issued.longest("reach-v3", 0.1) == np.inf  # nine successes cannot say
-    where = context(target, {"certificate": issued, "scout": scout}, TASK)
-    draft = where.built["prefill_draft"] = scoped(ScopedSettings(), where)
-    assert isinstance(draft, ScoutProposer)
-    guarded = decoder(target, draft, skip=certified(CertifiedSkipSettings(guard=0.3), where))
-    for episode in range(2):
-        guarded.reset(TASK, episode, np.zeros(3))
-        records = [guarded.decode(observed(target, i)) for i in range(9)]
-        assert [record.forwards == 0 for record in records] == [True] * 7 + [False] * 2
-
-
-def test_the_guards_false_alarms_are_as_rare_as_it_says(target: CompactTarget) -> None:
-    random = np.random.default_rng(0)
-    alarms = []
-    for _ in range(4000):
-        lengths = random.integers(10, 60, 22)  # ties too
-        issued = certificate(target, 1, lengths={TASK: sorted(map(int, lengths[:-1]))})
-        alarms.append(lengths[-1] > issued.longest(TASK, 0.1))
-    assert 0.06 < np.mean(alarms) <= 0.1
-
-
 def test_pairs_that_are_missing_are_counted() -> None:
     same = np.array([(1.0, 1.0)] * 30)
     assert 0 < _needed(same, 5.0, 0.1) < 200

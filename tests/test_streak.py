@@ -10,15 +10,12 @@ import torch
 from examples.own_target import MockTarget
 from test_unverified import SHOWN, Near
 
-from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.parts import Fixed
-from kerv_cli.lab.policy import warm_up
 from kerv_cli.methods.merged.proposer import MergedProposer
 from kerv_cli.methods.spec_vla import Relaxed
 from kerv_cli.methods.streak import StreakSkip, StreakSkipSettings
-from kerv_cli.worlds.metaworld.spec import SPEC
 
 
 def decoder_of(source: Any, target: MockTarget, draft: Any = None, radius: int = 0, **settings: Any) -> Decoder:
@@ -69,35 +66,6 @@ def test_an_episode_begins_with_a_verification() -> None:
     decoder.finish(True)
     decoder.reset("t", 1, np.zeros(3))
     assert modes(decoder, 3) == "vsv"
-
-
-@torch.inference_mode()
-def test_trust_that_is_kept_outlasts_the_episode_of_its_task_alone() -> None:
-    target = MockTarget()
-    source = near(target)
-    decoder = decoder_of(source, target, keeps=True, tolerance=0.0)
-    begun = [modes(decoder, 5)]
-    for task in ("t", "other", "t"):
-        decoder.finish(True)
-        decoder.reset(task, 1, np.zeros(3))
-        begun.append(modes(decoder, 6))
-    assert begun == ["vsvss", "ssvsss", "vsvssv", "ssssvs"]
-    source.drafted = near(target, bins=1).drafted
-    assert modes(decoder, 9) == "sssssssvv"
-    decoder.finish(False)
-    decoder.reset("t", 2, np.zeros(3))
-    assert modes(decoder, 2) == "vv"
-
-
-@torch.inference_mode()
-def test_trust_that_is_kept_is_not_that_of_a_warm_up() -> None:
-    target = MockTarget()
-    still = Observation(np.zeros(1), np.zeros(0), "")
-    decoder = decoder_of(Near(target, target.encode(still)), target, keeps=True)
-    warm_up(decoder, "t", SPEC.observation, 8)
-    assert decoder.decode(still).skipped  # it agreed
-    decoder.reset("t", 1, np.zeros(3))
-    assert not decoder.decode(still).skipped
 
 
 class ByPlace(MockTarget):

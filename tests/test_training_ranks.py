@@ -156,8 +156,6 @@ def test_a_policy_acts_by_its_method(tmp_path: Path) -> None:
     first = decoder.decode(world.observe(decoder.cameras)).actions
     world.close()
     np.testing.assert_allclose(episode.executed[: len(first)], first, atol=1e-6)
-    refused = CliRunner().invoke(app, ["demos", "policy=vision", "method=watch", "task=reach", *short])
-    assert (refused.exit_code, "skip=watch with kerv demos" in refused.stderr) == (2, True)
 
 
 @pytest.mark.parametrize("method", ["ar", "early_unverified"])

@@ -14,10 +14,10 @@ from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.acceptance import Acceptance, Strict
 from kerv_cli.engine.chunk import ActionHistory, Chunk, Clock, Rejection, Situation, steps_of
 from kerv_cli.engine.draft import EMPTY, Draft
-from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold, Watches
+from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import Target
-from kerv_cli.engine.record import PARALLEL, DecodeRecord, Look, Round
+from kerv_cli.engine.record import PARALLEL, DecodeRecord, Round
 from kerv_cli.engine.transfer import read, upload
 from kerv_cli.engine.tree import TokenTree
 
@@ -77,13 +77,6 @@ class Decoder:
         nodes = max((p.nodes for p in (draft, self.parts.proposer) if p is not None), default=0)
         self.cache = target.new_cache(1, target.max_prompt + size + max(nodes, size) + 1)
         self.situation = Situation("", ActionHistory(target.actions.dofs))
-        self.watch = self.parts.skip if isinstance(self.parts.skip, Watches) else None
-        self.plan = np.zeros((0, target.actions.dofs), np.float32)  # actions of the last decode, environment units
-
-    @property
-    def watcher(self) -> Decoder | None:
-        """Itself, where its method looks at the world while a chunk is executed."""
-        return None if self.watch is None else self
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -109,9 +102,8 @@ class Decoder:
 
     def finish(self, success: bool) -> None:
         """The episode ended."""
-        for part in (self.parts.skip, self.parts.prefill_draft, self.parts.proposer):
-            if part is not None:
-                part.finish(success)
+        if self.parts.skip is not None:
+            self.parts.skip.finish(success)
 
     @torch.inference_mode()
     def decode(self, observation: Observation) -> DecodeRecord:
@@ -119,7 +111,6 @@ class Decoder:
         clock = Clock(self.target.device)
         chunk = self.decode_prompt(self._encoding(observation, clock), clock, observation)
         actions, predicted = self.actions_of(chunk)
-        self.plan = actions
         self.threshold.update(chunk.variability)
         if self.parts.rectifier is not None:
             self.parts.rectifier.next_decode()
@@ -136,21 +127,6 @@ class Decoder:
             return prompt
 
         return encode
-
-    def looks_at(self, step: int) -> bool:
-        """Whether the method looks before control step `step` ≥ 1 of its last chunk."""
-        return self.watch is not None and step % self.watch.every == 0
-
-    @torch.inference_mode()
-    def look(self, observation: Observation, step: int) -> Look:
-        """Whether the last chunk is executed on from its control step `step`, as its method sees the world now."""
-        assert self.watch is not None
-        clock, space = Clock(self.target.device), self.target.actions
-        prompt = self._encoding(observation, clock)
-        chunk = Chunk(prompt, self.steps, space, self.cache, self.situation, observation=observation)
-        keeps = self.watch.keeps(chunk, space.encode(self.plan[step]).tolist())
-        clock.lap("propose")
-        return Look(keeps, clock.stop(), clock.phases)
 
     def actions_of(self, chunk: Chunk) -> tuple[np.ndarray, int]:
         """The chunk's actions (steps, D) float32 in environment units, and how many of their numbers were predicted."""

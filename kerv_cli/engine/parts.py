@@ -97,14 +97,3 @@ class TakesMany(Protocol):
 
     def take_many(self, chunks: Sequence[Chunk], cache: Callable[[int], Cache]) -> None:
         """Completes B chunks. cache: rows -> an empty one."""
-
-
-@runtime_checkable
-class Watches(Protocol):
-    """A skip rule that goes on looking while a chunk is executed. every: control steps between two looks."""
-
-    every: int
-
-    def keeps(self, chunk: Chunk, planned: Sequence[int]) -> bool:
-        """Whether the plan is executed on. chunk: an empty one, of the present observation. planned: the D tokens of
-        the action that is planned for now."""

@@ -43,9 +43,6 @@ class Proposer:
         target's states at chunk indices first … first + T − 1. target_tokens: the round's 1 + n argmax tokens, those
         behind rejected nodes included."""
 
-    def finish(self, success: bool) -> None:
-        """An episode ended. One that another follows without it, as in a warm-up, is not to be remembered."""
-
 
 class ChainProposer(Proposer):
     """Drafts chains on the host. One that does so before the prefill (trait `chains`) is a source of merged drafts and

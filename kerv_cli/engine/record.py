@@ -6,7 +6,7 @@ Notation (docs/methods.md §0): D degrees of freedom, H control steps in a chunk
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -69,16 +69,6 @@ class Delay:
 
 
 @dataclass(frozen=True)
-class Look:
-    """A look at the world while a chunk is executed. keeps: whether the rest of the chunk is executed too. seconds,
-    phases: of inference, as in `DecodeRecord`."""
-
-    keeps: bool
-    seconds: float
-    phases: dict[str, float]
-
-
-@dataclass(frozen=True)
 class DecodeRecord:
     """One call of the decoder: from an observation to the actions to execute."""
 
@@ -98,16 +88,6 @@ class DecodeRecord:
     reason: str | None = None  # why a skip rule executed the draft unverified or had it verified, where it says so
     deviation: float | None = None  # mean abs difference to AR's chunk from the same observation, where sampled
     delay: Delay | None = None  # None: the world waited
-    looks: int = 0  # looks at the world while the chunk was executed; their time is in `seconds` and `phases`
-    abandoned: int = 0  # control steps of the chunk that were given up after the last look
-
-    def with_look(self, look: Look, left: int) -> DecodeRecord:
-        """After a look, before which `left` control steps of the chunk were not yet executed."""
-        phases = {name: seconds + look.phases.get(name, 0.0) for name, seconds in self.phases.items()}
-        abandoned = 0 if look.keeps else left
-        return replace(
-            self, seconds=self.seconds + look.seconds, phases=phases, looks=self.looks + 1, abandoned=abandoned
-        )
 
     @property
     def delay_steps(self) -> int | None:

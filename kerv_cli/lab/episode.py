@@ -12,7 +12,7 @@ import numpy as np
 
 from kerv_cli.base.settings import CameraSettings
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.record import DecodeRecord, Delay, EpisodeRecord, Look
+from kerv_cli.engine.record import DecodeRecord, Delay, EpisodeRecord
 from kerv_cli.lab.clock import RealClock
 from kerv_cli.worlds.spec import World
 
@@ -42,16 +42,6 @@ class ActionDecoder(Follower, Protocol):
 
     def decode(self, observation: Observation) -> DecodeRecord:
         """The present observation, with the images of `cameras` -> the actions to execute and their record."""
-
-
-class Watcher(Protocol):
-    """What may look at the world while its last chunk is executed: the attribute `watcher` of a decoder."""
-
-    def looks_at(self, step: int) -> bool:
-        """Whether `look` is to be asked before control step `step` ≥ 1 of the chunk."""
-
-    def look(self, observation: Observation, step: int) -> Look:
-        """Whether the chunk is executed on from `step`."""
 
 
 class _Execution:
@@ -103,20 +93,6 @@ class _Execution:
         while len(self.in_hand) > rest and not self.world.done:
             self.step()
 
-    def watched(self, decode: DecodeRecord, watcher: Watcher) -> DecodeRecord:
-        """Executes the chunk in hand for as long as `watcher` keeps it -> its record, with the looks."""
-        step = 0
-        while self.in_hand and not self.world.done:
-            if step and watcher.looks_at(step):
-                look = watcher.look(self.world.observe(self.follower.cameras), step)
-                decode = decode.with_look(look, len(self.in_hand))
-                if not look.keeps:
-                    self.in_hand.clear()
-                    break
-            self.step()
-            step += 1
-        return decode
-
     def during(self, delay: Delay) -> Delay:
         """The world goes on for a decode's delay -> the delay, with what was executed."""
         before, in_hand = len(self.actions), len(self.in_hand)
@@ -166,7 +142,6 @@ def episode(
     world.reset(seed)
     follower.reset(world.task, seed, world.end_effector)
     execution = _Execution(world, follower, camera, on_step)
-    watcher: Watcher | None = getattr(follower, "watcher", None)
     decodes: list[DecodeRecord] = []
     decode_steps: list[int] = []
     if clock is not None:
@@ -180,8 +155,6 @@ def episode(
         decodes.append(decode)
         decode_steps.append(len(execution.actions))
         execution.take(decodes[-1], clock)
-        if watcher is not None:
-            decodes[-1] = execution.watched(decodes[-1], watcher)
         execution.until(0 if clock is None else clock.expected)
     follower.finish(world.succeeded)
     return EpisodeRecord(

@@ -14,7 +14,7 @@ from dataclasses import asdict
 from typing import Any
 
 from kerv_cli.base.errors import KervError
-from kerv_cli.base.registry import METHOD_KINDS, part_of, parts
+from kerv_cli.base.registry import METHOD_KINDS, part_of
 from kerv_cli.base.settings import (
     CONSTANT,
     EXPERT,
@@ -120,14 +120,9 @@ def complete_settings(settings: Plain) -> dict[str, Any]:
 
 
 def depends_on_order(settings: Plain) -> bool:
-    """Whether an episode's result depends on the episodes before it in its cell: a proposer that remembers them, a
-    streak that keeps its trust, or a skip level that feedback moves."""
-    skip, drafts = settings.get("skip", {}), [settings.get(kind, {}) for kind in ("proposer", "prefill_draft")]
-    names = [
-        n for d in drafts for n in (d.get("kind"), d.get("outside"), *d.get("sources", ()), *d.get("fallback", ()))
-    ]
-    remembers = {name for name in parts("proposer") if part_of("proposer", name).traits.get("remembers")}
-    return any(skip.get(name) for name in ("up", "down", "keeps")) or bool(remembers.intersection(names))
+    """Whether an episode's result depends on the episodes before it in its cell: feedback moves a skip level."""
+    skip = settings.get("skip", {})
+    return any(skip.get(name) for name in ("up", "down"))
 
 
 def stress_of(settings: Plain) -> dict[str, Any]:

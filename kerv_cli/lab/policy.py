@@ -17,7 +17,7 @@ from kerv_cli.engine.decoder import Decoder, deviation
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.lab import clock
 from kerv_cli.lab.clock import RealClock
-from kerv_cli.lab.episode import ActionDecoder, Watcher
+from kerv_cli.lab.episode import ActionDecoder
 from kerv_cli.lab.expert import ExpertDecoder
 from kerv_cli.lab.identity import OBSERVATION
 from kerv_cli.lab.plan import Cell, plan
@@ -64,8 +64,6 @@ def check(settings: RolloutSettings) -> dict[str, str]:
     if settings.deviation_every > 0:
         target.check_autoregressive(f"deviation_every={settings.deviation_every}", "there is no AR to differ from")
     method.check(target, settings.rollout.batch)
-    if settings.rollout.clock != WAITS:
-        method.check_unwatched(f"rollout.clock={settings.rollout.clock}", "a look has no latency there")
     clock.check(settings, spec, target)
     hashes = artifacts.check(method.needs)
     method.check_levels(tasks, artifacts.load)
@@ -133,11 +131,6 @@ class Around:
     def cameras(self) -> tuple[str, ...]:
         """Those of the decoder."""
         return self.decoder.cameras
-
-    @property
-    def watcher(self) -> Decoder | None:
-        """That of the decoder."""
-        return self.decoder.watcher
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
         """Begins an episode."""
@@ -251,10 +244,7 @@ def warm_up(
     """Runs a few decodes before anything is timed: first calls allocate memory and choose kernels. The hand is moved,
     so that parts that need a history or a path run too. pixels: size of the images."""
     still = still_observation(decoder, space, pixels)
-    watcher: Watcher | None = getattr(decoder, "watcher", None)
     decoder.reset(task, 0, np.array([0.0, 0.0, 0.1]))
     for i in range(decodes):
-        for step, action in enumerate(decoder.decode(still).actions):
-            if step and watcher is not None and watcher.looks_at(step):
-                watcher.look(still, step)
+        for action in decoder.decode(still).actions:
             decoder.observe(action, np.array([0.01 * i, 0.0, 0.1]))

@@ -118,8 +118,6 @@ _DECODE: Fields = {
     "rounds": (pa.list_(_ROUND), lambda decode: [asdict(one) for one in decode.rounds]),
     **_attributes("compensated"),
     **_attributes("skipped", kind=FLAG),
-    # at the world while the chunk was executed; control steps given up after the last of them
-    **_attributes("looks", "abandoned"),
     **_attributes("variability", "similarity", "metric", "deviation", kind=FLOAT),
     **_attributes("reason", kind=TEXT),  # of a skip rule: trusted, streak; null without one that says so
     "delay_seconds": (FLOAT, _delay("seconds")),  # these: null where the world waited

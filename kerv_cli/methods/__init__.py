@@ -8,9 +8,8 @@ registration, imports neither torch nor numpy; code that does lies beside it.
     heisd                       HeiSD: the datastore and its drafts; two sides of a boundary, verify-skip
     jacobi, parallel            PD-VLA's and OpenVLA-OFT's decoding
     early, merged               ours: a draft before the prefill (`one_pass`)
-    scout, self_cache           ours: other sources of whole chunks
+    scout                       ours: whole chunks from the images, without the target
     streak, unverified          ours: drafts that are executed without a verification
-    agreement                   ours: … where a second source agrees; watching a plan being executed
     certified                   ours: … on the tasks of a certificate of success
     sp_vla                      SP-VLA: a regression where motion is fast
 

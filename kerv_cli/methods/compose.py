@@ -132,17 +132,6 @@ class Method:
                 "decodes, use threshold=fixed"
             )
 
-    def check_unwatched(self, where: str, why: str) -> None:
-        """Refuses a method that looks at the world while a chunk is executed, where that is impossible. where, why: for
-        the message.
-
-        Raises:
-            UsageError: it is one.
-        """
-        part = self.parts["skip"]
-        if part.traits.get("watches"):
-            raise UsageError(f"skip={part.name} with {where}: {why}")
-
     def check_levels(self, tasks: Iterable[str], artifact: Callable[[str], Any]) -> None:
         """Refuses a calibration without the reference levels of these tasks, where the threshold reads them.
 

@@ -27,20 +27,18 @@ class StreakSkipSettings:
     most: int = number(8, 1)  # decodes in a row without a verification
     opening: int = number(0, 0)  # decodes that an episode begins with, unverified
     tolerance: float = number(0.05, 0)  # mean abs difference that still agrees, normalised; 0: accepted whole
-    keeps: bool = False  # an episode begins with the trust that the task's last one ended with, not with `opening`
 
 
 class StreakSkip(Skip):
     """A chunk whose draft agrees with the target's tokens allows one unverified decode before the next verification,
     the next one in a row two, then four, up to `most`; a chunk that does not agree ends it. An episode begins with a
-    verification, with `opening` unverified decodes, or with those that the task's last episode allowed at its end."""
+    verification, or with `opening` unverified decodes."""
 
     def __init__(self, settings: StreakSkipSettings, source: ChainProposer) -> None:
         self.settings, self.source = settings, source
         self.allowed = 0  # unverified decodes after the last verification
         self.left = 0  # of these, how many are still to come
         self.chain: tuple[int, ...] = ()  # the source's draft of this chunk
-        self.task, self.kept = "", dict[str, int]()  # task -> unverified decodes that its last verification allowed
 
     @classmethod
     def build(cls, settings: StreakSkipSettings, context: Context) -> StreakSkip:
@@ -50,8 +48,7 @@ class StreakSkip(Skip):
 
     def begin(self, task: str, seed: int) -> None:
         """An episode begins."""
-        self.task, opening = task, self.settings.opening
-        self.allowed = self.left = self.kept.get(task, opening) if self.settings.keeps else opening
+        self.allowed = self.left = self.settings.opening
 
     def take(self, chunk: Chunk) -> bool:
         """Fills the chunk with the source's draft while unverified decodes are left -> whether it did."""
@@ -69,10 +66,6 @@ class StreakSkip(Skip):
         """The prefill verified the chunk: allows twice as many unverified decodes, or none."""
         self.allowed = min(self.settings.most, 2 * self.allowed or 1) if self._agrees(chunk) else 0
         self.left = self.allowed
-
-    def finish(self, success: bool) -> None:
-        """An episode ended; a warm-up, which does not, leaves nothing behind."""
-        self.kept[self.task] = self.allowed
 
     def _agrees(self, chunk: Chunk) -> bool:
         """Whether the source's draft was judged, and was accepted whole or is at most `tolerance` from the target's

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from kerv_cli.base.config import as_words, compose
 from kerv_cli.base.errors import UsageError
@@ -153,7 +152,6 @@ def certify(
         seeds=seeds_text(seed for cell in cells for seed in cell.seeds),
         candidates=candidates,
         chosen=chosen,
-        lengths={} if chosen is None else _lengths(episodes[episodes["label"] == candidates[chosen].label]),
         provenance={"command": "kerv calibrate success", "engine": ENGINE, **provenance(first.runtime.device)},
     )
 
@@ -197,12 +195,6 @@ def _needed_text(pairs: int) -> str:
     if pairs > MOST_PAIRS:
         return f"more than {MOST_PAIRS:,}"
     return {0: "", -1: "not at these rates"}.get(pairs, f"about {pairs} more")
-
-
-def _lengths(episodes: pd.DataFrame) -> dict[str, list[int]]:
-    """Task -> decodes of each success, ascending."""
-    tasks = episodes[episodes["success"]].sort_values("decodes").groupby("task")["decodes"]
-    return {str(task): [int(count) for count in counts] for task, counts in tasks}
 
 
 def _bound(margin: float) -> float:

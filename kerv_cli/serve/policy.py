@@ -53,8 +53,6 @@ class Policy:
         self.task = self._task()
         self.method = Method.of(settings)
         self.method.check(self.artifacts.description, settings.batch, "batch")
-        if settings.protocol != VLA_EVAL:
-            self.method.check_unwatched("kerv serve", "a client executes chunks without a look between their steps")
         self.identity = self.artifacts.check(self.method.needs)
         if "certificate" in self.method.needs:
             self.artifacts.load("certificate").check_environment(self.artifacts.description.environment)

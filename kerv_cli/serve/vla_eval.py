@@ -148,7 +148,6 @@ class VlaEval(Conversation):
         episode = self.episode = self.episode or _Episode.of({})
         state = payload.get("state", payload.get("states"))
         numbers = self.policy.interface.numbers(state, "state", payload)
-        observe = functools.partial(self._observation, episode, payload, numbers)
         felt = Observation(*numbers)
         hand = hand_of(felt)
         if not episode.begun:
@@ -160,9 +159,9 @@ class VlaEval(Conversation):
         if self.session.is_held(felt, bool(episode.sent)):
             episode.left.clear()  # what was planned from a state before it is not executed on
             return self._act(episode, episode.sent[-1], None)
-        seconds = self._look(episode, observe)
+        seconds = None
         if not episode.left:
-            record = self.session.decode(observe())
+            record = self.session.decode(self._observation(episode, payload, numbers))
             seconds = record.seconds
             episode.decodes.append(record)
             episode.decode_steps.append(len(episode.sent))
@@ -175,19 +174,6 @@ class VlaEval(Conversation):
         episode.sent.append(np.clip(action, space.low, space.high).astype(np.float32))
         sent = self.policy.interface.converted(action[None])[0].astype(np.float32)
         return Reply(self._message("action", {"actions": sent}), seconds)
-
-    def _look(self, episode: _Episode, observe: Callable[[], Observation]) -> float | None:
-        """Lets a method that looks at the world during a chunk decide whether the rest of the chunk is executed ->
-        seconds that it took; None where it did not look."""
-        watcher = getattr(self.session.decoder, "watcher", None)
-        step = len(episode.sent) - episode.decode_steps[-1] if episode.decode_steps else 0
-        if watcher is None or not episode.left or not watcher.looks_at(step):
-            return None
-        look = watcher.look(observe(), step)
-        episode.decodes[-1] = episode.decodes[-1].with_look(look, len(episode.left))
-        if not look.keeps:
-            episode.left.clear()
-        return float(look.seconds)
 
     def _observation(self, episode: _Episode, payload: Message, numbers: tuple[np.ndarray, np.ndarray]) -> Observation:
         """The observation in a payload, whose instruction the episode notes.

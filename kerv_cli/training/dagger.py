@@ -95,9 +95,7 @@ class PolicyActs:
                 f"world.camera.name={views[0]}, or join further views behind it"
             )
         if not _is_plain(settings):
-            method = Method.of(settings)
-            method.check(description)
-            method.check_unwatched("kerv demos", "what acts looks at the world once per chunk")
+            Method.of(settings).check(description)
         return cls(settings, _hash(settings))
 
     def __call__(self, config: DemoConfig) -> PolicyActor:

@@ -12,12 +12,10 @@ from kerv_cli.base.registry import PREFILL, add, find, part_of
 
 @dataclass
 class CertifiedSkipSettings:
-    """On the certificate's tasks the rule that it certifies, until an episode lasts longer than all but the share
-    `guard` of the certified successes; elsewhere a streak of at most `most` (§4.5)."""
+    """On the certificate's tasks the rule that it certifies; elsewhere a streak of at most `most` (§4.5)."""
 
     kind: str = "certified"
     most: int = number(8, 1)
-    guard: float = number(0.0, 0, 0.5, help="false alarms of the guard, share of successes; 0: no guard")
 
 
 @dataclass

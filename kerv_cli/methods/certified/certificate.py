@@ -6,7 +6,6 @@ that come of it are ordinary ones.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -15,7 +14,6 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import part_of
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.parts import Skip
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.methods.artifacts import Artifact, MadeFor
@@ -64,8 +62,7 @@ class Certificate:
     success, with confidence 1 − delta.
 
     drafts: kind -> hash of the artifacts that drafted. method: kind -> settings of the other parts. chunk: H. world:
-    camera and horizon. dtype: number format. seeds: the selection seeds, as text. lengths: task -> decodes of each
-    success of the chosen rule, ascending.
+    camera and horizon. dtype: number format. seeds: the selection seeds, as text.
     """
 
     target: str
@@ -82,20 +79,12 @@ class Certificate:
     seeds: str
     candidates: list[Candidate]
     chosen: int | None
-    lengths: dict[str, list[int]] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
 
     @property
     def certified(self) -> Candidate | None:
         """The boldest rule of those that were certified; None: none was."""
         return None if self.chosen is None else self.candidates[self.chosen]
-
-    def longest(self, task: str, share: float) -> float:
-        """Decodes that a success of `task` outlasts with probability `share` at most, over certified successes and the
-        present one (split conformal prediction); infinite where the certificate has too few to say."""
-        lengths = self.lengths.get(task, [])
-        rank = math.ceil((1 - share) * (len(lengths) + 1))
-        return lengths[rank - 1] if 0 < rank <= len(lengths) else math.inf
 
     def check_method(self, method: Mapping[str, Any], dtype: str) -> None:
         """Refuses a method that decodes otherwise than what was certified. method: kind -> settings of its parts.
@@ -200,37 +189,9 @@ def certified(settings: CertifiedSkipSettings, context: Context) -> Skip | None:
     chunk = context.chunk or context.target.chunk
     if chunk != certificate.chunk:
         raise UsageError(f"skip=certified with chunk={chunk}: the certificate is of {certificate.chunk}")
-    rule = _built(certificate.certified.rule, context)
-    return Guarded(rule, certificate.longest(context.task, settings.guard)) if settings.guard else rule
+    return _built(certificate.certified.rule, context)
 
 
 def _built(rule: Any, context: Context) -> Skip:
     skip: Skip = part_of("skip", rule.kind).built(rule, context)
     return skip
-
-
-class Guarded(Skip):
-    """Trusts as `rule` does in the first `longest` decodes of an episode; the target verifies every later one."""
-
-    def __init__(self, rule: Skip, longest: float) -> None:
-        self.rule, self.longest, self.phase = rule, longest, rule.phase
-        self.decodes = 0
-
-    def begin(self, task: str, seed: int) -> None:
-        """An episode begins."""
-        self.decodes = 0
-        self.rule.begin(task, seed)
-
-    def finish(self, success: bool) -> None:
-        """An episode ended."""
-        self.rule.finish(success)
-
-    def take(self, chunk: Chunk) -> bool:
-        """Whether the rule takes the chunk; never behind `longest`."""
-        self.decodes += 1
-        return self.decodes <= self.longest and self.rule.take(chunk)
-
-    def verified(self, chunk: Chunk) -> None:
-        """The prefill judged the draft; told to the rule as long as it decides."""
-        if self.decodes <= self.longest:
-            self.rule.verified(chunk)

@@ -251,8 +251,8 @@ def predictor_of(settings: NoSettings, context: Context) -> Predictor:
 
 
 class PredictionProposer(ChainProposer):
-    """A kinematic prediction of the chunk (docs/methods.md §3.1, §6: `hold`, `kalman_only`). Committed steps of the
-    chunk count as executed. Drafts nothing while the history is shorter than the predictor's minimum."""
+    """A kinematic prediction of the chunk (docs/methods.md §3.1, §6: `hold`, `kalman`). Committed steps of the chunk
+    count as executed. Drafts nothing while the history is shorter than the predictor's minimum."""
 
     def __init__(self, predictor: Predictor) -> None:
         self.name, self.predictor = predictor.name, predictor

@@ -51,11 +51,6 @@ class MergedProposer(ChainProposer):
         for source in (*self.sources, *self.fallback):
             source.reset()
 
-    def finish(self, success: bool) -> None:
-        """Tells the sources."""
-        for source in (*self.sources, *self.fallback):
-            source.finish(success)
-
     def propose(self, chunk: Chunk, depth: int) -> Draft:
         """One prefix tree of all sources' chains; fallback sources join where none of the others is sure."""
         draft = self._on_device(chunk, depth)
