@@ -167,7 +167,7 @@ def test_the_fit_finds_the_noise_that_made_the_data(ratio: float) -> None:
     speed = np.cumsum(acceleration, 1)
     place = np.cumsum(np.c_[np.zeros(len(speed)), speed[:, :-1] + 0.5 * acceleration[:, 1:]], 1)
     seen = 1e-3 * (place + random.normal(0, 1, place.shape))  # small: nothing is clipped, and only the ratio counts
-    q, damping = fit_noise(seen[:, :10], seen[:, 10:], 2, (1.0,))
+    q, damping = fit_noise(seen[:, :10], seen[:, 10:], (1.0,))
     assert damping == 1.0
     assert ratio / 4 < q < 4 * ratio
 
@@ -287,7 +287,7 @@ def calibration(levels: dict[str, float]) -> Calibration:
         target=MadeFor("a" * 64, SPACE, 4),
         demos=Demonstrations("b" * 64, {}),
         window=10,
-        noise={kind: Noise.uniform(4, 1.0) for kind in ("kalman", "damped", "acceleration")},
+        noise={kind: Noise.uniform(4, 1.0) for kind in ("kalman", "damped")},
         errors={},
         variability={task: Variability(level, 5, level, level, level) for task, level in levels.items()},
         boundary=BoundarySection(8, {"15": BoundaryRanges(0.01, 2.0, 0.0, 0.2)}),

@@ -18,7 +18,6 @@ from kerv_cli.methods.kinematics.prediction import (
     FILTERS,
     HORIZON,
     PREDICTORS,
-    Acceleration,
     Hold,
     Kalman,
     Linear,
@@ -45,22 +44,19 @@ def predictor(kind: str, held: tuple[bool, ...] = HELD, **shape: int) -> Predict
     return build_predictor(kind, np.array(held), NOISE, **shape)
 
 
-def most_probable_path(
-    window: np.ndarray, q: float, r: float, steps: int, order: int, damping: float = 1.0
-) -> np.ndarray:
+def most_probable_path(window: np.ndarray, q: float, r: float, steps: int, damping: float = 1.0) -> np.ndarray:
     """(steps,): the reference, without a recursion. The first state and every random push are unknowns; the most
     probable ones are a weighted least-squares solution, and what is ahead goes on from them without a push."""
-    transition = {2: np.array([[1, damping], [0, damping]]), 3: np.array([[1, 1, 0.5], [0, 1, 1], [0, 0, 1]])}[order]
-    push = np.array([0.5, 1.0, 1.0])[:order]
+    transition, push = np.array([[1, damping], [0, damping]]), np.array([0.5, 1.0])
     pushes = len(window) - 1
-    state = np.hstack([np.eye(order), np.zeros((order, pushes))])  # of time 0, in the unknowns
+    state = np.hstack([np.eye(2), np.zeros((2, pushes))])  # of time 0, in the unknowns
     first, rows = state.copy(), []
     for i in range(pushes):
         state = transition @ state
-        state[:, order + i] += push
+        state[:, 2 + i] += push
         rows.append(state[0].copy())
-    pushed = np.eye(order + pushes)[order:]
-    known = [window[0], *[0.0] * (order - 1)]
+    pushed = np.eye(2 + pushes)[2:]
+    known = [window[0], 0.0]
     weighted = np.vstack([first / np.sqrt(r), np.reshape(rows, (pushes, -1)) / np.sqrt(r), pushed / np.sqrt(q)])
     wanted = np.concatenate([np.array(known) / np.sqrt(r), window[1:] / np.sqrt(r), np.zeros(pushes)])
     unknowns, *_ = np.linalg.lstsq(weighted, wanted, rcond=None)
@@ -76,26 +72,26 @@ log_scale = st.floats(-4, 3).map(lambda x: 10.0**x)
 
 
 @settings(deadline=None)  # the machine is shared
-@given(windows, log_scale, log_scale, st.integers(1, HORIZON), st.sampled_from([(2, 1.0), (2, 0.7), (3, 1.0)]))
+@given(windows, log_scale, log_scale, st.integers(1, HORIZON), st.sampled_from([1.0, 0.7]))
 def test_the_weights_are_those_of_the_most_probable_path(
-    window: np.ndarray, q: float, r: float, steps: int, model: tuple[int, float]
+    window: np.ndarray, q: float, r: float, steps: int, damping: float
 ) -> None:
-    weights = kalman_weights(q, r, len(window), steps, *model)
+    weights = kalman_weights(q, r, len(window), steps, damping)
     assert weights.shape == (steps, len(window))
-    expected = most_probable_path(window, q, r, steps, *model)
+    expected = most_probable_path(window, q, r, steps, damping)
     np.testing.assert_allclose(weights @ window, expected, rtol=1e-6, atol=1e-6)
 
 
 @settings(deadline=None)  # the machine is shared
 @given(arrays(np.float64, st.tuples(st.integers(3, 14), st.just(DOFS)), elements=st.floats(-1, 1)))
 def test_predict_goes_on_along_the_newest_actions_most_probable_path_clipped(history: np.ndarray) -> None:
-    for kind, order in (("kalman", 2), ("damped", 2), ("acceleration", 3)):
+    for kind in FILTERS:
         noise = NOISE[kind]
         ahead = predictor(kind, minimum=3).predict(history, 4)
         assert ahead is not None
         for dof in range(DOFS - 1):
             window = history[-WINDOW:, dof]
-            expected = most_probable_path(window, noise.q[dof], noise.r[dof], 4, order, noise.damping[dof])
+            expected = most_probable_path(window, noise.q[dof], noise.r[dof], 4, noise.damping[dof])
             np.testing.assert_allclose(ahead[:, dof], np.clip(expected, -1, 1), atol=1e-9)
 
 
@@ -106,23 +102,15 @@ def test_a_constant_is_held(kind: str, value: float, length: int) -> None:
     np.testing.assert_allclose(ahead, value, atol=1e-9)
 
 
-@pytest.mark.parametrize("order", [2, 3])
-def test_a_line_is_extrapolated_the_better_the_longer_the_window(order: int) -> None:
+def test_a_line_is_extrapolated_the_better_the_longer_the_window() -> None:
     ahead = np.arange(1, 5)
     errors = []
     for length in (4, 8, 16, 32, 64):
         line = 0.3 - 0.02 * np.arange(length)
         truth = line[-1] - 0.02 * ahead
-        errors.append(np.abs(kalman_weights(1.0, 1.0, length, 4, order) @ line - truth).max())
+        errors.append(np.abs(kalman_weights(1.0, 1.0, length, 4) @ line - truth).max())
     assert all(later < 0.5 * earlier for earlier, later in itertools.pairwise(errors[:4]))
     assert errors[-1] < 1e-9
-
-
-def test_a_parabola_needs_the_acceleration() -> None:
-    time = np.arange(68)
-    curve = 1e-4 * (time - 30.0) ** 2
-    velocity, acceleration = (kalman_weights(1.0, 1.0, 64, 4, order) @ curve[:64] for order in (2, 3))
-    assert np.abs(acceleration - curve[64:]).max() < 1e-9 < 1e-5 < np.abs(velocity - curve[64:]).max()
 
 
 @pytest.mark.parametrize("ratio", [0.01, 1.0, 30.0])
@@ -230,7 +218,7 @@ def test_wrong_requests() -> None:
     with pytest.raises(UsageError, match="kerv calibrate"):
         build_predictor("kalman", np.array(HELD), {})
     with pytest.raises(UsageError, match="minimum history"):
-        Acceleration(np.array(HELD), NOISE["acceleration"], minimum=2)
+        Kalman(np.array(HELD), NOISE["kalman"], minimum=1)
     with pytest.raises(UsageError, match="minimum history"):
         Hold(np.array(HELD), minimum=WINDOW + 1)
     with pytest.raises(ValueError, match="9 steps of 4"):

@@ -122,7 +122,7 @@ def test_every_proposer_says_when_it_can_draft() -> None:
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("kerv_cli.methods.ar:nothing_there", "kerv_cli.methods.ar has no nothing_there"),
+        ("kerv_cli.methods.streak:nothing_there", "kerv_cli.methods.streak has no nothing_there"),
         ("kerv_cli.nowhere:build", "kerv_cli.nowhere"),
     ],
 )

@@ -26,7 +26,7 @@ PLUGINS = "KERV_PLUGINS"
 
 MODULES = (
     "kerv_cli.worlds.registration",
-    "kerv_cli.targets.registration",
+    "kerv_cli.targets",
     "kerv_cli.methods.ar",
     "kerv_cli.methods.spec_vla",
     "kerv_cli.methods.eagle",
@@ -112,8 +112,8 @@ class Part:
         return self.settings(kind=self.name)
 
     def built(self, *arguments: Any, **keywords: Any) -> Any:
-        """Imports and calls `build`."""
-        return load(self.build)(*arguments, **keywords)
+        """Imports and calls `build`; None for a part without one, which stands for the absence of a part."""
+        return load(self.build)(*arguments, **keywords) if self.build else None
 
     def check_settings(self, settings: Any, what: str) -> None:
         """Checks these settings as `limits.check_settings`, then by `check`. what: how messages call the settings.

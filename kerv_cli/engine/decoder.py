@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -77,6 +77,9 @@ class Decoder:
         nodes = max((p.nodes for p in (draft, self.parts.proposer) if p is not None), default=0)
         self.cache = target.new_cache(1, target.max_prompt + size + max(nodes, size) + 1)
         self.situation = Situation("", ActionHistory(target.actions.dofs))
+        # set from outside: decodes every `every`-th observation of an episode too, outside the timing
+        self.reference: Decoder | None = None
+        self.every = self.decodes = 0
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -85,7 +88,7 @@ class Decoder:
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
         """A new episode begins, with the end effector at (3,) metres."""
-        boundary = self.parts.boundary
+        self.decodes, boundary = 0, self.parts.boundary
         random = boundary.numbers(task, seed) if boundary is not None else np.random.default_rng(seed)
         history = ActionHistory(self.target.actions.dofs)
         self.situation = Situation(task, history, [np.asarray(end_effector)], random)
@@ -114,8 +117,12 @@ class Decoder:
         self.threshold.update(chunk.variability)
         if self.parts.rectifier is not None:
             self.parts.rectifier.next_decode()
-        seconds = clock.stop()
-        return record_of(chunk, actions, seconds, clock.phases, predicted)
+        record = record_of(chunk, actions, clock.stop(), clock.phases, predicted)
+        self.decodes += 1
+        if self.reference is None or self.decodes % self.every:
+            return record
+        autoregressive = self.reference.decode(observation).actions
+        return replace(record, deviation=deviation(self.target.actions, actions, autoregressive))
 
     def _encoding(self, observation: Observation, clock: Clock) -> Callable[[], Tensor]:
         """A function that encodes the observation; its seconds are added to the phase `vision`."""

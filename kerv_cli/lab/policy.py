@@ -13,8 +13,7 @@ from kerv_cli.base.settings import EXPERT, WAITS, PolicySettings, RolloutSetting
 from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.base.views import frame_shape
 from kerv_cli.engine.batched import BatchDecoder
-from kerv_cli.engine.decoder import Decoder, deviation
-from kerv_cli.engine.record import DecodeRecord
+from kerv_cli.engine.decoder import Decoder
 from kerv_cli.lab import clock
 from kerv_cli.lab.clock import RealClock
 from kerv_cli.lab.episode import ActionDecoder
@@ -121,54 +120,6 @@ def _check_expert(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
             raise UsageError(f"policy=expert with {kind}={part.kind}: the expert decodes nothing, leave it out")
 
 
-class Around:
-    """Base of what adds something to a decoder: all that it does not do itself, the decoder does."""
-
-    def __init__(self, decoder: Decoder) -> None:
-        self.decoder = decoder
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """Those of the decoder."""
-        return self.decoder.cameras
-
-    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
-        """Begins an episode."""
-        self.decoder.reset(task, seed, end_effector)
-
-    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
-        """Tells the decoder."""
-        self.decoder.observe(action, end_effector)
-
-    def finish(self, success: bool) -> None:
-        """Tells the decoder."""
-        self.decoder.finish(success)
-
-
-class Sampled(Around):
-    """A decoder that also decodes every `every`-th observation autoregressively, outside the timing, and records the
-    deviation. AR needs no history, so that only the decoder is told what was executed."""
-
-    def __init__(self, decoder: Decoder, reference: Decoder, every: int) -> None:
-        super().__init__(decoder)
-        self.reference, self.every, self.count = reference, every, 0
-
-    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
-        """Begins an episode of both decoders."""
-        self.count = 0
-        super().reset(task, seed, end_effector)
-        self.reference.reset(task, seed, end_effector)
-
-    def decode(self, observation: Observation) -> DecodeRecord:
-        """The decoder's record; every `every`-th with the mean deviation from AR, in normalised action units."""
-        record = self.decoder.decode(observation)
-        self.count += 1
-        if self.count % self.every:
-            return record
-        reference = self.reference.decode(observation).actions
-        return dataclasses.replace(record, deviation=deviation(self.decoder.target.actions, record.actions, reference))
-
-
 def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
     """The decoder of one setting on one task, warmed up.
 
@@ -180,9 +131,12 @@ def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
         decoder: ActionDecoder = ExpertDecoder()
     else:
         artifacts = artifacts_of(settings)
-        decoder = Method.of(settings).decoder(artifacts.target, artifacts.load, task)
+        decoder = of_method = Method.of(settings).decoder(artifacts.target, artifacts.load, task)
         if settings.deviation_every > 0:
-            decoder = Sampled(decoder, Decoder(artifacts.target, chunk=settings.chunk), settings.deviation_every)
+            of_method.every, of_method.reference = (
+                settings.deviation_every,
+                Decoder(artifacts.target, chunk=settings.chunk),
+            )
     warm_up(decoder, task, spec.observation, settings.world.camera.size)
     return decoder
 

@@ -103,7 +103,7 @@ class Calibration:
     kind: Literal["calibration"] = "calibration"
 
     def __post_init__(self) -> None:
-        if set(self.noise) != set(FILTERS):
+        if not set(FILTERS) <= set(self.noise):
             raise ValueError("the noise of a filter is missing")
         if any(len(noise.q) != self.target.actions.dofs for noise in self.noise.values()):
             raise ValueError("the noise is not that of the action space")

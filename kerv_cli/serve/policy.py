@@ -19,8 +19,8 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.batched import BatchDecoder, Lane
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.engine.record import DecodeRecord
-from kerv_cli.lab.episode import ActionDecoder
-from kerv_cli.lab.policy import Around, artifacts_of, warm_up
+from kerv_cli.lab.episode import Follower
+from kerv_cli.lab.policy import artifacts_of, warm_up
 from kerv_cli.methods.compose import Method
 from kerv_cli.serve.guard import HOLD, Finite, StateRange
 from kerv_cli.serve.session import GRIPPERS, Interface, Session
@@ -132,23 +132,32 @@ class Policy:
         try:
             yield session
         finally:
-            if isinstance(session.decoder, Alone):
-                self.take_back(session.decoder.decoder)
+            if isinstance(session.decoder, Decoder):
+                self.take_back(session.decoder)
 
     def new_session(self) -> Session:
         """A session for one more client."""
         holds = self.settings.outside == HOLD
-        return Session(self._client_decoder, self.task, self.by_task, self.range, holds)
+        return Session(self._client_decoder, self.task, self.by_task, self.range, holds, self._decode)
 
     def take_back(self, decoder: Decoder) -> None:
         """Keeps the decoder of a client that has left, for the next client; not one that is for a single task."""
         if not self.by_task:
             self._idle.append(decoder)
 
-    def _client_decoder(self, task: str) -> ActionDecoder:
+    def _client_decoder(self, task: str) -> Follower:
         if self._together is not None:
-            return Seat(self._together)
-        return Alone(self._idle.pop() if self._idle else self._decoder(task), self._turn)
+            return self._together.decoder.lane()
+        return self._idle.pop() if self._idle else self._decoder(task)
+
+    def _decode(self, decoder: Any, observation: Observation) -> DecodeRecord:
+        """The record of a client's observation. One decoder decodes at a time."""
+        if self._together is not None:
+            return self._together.decode(decoder, observation)
+        with self._turn:
+            record: DecodeRecord = decoder.decode(observation)
+            check_finite(decoder)
+        return record
 
     def _decoder(self, task: str) -> Decoder:
         """A new decoder, after a few observations of zeros: first calls allocate memory and choose kernels."""
@@ -172,21 +181,6 @@ def check_finite(decoder: Decoder | BatchDecoder) -> None:
     """Raises KervError: the last decode computed numbers that are not finite."""
     target: Any = decoder.target
     target.check()
-
-
-class Alone(Around):
-    """A client's decoder, which decodes when no other one does."""
-
-    def __init__(self, decoder: Decoder, turn: threading.Lock) -> None:
-        super().__init__(decoder)
-        self.turn = turn
-
-    def decode(self, observation: Observation) -> DecodeRecord:
-        """The decoder's record."""
-        with self.turn:
-            record = self.decoder.decode(observation)
-            check_finite(self.decoder)
-        return record
 
 
 @dataclass(frozen=True)
@@ -233,16 +227,3 @@ class Together:
                 return
             for one in batch:
                 self._settle([one])
-
-
-class Seat(Lane):
-    """A client's lane of a batch."""
-
-    def __init__(self, together: Together) -> None:
-        target = together.decoder.target
-        super().__init__(target.actions, target.cameras)
-        self.together = together
-
-    def decode(self, observation: Observation) -> DecodeRecord:
-        """The batch's record of it, without times."""
-        return self.together.decode(self, observation)

@@ -12,7 +12,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
 from kerv_cli.base.views import frame_shape
 from kerv_cli.engine.record import DecodeRecord
-from kerv_cli.lab.episode import ActionDecoder
+from kerv_cli.lab.episode import Follower
 from kerv_cli.serve.guard import StateRange
 from kerv_cli.serve.wire import Message
 
@@ -134,17 +134,18 @@ class Session:
 
     def __init__(
         self,
-        decoder: Callable[[str], ActionDecoder],
+        decoder: Callable[[str], Follower],
         task: str = "",
         by_task: bool = False,
         range: StateRange | None = None,
         holds: bool = False,
+        decode: Callable[[Any, Observation], DecodeRecord] = lambda decoder, observation: decoder.decode(observation),
     ) -> None:
         """decoder: makes the decoder of a task. task: of every episode; empty: the client names it. by_task: a new task
-        needs a new decoder."""
+        needs a new decoder. decode: (decoder, observation) -> record."""
         self._make, self._by_task, self.task = decoder, by_task, task
         self.decoder: Any = None if by_task else decoder(task)
-        self.range, self.holds = range, holds
+        self.range, self.holds, self._decode = range, holds, decode
         self.say: Callable[[str], None] = lambda line: None
 
     def begin(self, task: str, seed: int, hand: np.ndarray) -> None:
@@ -170,5 +171,4 @@ class Session:
 
     def decode(self, observation: Observation) -> DecodeRecord:
         """The actions for an observation, and their record."""
-        record: DecodeRecord = self.decoder.decode(observation)
-        return record
+        return self._decode(self.decoder, observation)

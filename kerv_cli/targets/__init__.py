@@ -1,0 +1,15 @@
+"""The families of targets that kerv has itself; imported for what they register."""
+
+from __future__ import annotations
+
+from kerv_cli.base.registry import add
+
+add("target", "compact", "kerv_cli.targets.compact.folder:build")
+add(
+    "target",
+    "openvla",
+    "kerv_cli.targets.openvla.target:build",
+    weights="kerv_cli.targets.openvla.target:check_weights",
+    importer="kerv_cli.targets.openvla.importing:import_checkpoint",
+    images_alone=True,  # reads no state
+)

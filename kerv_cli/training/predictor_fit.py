@@ -115,7 +115,7 @@ def choose_episodes(dataset: DemoDataset, tasks: Sequence[str], limit: int, shar
     return chosen
 
 
-def fit_noise(past: np.ndarray, future: np.ndarray, order: int, dampings: Sequence[float]) -> tuple[float, float]:
+def fit_noise(past: np.ndarray, future: np.ndarray, dampings: Sequence[float]) -> tuple[float, float]:
     """(q, damping) with the smallest mean absolute error over all moments and steps, for r = 1.
 
     past (n, window), future (n, H) of one DoF. Searched on a grid: `RATIOS` x `dampings`.
@@ -123,7 +123,7 @@ def fit_noise(past: np.ndarray, future: np.ndarray, order: int, dampings: Sequen
     window, steps = past.shape[1], future.shape[1]
 
     def error(candidate: tuple[float, float]) -> float:
-        weights = kalman_weights(candidate[0], 1.0, window, steps, order, candidate[1])
+        weights = kalman_weights(candidate[0], 1.0, window, steps, candidate[1])
         return float(np.abs(np.clip(past @ weights.T, -1.0, 1.0) - future).mean())
 
     return min(((float(q), damping) for damping in dampings for q in RATIOS), key=error)
@@ -134,10 +134,10 @@ def fit_filters(windows: Windows, steps: int, held: np.ndarray) -> dict[str, Noi
     DoFs that are not fitted, because they are held."""
     past, future = windows.where(~windows.held_out)
     noise = {}
-    for kind, model in FILTERS.items():
+    for kind in FILTERS:
         dampings = DAMPINGS if kind == "damped" else (1.0,)
         fits = [
-            (0.0, 1.0) if held[dof] else fit_noise(past[..., dof], future[:, :steps, dof], model.order, dampings)
+            (0.0, 1.0) if held[dof] else fit_noise(past[..., dof], future[:, :steps, dof], dampings)
             for dof in range(past.shape[2])
         ]
         noise[kind] = Noise(tuple(q for q, _ in fits), (1.0,) * len(fits), tuple(d for _, d in fits))

@@ -26,7 +26,6 @@ for _name, _fitted, _colour in (
     ("linear", False, 0x0072B2),
     ("kalman", True, 0xD55E00),  # a filter reads the noise that `kerv calibrate` fitted
     ("damped", True, 0xA0522D),
-    ("acceleration", True, 0x4C9F70),
 ):
     add("predictor", _name, _PREDICTION + "predictor_of", fitted=_fitted)
     _drafts = (_PREDICTION + "PredictionProposer.build", NoSettings, ("calibration",) if _fitted else ())

@@ -32,9 +32,9 @@ DRAFT = "draft"
 class Noise:
     """Noise of a Kalman filter per DoF; entries of strict DoFs are not used, because those are held.
 
-    q: variance of the random acceleration (order 2) or change of acceleration (order 3) in one step. r: variance of
-    the observation. Only their ratio matters, because the prior is scaled by r. damping: share of the velocity that is
-    left after one step; 1 is the paper's constant velocity, less is *ours*.
+    q: variance of the random acceleration in one step. r: variance of the observation. Only their ratio matters,
+    because the prior is scaled by r. damping: share of the velocity that is left after one step; 1 is the paper's
+    constant velocity, less is *ours*.
 
     Raises:
         UsageError: a number out of range, or another count of numbers.
@@ -58,33 +58,25 @@ class Noise:
         return cls((q,) * dofs, (1.0,) * dofs, (1.0,) * dofs)
 
 
-def motion_model(order: int, damping: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """(F, Q / q) of the state [a, ȧ] (order 2) or [a, ȧ, ä] (order 3), discrete white noise, dt = 1.
-
-    Raises:
-        ValueError: another order, or damping with order 3.
-    """
-    if order == 2:
-        return np.array([[1.0, damping], [0.0, damping]]), np.outer([0.5, 1.0], [0.5, 1.0])
-    if order == 3 and damping == 1.0:
-        return np.array([[1.0, 1.0, 0.5], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]]), np.outer([0.5, 1, 1], [0.5, 1, 1])
-    raise ValueError(f"no motion model of order {order} with damping {damping}")
+def transition_of(damping: float) -> np.ndarray:
+    """F of the state [a, ȧ], discrete white noise, dt = 1."""
+    return np.array([[1.0, damping], [0.0, damping]])
 
 
 @functools.lru_cache(maxsize=64)
-def filter_state(ratio: float, window: int, order: int, damping: float) -> np.ndarray:
-    """The filter's state after `window` actions (order, window): column i is what action i contributes.
+def filter_state(ratio: float, window: int, damping: float) -> np.ndarray:
+    """The filter's state after `window` actions (2, window): column i is what action i contributes.
 
-    ratio: q / r. The filter begins on the first action with state [a₀, 0(, 0)] and covariance r · I; it then predicts
+    ratio: q / r. The filter begins on the first action with state [a₀, 0] and covariance r · I; it then predicts
     and updates once per further action.
     """
     from filterpy.kalman import KalmanFilter
 
-    transition, noise = motion_model(order, damping)
-    model = KalmanFilter(dim_x=order, dim_z=1)
-    model.F, model.H = transition, np.eye(1, order)
-    model.P, model.Q, model.R = np.eye(order), ratio * noise, np.eye(1)  # in units of r
-    state = np.eye(order, 1)
+    transition = transition_of(damping)
+    model = KalmanFilter(dim_x=2, dim_z=1)
+    model.F, model.H = transition, np.eye(1, 2)
+    model.P, model.Q, model.R = np.eye(2), ratio * np.outer([0.5, 1.0], [0.5, 1.0]), np.eye(1)  # in units of r
+    state = np.eye(2, 1)
     for i in range(1, window):
         state = transition @ np.pad(state, ((0, 0), (0, 1)))
         model.predict()
@@ -95,10 +87,10 @@ def filter_state(ratio: float, window: int, order: int, damping: float) -> np.nd
     return state
 
 
-def kalman_weights(q: float, r: float, window: int, horizon: int, order: int = 2, damping: float = 1.0) -> np.ndarray:
+def kalman_weights(q: float, r: float, window: int, horizon: int, damping: float = 1.0) -> np.ndarray:
     """(horizon, window): row h − 1 times the window, oldest first, is the filter's prediction h steps ahead."""
-    transition, _ = motion_model(order, damping)
-    state = filter_state(q / r, window, order, damping)
+    transition = transition_of(damping)
+    state = filter_state(q / r, window, damping)
     return np.stack([(np.linalg.matrix_power(transition, h) @ state)[0] for h in range(1, horizon + 1)])
 
 
@@ -179,7 +171,6 @@ class Kalman(Predictor):
 
     name = "kalman"
     least = 2
-    order = 2
 
     def __init__(
         self,
@@ -195,7 +186,7 @@ class Kalman(Predictor):
     def weights(self, dof: int, window: int) -> np.ndarray:
         """(horizon, window) of the filter with this DoF's noise, see `kalman_weights`."""
         q, r, damping = self.noise.q[dof], self.noise.r[dof], self.noise.damping[dof]
-        return kalman_weights(q, r, window, self.horizon, self.order, damping)
+        return kalman_weights(q, r, window, self.horizon, damping)
 
 
 class Damped(Kalman):
@@ -204,16 +195,8 @@ class Damped(Kalman):
     name = "damped"
 
 
-class Acceleration(Kalman):
-    """Kalman filter with a constant-acceleration state (ablation)."""
-
-    name = "acceleration"
-    least = 3
-    order = 3
-
-
 PLAIN: dict[str, type[Predictor]] = {kind.name: kind for kind in (Hold, Linear)}
-FILTERS: dict[str, type[Kalman]] = {kind.name: kind for kind in (Kalman, Damped, Acceleration)}
+FILTERS: dict[str, type[Kalman]] = {kind.name: kind for kind in (Kalman, Damped)}
 PREDICTORS = (*PLAIN, *FILTERS)
 
 
