@@ -28,7 +28,6 @@ from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.eagle.drafter import Drafter
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter
-from kerv_cli.methods.heisd import QdrantSearchSettings
 from kerv_cli.methods.heisd.datastore import Datastore
 from kerv_cli.targets import checkpoint
 from kerv_cli.training.calibration import CalibrationRun
@@ -138,17 +137,6 @@ def test_a_changed_file_is_another_artifact(results: Path) -> None:
     assert {kind for kind in before if before[kind] != after[kind]} == {"datastore"}
     again = Artifacts(asked.results, asked.policy).load("datastore")
     assert len(again.vectors) < len(store.vectors)
-
-
-def test_who_searches_is_part_of_what_is_loaded(results: Path) -> None:
-    pytest.importorskip("qdrant_edge")
-    policy = PolicySettings(target="nano-state")
-    exact = Artifacts(str(results), policy).load("datastore")
-    qdrant = Artifacts(str(results), policy, QdrantSearchSettings()).load("datastore")
-    assert exact is not qdrant
-    assert type(exact.index) is not type(qdrant.index)
-    assert exact.content == qdrant.content
-    assert Artifacts(str(results), policy, QdrantSearchSettings()).load("datastore") is qdrant
 
 
 def test_an_artifact_of_another_target_is_refused(results: Path) -> None:

@@ -6,7 +6,6 @@ import json
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -21,12 +20,10 @@ from typer.testing import CliRunner
 
 from kerv_cli.base.errors import CheckpointError, KervError, StorageError, UnknownName, UsageError
 from kerv_cli.base.files import read_json, sha256_of, write_json
-from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.settings import EVALUATION_SEED, BuildDatastoreSettings, PolicySettings
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.tree import ROOT, TokenTree, merge
-from kerv_cli.methods.heisd import QdrantSearchSettings
 from kerv_cli.methods.heisd.datastore import Datastore, Manifest, Shard, check_seeds, prompt_key
 from kerv_cli.methods.heisd.rules import neighbour_tree
 from kerv_cli.targets.checkpoint import TargetDescription, load_target
@@ -195,24 +192,6 @@ def test_few_rows_are_read_whole() -> None:
     index = store_of(vectors, {"a": slice(0, 9000)}).index
     assert index is not None
     assert max(len(index.candidates(vectors[row], "a", 5, None)) for row in range(0, 9000, 500)) < 30
-
-
-@pytest.mark.bits
-@pytest.mark.parametrize("name", ["nano-state", "nano-vision"])
-def test_every_backend_opens_a_datastore(results: Path, name: str) -> None:
-    store, _, description = opened(results, name)
-    backends: list[Any] = [NoSettings("exact")]
-    if find_spec("qdrant_edge") is not None:
-        backends.append(QdrantSearchSettings())
-    for chosen in backends:
-        other = Datastore.open(folder_of(results, name), description, chosen)
-        assert other.manifest == store.manifest
-        for task, shard in store.shards.items():
-            for row in range(shard.start, shard.stop):
-                asked_for = (store.vectors[row], task, 3, int(store.seeds[row]) if row % 2 else None)
-                expected, neighbours = store.query(*asked_for), other.query(*asked_for)
-                for field in ("similarity", "chunks", "seeds", "steps", "left"):
-                    assert np.array_equal(getattr(neighbours, field), getattr(expected, field))
 
 
 def test_a_task_that_is_not_there_gets_one_line(results: Path) -> None:

@@ -23,7 +23,7 @@ from kerv_cli.lab.resolve import ResolvedStudy, idle_overrides
         ("method=spec_vla acceptance=sequence threshold.r=5", "threshold.r=5"),
         ("method=spec_vla policy.datastore=mine", "policy.datastore=mine"),
         ("method=spec_vla policy.drafter=mine", ""),
-        ("method=spec_vla datastore=qdrant", "datastore=qdrant"),
+        ("method=spec_vla datastore=exact", "datastore=exact"),
         ("method=early_unverified rectifier=compensate", "rectifier=compensate"),
         ("method=one_pass_streak prefill_draft=scout skip=always rectifier=compensate", "rectifier=compensate"),
         ("method=one_pass_streak prefill_draft=hold skip=always rectifier=compensate", ""),

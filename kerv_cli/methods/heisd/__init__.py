@@ -24,20 +24,10 @@ class RetrievalProposerSettings:
     nodes: int = number(50, 1, MOST_TOKENS)  # tree nodes
 
 
-@dataclass
-class QdrantSearchSettings:
-    """The Qdrant engine (the extra: pip install 'kerv[qdrant]')."""
-
-    kind: str = "qdrant"
-    url: str | None = None  # a server, e.g. http://localhost:6333; None: the engine in this process
-
-
 add("artifact", "datastore", _DATASTORE + "DatastoreArtifact", by_task=True)
 _retrieval = (_RULES + "RetrievalProposer.build", RetrievalProposerSettings, ("datastore",))
 add("proposer", "retrieval", *_retrieval, colour=0x009E73, when=PREFILL, chains=True)
-# what searches: every backend finds the same neighbours
 add("datastore", "exact", _DATASTORE + "ExactIndex")
-add("datastore", "qdrant", "kerv_cli.methods.heisd.qdrant:qdrant_index", QdrantSearchSettings)
 
 
 @dataclass
