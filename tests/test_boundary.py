@@ -39,11 +39,6 @@ def boundary_of(kind: str, **values: Any) -> Boundary:
     return built
 
 
-def pseudo_radius(points: np.ndarray) -> float:
-    """The "radius" of HeiSD's public code (docs/methods.md §4.4): a constant times the mean speed of points (n, 3)."""
-    return 10.0 * path_length(points) / (len(points) - 1)
-
-
 def rotation(rng: np.random.Generator) -> np.ndarray:
     """(3, 3), proper, uniformly random."""
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
@@ -109,33 +104,6 @@ def test_another_shape_is_refused() -> None:
         radius_of_curvature(np.zeros((15, 2)))
 
 
-def deviation_of_curvature(sigma: float, length: float, n: int = WINDOW) -> float:
-    """Standard deviation of a curvature fitted to n evenly spaced points with noise sigma: the least-squares parabola's
-    second derivative, σ √(720 / n) / L². Any fit of a shallow arc has it to first order."""
-    return sigma * math.sqrt(720 / n) / length**2
-
-
-@settings(deadline=None)
-@given(seeds, st.floats(0.03, 0.3), st.floats(0.5, 2.0))
-def test_noise_moves_the_curvature_of_an_arc_as_little_as_a_parabola_fit_allows(
-    seed: int, radius: float, angle: float
-) -> None:
-    rng = np.random.default_rng(seed)
-    length = radius * angle
-    sigma = length * angle / 8 / 20  # a twentieth of the arc's height
-    points = arc(rng, radius, length) + rng.normal(size=(WINDOW, 3)) * sigma
-    assert abs(1 / radius_of_curvature(points) - 1 / radius) < 6 * deviation_of_curvature(sigma, length)
-
-
-@settings(deadline=None)
-@given(seeds, st.floats(0.03, 0.3), st.floats(1e-5, 2e-4))
-def test_a_noisy_line_stays_nearly_straight(seed: int, length: float, sigma: float) -> None:
-    rng = np.random.default_rng(seed)
-    points = line(rng, length) + rng.normal(size=(WINDOW, 3)) * sigma
-    # the plane is free to turn into the noise: both directions across the line bend it
-    assert 1 / radius_of_curvature(points) < 6 * math.sqrt(2) * deviation_of_curvature(sigma, length)
-
-
 @settings(deadline=None)
 @given(seeds)
 def test_both_measures_survive_rigid_motion_and_reversal(seed: int) -> None:
@@ -152,25 +120,6 @@ def test_both_measures_survive_rigid_motion_and_reversal(seed: int) -> None:
 def test_the_path_length_is_the_way_travelled() -> None:
     assert path_length(np.array([[0, 0, 0], [0.3, 0.4, 0], [0, 0, 0]])) == pytest.approx(1.0)
     assert path_length(np.zeros((1, 3))) == path_length(np.zeros((0, 3))) == 0.0
-
-
-def test_the_pseudo_radius_cannot_tell_arcs_from_lines_and_ours_can() -> None:
-    rng = np.random.default_rng(0)
-    noise = 1e-4  # metres
-    bent, straight = [], []
-    for speed in np.linspace(0.002, 0.01, 100):  # metres per control step, the same for both
-        length, radius = speed * (WINDOW - 1), rng.uniform(0.01, 0.03)
-        bent.append(arc(rng, radius, length) + rng.normal(size=(WINDOW, 3)) * noise)
-        straight.append(line(rng, length) + rng.normal(size=(WINDOW, 3)) * noise)
-
-    def separated(measure: object) -> float:
-        """Share of (arc, line) pairs in the right order: 0.5 is chance, 1 is perfect (the area under the ROC)."""
-        arcs, lines = (np.array([measure(p) for p in paths]) for paths in (bent, straight))  # type: ignore[operator]
-        return float((arcs[:, None] < lines[None]).mean())
-
-    assert separated(pseudo_radius) == pytest.approx(0.5, abs=0.05)
-    assert separated(radius_of_curvature) == 1.0
-    assert max(map(radius_of_curvature, bent)) < min(map(radius_of_curvature, straight))
 
 
 def test_ranges_are_the_minimum_and_the_95th_percentile_of_finite_values() -> None:

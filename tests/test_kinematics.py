@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 
 import numpy as np
@@ -100,37 +99,6 @@ def test_predict_goes_on_along_the_newest_actions_most_probable_path_clipped(his
 def test_a_constant_is_held(kind: str, value: float, length: int) -> None:
     ahead = predictor(kind).predict(np.full((length, DOFS), value), HORIZON)
     np.testing.assert_allclose(ahead, value, atol=1e-9)
-
-
-def test_a_line_is_extrapolated_the_better_the_longer_the_window() -> None:
-    ahead = np.arange(1, 5)
-    errors = []
-    for length in (4, 8, 16, 32, 64):
-        line = 0.3 - 0.02 * np.arange(length)
-        truth = line[-1] - 0.02 * ahead
-        errors.append(np.abs(kalman_weights(1.0, 1.0, length, 4) @ line - truth).max())
-    assert all(later < 0.5 * earlier for earlier, later in itertools.pairwise(errors[:4]))
-    assert errors[-1] < 1e-9
-
-
-@pytest.mark.parametrize("ratio", [0.01, 1.0, 30.0])
-def test_the_steady_state_is_the_alpha_beta_filter(ratio: float) -> None:
-    """Kalata's closed form of the gains for the tracking index sqrt(q / r)."""
-    index = math.sqrt(ratio)
-    root = (4 + index - math.sqrt(8 * index + index**2)) / 4
-    alpha = 1 - root**2
-    beta = 2 * (2 - alpha) - 4 * math.sqrt(1 - alpha)
-    newest = kalman_weights(ratio, 1.0, 200, 3)[:, -1]
-    np.testing.assert_allclose(newest, [alpha + h * beta for h in (1, 2, 3)], rtol=1e-6)
-
-
-def test_without_process_noise_it_is_the_line_of_a_ridge_regression() -> None:
-    """q = 0: least squares of a line; the first action is its prior, and one row pulls the slope to zero."""
-    window = np.random.default_rng(0).uniform(-1, 1, 10)
-    time = np.arange(10)
-    rows = np.vstack([np.c_[np.ones(10), time], [0.0, 1.0]])
-    (start, slope), *_ = np.linalg.lstsq(rows, np.append(window, 0.0), rcond=None)
-    np.testing.assert_allclose(kalman_weights(0.0, 1.0, 10, 2) @ window, start + slope * np.array([10, 11]), atol=1e-9)
 
 
 def test_only_the_ratio_of_the_noises_counts() -> None:

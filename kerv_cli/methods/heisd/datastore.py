@@ -37,8 +37,6 @@ VECTORS, PAYLOAD, PROJECTION = "vectors.npy", "payload.parquet", "projection.npy
 COLUMNS = {"seeds": "seed", "steps": "step", "left": "left"}
 AGAIN = "build one with 'kerv build datastore'"
 ROUNDING = 1e-5  # bounds the rounding of a float32 product of unit vectors
-OUTLINE = 24  # directions that hold nearly all of a shard's keys: of MT10's, all but 5e-4 of their squared length
-SAMPLE = 256  # rows that the directions are taken from
 
 
 @dataclass(frozen=True)
@@ -147,57 +145,8 @@ def best(vectors: np.ndarray, rows: np.ndarray, key: np.ndarray, k: int) -> tupl
     return rows[order], scores[order]
 
 
-def slack(longest: float, key: np.ndarray) -> float:
-    """Bound of the rounding error between two float32 scores. longest: norm of the longest vector. key: (d,)."""
-    return ROUNDING * longest * math.sqrt(key @ key)
-
-
-def length_of_longest(vectors: np.ndarray) -> float:
-    """Largest Euclidean norm among the rows of vectors (n, d); 0 without rows."""
-    return float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
-
-
-@dataclass(frozen=True)
-class Outline:
-    """A shard projected on p orthonormal directions: v = inside + rest, so v · key ≤ inside · inside' + |rest| |rest'|,
-    primes for the key's parts."""
-
-    vectors: np.ndarray  # (n, d) float32
-    directions: np.ndarray  # (d, p)
-    outline: np.ndarray  # (p + 1, n): coordinates inside, then the length of the rest
-    longest: float
-
-    @classmethod
-    def of(cls, vectors: np.ndarray) -> Outline:
-        """Outline of vectors (n, d): directions from the SVD of an evenly spaced sample of rows."""
-        sample = vectors[:: max(1, len(vectors) // SAMPLE)]
-        directions = np.linalg.svd(sample, full_matrices=False)[2][:OUTLINE].T
-        inside = vectors @ directions
-        rest = np.linalg.norm(vectors - inside @ directions.T, axis=1)
-        outline = np.vstack([inside.T, rest])
-        return cls(vectors, np.ascontiguousarray(directions), outline, length_of_longest(vectors))
-
-    def candidates(self, key: np.ndarray, k: int, excluded: np.ndarray | None) -> np.ndarray:
-        """Rows, ascending, among which are the k best for key (d,). excluded: (n,) bool, rows that are left out."""
-        inside = key @ self.directions
-        rest = key - self.directions @ inside
-        bounds = np.concatenate((inside, [math.sqrt(rest @ rest)]), dtype=np.float32) @ self.outline
-        if excluded is not None:
-            bounds[excluded] = -np.inf
-        if k >= len(bounds) - (0 if excluded is None else np.count_nonzero(excluded)):
-            return np.flatnonzero(bounds > -np.inf)
-        first = (bounds >= np.partition(bounds, -k)[-k]).nonzero()[0]
-        least = (self.vectors[first] @ key).min()  # k rows score this much
-        return (bounds >= least - slack(self.longest, key)).nonzero()[0]
-
-
 class ExactIndex:
-    """datastore=exact, the default: in this process, numpy.
-
-    Between two searches the target's weights displace the vectors from the processor's cache, so reading all of them
-    costs memory bandwidth. An outline, a few numbers per row, gives an upper bound of its score; only the vectors whose
-    bound reaches the k-th best score are read.
-    """
+    """datastore=exact, the default: one matrix product in this process."""
 
     def __init__(
         self,
@@ -208,14 +157,18 @@ class ExactIndex:
         settings: object = None,
     ) -> None:
         """vectors (rows, d) float32, seeds (rows,), shards: task -> rows; digest, settings: read by other searches."""
-        self.seeds, self.shards = seeds, shards
-        self.outlines = {task: Outline.of(vectors[shard]) for task, shard in shards.items()}
+        self.vectors, self.seeds, self.shards = vectors, seeds, shards
+        self.longest = float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """See `Index`; from the task's outline."""
+        """See `Index`. Rows that rounding may have put behind the k-th are among them."""
         shard = self.shards[task]
-        excluded = None if without is None else self.seeds[shard] == without
-        return self.outlines[task].candidates(key, k, excluded) + shard.start
+        scores = self.vectors[shard] @ key
+        if without is not None:
+            scores[self.seeds[shard] == without] = -np.inf
+        least = np.partition(scores, -k)[-k] if k <= len(scores) else -np.inf
+        slack = ROUNDING * self.longest * math.sqrt(key @ key)
+        return np.flatnonzero((scores >= least - slack) & (scores > -np.inf)) + shard.start
 
 
 @dataclass(frozen=True)
