@@ -99,11 +99,6 @@ def test_where_there_is_no_circle_the_radius_is_infinite(points: np.ndarray) -> 
     assert radius_of_curvature(points) == math.inf
 
 
-def test_another_shape_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"shape \(15, 2\)"):
-        radius_of_curvature(np.zeros((15, 2)))
-
-
 @settings(deadline=None)
 @given(seeds)
 def test_both_measures_survive_rigid_motion_and_reversal(seed: int) -> None:

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.errors import UsageError
 from kerv_cli.engine.chunk import WINDOW, ActionHistory
 from kerv_cli.methods.kinematics.prediction import (
     FILTERS,
@@ -181,10 +181,6 @@ def test_impossible_noise_is_refused(q: float, r: float, damping: float) -> None
 def test_wrong_requests() -> None:
     with pytest.raises(UsageError, match="one number per DoF"):
         Noise((1.0,), (1.0, 1.0), (1.0,))
-    with pytest.raises(UnknownName, match="did you mean kalman"):
-        predictor("kalmann")
-    with pytest.raises(UsageError, match="kerv calibrate"):
-        build_predictor("kalman", np.array(HELD), {})
     with pytest.raises(UsageError, match="minimum history"):
         Kalman(np.array(HELD), NOISE["kalman"], minimum=1)
     with pytest.raises(UsageError, match="minimum history"):

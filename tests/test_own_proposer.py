@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
-import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +19,8 @@ from test_calibration import write_dataset
 from test_decoding_lossless import assert_adds_up, plain_greedy, random_prompt, random_target
 from typer.testing import CliRunner
 
-from kerv_cli.base.config import compose, groups
-from kerv_cli.base.errors import CheckpointError, KervError, UsageError
+from kerv_cli.base.config import compose
+from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.settings import RolloutSettings, TrainDrafterSettings, settings_from
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
@@ -218,29 +214,3 @@ def test_it_is_trained_from_the_command_line_and_drafts_in_a_rollout(results: Pa
 def test_its_training_has_settings_of_its_own(words: list[str], says: str) -> None:
     with pytest.raises(UsageError, match=says):
         drafter_run(compose("train_drafter", words, TrainDrafterSettings))
-
-
-def test_it_is_a_choice_like_any_other() -> None:
-    known = groups()
-    assert "follow" in known["drafter"]
-    assert "follow" in known["proposer"]
-    assert "follow" in known["prefill_draft"]
-    with pytest.raises(KervError, match="did you mean follow"):
-        compose("rollout", ["proposer=folow"], RolloutSettings)
-    with pytest.raises(UsageError, match=r"proposer\.depth=-1"):
-        compose("rollout", ["proposer=follow", "proposer.depth=-1"], RolloutSettings)
-
-
-def test_the_command_knows_it_without_loading_anything_heavy() -> None:
-    path = os.pathsep.join([str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])])
-    code = "import sys; from kerv_cli.cli.app import main\ntry: main()\nfinally: print('torch' in sys.modules)"
-    done = subprocess.run(
-        [sys.executable, "-c", code, "rollout", "--cfg", "proposer=follow", "proposer.depth=3"],
-        env={**os.environ, "PYTHONPATH": path, "KERV_PLUGINS": "examples.own_proposer"},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    plain = re.sub(r" +#.*", "", done.stdout)
-    assert "proposer:\n  kind: follow\n  depth: 3\n" in plain
-    assert done.stdout.endswith("False\n")

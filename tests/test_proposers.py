@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_decoding_lossless import assert_adds_up, plain_greedy, random_prompt, random_target
 
-from kerv_cli.base.errors import UsageError
 from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
@@ -245,11 +244,6 @@ def test_a_seed_gives_the_random_boundary_its_own_numbers() -> None:
         decoder.reset("t", seed, np.zeros(3))
         drawn.append(decoder.situation.random.random())
     assert drawn[0] == drawn[1] != drawn[2]
-
-
-def test_a_chunk_longer_than_the_target_knows_is_refused() -> None:
-    with pytest.raises(UsageError, match="trained for 4 control steps"):
-        Decoder(random_target(0, 1, 1, 4), chunk=5)
 
 
 @pytest.mark.bits

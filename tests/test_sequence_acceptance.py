@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from kerv_cli.base.registry import find
 from kerv_cli.base.spaces import ActionSpace, Group
-from kerv_cli.engine.acceptance import Acceptance, Strict, accept_by_distance, accept_by_group
+from kerv_cli.engine.acceptance import Acceptance, Strict, accept_by_group
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
@@ -87,16 +87,6 @@ def test_the_sequence_rule_is_its_definition(
     assert (found.rejected is None) == (not children)
     if children:
         assert found.rejected in children
-
-
-@given(bushes(), st.data(), st.integers(0, 15))
-@settings(deadline=None)
-def test_no_limits_on_single_dofs_is_acceptance_by_distance(tree: TokenTree, data: st.DataObject, start: int) -> None:
-    """Groups of one DoF and a loose sum leave only the token limits: Spec-VLA's rule."""
-    limits = data.draw(st.lists(st.integers(0, 4), min_size=4, max_size=4))
-    target_tokens = [data.draw(st.integers(0, 5)) for _ in range(len(tree) + 1)]
-    single = accept_by_group(tree, target_tokens, start, limits, group_limit=99, bounds=space_of(1, 1, 1, 1).bounds)
-    assert single == accept_by_distance(tree, target_tokens, start, limits)
 
 
 def judge(tokens: list[int], start: int = 0, wanted: int = 100) -> int:

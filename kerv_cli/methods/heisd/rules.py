@@ -327,13 +327,8 @@ def radius_of_curvature(points: np.ndarray) -> float:
     The best-fit plane by singular values, in it Taubin's algebraic circle fit, which is exact on arcs. Centred and
     scaled to unit mean square, the fit's smallest singular vector (a, b, c) over [(z − 1) / 2, x, y], z = x² + y²,
     gives R = scale / |a|. Infinite for fewer than three points, a hand at rest and a straight line.
-
-    Raises:
-        ValueError: points of another shape.
     """
     points = np.asarray(points, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points have shape {points.shape}, not (n, 3)")
     if len(points) < LEAST:
         return math.inf
     centred = points - points.mean(0)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import NoSettings, find
 from kerv_cli.engine.chunk import WINDOW, Chunk
 from kerv_cli.engine.proposer import ChainProposer
@@ -209,18 +209,10 @@ def build_predictor(
     horizon: int = HORIZON,
 ) -> Predictor:
     """The predictor `kind`; held: (D,) bool, DoFs that keep their last value; `noise` holds the fitted noise of each
-    kind of filter.
-
-    Raises:
-        UnknownName: no such predictor.
-        UsageError: a filter without its noise, or a number out of range.
+    kind of filter. Raises UsageError: a number out of range.
     """
     if kind in PLAIN:
         return PLAIN[kind](held, minimum, window, horizon)
-    if kind not in FILTERS:
-        raise UnknownName("predictor", kind, PREDICTORS)
-    if kind not in noise:
-        raise UsageError(f"predictor '{kind}' has no fitted noise: run 'kerv calibrate'")
     return FILTERS[kind](held, noise[kind], minimum, window, horizon)
 
 
