@@ -1,7 +1,4 @@
-"""Drafters of the public EAGLE and Spec-VLA layout: what they compute, and their conventions.
-
-`tests/public_conventions.py` measures what a convention costs that the drafter was not trained with.
-"""
+"""Drafters of the public EAGLE and Spec-VLA layout: what they compute, and their conventions."""
 
 from __future__ import annotations
 
