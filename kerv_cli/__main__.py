@@ -13,12 +13,12 @@ def main() -> None:
     ours = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) is not signal.SIG_IGN]
     for number in ours:
         signal.signal(number, _end)
-    from kerv_cli.cli.app import main as run
+    from kerv_cli.cli.app import app
 
     for number in ours:
         signal.signal(number, _interrupt)
     sys.unraisablehook = _unraisable
-    run()
+    app()
 
 
 def _end(number: int, frame: FrameType | None) -> None:

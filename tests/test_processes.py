@@ -75,7 +75,7 @@ def run():
     except KeyboardInterrupt:
         print("cleared", flush=True)
 
-kerv_cli.cli.app.main = run
+kerv_cli.cli.app.app = run
 kerv.main()
 """
 

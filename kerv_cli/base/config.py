@@ -1,7 +1,6 @@
 """The only module that uses Hydra: it composes a command's settings, checks overrides, expands a grid.
 
-Typer owns the process and the messages. Overrides are checked before torch or MuJoCo load; a wrong one is answered by
-one line with the nearest known keys.
+Overrides are checked before torch or MuJoCo load. A wrong one is answered by one line.
 """
 
 from __future__ import annotations
@@ -11,25 +10,24 @@ import functools
 import itertools
 import math
 import os
-import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
 from kerv_cli.base import registry
-from kerv_cli.base.errors import GONE, UnknownName, UsageError
+from kerv_cli.base.errors import UnknownName, UsageError, did_you_mean
 from kerv_cli.base.files import read_yaml_file
 from kerv_cli.base.files import to_yaml as plain_yaml
-from kerv_cli.base.limits import check_settings, description, field_of
-from kerv_cli.base.near import KEYS, nearest, question
+from kerv_cli.base.limits import check_settings, description
 from kerv_cli.base.registry import PREFILL, SETTINGS_GROUPS, part_of
-from kerv_cli.base.settings import DERIVED_FROM, PolicySettings, TrainSettings, choices_of
+from kerv_cli.base.settings import DERIVED_FROM, choices_of
 
 T = TypeVar("T")
 
 _STRANGE = (ValueError, TypeError, AttributeError, RecursionError)
 """What Hydra raises at strange words, besides its own."""
+_LIST = "task=[reach,push]"
 MOST_POINTS = 10_000
 """Points of a grid; more are refused before they are expanded."""
 
@@ -72,7 +70,6 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
     Raises:
         UsageError: an override that cannot be parsed, an unknown key or name, a value of another type or out of range.
     """
-    check_once(overrides, groups())
     return Composer(command, schema).compose(overrides)
 
 
@@ -93,8 +90,6 @@ class Composer(Generic[T]):
         self._check(overrides)
         many = any(at.name == "task" and str(at.type).startswith("list") for at in fields(self.schema))  # type: ignore[arg-type]
         parsed = [_parsed(_task_list(word) if many else word) for word in overrides]
-        for word, override in zip(overrides, parsed, strict=True):
-            self._check_one_value(word, override)
         try:
             settings = self._settings(parsed)
         except (HydraException, OmegaConfBaseException) as error:
@@ -117,8 +112,8 @@ class Composer(Generic[T]):
             self._composed[rest] = nodes, cast(T, OmegaConf.to_object(nodes))
         nodes, settings = self._composed[rest]
         for override in values:
-            if override.value() == "" and (default := OmegaConf.select(nodes, override.key_or_group)):
-                raise _empty(override.key_or_group, default)
+            if override.value() == "" and OmegaConf.select(nodes, override.key_or_group):
+                raise UsageError(f"{override.key_or_group}= is empty: write a value, or leave it out")
         if all(_is_scalar(nodes, override) for override in values):
             settings = copy.deepcopy(settings)
             for override in values:
@@ -130,54 +125,13 @@ class Composer(Generic[T]):
         return cast(T, OmegaConf.to_object(nodes))
 
     def _check(self, overrides: Sequence[str]) -> None:
-        """Refuses what Hydra would answer at length or not at all: words that are no overrides, unknown group choices,
-        several choices where the command takes one."""
+        """Refuses words that are no overrides, and unknown choices of a group."""
         for word in overrides:
             key, equals, value = word.partition("=")
             if not equals or not key or key[0] == "~":  # nothing is taken away from settings
-                hint = GONE.get((self.command, word)) or f"write key=value, {self._hint(word)}"
-                raise UsageError(f"'{word}' is not an override: {hint}")
-            if key != key.strip() or value != value.strip():
-                raise UsageError(f"'{word}' has spaces around its '=': write {key.strip()}={value.strip()}")
-            if key not in self.groups or value in self.groups[key]:
-                continue
-            if not value:
-                raise _empty(key, choices_of(self.schema).get(key, "NAME"))
-            if key in ("study", "method") and "/" in value:
-                raise UsageError(f"{word} is no YAML file: name one that ends in .yaml, or a {key} that kerv has")
-            several = [name.strip() for name in value.split(",")]
-            if len(several) > 1 and set(several) <= set(self.groups[key]):
-                grid = self.command == "rollout"
-                hint = "-m runs each in turn, or" if grid else "this command takes one:"
-                raise UsageError(f"{word} names {len(several)} choices: {hint} choose one of them")
-            raise UnknownName(key, value, self.groups[key], self._of_policy(key, value))
-
-    def _of_policy(self, key: str, value: str) -> str:
-        """What the writer of a choice that no group has may have meant: weights by their name."""
-        mine = {at.name for at in fields(self.schema)}  # type: ignore[arg-type]
-        name = "target" if key == "policy" else key
-        weights = "policy" in mine and name in {at.name for at in fields(PolicySettings)}
-        return f"policy.{name}={value} names weights" if weights and (key == "policy" or key not in mine) else ""
-
-    def _hint(self, word: str) -> str:
-        """What the writer of a word without `=` may have meant, e.g. `episodes:`."""
-        keys = [*choices_of(self.schema), *(at.name for at in fields(self.schema))]  # type: ignore[arg-type]
-        key, _, value = word.partition(":")
-        near = nearest(key, keys, KEYS)[:1]
-        return question(near, f"={value}") or f"see 'kerv {spoken(self.command)} --cfg' for the keys"
-
-    def _check_one_value(self, word: str, override: Any) -> None:
-        """Refuses several values where one is taken."""
-        if not override.is_sweep_override():
-            return
-        key, _, value = word.partition("=")
-        kind = next((str(at.type) for at in fields(self.schema) if at.name == key), "")  # type: ignore[arg-type]
-        hint = "this command takes one: choose one of them"
-        if kind.startswith("list"):
-            hint = f"write {key}=[{value}]"
-        elif self.command == "rollout":
-            hint = "-m runs each in turn, or choose one of them"
-        raise UsageError(f"{word} holds several values: {hint}")
+                raise UsageError(f"'{word}' is not an override: write key=value, a list without spaces: {_LIST}")
+            if key in self.groups and value not in self.groups[key]:
+                raise UnknownName(key, value, self.groups[key])
 
     def _is_value(self, override: Any) -> bool:
         """Whether an override sets one key to one value."""
@@ -255,25 +209,9 @@ def _parsed(word: str) -> Any:
     try:
         return OverridesParser.create().parse_overrides([word])[0]
     except (HydraException, *_STRANGE) as error:
-        raise UsageError(f"cannot read '{word[:200]}': {_readable(word)}") from error
-
-
-def _readable(word: str) -> str:
-    """What the writer of a word that Hydra cannot parse may have meant."""
-    key, _, value = word.partition("=")
-    if re.search(r"\s[\w.]+=", value):
-        return f"these are several settings, leave out the quotes: {word.replace(', ', ' ')}"
-    names = re.findall(r"[^\s\[\],;]+", value)
-    if re.match(r"\[|[^/~]*[,;]", value) and names:
-        return f"write {key}={names[0]}" if len(names) == 1 else f"write {key}=[{','.join(names)}]"
-    if any(value.count(a) != value.count(b) for a, b in ("[]", "{}", "()")) or value.count("'") % 2:
-        return "its brackets or quotes do not match"
-    quoted = f"{key}='{value}'"
-    return f'quote it: "{quoted}"'
-
-
-def _empty(key: str, default: Any) -> UsageError:
-    return UsageError(f"{key}= is empty: write {key}={default}, or leave it out")
+        key, _, value = word.partition("=")
+        hint = f"""write a list without spaces, {_LIST}, or quote the value: "{key}='{value}'\""""
+        raise UsageError(f"cannot read '{word[:200]}': {hint}") from error
 
 
 def _composed(command: str, overrides: Sequence[str], schema: type) -> Any:
@@ -348,26 +286,21 @@ def method_of_file(overrides: Sequence[str]) -> tuple[list[str], str | None]:
 def expand(overrides: str | Sequence[str]) -> list[list[str]]:
     """Hydra's grid grammar -> one override list per point: `threshold.r=0,3` or `threshold.r=range(0,4)`.
 
-    A string is split at white space outside quotes. The grid is counted before it is expanded.
+    A string is split at white space outside quotes.
 
     Raises:
-        UsageError: an override that cannot be parsed, or more than MOST_POINTS points.
+        UsageError: an override that cannot be parsed, no point, or more than MOST_POINTS of them.
     """
     from hydra.errors import HydraException
 
     words = split_words(overrides) if isinstance(overrides, str) else list(overrides)
-    parsed = [_parsed(word) for word in words]
     try:
-        points = math.prod(map(_count, parsed))
-        if points > MOST_POINTS:
-            raise UsageError(f"'{' '.join(words)}' is a grid of {points:.6g} points: at most {MOST_POINTS}")
-        if not points:
-            raise UsageError(f"'{' '.join(words)}' is a grid without a point: a range ends before it begins")
-        axes = [list(_points(o)) for o in parsed]
-    except HydraException as error:
-        raise UsageError(f"cannot read '{' '.join(words)}': {_one_line(error)}") from error
-    except _STRANGE as error:
+        axes = [list(itertools.islice(_points(_parsed(word)), MOST_POINTS + 1)) for word in words]
+    except (HydraException, *_STRANGE) as error:
         raise UsageError(f"cannot read '{' '.join(words)[:200]}': {_one_line(error)}") from error
+    points = math.prod(map(len, axes))
+    if not 0 < points <= MOST_POINTS:
+        raise UsageError(f"'{' '.join(words)}' is a grid of {points:.6g} points: from 1 to {MOST_POINTS} are possible")
     return [list(point) for point in itertools.product(*axes)]
 
 
@@ -383,27 +316,6 @@ def split_words(text: str) -> list[str]:
         return shlex.split(text)
     except ValueError as error:
         raise UsageError(f"cannot read '{text}': {error}") from error
-
-
-def _count(override: Any) -> float:
-    """Number of points that an override stands for.
-
-    Raises:
-        UsageError: a range without an end or with steps of 0, an interval, a glob.
-    """
-    from hydra.core.override_parser.types import ChoiceSweep, RangeSweep
-
-    value = override.value()
-    if not override.is_sweep_override():
-        return 1
-    if isinstance(value, ChoiceSweep):
-        return len(value.list)
-    if not isinstance(value, RangeSweep):
-        raise UsageError(f"'{override.input_line}' is no list of values: write key=a,b,c or key=range(first,end,step)")
-    numbers = value.start, value.stop, value.step
-    if any(number is None or not math.isfinite(number) for number in numbers) or not value.step:
-        raise UsageError(f"'{override.input_line}': a range needs a first number, an end and a step that is not 0")
-    return max(0, math.ceil((value.stop - value.start) / value.step))  # type: ignore[operator]
 
 
 def _points(override: Any) -> Iterator[str]:
@@ -441,88 +353,22 @@ def _one_yaml(key: str, value: Any) -> str:
     return plain_yaml({key: value}, width=2**30, default_flow_style=False, allow_unicode=True)
 
 
-def check_once(overrides: Iterable[str], names: Iterable[str]) -> None:
-    """Refuses two choices from one group; of a key that is given twice, the last value counts."""
-    first: dict[str, str] = {}
-    for key, value in (word.lstrip("+").split("=", 1) for word in overrides if "=" in word):
-        if key in names and key in first:
-            raise UsageError(f"{key}= is given twice, {first[key]} and {value}: leave one out")
-        first[key] = value
-
-
-def spoken(command: str) -> str:
-    """A command's name as it is typed: `train_drafter` -> `train drafter`."""
-    return command.replace("_", " ")
-
-
 def _task_list(word: str) -> str:
     """Adds the brackets that `task=reach` and `task=reach,push` leave out. Raises UsageError: no task at all."""
     key, value = word.split("=", 1)
-    if key == "task" and value.strip("[] ") == "":
-        raise UsageError("name at least one task or suite: task=NAME, or leave it out")
+    if key == "task" and not value:
+        raise UsageError("task= is empty: name a task or a suite, or leave it out")
     return f"task=[{value}]" if key == "task" and not value.startswith("[") else word
 
 
 def _explained(command: str, error: Exception, overrides: Sequence[str], schema: type) -> UsageError:
     """Names the first unknown key and the nearest known ones; without one, Hydra's own message on one line."""
-    from hydra.errors import HydraException
-
-    choices = [word for word in overrides if word.split("=", 1)[0] in groups()]
-    try:
-        keys = _keys(command, choices, schema)
-    except HydraException:  # the choices alone do not compose
-        return UsageError(_one_line(error.__cause__ or error))
-    for word in overrides:
-        key, _, value = word.partition("=")
-        if key in keys:
-            continue
-        if key not in groups():
-            near = nearest(key, [one for one in keys if not any(other.startswith(f"{one}.") for other in keys)], KEYS)
-            hint = question(near, f"={value}") or _elsewhere(command, key)
+    keys = keys_of(command, [word for word in overrides if word.split("=", 1)[0] in groups()], schema)
+    for key in (word.split("=", 1)[0] for word in overrides):
+        if key not in keys and key not in choices_of(schema):
+            hint = did_you_mean(key, keys) or f"see 'kerv {command.replace('_', ' ')} --cfg' for the keys"
             return UsageError(f"unknown key '{key}': {hint}")
-    return _wrong_value(error, overrides, keys, schema)
-
-
-def _elsewhere(command: str, key: str) -> str:
-    """Which commands have a setting that this one has not."""
-    head, leaf = key.split(".")[0], key.rsplit(".", 1)[-1]
-    owners = []
-    for name, part in registry.parts("command").items():
-        own = {at.name for at in fields(part.settings)}
-        train = {at.name for at in fields(TrainSettings)} if "train" in own else set()
-        if head in own or leaf in train:
-            owners.append(f"'kerv {name}'")
-    others = f"a setting of {', '.join(sorted(owners)[:3])}; " if 0 < len(owners) < 9 else ""
-    return f"{others}see 'kerv {spoken(command)} --cfg' for the keys"
-
-
-_KINDS = {"Integer": "a whole number", "Float": "a number", "bool": "true or false"}
-_NUMBER = re.compile(r"-?\d+\.?\d*(e[+-]?\d+)?", re.IGNORECASE)
-
-
-def _wrong_value(error: Any, overrides: Sequence[str], keys: Sequence[str], schema: type) -> UsageError:
-    """Says what kind of value a key takes, with one that it would take."""
-    key = str(getattr(error, "full_key", None) or "")
-    value = next((word.split("=", 1)[1] for word in reversed(overrides) if word.startswith(f"{key}=")), None)
-    plain = _one_line(error.__cause__ or error)
-    if not key or value is None:
-        return UsageError(plain)
-    below = [one for one in keys if one.startswith(f"{key}.")]
-    if below:
-        named = [one for one in below if one.rsplit(".", 1)[-1] in ("kind", "name")]
-        return UsageError(f"{key}={value}: {question(named, f'={value}') or 'it has settings: ' + ', '.join(below)}")
-    if "ListConfig" in plain:
-        return UsageError(f"{key}={value}: a list, write {key}=[{value}]")
-    kind = re.search("|".join(_KINDS), plain)
-    if kind is None:
-        return UsageError(plain)
-    number = _NUMBER.match(value)
-    at, example = field_of(schema, key)
-    if number and math.isfinite(float(number[0])) and kind[0] != "bool" and "%" not in value:
-        example = int(float(number[0])) if kind[0] == "Integer" else number[0]
-    such = "" if example is None else f", e.g. {key}={str(example).lower()}"
-    about = f" ({description(at)})" if at is not None and description(at) else ""
-    return UsageError(f"{key}={value}: {_KINDS[kind[0]]}{such}{about}")
+    return UsageError(_one_line(error.__cause__ or error))
 
 
 def keys_of(command: str, choices: Sequence[str], schema: type) -> list[str]:
@@ -550,8 +396,7 @@ def _keys(command: str, choices: Sequence[str], schema: type) -> list[str]:
 
 
 def _one_line(error: BaseException) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    useful = [line for line in lines if not line.startswith(("object_type", "reference_type", "See https"))]
-    keys = [line for line in useful if line.startswith("full_key:")]
-    text = " ".join(line for line in useful if not line.startswith("full_key:"))
-    return f"{keys[0].removeprefix('full_key:').strip()}: {text}" if keys else text
+    """An error's message without the lines that OmegaConf adds, behind the key that it is about."""
+    key = getattr(error, "full_key", None)
+    text = " ".join(str(error).partition("\n    full_key:")[0].split())
+    return f"{key}: {text}" if key else text

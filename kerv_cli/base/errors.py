@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterable
 from typing import Any
-
-from kerv_cli.base.near import nearest, question
 
 
 class KervError(Exception):
@@ -27,31 +26,20 @@ class UsageError(KervError):
     exit_code = 2
 
 
-_GATE = (
-    "the calibrated gate is gone, commit 72e42ef is the last with it: method=one_pass_streak needs no calibration and "
-    "was nowhere shown to be slower per episode; 'kerv calibrate success' certifies success instead (docs/methods.md)"
-)
-GONE = {
-    ("calibrate", "risk"): _GATE,
-    ("method", "one_pass_risk"): _GATE,
-    ("skip", "risk"): _GATE,
-    ("study", "risk_h8"): _GATE,
-    ("study", "scores"): _GATE,
-    ("train command", "score"): _GATE,
-}
-"""Kind and name of what an older kerv had -> what replaces it; of a command its name and the next word."""
-
-
 class UnknownName(UsageError):
-    """A name that no registry knows; the message lists the nearest ones, or says what replaces it. more: behind
-    them, in brackets."""
+    """A name that no registry knows. The message names the nearest ones."""
 
-    def __init__(self, kind: str, name: str, names: Iterable[str], more: str = "") -> None:
+    def __init__(self, kind: str, name: str, names: Iterable[str]) -> None:
         names = list(names)
-        hint = question(nearest(name, names)) or f"known: {', '.join(names)}"
-        gone = GONE.get((kind.split(".")[0], name))
-        hint = f"{hint} ({more})" if more else hint
-        super().__init__(f"{kind} '{name}': {gone}" if gone else f"unknown {kind} '{name}': {hint}")
+        hint = did_you_mean(name, names) or f"known: {', '.join(names)}"
+        super().__init__(f"unknown {kind} '{name}': {hint}")
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return `did you mean a or b?` with at most three known names that look alike, or an empty string."""
+    names = {one.lower(): one for one in known}
+    near = [names[one] for one in difflib.get_close_matches(name.lower(), names)]
+    return f"did you mean {' or '.join(near)}?" if near else ""
 
 
 class Interrupted(KervError):

@@ -70,7 +70,7 @@ TRAITS: Mapping[str, tuple[str, ...]] = {
     "environment": ("names",),
     "stress": ("needed",),
     "executor": ("package", "extra"),
-    "command": ("help", "keys", "examples", "names", "typed", "writes", "each", "completes", "values", "lists"),
+    "command": ("help", "keys", "examples", "names", "typed", "writes", "each", "lists"),
 }
 """Every kind of part -> the traits that one may have."""
 REQUIRED = {"proposer": "when", "stress": "needed"}

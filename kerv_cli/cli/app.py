@@ -4,14 +4,12 @@ heavy is imported here."""
 from __future__ import annotations
 
 import os
-import shlex
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.near import COMMANDS, nearest, question
+from kerv_cli.base.errors import UnknownName
 from kerv_cli.base.registry import parts
 from kerv_cli.cli.command import CONTEXT, commands_below, summary_of, typer_command
 from kerv_cli.cli.common import one_line_errors
@@ -19,7 +17,7 @@ from kerv_cli.cli.common import one_line_errors
 # kerv's own commands register themselves, in the order of the help
 # isort: off
 from kerv_cli.cli import demos, train, prepare, build, calibrate, rollout, sweep, serve, report, runs, view  # noqa: F401
-from kerv_cli.cli import bench, doctor, completion  # noqa: F401
+from kerv_cli.cli import bench, doctor  # noqa: F401
 # isort: on
 
 # Set before numpy loads: by default its products use every core, whatever runtime.threads says.
@@ -55,38 +53,14 @@ class Commands(TyperGroup):
         return family
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        """The command that the first words name: `demos export` is a command beside `demos`.
-
-        Raises:
-            UsageError: the first word is no command; the line says which is meant.
-        """
-        if self.prefix + " ".join(args[:2]) in parts("command"):
-            return " ".join(args[:2]), typer_command(parts("command")[self.prefix + " ".join(args[:2])]), args[2:]
+        """The command that the first words name: `demos export` is a command beside `demos`."""
+        name = " ".join(args[:2])
+        if self.prefix + name in parts("command"):
+            return name, typer_command(parts("command")[self.prefix + name]), args[2:]
         command = self.get_command(ctx, args[0])
-        if command is not None or ctx.resilient_parsing:
-            return args[0], command, args[1:]
-        names = self.list_commands(ctx)
-        if "=" not in args[0]:
-            raise self._unknown(args[0], args[1:], names)
-        at = next((at for at, word in enumerate(args) if word in names), 0)
-        line = [*args[at:], *args[:at]] if at else ["COMMAND", *args]
-        which = f", COMMAND is {' or '.join(names)}" if self.prefix and not at else ""
-        raise UsageError(f"settings follow the command: kerv {self.prefix}{shlex.join(line)}{which}")
-
-    def _unknown(self, word: str, rest: list[str], names: list[str]) -> UsageError:
-        """The error for a first word that is no command."""
-        what = f"unknown {self.prefix}command '{word}'"
-        if word == "kerv":
-            return UsageError("kerv stands twice in this line: leave one out")
-        if word in ("help", "version"):
-            line = ["kerv", *self.prefix.split(), *(rest if word == "help" else []), f"--{word}"]
-            return UsageError(f"{what}: did you mean '{' '.join(line)}'?")
-        full = [part.name.removeprefix(self.prefix) for part in commands_below(self.prefix)]
-        called = {name.removeprefix(self.prefix): words for name, words in COMMANDS.items()}
-        near = nearest(word, [*names, *full], called)
-        if not near and self.prefix:
-            near = [f"kerv {one.name}" for one in parts("command").values() if one.name.split()[-1] == word]
-        return UsageError(f"{what}: {question(near)}") if near else UnknownName(f"{self.prefix}command", word, names)
+        if command is None and not ctx.resilient_parsing:
+            raise UnknownName(f"{self.prefix}command", args[0], self.list_commands(ctx))
+        return args[0], command, args[1:]
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Lists the commands without importing what they run."""
@@ -121,7 +95,6 @@ app = typer.Typer(
     help="Fast vision-language-action policies on Meta-World: train, sweep, report, look.",
     epilog="Settings follow the command as key=value, e.g. kerv rollout method=spec_vla task=drawer-open threshold.r=5",
     no_args_is_help=True,
-    add_completion=False,  # `kerv completion` installs a script for bash that knows of '='
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings=CONTEXT,
@@ -144,12 +117,3 @@ def kerv(
     ] = False,
 ) -> None:
     """Options of kerv itself."""
-
-
-def main() -> None:
-    """Runs the command line."""
-    if "_KERV_COMPLETE" in os.environ:  # a shell asks; typer registers its shells with add_completion only
-        from typer._completion_classes import completion_init
-
-        completion_init()
-    app()

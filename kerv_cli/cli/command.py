@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import Field, fields
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -17,11 +17,10 @@ from typing import Annotated, Any, TypeVar
 import typer
 from typer.core import TyperCommand
 
-from kerv_cli.base.config import compose, conf_dir, groups, keys_of, to_yaml
-from kerv_cli.base.errors import UsageError
+from kerv_cli.base.config import compose, conf_dir, groups, to_yaml
+from kerv_cli.base.errors import UnknownName
 from kerv_cli.base.files import read_yaml_file
 from kerv_cli.base.limits import field_of
-from kerv_cli.base.near import KEYS, nearest, question
 from kerv_cli.base.places import check_writable
 from kerv_cli.base.registry import NoSettings, Part, add, find, load, parts
 from kerv_cli.base.settings import CommandSettings, choices_of
@@ -38,8 +37,7 @@ def command(name: str, settings: type = CommandSettings, keys: str = "", **trait
         traits: examples: command lines that work, for the help. names: help of words that are no overrides. lists:
             settings whose lists need no brackets. typed: word on the command line -> the setting it sets, where the two
             differ. writes: whether it stores results, so that a folder that cannot be written is refused first
-            (default: true). each: the command whose settings all other words go to. completes: what makes completions
-            of names.
+            (default: true). each: the command whose settings all other words go to.
     """
 
     def declare(run: F) -> F:
@@ -49,15 +47,17 @@ def command(name: str, settings: type = CommandSettings, keys: str = "", **trait
     return declare
 
 
-def schemas_of(part: Part) -> list[tuple[str, type]]:
-    """The command and its settings' class, then that of `each`."""
+def schemas_of(part: Part) -> list[type]:
+    """The class of the command's settings, then that of `each`."""
     others = [find("command", part.traits["each"])] if "each" in part.traits else []
-    return [(one.name, one.settings) for one in (part, *others)]
+    return [one.settings for one in (part, *others)]
 
 
 def top_keys(part: Part) -> list[str]:
     """The names that the command takes in front of `=` or a dot: typed words, groups of conf/, settings."""
-    schemas = [schema for _, schema in schemas_of(part)]
+    if part.settings is NoSettings:
+        return []
+    schemas = schemas_of(part)
     groups = [group for schema in schemas for group in choices_of(schema)]
     names = [at.name for schema in schemas for at in fields(schema)]
     hidden = {key for key in part.traits.get("typed", {}).values() if "." not in key}
@@ -72,7 +72,6 @@ def typer_command(part: Part) -> TyperCommand:
 
     def callback(overrides: list[str] | None = None, cfg: bool = False, **options: object) -> None:
         words, names = _split(part, overrides or [], "names" in parameters)
-        _check_bare(part, words)
         arguments = {"words": words, "names": names, "cfg": cfg}
         if "settings" in parameters or (cfg and "cfg" not in parameters):
             arguments["settings"] = _settings(part, words, cfg)
@@ -105,54 +104,29 @@ def _words_argument(part: Part) -> object:
 
 
 def complete(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Completions of a word of the command that is typed."""
-    return completions(" ".join(ctx.command_path.split()[1:]), list(ctx.params.get("overrides") or []), incomplete)
-
-
-def completions(command: str, words: Sequence[str], incomplete: str) -> list[str]:
-    """`me` -> `method=`; `method=s` -> every method that begins so; `threshold.` -> the keys of the chosen threshold.
-
-    Args:
-        command: e.g. `rollout`, `train drafter`.
-        words: the overrides in front of it: a chosen part has keys of its own.
-    """
-    part = parts("command")[command]
-    key, equals, _ = incomplete.partition("=")
-    if equals:
-        candidates = [f"{key}={name}" for name in _values(part, key)]
-    elif "." in incomplete:
-        candidates = [f"{name}=" for name in _keys(part, words, incomplete)]
-    else:
-        keys = [] if part.settings is NoSettings else [f"{name}=" for name in top_keys(part)]
-        below = [] if words else [one.name.removeprefix(f"{command} ") for one in commands_below(f"{command} ")]
-        candidates = [*part.traits.get("completes", list)(), *below, *keys]
-    return [word for word in dict.fromkeys(candidates) if word.startswith(incomplete)]
+    """Completions of a word: `me` -> `method=`; `method=s` -> every method that begins so. bash splits words at `=`."""
+    part = parts("command")[" ".join(ctx.command_path.split()[1:])]
+    keys, before = top_keys(part), [word for word in ctx.params.get("overrides") or () if word != "="]
+    if before and before[-1] in keys:
+        return [name for name in _values(part, before[-1]) if name.startswith(incomplete)]
+    key, equals, typed = incomplete.partition("=")
+    if not equals:
+        return [f"{name}=" for name in keys if name.startswith(incomplete)]
+    return [f"{key}={name}" for name in _values(part, key) if name.startswith(typed)]
 
 
 def _values(part: Part, key: str) -> list[str]:
+    """The names that a key can be set to; none where any value is possible."""
     if key == "task":
         from kerv_cli.worlds import task_names
 
         return list(task_names())
-    if key in part.traits.get("values", {}):
-        return list(part.traits["values"][key]())
-    if key == "world.stress.kind":
-        return list(parts("stress"))
-    for _, schema in schemas_of(part):
+    for schema in schemas_of(part):
         if key in choices_of(schema):
             return groups()[key]
         for at in fields(schema):
-            if at.name == key and "names" in at.metadata:
-                return list(at.metadata["names"])
-    return []
-
-
-def _keys(part: Part, words: Sequence[str], incomplete: str) -> list[str]:
-    """Dotted keys of the command, given the parts that the words before choose."""
-    for name, schema in schemas_of(part):
-        if incomplete.split(".")[0] in {at.name for at in fields(schema)}:
-            choices = [word for word in words if word.split("=", 1)[0] in choices_of(schema)]
-            return keys_of(name.replace(" ", "_"), choices, schema)
+            if at.name == key:
+                return list(at.metadata.get("names", ()))
     return []
 
 
@@ -160,52 +134,15 @@ def _split(part: Part, words: list[str], named: bool) -> tuple[list[str], list[s
     """Splits words into (overrides, names). named: the command takes names; else every word has to be an override."""
     if not named:
         return words, []
-    keys = set(top_keys(part)) if part.settings is not NoSettings else set()
+    keys = set(top_keys(part))
     overrides = [word for word in words if "=" in word and word.lstrip("+").partition("=")[0].split(".")[0] in keys]
     names = [word for word in words if word not in overrides]
     filters = set(re.findall(r"(\w+)=", part.traits["names"]))
     for name in names:
-        key, equals, value = name.partition("=")
-        if equals and re.fullmatch(r"[\w.]+", key) and key not in filters and not Path(name).exists():
-            keys |= filters
-            hint = question(nearest(key, keys, KEYS), f"={value}") or f"known: {', '.join(sorted(keys)) or 'none'}"
-            raise UsageError(f"unknown key '{key}': {hint}")
+        key, equals, _ = name.partition("=")
+        if equals and key not in filters and not Path(name).exists():
+            raise UnknownName("key", key, sorted(keys | filters))
     return overrides, names
-
-
-def _check_bare(part: Part, words: list[str]) -> None:
-    """Refuses settings with spaces around `=`, and a value without its key: `kerv rollout reach`.
-
-    Raises:
-        UsageError: names the setting that is meant.
-    """
-    if part.settings is NoSettings:
-        return
-    keys = top_keys(part)
-    for number, word in enumerate(words):
-        after = next((one.lstrip("=") for one in words[number + 1 :] if one != "="), "")
-        if "=" in word and (word[-1] not in ",=" or not after or "=" in after):
-            continue
-        taking = [key for key in keys if {word, f"{word}-v3"} & set(_values(part, key))]
-        if word[-1] in ",=":
-            meant = f"{word.rstrip(',')}{after}" if word[-1] == "=" else _in_brackets(word + after)
-        elif word.rstrip(":") in keys and after and "=" not in after:
-            meant = f"{word.rstrip(':')}={after}"
-        elif taking == ["task"] and number and words[number - 1].startswith("task="):
-            meant = _in_brackets(f"{words[number - 1]},{word}")
-        elif taking:
-            meant = f"{taking[0]}={word}"
-        elif word.endswith((".yaml", ".yml")) and {"study", "method"} & set(keys):
-            meant = f"{'study' if 'study' in keys else 'method'}={word}"
-        else:
-            continue
-        raise UsageError(f"'{word}' is not an override: did you mean {meant}?")
-
-
-def _in_brackets(word: str) -> str:
-    """A list in brackets: `task=reach,push` -> `task=[reach,push]`."""
-    key, _, value = word.partition("=")
-    return f"{key}=[{value.strip('[]')}]"
 
 
 def _settings(part: Part, words: list[str], cfg: bool) -> Any:
@@ -218,13 +155,7 @@ def _settings(part: Part, words: list[str], cfg: bool) -> Any:
     pairs = [(typed.get(key, key), equals, value) for key, equals, value in (word.partition("=") for word in words)]
     lists = part.traits.get("lists", ())
     plain = [f"{key}=[{value.strip('[]')}]" if key in lists else key + equals + value for key, equals, value in pairs]
-    try:
-        settings: Any = compose(part.name.replace(" ", "_"), plain, part.settings)
-    except UsageError as error:
-        for key, name in typed.items():
-            if str(error).startswith(f"{name}="):
-                raise UsageError(key + str(error).removeprefix(name)) from error
-        raise
+    settings: Any = compose(part.name.replace(" ", "_"), plain, part.settings)
     if cfg:
         typer.echo(to_yaml(settings), nl=False)
         raise typer.Exit(0)
@@ -237,21 +168,6 @@ class CommandWithSettings(TyperCommand):
     """Adds to the help what the command's words can be."""
 
     part: Part
-
-    def keys(self) -> list[str]:
-        """Every key that the command takes, dotted ones included."""
-        if self.part.settings is NoSettings:
-            return []
-        below = (keys_of(name.replace(" ", "_"), [], schema) for name, schema in schemas_of(self.part))
-        return [*top_keys(self.part), *(key for keys in below for key in keys)]
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Reads options and words. Some of typer's errors do not say which command they are of: here all do."""
-        try:
-            return super().parse_args(ctx, args)
-        except typer.TyperException as error:
-            error.ctx = ctx  # type: ignore[attr-defined]
-            raise
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
         """Writes the settings that people use, commands below this one, and examples."""
@@ -277,7 +193,7 @@ def summary_of(part: Part) -> str:
 def _row(part: Part, key: str) -> tuple[str, str]:
     """(key=default, type and description) of a setting. key: as typed."""
     name = part.traits.get("typed", {}).get(key, key)
-    schema = next(schema for _, schema in schemas_of(part) if name.split(".")[0] in {at.name for at in fields(schema)})
+    schema = next(schema for schema in schemas_of(part) if name.split(".")[0] in {at.name for at in fields(schema)})
     at, value = field_of(schema, name)
     assert at is not None
     default = choices_of(schema).get(name, _of_file(schema, name, value))

@@ -5,9 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-import re
 import shlex
-import shutil
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -18,7 +16,6 @@ import typer
 
 from kerv_cli.base.durations import left
 from kerv_cli.base.errors import Interrupted, KervError, UsageError
-from kerv_cli.base.near import KEYS, OPTIONS, nearest, question
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -64,8 +61,8 @@ def print_plan(text: str, as_json: bool = False) -> None:
 @contextmanager
 def one_line_errors(words: Sequence[str]) -> Iterator[None]:
     """Every exception within is printed as one line and becomes an exit code: a KervError's own, 2 for what typer
-    cannot parse, 130 for Ctrl-C, 1 for others. Commands named in the line run as they stand. KERV_TRACEBACK=1 raises
-    the exception instead. words: of the command line."""
+    cannot parse, 130 for Ctrl-C, 1 for others. KERV_TRACEBACK=1 raises the exception instead. words: of the command
+    line."""
     try:
         yield
     except (typer.Exit, typer.Abort):
@@ -73,7 +70,7 @@ def one_line_errors(words: Sequence[str]) -> Iterator[None]:
     except KervError as error:
         if isinstance(error, UsageError) and _is_of_an_interrupt(error):
             _refuse("interrupted", Interrupted.exit_code, None)
-        _refuse(runnable(str(error), words), error.exit_code, error)
+        _refuse(str(error), error.exit_code, error)
     except typer.TyperException as error:
         if "\n" in error.format_message():  # the help, where the command is left out
             raise
@@ -86,8 +83,6 @@ def one_line_errors(words: Sequence[str]) -> Iterator[None]:
     except OSError as error:
         _refuse(f"{error.strerror or error}: {error.filename or ''}".rstrip(": "), 1, error)
     except Exception as error:  # noqa: BLE001 - the edge: whatever it is, the user gets one line
-        if isinstance(error, MemoryError) or re.search("allocate memory|bad_alloc|start new thread", str(error)):
-            _refuse("out of memory: end other programs, or ask for less", 1, error)
         _refuse(f"internal error, {type(error).__name__}: {error}; set KERV_TRACEBACK=1 to see where", 1, error)
 
 
@@ -99,60 +94,12 @@ def _is_of_an_interrupt(error: BaseException | None) -> bool:
 
 
 def _parse_error(error: Any, words: Sequence[str]) -> str:
-    """What typer cannot parse, and what is meant instead. words: of the command line."""
-    name, command = getattr(error, "option_name", None), getattr(error.ctx, "command", None)
-    if name is None or command is None:
-        return str(error.format_message())
-    options = {option: one for one in command.params for option in one.opts if option.startswith("-")}
-    if name in options:
-        return f"{error.message.rstrip('.')}: {options[name].help}"
-    typed = next((word for word in words if word.startswith(name) or re.match(rf"-[^-].*{name[-1]}", word)), name)
-    stem, _, value = typed.lstrip("-").partition("=")
-    after = next(iter(words[words.index(typed) + 1 :]), "")
-    value = value or ("" if "=" in after or after.startswith("-") else after)
-    key = stem.replace("-", "_")
-    keys: list[str] = command.keys() if hasattr(command, "keys") else []
-    if key in ("resume", "continue"):
-        return f"No such option: {typed}: leave it out, the same command goes on where it was interrupted"
-    near = nearest(f"--{key}", [*options, *keys], {**KEYS, **OPTIONS})
-    if near[:1] == ["runtime.device"] and (value or "0").isdigit():  # a GPU's number
-        value = "cuda"
-    if near and not near[0].startswith("-"):
-        return f"No such option: {typed}; settings have no dashes: {near[0]}={value or 'VALUE'}"
-    return f"No such option: {typed}: {question(near) or f'{error.ctx.command_path} --help lists them'}"
-
-
-_LONGEST = 2000
-"""Letters of a message."""
-_QUOTED = re.compile(r"(['`])kerv ((?:train |build |runs )?[a-z]+)((?: [^'`]*)?)\1")
-_SHARED = {
-    "results": None,  # None: every command takes it
-    "policy": ("rollout", "sweep", "calibrate", "build datastore", "train drafter", "prepare"),
-    "demos": ("train target", "train drafter", "calibrate", "build datastore", "prepare"),
-    "for": ("prepare",),
-}
-"""Settings of the present command that a command in its messages needs too -> the commands that take them."""
-
-
-def runnable(message: str, words: Sequence[str]) -> str:
-    """The message, in which every quoted command can be copied: it begins as kerv is called here, and has the present
-    command's settings without which it would work on another folder or another policy."""
-
-    def completed(match: re.Match[str]) -> str:
-        quote, name, rest = match.groups()
-        # `prepare for=METHOD` makes what a rollout's method needs
-        line = [re.sub("^method=", "for=", word) for word in words] if name == "prepare" else words
-        keys = {word.split("=", 1)[0] for word in shlex.split(rest)}
-        shared = [shlex.quote(word) for word in line if _is_shared(word, name) and word.split("=", 1)[0] not in keys]
-        return f"{quote}{' '.join([kerv_command(), name, *rest.split(), *shared])}{quote}"
-
-    return _QUOTED.sub(completed, message)
-
-
-def _is_shared(word: str, command: str) -> bool:
-    key = word.split("=", 1)[0].split(".", 1)[0]
-    takers = _SHARED.get(key, ())
-    return "=" in word and (takers is None or command in takers)
+    """What typer cannot parse, and that settings have no dashes. words: of the command line."""
+    name, message = getattr(error, "option_name", None), " ".join(error.format_message().split())
+    if name is None or not message.startswith("No such option") or getattr(error, "possibilities", None):
+        return message
+    setting = next((word for word in words if word.startswith(name)), name).lstrip("-")
+    return f"{message.rstrip('.')}; settings have no dashes: {setting if '=' in setting else f'{setting}=VALUE'}"
 
 
 def results_word(words: Iterable[str]) -> str:
@@ -166,10 +113,7 @@ def _refuse(message: str, code: int, error: BaseException | None) -> None:
     if code == Interrupted.exit_code:
         # objects in the making cannot clean up behind themselves, e.g. a GL context: no news to the user
         sys.unraisablehook = lambda unraisable: None
-    message = " ".join(message.split())
-    if len(message) > _LONGEST:  # a word of the command line, which the user has seen
-        message = f"{message[: _LONGEST // 2]} … {message[-_LONGEST // 2 :]}"
-    typer.echo(f"kerv: {message}", err=True)
+    typer.echo(f"kerv: {' '.join(message.split())}", err=True)
     raise typer.Exit(code)
 
 
@@ -221,11 +165,6 @@ def _plain_lines(title: str) -> Callable[..., None]:
             typer.echo(", ".join(filter(None, (f"{title} {done}/{total}", rest, text))), err=True)
 
     return advance
-
-
-def kerv_command() -> str:
-    """The command to show in hints: `kerv` where the shell finds it, else the path of this script."""
-    return "kerv" if shutil.which("kerv") or not sys.argv[0].endswith("kerv") else os.path.relpath(sys.argv[0])
 
 
 def console(stderr: bool = False) -> Console:

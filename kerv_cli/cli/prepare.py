@@ -7,21 +7,15 @@ from collections.abc import Sequence
 
 import typer
 
-from kerv_cli.base.config import groups
 from kerv_cli.base.durations import about, duration
 from kerv_cli.base.errors import Interrupted
 from kerv_cli.base.registry import parts
 from kerv_cli.base.settings import PrepareSettings
 from kerv_cli.cli.command import command, typer_command
-from kerv_cli.cli.common import ShowPlan, kerv_command, print_table, results_word
+from kerv_cli.cli.common import ShowPlan, print_table, results_word
 
 NOT_OF_STEPS = ("for", "steps")
 """Settings that the steps do not take; demos= is for all of them but the certificate."""
-
-
-def method_names() -> list[str]:
-    """Values of `for=`."""
-    return groups()["method"]
 
 
 @command(
@@ -31,7 +25,6 @@ def method_names() -> list[str]:
     examples=("kerv prepare policy.target=mine", "kerv prepare policy.target=mine for=one_pass,kerv --plan"),
     typed={"for": "methods"},
     lists=("methods",),
-    values={"for": method_names},
 )
 def prepare(settings: PrepareSettings, words: list[str], plan: ShowPlan = False) -> None:
     """Make everything that methods need of a target, in order: drafters, datastore, calibration, certificate. What is
@@ -47,7 +40,7 @@ def prepare(settings: PrepareSettings, words: list[str], plan: ShowPlan = False)
         return shlex.join([*step.command, *shared])
 
     steps, name = planned(settings), settings.policy.target
-    rows = [(s.kind, s.state, duration(s.seconds) if s.seconds else "", f"{kerv_command()} {line(s)}") for s in steps]
+    rows = [(s.kind, s.state, duration(s.seconds) if s.seconds else "", f"kerv {line(s)}") for s in steps]
     title = f"{name}, {about(sum(step.seconds for step in steps))}"
     print_table(("what", "state", "about", "command"), rows, title)
     if plan:
@@ -56,9 +49,9 @@ def prepare(settings: PrepareSettings, words: list[str], plan: ShowPlan = False)
         # read anew: what was just made decides whether what is made from it is still good
         step = next(step for step in planned(settings) if step.kind == kind)
         if step.state != THERE:
-            typer.echo(f"\n{kerv_command()} {line(step)}")
+            typer.echo(f"\nkerv {line(step)}")
             run(shlex.split(line(step)))
-    typer.echo(f"\n{name} is ready: {kerv_command()} sweep study=own policy.target={name}{results_word(words)}")
+    typer.echo(f"\n{name} is ready: kerv sweep study=own policy.target={name}{results_word(words)}")
 
 
 def run(line: Sequence[str]) -> None:

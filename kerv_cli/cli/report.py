@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -26,11 +25,6 @@ Choose = Annotated[
 ]
 
 
-def studies_there() -> list[str]:
-    """Names of the studies in ./results."""
-    return sorted(path.parent.name for path in Path("results/studies").glob("[!.]*/plan.yaml"))
-
-
 @command(
     "report",
     ReportSettings,
@@ -39,7 +33,6 @@ def studies_there() -> list[str]:
     # a folder of results; to Hydra study= would be a choice among the files of conf/study
     typed={"study": "only"},
     lists=("on",),
-    values={"study": studies_there},
 )
 def report(
     settings: ReportSettings,

@@ -18,7 +18,6 @@ from kerv_cli.cli.common import (
     ShowPlan,
     at_work,
     console,
-    kerv_command,
     print_json,
     print_notes,
     print_table,
@@ -144,10 +143,10 @@ def _print_rollout(store: StudyStore, as_json: bool, where: str) -> None:
         console().print(SummaryTable(data.table))
     else:
         _print_setting(data, per_task, whole[0])
-    show = f"{kerv_command()} runs show {store.name}{where}"
+    show = f"kerv runs show {store.name}{where}"
     typer.echo(f"run {store.name} in {store.root}; its settings and figures: {show}")
     if store.recordings:
-        typer.echo(f"{len(store.recordings)} recordings; open one with: {kerv_command()} view {store.recordings[0]}")
+        typer.echo(f"{len(store.recordings)} recordings; open one with: kerv view {store.recordings[0]}")
 
 
 def _print_setting(data: StudyData, per_task: list[Row], whole: Row) -> None:

@@ -13,7 +13,7 @@ from kerv_cli.base.errors import Interrupted, UsageError
 from kerv_cli.base.places import results_dir
 from kerv_cli.base.settings import CommandSettings, ImportSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan, console, kerv_command, print_json, print_table, results_word
+from kerv_cli.cli.common import AsJson, ShowPlan, console, print_json, print_table, results_word
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,16 +30,9 @@ To = Annotated[str, typer.Option("--to", help="csv, trackio, wandb (offline) or 
 Folder = Annotated[Path | None, typer.Option("--dir", help="Where it is written; default results/exports.")]
 
 
-def run_ids() -> list[str]:
-    """Ids of the runs in ./results."""
-    from kerv_cli.lab.catalogue import find_runs
-
-    return [run.id for run in find_runs("results")]
-
-
 def _command_on_runs(name: str, *examples: str) -> Callable[[F], F]:
     """Declares a command whose names are runs."""
-    return command(f"runs {name}", names=RUNS, completes=run_ids, keys="results", examples=examples)
+    return command(f"runs {name}", names=RUNS, keys="results", examples=examples)
 
 
 def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a run") -> list[str]:
@@ -206,7 +199,7 @@ def rerun(
         print_json({"run": entry.id, "folder": entry.folder, "episodes": shared, "same_tokens": same})
         return
     typer.echo(f"{entry.id}: the same tokens in {same} of {shared} episodes of {run.id}")
-    typer.echo(f"both side by side: {kerv_command()} runs compare {run.id} {entry.id}{results_word(words)}")
+    typer.echo(f"both side by side: kerv runs compare {run.id} {entry.id}{results_word(words)}")
 
 
 @_command_on_runs("rm", "kerv runs rm last", "kerv runs rm main --yes")
@@ -280,4 +273,4 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
     for line in notes:
         typer.echo(line)
     console().print(SummaryTable(table))
-    typer.echo(f"study {name}: {kerv_command()} report study={name}, {kerv_command()} report --choose study={name}")
+    typer.echo(f"study {name}: kerv report study={name}, kerv report --choose study={name}")

@@ -16,11 +16,9 @@ from kerv_cli.cli.common import (
     ShowPlan,
     at_work,
     console,
-    kerv_command,
     print_json,
     print_notes,
     print_table,
-    runnable,
 )
 
 if TYPE_CHECKING:
@@ -109,7 +107,7 @@ def _list_studies(as_json: bool) -> None:
         print_json([dict(zip((*columns[:5], "title"), row, strict=True)) for row in rows])
         return
     print_table(columns, rows, "episodes: per task; in all: settings x tasks x episodes")
-    typer.echo(f"run one, e.g.: {kerv_command()} sweep study=demo; what it would do: --plan")
+    typer.echo("run one, e.g.: kerv sweep study=demo; what it would do: --plan")
 
 
 def _warn(lines: Iterable[str]) -> None:
@@ -215,7 +213,7 @@ def print_study(table: DataFrame, store: StudyStore, words: list[str]) -> None:
     apart = not_in_turn(table)
     if apart:
         mend = "" if store.is_imported else f"; '{store.sweep_command('rerun=timed')}' does that"
-        typer.echo(f"no speedup of {', '.join(apart)}: not measured in turn with the baseline{runnable(mend, words)}")
+        typer.echo(f"no speedup of {', '.join(apart)}: not measured in turn with the baseline{mend}")
     note = store.read_plan().note
     if note:
         typer.echo(f"\n{note}\n")
@@ -229,7 +227,7 @@ def print_verdict(table: DataFrame, store: StudyStore, loss: float) -> None:
     typer.echo(f"page: {store.root / 'report.html'}")
     recordings = store.recordings
     mend = "" if store.is_imported else "; the same sweep with record=1 rerun=all does that"
-    typer.echo(f"watch: {f'{kerv_command()} view {recordings[0]}' if recordings else f'nothing is recorded{mend}'}")
+    typer.echo(f"watch: {f'kerv view {recordings[0]}' if recordings else f'nothing is recorded{mend}'}")
 
 
 def _print_outcome(
@@ -260,5 +258,4 @@ def _print_outcome(
                 write_study(store, data if is_whole else load_study(store), resolved.sweep.loss)
             print_verdict(data.table, store, resolved.sweep.loss)
     for failure in outcome.failed:
-        reason = runnable(failure.reason, words)
-        typer.echo(f"kerv: {failure.cell.label} on {failure.cell.task}: {reason}", err=True)
+        typer.echo(f"kerv: {failure.cell.label} on {failure.cell.task}: {failure.reason}", err=True)

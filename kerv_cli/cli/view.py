@@ -19,20 +19,12 @@ To = Annotated[Path | None, typer.Option("--to", help="Write a film of one recor
 Summary = Annotated[bool, typer.Option("--summary", help="Print what a recording holds instead.")]
 
 
-def _ids() -> list[str]:
-    """Of the sweeps and rollouts in ./results."""
-    from kerv_cli.lab.catalogue import find_runs
-
-    return [run.id for run in find_runs("results") if run.has_episodes]
-
-
 @command(
     "view",
     ViewSettings,
     keys="results",
     examples=("kerv view last", "kerv view --to episode.gif NAME.rrd"),
     names="NAME: runs (id, a unique part of it, or last), recordings (.rrd) or folders of them, and results=DIR.",
-    completes=_ids,
     writes=False,
 )
 def view(

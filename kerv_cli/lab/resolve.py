@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from kerv_cli.base.config import MOST_POINTS, Composer, check_once, compose, expand, split_words, swept_keys
+from kerv_cli.base.config import MOST_POINTS, Composer, compose, expand, split_words, swept_keys
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.files import read_yaml_file
 from kerv_cli.base.limits import check_label
@@ -55,7 +55,6 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     Raises:
         UsageError: an unknown key or name; a key on the command line that the study itself varies; too many settings.
     """
-    check_once(overrides, ["study"])
     file = next((o for o in overrides if o.startswith("study=") and o.endswith((".yaml", ".yml"))), None)
     of_sweep = [o for o in overrides if o != file and _key(o).split(".")[0] in SweepSettings.__dataclass_fields__]
     of_settings = [o for o in overrides if o != file and (o not in of_sweep or o.startswith("results="))]

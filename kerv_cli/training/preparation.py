@@ -70,7 +70,7 @@ def needs(methods: tuple[str, ...], sees: bool, runnable: bool = True) -> tuple[
     names = groups()["method"]
     for name in methods:
         if name not in names:
-            raise UnknownName("method", name, names, more="without for= it is all of them")
+            raise UnknownName("method", name, names)
     artifacts = parts("artifact")
     seeing = {kind for kind, part in artifacts.items() if part.traits.get("sees")}
     kinds: set[str] = set()
