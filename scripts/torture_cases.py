@@ -25,7 +25,7 @@ PLANNED = {  # command of conf/ -> its words; all are plans, so that nothing lon
     "build_datastore": f"build datastore --plan demos=few task={TASK}",
     "calibrate": f"calibrate --plan demos=few task={TASK}",
 }
-NAMED = ("runs list", "runs show", "runs compare", "runs diff", "runs rerun --plan", "runs export --to")
+NAMED = ("runs list", "runs show", "runs compare", "runs rerun --plan", "runs export --to")
 STRANGE_KEYS = ("nothing", "threshold.", ".r", "", "a.b.c", "study.common", "study.settings", "study.repeats")
 _WORDS = """
 =cmd|x +x\tx kind=sweep last tortured tortured:ar certified mlflow csv

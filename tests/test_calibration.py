@@ -406,7 +406,7 @@ def test_the_command_prints_what_it_found(results: Path) -> None:
     ]
     done = CliRunner().invoke(app, [*common, "decodes=0", "name=without"])
     assert done.exit_code == 0, done.output
-    for word in ("K_S", "fitted q / r", "held-out error", "hold", "damped", "h=4", "without", "radius R, minimum"):
+    for word in ("K_S", "held-out error", "hold", "damped", "h=4", "without"):
         assert word in done.output
     assert "reference levels K_S: decodes=0; left empty\n" in done.output
     assert "skip levels: no datastore" in done.output

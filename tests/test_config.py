@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import asdict, fields, is_dataclass
 from itertools import chain
-from pathlib import Path
 
 import pytest
 import yaml
@@ -34,16 +32,6 @@ def test_every_command_composes_and_shows_what_every_setting_is() -> None:
 def test_every_setting_has_a_description() -> None:
     kinds = [kind for kind in vars(s).values() if is_dataclass(kind) and kind.__module__ == s.__name__]
     assert [f"{kind.__name__}.{at.name}" for kind in kinds for at in fields(kind) if not description(at)] == []
-
-
-def test_a_configuration_of_ones_own_may_choose_for_a_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`conf/<command>.yaml`, as older versions had them."""
-    shutil.copytree(conf_dir(), tmp_path / "conf")
-    text = "defaults:\n  - base_train_target\n  - target: tiny\n  - train: target\n  - _self_\nname: mine\n"
-    (tmp_path / "conf/train_target.yaml").write_text(text)
-    monkeypatch.setenv("KERV_CONF_DIR", str(tmp_path / "conf"))
-    settings = compose("train_target", ["train.steps=7"], s.TrainTargetSettings)
-    assert (settings.name, settings.target.size, settings.train.steps) == ("mine", "tiny", 7)
 
 
 WHOLE = {group: names for group, names in groups().items() if group not in PART_GROUPS}

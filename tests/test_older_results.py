@@ -143,25 +143,6 @@ def test_what_the_gate_measured_is_listed_shown_and_reported_as_it_was(gated: tu
     assert before.loc[before["label"] == "one_pass_risk", "realised_risk"].notna().all()
 
 
-def test_the_gate_is_not_run_again(gated: tuple[Path, str]) -> None:
-    folder, results = gated
-    (folder / "gate.yaml").write_text("settings: {ar: method=ar, gate: method=one_pass_risk skip.epsilon=0.2}")
-    gone = (
-        ("sweep", f"study={folder}/gate.yaml", "--plan"),
-        ("sweep", "study=scores", "--plan"),
-        ("rollout", "method=one_pass_risk", "task=reach"),
-        ("rollout", "method=one_pass", "skip=risk", "task=reach"),
-        ("runs", "rerun", "gate"),
-        ("calibrate", "risk", "policy.target=few"),
-        ("train", "score", "policy.target=few"),
-    )
-    for words in gone:
-        refused = kerv(*words, results)
-        assert refused.exit_code == 2, refused.output
-        assert "gate is gone, commit 72e42ef is the last with it: method=one_pass_streak" in refused.stderr
-        assert len(refused.stderr.splitlines()) == 1
-
-
 @pytest.mark.bits
 def test_its_tokens_are_those_of_today(results: str, tmp_path: Path) -> None:
     """A run of every method on the stored weights, again, whatever the CPU."""

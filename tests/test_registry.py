@@ -66,28 +66,14 @@ def test_a_name_belongs_to_one_piece_of_code(shelf: dict[str, dict[str, Part]]) 
     ("part", "says"),
     [
         (Part("propser", "mine", "one:build"), "unknown kind of part 'propser': did you mean proposer"),
-        (
-            Part("proposer", "mine", "one:build"),
-            "proposer 'mine' lacks the trait when: the traits of this kind",
-        ),
-        (
-            Part("proposer", "mine", "one:build", traits={"when": PREFILL, "chain": True}),
-            "proposer 'mine' has an unknown trait chain: the traits of this kind are when, chains, sides",
-        ),
+        (Part("proposer", "mine", "one:build"), "proposer 'mine' lacks the trait when"),
         (Part("threshold", "mine", "one:build", traits={"when": PREFILL}), "unknown trait when: this kind has none"),
-        (Part("stress", "mine", "one:build"), "stress 'mine' lacks the trait needed"),
-        (
-            Part("threshold", "mine", "one:build", settings=int),
-            "its settings int must be a dataclass with a",
-        ),
+        (Part("threshold", "mine", "one:build", settings=int), "its settings int must be a dataclass with a"),
     ],
 )
-def test_a_part_that_is_not_of_its_kind_is_refused_in_one_line(
-    shelf: dict[str, dict[str, Part]], part: Part, says: str
-) -> None:
-    with pytest.raises(UsageError, match=says) as refused:
+def test_a_part_that_is_not_of_its_kind_is_refused(shelf: dict[str, dict[str, Part]], part: Part, says: str) -> None:
+    with pytest.raises(UsageError, match=says):
         register(part)
-    assert "\n" not in str(refused.value)
     assert part.name not in shelf.get(part.kind, {})
 
 
@@ -119,10 +105,11 @@ def test_every_proposer_says_when_it_can_draft() -> None:
     assert all(find("proposer", name).traits["when"] == PREFILL for name in chains)
 
 
-@pytest.mark.parametrize("name", ["kerv_cli.methods.streak:nothing_there", "kerv_cli.nowhere:build"])
-def test_what_is_not_there_gets_one_line(name: str) -> None:
-    with pytest.raises(UsageError, match=name.split(":")[0]):
-        load(name)
+def test_what_is_not_there_gets_one_line() -> None:
+    with pytest.raises(UsageError, match=r"kerv_cli.methods.streak has no nothing_there"):
+        load("kerv_cli.methods.streak:nothing_there")
+    with pytest.raises(UsageError, match=r"kerv_cli.nowhere"):
+        load("kerv_cli.nowhere:build")
 
 
 def kerv(*words: str, folder: Path, plugins: str = "") -> subprocess.CompletedProcess[str]:

@@ -64,8 +64,7 @@ def _parts_of(group: str) -> dict[str, registry.Part]:
 
 
 def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
-    """The command's settings: the dataclass `schema`, its groups of `conf/` and the overrides. A `<command>.yaml` in
-    `KERV_CONF_DIR` chooses the groups instead, and what it sets outranks them.
+    """The command's settings: the dataclass `schema`, its groups of `conf/` and the overrides.
 
     Raises:
         UsageError: an override that cannot be parsed, an unknown key or name, a value of another type or out of range.
@@ -233,9 +232,8 @@ def _composed(command: str, overrides: Sequence[str], schema: type) -> Any:
         for name, part in _parts_of(group).items():
             own_file = (conf_dir() / group / f"{name}.yaml").is_file()  # it begins with the part's settings
             _store_part(f"base_{group}" if own_file else group, name, part.settings)
-    own = not (conf_dir() / f"{command}.yaml").is_file()
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return hydra_compose(f"own_{command}" if own else command, overrides=list(overrides))
+        return hydra_compose(f"own_{command}", overrides=list(overrides))
 
 
 def _open_mappings(node: Any) -> None:
@@ -322,7 +320,9 @@ def _points(override: Any) -> Iterator[str]:
     if not override.is_sweep_override():
         yield override.input_line
         return
-    key = override.get_key_element()
+    key, value = override.get_key_element(), override.value()
+    if hasattr(value, "step") and abs(value.stop - value.start) > MOST_POINTS * abs(value.step):
+        raise UsageError(f"'{override.input_line}' is too long: a grid has at most {MOST_POINTS} points")
     for value in override.sweep_string_iterator():
         yield f"{key}={value}"
 

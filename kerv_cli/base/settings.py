@@ -488,11 +488,6 @@ class ReportSettings(CommandSettings):
 
 
 @dataclass
-class ViewSettings(CommandSettings):
-    """`kerv view`."""
-
-
-@dataclass
 class BuildTargetSettings(RunSettings):
     """`kerv build target`: a published checkpoint as a target of ours. Nothing is copied: it stays where it lies."""
 

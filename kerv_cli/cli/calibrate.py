@@ -47,9 +47,7 @@ def calibrate(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
     with console(stderr=True).status("fitting the predictors"):
         calibration = run.finish(variability, boundary, skip)
     _tasks(calibration, run.path)
-    _noise(calibration)
     _errors(calibration)
-    _boundary(calibration)
     _skip(calibration)
     for line in run.notes:
         typer.echo(line)
@@ -65,16 +63,6 @@ def _tasks(calibration: Calibration, path: Path) -> None:
         errors = (f"{kalman[number]:.4f}", f"{hold[number]:.4f}")
         rows.append((name, counts["training"], counts["held_out"], *levels, *errors))
     print_table(columns, rows, f"calibration in {path}")
-
-
-def _noise(calibration: Calibration) -> None:
-    space = calibration.target.actions
-    moving = [dof for dof in range(space.dofs) if not space.is_strict[dof]]
-    rows = [
-        (kind, *(f"{noise.q[dof] / noise.r[dof]:.3g} ({noise.damping[dof]:.2g})" for dof in moving))
-        for kind, noise in calibration.noise.items()
-    ]
-    print_table(("filter", *(space.names[dof] for dof in moving)), rows, "fitted q / r (damping)")
 
 
 def _moving_errors(calibration: Calibration, kind: str) -> np.ndarray:
@@ -93,17 +81,6 @@ def _errors(calibration: Calibration) -> None:
         rows.append((kind, *(f"{e:.4f}" for e in error.mean(0)), *wins))
     columns = ("predictor", *(f"h={h}" for h in range(1, horizon + 1)), "below hold at h=1", f"at h={horizon}")
     print_table(columns, rows, "held-out error of the moving DoFs, mean of tasks, normalised action units")
-
-
-def _boundary(calibration: Calibration) -> None:
-    if calibration.boundary is None:
-        return
-    rows = []
-    for window, r in calibration.boundary.windows.items():
-        bounds = (r.radius_low, r.radius_high, r.length_low, r.length_high)
-        rows.append((window, *(f"{1000 * metres:.1f}" for metres in bounds)))
-    columns = ("positions", "radius R, minimum", "95th percentile", "length D, minimum", "95th percentile")
-    print_table(columns, rows, "ranges of the boundary's metric, mm")
 
 
 def _skip(calibration: Calibration) -> None:

@@ -19,7 +19,6 @@ Publish = Annotated[
 ]
 
 
-Files = Annotated[bool, typer.Option("--files", help="List every file that was written.")]
 Choose = Annotated[
     bool, typer.Option("--choose", help="Say which setting to take: the Pareto front, and the fastest safe one.")
 ]
@@ -39,7 +38,6 @@ def report(
     words: list[str],
     publish: Publish = False,
     choose: Choose = False,
-    files: Files = False,
     as_json: AsJson = False,
 ) -> None:
     """Write CSV tables (per task and aggregated), plots and an HTML page of the studies."""
@@ -66,8 +64,6 @@ def report(
     if output.priced is not None:
         summary = repriced_summary(output.priced)
         print_table(summary.columns, summary.itertuples(index=False), ASSUMES)
-    for path in output.files if files else ():
-        typer.echo(str(path))
     for name, table in output.tables.items():
         if settings.only is None:
             typer.echo(name)

@@ -130,21 +130,6 @@ def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False
         _print_results(comparison)
 
 
-@_command_on_runs("diff", "kerv runs diff main:ar main:kerv", "kerv runs diff main last")
-def diff(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
-    """Show what differs between two runs in settings, weights, machine and versions."""
-    from kerv_cli.report import compare as comparing
-
-    pairs = comparing.pairs_to_compare(settings.results, *_run_names(names, 2, 2, "two runs, ID or ID:SETTING"))
-    by_pair = {f"{a.name} → {b.name}": comparing.differences(a, b) for a, b in pairs}
-    if as_json:
-        print_json({name: [asdict(difference) for difference in rows] for name, rows in by_pair.items()})
-        return
-    for name, rows in by_pair.items():
-        typer.echo(f"\n{name}")
-        _print_differences(rows)
-
-
 def _print_differences(rows: list[Difference]) -> None:
     if not rows:
         typer.echo("no difference in settings, weights, machine or versions")

@@ -10,7 +10,7 @@ import typer
 
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.places import check_writable, results_dir
-from kerv_cli.base.settings import ViewSettings
+from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
 
 Together = Annotated[bool, typer.Option("--together", help="Show two recordings of one seed side by side.")]
@@ -21,14 +21,14 @@ Summary = Annotated[bool, typer.Option("--summary", help="Print what a recording
 
 @command(
     "view",
-    ViewSettings,
+    CommandSettings,
     keys="results",
     examples=("kerv view last", "kerv view --to episode.gif NAME.rrd"),
     names="NAME: runs (id, a unique part of it, or last), recordings (.rrd) or folders of them, and results=DIR.",
     writes=False,
 )
 def view(
-    settings: ViewSettings,
+    settings: CommandSettings,
     names: list[str],
     together: Together = False,
     web: Web = False,
