@@ -251,7 +251,6 @@ def test_the_command_prints_ranges_and_levels(copy: Path) -> None:
     done = CliRunner().invoke(app, ["calibrate", *words(copy, "epsilon=1.9", "confidence=0.5")])
     assert done.exit_code == 0, done.output
     for word in (
-        "length D, minimum",
         "s_min",
         "would be skipped",
         "error ≤ 1.9",

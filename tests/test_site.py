@@ -68,7 +68,7 @@ def test_links_of_the_repository_become_links_of_the_site(docs: Any) -> None:
 
 def test_the_reference_has_the_help_of_every_command(docs: Any) -> None:
     page = docs.reference()
-    for words in (("rollout",), ("train", "target"), ("runs", "compare"), ("completion",)):
+    for words in (("rollout",), ("train", "target"), ("runs", "compare")):
         assert f"## `kerv {' '.join(words)}`" in page
         shown = CliRunner().invoke(app, [*words, "--help"], prog_name="kerv", env={"COLUMNS": str(docs.WIDTH)})
         assert shown.output.rstrip() in page

@@ -140,7 +140,7 @@ def _split(part: Part, words: list[str], named: bool) -> tuple[list[str], list[s
     filters = set(re.findall(r"(\w+)=", part.traits["names"]))
     for name in names:
         key, equals, _ = name.partition("=")
-        if equals and key not in filters and not Path(name).exists():
+        if equals and re.fullmatch(r"[\w.]+", key) and key not in filters and not Path(name).exists():
             raise UnknownName("key", key, sorted(keys | filters))
     return overrides, names
 
