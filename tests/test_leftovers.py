@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import socket
 import subprocess
@@ -13,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from kerv_cli.base import files
-from kerv_cli.base.errors import StorageError
 from kerv_cli.base.files import atomic_path, write_folder
 from kerv_cli.base.leftovers import clean, is_left_over, left_over, temporary_beside
 
@@ -80,29 +78,6 @@ def test_where_folders_cannot_be_exchanged_two_renames_do(tmp_path: Path, monkey
     assert write(folder, "new")
     assert (folder / "file").read_text() == "new"
     assert [path.name for path in tmp_path.iterdir()] == ["store"]
-
-
-def test_a_kill_between_two_renames_and_a_failed_one_lose_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = tmp_path / "store"
-    write(folder, "old")
-    monkeypatch.setattr(files.ctypes, "CDLL", lambda name, use_errno: object())
-    rename, refused = os.rename, [True]
-
-    def failing(a: Path, b: Path) -> None:
-        if b == folder and not folder.exists() and refused and refused.pop():
-            raise PermissionError(errno.EACCES, "Permission denied")
-        rename(a, b)
-
-    monkeypatch.setattr(os, "rename", failing)
-    with pytest.raises(StorageError, match="permission denied"):
-        write(folder, "new")
-    assert (folder / "file").read_text() == "old"
-    assert [path.name for path in tmp_path.iterdir()] == ["store"]
-    folder.rename(tmp_path / ".store.older")  # as a kill leaves it
-    assert not write(folder, "new", replace=False)
-    assert (folder / "file").read_text() == "old"
 
 
 def fail(folder: Path) -> None:

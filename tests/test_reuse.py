@@ -8,8 +8,6 @@ import shutil
 from pathlib import Path
 
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from studies_synthetic import (
     IDENTITY,
@@ -21,7 +19,6 @@ from studies_synthetic import (
     threshold_study,
 )
 
-from kerv_cli.base.files import sha256_of
 from kerv_cli.base.settings import RolloutSettings
 from kerv_cli.lab import identity
 from kerv_cli.lab.execute import execute
@@ -173,16 +170,6 @@ def test_settings_without_an_effect_do_not_count(store: StudyStore) -> None:
     assert not cover([cell], Stock(store)).reasons
 
 
-def test_a_setting_that_is_new_counts_only_where_it_is_used(store: StudyStore) -> None:
-    """As after an update: the stored settings lack one, and hold one that this kerv does not know."""
-    cells = threshold_study(["reach-v3"])
-    swept(store, cells)
-    plain = cells[0].settings
-    older = {key: value for key, value in plain.items() if key not in ("rollout", "deviation_every")}
-    assert identity.work_of(older, IDENTITY) == identity.work_of(plain, IDENTITY)
-    assert identity.work_of({**plain, "of_a_newer_kerv": 3}, IDENTITY) != identity.work_of(plain, IDENTITY)
-
-
 def test_what_depends_on_the_order_of_episodes_is_reused_whole(store: StudyStore) -> None:
     def cells(episodes: int) -> list[Cell]:
         settings = settings_of("retrieval", episodes=episodes)
@@ -226,39 +213,8 @@ def test_a_damaged_cell_is_set_aside_and_run_again(store: StudyStore) -> None:
     assert calls == ["naive_sd"]
 
 
-def test_a_cell_of_a_newer_kerv_is_left_alone(store: StudyStore) -> None:
-    cells = threshold_study(["reach-v3"])
-    swept(store, cells)
-    path = store.cells / cells[0].id / "status.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "format": 99}))
-    (failed,) = execute(cells, prepare, store).failed
-    assert failed.reason == f"cell {path.parent} is of a newer kerv (format 99): update kerv"
-    assert store.damages() == []
-
-
 def test_a_study_renamed_by_hand_is_the_study_of_its_new_name(store: StudyStore) -> None:
     swept(store, threshold_study(["reach-v3"]))
     store.root.rename(store.root.with_name("better"))
     assert load_study(StudyStore(store.root.parent.parent, "better")).plan.name == "better"
     assert not cover(threshold_study(["reach-v3"]), Stock(store)).reasons, "found in the other folder"
-
-
-def test_columns_that_a_cell_lacks_are_empty_and_further_ones_stay(store: StudyStore) -> None:
-    """As between two versions of kerv: one cell is older than a column, and has one of a newer version."""
-    cells = threshold_study(["reach-v3"])
-    swept(store, cells)
-    folder = store.cells / cells[0].id
-    table = pq.read_table(folder / "episodes.parquet").drop_columns(["jerk", "held_steps"])
-    table = table.append_column("of_a_newer_kerv", pa.array(range(table.num_rows)))
-    pq.write_table(table, folder / "episodes.parquet")
-    status = json.loads((folder / "status.json").read_text())
-    status["files"]["episodes.parquet"] = sha256_of(folder / "episodes.parquet")
-    del status["sha256"], status["format"]
-    (folder / "status.json").write_text(json.dumps(status))
-
-    episodes = load_study(store).episodes
-    assert episodes.loc[episodes["label"] == "ar", "jerk"].isna().all()
-    assert episodes.loc[episodes["label"] == "ar", "of_a_newer_kerv"].tolist() == [0, 1, 2, 3]
-    assert episodes.loc[episodes["label"] == "naive_sd", "of_a_newer_kerv"].isna().all()
-    assert table_of(store)["successes"].notna().all()
-    assert not cover(cells, Stock(store)).reasons

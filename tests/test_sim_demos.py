@@ -234,21 +234,6 @@ def as_format_1(folder):
         (folder / name).write_text(json.dumps({**value, "format": 1}))
 
 
-@pytest.mark.bits
-def test_a_dataset_of_format_1_is_metaworlds_and_can_be_gone_on_with(copied):
-    before = DemoDataset.open(copied)
-    as_format_1(copied)
-    opened = DemoDataset.open(copied)
-    assert opened.manifest == before.manifest
-    assert opened.load(1).labels.tobytes() == before.load(1).labels.tobytes()
-    (copied / "manifest.json").unlink()
-    opened.episodes[1].path.unlink()
-    assert record(CONFIG, copied).sha256 == before.sha256
-    (copied / "manifest.json").write_text('{"format": 3}')
-    with pytest.raises(CheckpointError, match="has format 3, this kerv reads 2 and 1"):
-        DemoDataset.open(copied)
-
-
 def test_a_dataset_of_experts_with_several_ways_is_read_and_not_gone_on_with(copied):
     for name in ("manifest.json", "recording.json"):
         value = json.loads((copied / name).read_text())

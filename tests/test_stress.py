@@ -329,17 +329,15 @@ def settings(*words: str) -> RolloutSettings:
     return compose("rollout", ["policy=expert", "task=insert-peg", *words], RolloutSettings)
 
 
-def test_an_unstressed_cell_is_what_it_was_before_there_was_stress() -> None:
+def test_a_stress_of_level_0_is_no_stress() -> None:
     def whole(plain: dict[str, Any]) -> str:
         return work_of(plain, {})
 
     now, zero = dataclasses.asdict(settings()), dataclasses.asdict(settings("world.stress.kind=light"))
-    old = {**now, "world": {key: value for key, value in now["world"].items() if key != "stress"}}
     two = dataclasses.asdict(settings("world.stress.kind=light", "world.stress.level=2"))
-    assert whole(now) == whole(old) == whole(zero) != whole(two)
-    assert settings_from(old).world.stress == StressSettings()  # a plan from before can be read
+    assert whole(now) == whole(zero) != whole(two)
     assert settings_from(two).world.stress == StressSettings("light", 2)
-    assert [stress_of(plain)["kind"] for plain in (now, old, zero, two)] == ["none", "none", "none", "light"]
+    assert [stress_of(plain)["kind"] for plain in (now, zero, two)] == ["none", "none", "light"]
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,6 @@ from kerv_cli.base.settings import (
     DemosSettings,
     PolicySettings,
     RolloutSettings,
-    TrainSettings,
     WorldSettings,
 )
 from kerv_cli.cli.app import app
@@ -30,7 +29,6 @@ from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.imitation import task_borders
 from kerv_cli.training.loop import draw_samples
 from kerv_cli.training.ranks import Ranks, join
-from kerv_cli.training.runs import run_settings
 from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.recording import DemoConfig, record, run_expert
@@ -92,12 +90,6 @@ def test_balanced_tasks_are_drawn_alike() -> None:
     assert share(0.0) == pytest.approx(0.1, abs=0.01)
     assert share(1.0) == pytest.approx(0.5, abs=0.02)
     assert share(0.5) == pytest.approx(0.25, abs=0.02)  # 1 : 3, the root of 1 : 9
-
-
-def test_runs_from_before_a_setting_are_the_same_runs() -> None:
-    assert not {"balance", "colour"} & run_settings(TrainSettings()).keys()
-    assert run_settings(TrainSettings(balance=0.5))["balance"] == 0.5
-    assert run_settings(TrainSettings(colour=0.5))["colour"] == 0.5
 
 
 def test_datasets_add_up(results: Path) -> None:

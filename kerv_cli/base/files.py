@@ -9,22 +9,20 @@ import functools
 import hashlib
 import json
 import os
-import re
 import shutil
 import stat
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kerv_cli.base.errors import CheckpointError, StorageError
-from kerv_cli.base.leftovers import clean, older_beside, temporary_beside
+from kerv_cli.base.leftovers import clean, temporary_beside
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 MOST_TEXT = 2**28
-"""Bytes of a JSON, YAML or CSV file; kerv's own are far smaller."""
+"""Bytes of a JSON or YAML file; kerv's own are far smaller."""
 MOST_BYTES = 2**36
 """Bytes of weights or of a table."""
 
@@ -92,7 +90,6 @@ def write_folder(folder: Path, fill: Callable[[Path], object], replace: bool = F
         with storage_errors(folder):
             folder.parent.mkdir(parents=True, exist_ok=True)
             _clean_once(folder.parent)
-            _put_back(folder)
             temporary.mkdir()
             fill(temporary)
             for path in (*temporary.rglob("*"), temporary):
@@ -118,29 +115,14 @@ def _rename_once(temporary: Path, folder: Path) -> bool:
 
 
 def _exchange(a: Path, b: Path) -> None:
-    """Exchanges the names of two folders in one step; in two where the file system or the system cannot."""
+    """Puts folder `a` in the place of `b`: in one step, or where the file system cannot, after removing `b`."""
     libc = ctypes.CDLL(None, use_errno=True)
     if hasattr(libc, "renameat2"):
         here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
         if libc.renameat2(here, os.fsencode(a), here, os.fsencode(b), exchange) == 0:
             return
-    aside = older_beside(b)
-    os.rename(b, aside)
-    try:
-        os.rename(a, b)
-    except OSError:
-        os.rename(aside, b)
-        raise
-    os.rename(aside, a)
-
-
-def _put_back(folder: Path) -> None:
-    """Puts the older folder back where a process ended between the two renames, or removes it after the second."""
-    aside = older_beside(folder)
-    if folder.exists():
-        shutil.rmtree(aside, ignore_errors=True)
-    elif aside.is_dir():
-        os.rename(aside, folder)
+    shutil.rmtree(b)
+    os.rename(a, b)
 
 
 def visible(folder: Path) -> list[Path]:
@@ -192,7 +174,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def regular(path: Path, most: int = MOST_BYTES) -> Path:
-    """The path of a file that can be read to its end: every reader of kerv and of a library gets it from here.
+    """The path of a file that can be read to its end, for files that come from elsewhere.
 
     Raises:
         OSError: it is missing, or a folder, a pipe or a device, on which a reader would wait.
@@ -202,7 +184,7 @@ def regular(path: Path, most: int = MOST_BYTES) -> Path:
     if not stat.S_ISREG(status.st_mode):
         raise OSError(errno.EINVAL, "it is no regular file", str(path))
     if status.st_size > most:
-        raise ValueError(f"{path} has {status.st_size} bytes, more than the {most} that kerv writes")
+        raise ValueError(f"{path} has {status.st_size} bytes, more than the {most} that kerv reads")
     return Path(path)
 
 
@@ -215,15 +197,12 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
     """A parquet file, or those of `columns` that it has.
 
     Raises:
-        OSError, ValueError: as `regular`, it is no parquet, or its columns would take more than MOST_BYTES.
+        OSError, ValueError: it is missing or no parquet.
     """
     import pyarrow.parquet as pq
 
     # without pyarrow's dataset machinery, which costs several times the reading of a small file
-    with pq.ParquetFile(regular(path)) as file:
-        groups = (file.metadata.row_group(number) for number in range(file.metadata.num_row_groups))
-        if max(file.metadata.num_rows, sum(group.total_byte_size for group in groups)) > MOST_BYTES:
-            raise ValueError(f"{path} stands for more than {MOST_BYTES} bytes")
+    with pq.ParquetFile(path) as file:
         present = None if columns is None else [name for name in columns if name in file.schema_arrow.names]
         return file.read(columns=present, use_threads=False)
 
@@ -232,17 +211,14 @@ def read_json(path: Path) -> Any:
     """The value in a JSON file.
 
     Raises:
-        CheckpointError: the file is missing, no regular one, too large, not JSON, or nested deeper than kerv's own
-            files are.
+        CheckpointError: the file is missing, no regular one, too large or not JSON.
     """
     try:
-        value = json.loads(read_text(path))
-        check_shape(value)
+        return json.loads(read_text(path))
     except FileNotFoundError as error:
         raise CheckpointError(f"{path} is missing") from error
     except (OSError, ValueError, RecursionError) as error:
         raise CheckpointError(f"{path} cannot be read as JSON: {error}") from error
-    return value
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
@@ -262,32 +238,14 @@ def read_yaml(text: str) -> Any:
     """The plain values in a YAML text.
 
     Raises:
-        ValueError: it is not YAML, nested too deep, or its aliases stand for more values than a file of kerv's holds.
+        ValueError: it is not YAML.
     """
     import yaml
 
-    check_nesting(text)
     try:
-        value = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        return yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     except (yaml.YAMLError, RecursionError) as error:
         raise ValueError(f"not YAML: {error}") from error
-    check_shape(value)
-    return value
-
-
-def check_nesting(text: str, depth: int = 1000) -> None:
-    """Refuses a YAML text that is nested so deep that a parser would run out of its stack.
-
-    Raises:
-        ValueError: more than `depth` open brackets, or a line that begins with more indentation than that.
-    """
-    opened = 0
-    for bracket in re.findall(r"[\[\]{}]", text) if text.count("[") + text.count("{") > depth else ():
-        opened = opened + 1 if bracket in "[{" else max(0, opened - 1)
-        if opened > depth:
-            raise ValueError(f"nested more than {depth} deep")
-    if re.search(rf"^[ \t?:-]{{{depth}}}", text, re.MULTILINE):
-        raise ValueError(f"nested more than {depth} deep")
 
 
 def to_yaml(value: Any, **options: Any) -> str:
@@ -296,29 +254,6 @@ def to_yaml(value: Any, **options: Any) -> str:
 
     text: str = yaml.dump(value, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False, **options)
     return text
-
-
-def check_shape(value: Any, depth: int = 64, most: int = 5_000_000) -> None:
-    """Refuses values that later code would follow without end.
-
-    Raises:
-        ValueError: containers more than `depth` deep, or more than `most` values with every alias followed.
-    """
-    # every container once, with how often it occurs on its level: aliases may repeat one beyond all bounds
-    level, count = {id(v): (v, 1) for v in [value] if isinstance(v, dict | list)}, 0
-    for _ in range(depth):
-        if not level:
-            return
-        count += sum(times * len(container) for container, times in level.values())
-        if count > most:
-            raise ValueError(f"it holds more than {most} values")
-        below: dict[int, tuple[Any, int]] = {}
-        for container, times in level.values():
-            for inner in container.values() if isinstance(container, dict) else container:
-                if isinstance(inner, dict | list):
-                    below[id(inner)] = inner, times + below.get(id(inner), (inner, 0))[1]
-        level = below
-    raise ValueError(f"it is nested more than {depth} deep")
 
 
 def sha256_of(path: Path) -> str:
@@ -336,5 +271,5 @@ def sha256_of(path: Path) -> str:
 
 @functools.lru_cache(maxsize=4096)
 def _sha256(path: str, inode: int, size: int, changed: int) -> str:
-    with regular(Path(path), most=sys.maxsize).open("rb") as file:
+    with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

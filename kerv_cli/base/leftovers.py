@@ -3,7 +3,6 @@
 .<name>.<host>.<process>-<8 digits>.tmp   a file or a folder that is being written, or removed; its process is named, so
                                           that what a dead one left can be removed
 .<name>.lock                              held while <name> is changed
-.<name>.older                             <name> between two renames, where folders cannot be exchanged in one step
 """
 
 from __future__ import annotations
@@ -32,11 +31,6 @@ def temporary_beside(path: Path) -> Path:
 def lock_beside(path: Path) -> Path:
     """The lock of `path`."""
     return path.with_name(f".{path.name}.lock")
-
-
-def older_beside(path: Path) -> Path:
-    """Where an older folder lies between two renames; no temporary name, so that nothing removes it."""
-    return path.with_name(f".{path.name}.older")
 
 
 def is_left_over(path: Path) -> bool:

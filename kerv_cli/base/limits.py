@@ -80,16 +80,9 @@ def check_label(label: str) -> str:
     Raises:
         UsageError: it is not.
     """
-    if not 0 < len(label) <= 1000 or not label.isprintable() or is_formula(label):
-        raise UsageError(
-            f"'{' '.join(label[:80].split())}' names no setting: one line of text that begins with a letter"
-        )
+    if not 0 < len(label) <= 1000 or not label.isprintable():
+        raise UsageError(f"'{' '.join(label[:80].split())}' names no setting: write one line of text")
     return label
-
-
-def is_formula(text: str) -> bool:
-    """Whether a spreadsheet would compute a cell of this text."""
-    return re.match(r"[=+@\t\r]|-(?![\d.;]*$)", text) is not None
 
 
 def check_settings(settings: Any, what: str = "") -> None:

@@ -151,8 +151,6 @@ class TaskSettings(RunSettings):
 DEFAULT_TASKS = ["MT10"]
 """Where neither a word nor a target names any."""
 MODEL, EXPERT = "model", "expert"
-_GONE_WITH_THE_GATE = ("risk", "score")
-"""Settings of a policy that commit 72e42ef still had (docs/methods.md §4.6); stored settings have them."""
 DERIVED_FROM = ("policy.kind",)
 """Keys of settings that others are derived from when a dataclass is made."""
 
@@ -585,26 +583,23 @@ def choices_of(schema: type) -> dict[str, str]:
     return parts | dict(getattr(schema, "groups", {}))
 
 
-def settings_from(plain: Mapping[str, Any], tolerant: bool = False) -> RolloutSettings:
+def settings_from(plain: Mapping[str, Any]) -> RolloutSettings:
     """The settings of a rollout from nested dicts and lists: `read_settings` with its class."""
-    return read_settings(RolloutSettings, plain, tolerant)
+    return read_settings(RolloutSettings, plain)
 
 
-def read_settings(schema: type[S], plain: Mapping[str, Any], tolerant: bool = False) -> S:
+def read_settings(schema: type[S], plain: Mapping[str, Any]) -> S:
     """Settings of the class `schema` from nested dicts and lists, the inverse of `asdict`. The settings of a part get
-    the class that its registration names. tolerant: keys that this kerv does not know are left out instead of refused.
+    the class that its registration names.
 
     Raises:
         CheckpointError: not such settings. UnknownName: a part that is not registered here.
     """
-    plain = dict(plain)
-    if isinstance(plain.get("policy"), Mapping):
-        plain["policy"] = {name: value for name, value in plain["policy"].items() if name not in _GONE_WITH_THE_GATE}
-    settings = manifests.read(schema, plain, "a stored setting", tolerant)
+    settings = manifests.read(schema, plain, "a stored setting")
     for group in SETTINGS_GROUPS:
         value = getattr(settings, group, None)
         if not isinstance(value, Mapping):
-            continue  # a kind of part that is younger than these settings: its default
+            continue  # the settings name no such part: its default
         part_settings = part_of(group, value["kind"]).settings
-        setattr(settings, group, manifests.read(part_settings, value, f"a stored setting's {group}", tolerant))
+        setattr(settings, group, manifests.read(part_settings, value, f"a stored setting's {group}"))
     return settings

@@ -105,6 +105,6 @@ def training_again(run: RunEntry, results: str) -> TargetRun | DrafterRun:
     name = _free(run.folder.parent, run.folder.name)
     if run.kind == "target":
         return TargetRun(dataclasses.replace(read(TrainTargetSettings, value, str(path)), name=name))
-    settings = read_settings(TrainDrafterSettings, value, tolerant=True)
+    settings = read_settings(TrainDrafterSettings, value)
     others = settings.policy.others | {run.kind: name}
     return drafter_run(dataclasses.replace(settings, policy=dataclasses.replace(settings.policy, others=others)))

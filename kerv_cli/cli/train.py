@@ -88,7 +88,7 @@ def run_training(run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading
         return
     from kerv_cli.report.curves import save_curves
 
-    plot = save_curves(run.folder, run.losses)
+    plot = save_curves(run.folder)
     if as_json:
         print_json({"folder": run.folder, "best": metrics, "curves": plot})
         return

@@ -17,7 +17,7 @@ KINDS = ("encode", "prefill", "verify", "feed", "draft", "tree", "early", "retri
 """Kinds of a profile's costs: docs/measuring.md."""
 
 FORMAT = 2
-"""Of a profile whose costs were measured inside whole decodes; older ones, without a format, forward by forward."""
+"""Of a profile."""
 
 DRAFTER = "drafter"
 _SOURCES = {"early": "early", "merged": "early", "retrieval": "retrieval"}
@@ -37,8 +37,8 @@ class Profile:
     """Seconds of every forward by its rows, and of drafts. Between measured rows times are interpolated, behind the
     last ones continued in a straight line.
 
-    prompt: P. phases: kind -> (rows, seconds), rows increasing. tokens: N of the chunks; 0: not recorded. about:
-    target, machine, versions.
+    prompt: P. phases: kind -> (rows, seconds), rows increasing. tokens: N of the chunks. about: target, machine,
+    versions.
     """
 
     prompt: int
@@ -75,8 +75,8 @@ class Profile:
         return {"format": FORMAT, "prompt": self.prompt, "tokens": self.tokens, "phases": phases}
 
 
-def read_profile(path: Path, least: int = 1) -> Profile:
-    """The profile in the document of a bench. least: its format.
+def read_profile(path: Path) -> Profile:
+    """The profile in the document of a bench.
 
     Raises:
         CheckpointError: no such document, or one of another format.
@@ -84,18 +84,14 @@ def read_profile(path: Path, least: int = 1) -> Profile:
     document = read_json(path)
     try:
         stored = document["profile"]
-        form = int(stored.get("format", 1))
         phases = {k: (tuple(v["rows"]), tuple(v["seconds"])) for k, v in stored["phases"].items()}
         about = {key: value for key, value in document.items() if isinstance(value, str | bool | int | float)}
-        profile = Profile(int(stored["prompt"]), phases, int(stored.get("tokens", 0)), about)
+        profile = Profile(int(stored["prompt"]), phases, int(stored["tokens"]), about)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise CheckpointError(f"{path} holds no latency profile: make one with 'kerv bench'") from error
-    if not least <= form <= FORMAT:
-        age = "an older" if form < least else "a newer"
-        raise CheckpointError(
-            f"{path} is of {age} kerv (format {form}, here {FORMAT}): measure it again with "
-            f"'kerv bench target={about.get('target', 'TARGET')}'"
-        )
+    if stored.get("format") != FORMAT:
+        target = about.get("target", "TARGET")
+        raise CheckpointError(f"{path} has another format than {FORMAT}: measure it with 'kerv bench target={target}'")
     return profile
 
 

@@ -30,8 +30,6 @@ from kerv_cli.lab.plan import Cell, unique_cells
 from kerv_cli.lab.store import ROLLOUTS, STUDIES, StudyStore, stores
 
 SWEEP, ROLLOUT = "sweep", "rollout"
-OLDER = ("risk", "score")
-"""Kinds of artifacts that an older kerv made."""
 LOG, WEIGHTS = "log.csv", "model.safetensors"
 """Files of a training."""
 LAST = "last"
@@ -40,7 +38,7 @@ LAST = "last"
 
 def artifact_kinds() -> tuple[str, ...]:
     """Kinds of what is recorded, trained, built and calibrated, those of plugins among them."""
-    return ("demos", "target", *parts("artifact"), *OLDER)
+    return ("demos", "target", *parts("artifact"))
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ claims/<block>.running    id of the block's cell that runs now and the number of
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import socket
 import time
@@ -17,7 +16,7 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from kerv_cli.base.errors import CheckpointError, StorageError
+from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import read_json, read_text, storage_errors, write_json
 from kerv_cli.base.leftovers import is_alive, lock_beside, temporary_beside
 from kerv_cli.base.manifests import read
@@ -139,23 +138,18 @@ def _changed(path: Path) -> float:
 @contextlib.contextmanager
 def write_lock(path: Path) -> Iterator[None]:
     """Lets one process at a time change `path`; readers need no lock. The lock is an empty file beside `path`, which is
-    there as long as it is held; a link in its place is refused.
+    there as long as it is held.
 
     Raises:
-        StorageError: the disk refused, or the lock is a link.
+        StorageError: the disk refused.
     """
     import fcntl
 
     lock = lock_beside(path)
     while True:
-        try:
-            with storage_errors(lock):
-                lock.parent.mkdir(parents=True, exist_ok=True)
-                descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
-        except OSError as error:
-            if error.errno != errno.ELOOP:
-                raise
-            raise StorageError(f"{lock} is a link, which kerv does not write through: remove it") from None
+        with storage_errors(lock):
+            lock.parent.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX)
             if not _is_at(descriptor, lock):  # who held it before has removed it
@@ -163,8 +157,7 @@ def write_lock(path: Path) -> Iterator[None]:
             try:
                 yield
             finally:
-                if not os.fstat(descriptor).st_size:  # else it is no lock of kerv's
-                    lock.unlink(missing_ok=True)
+                lock.unlink(missing_ok=True)
             return
         finally:
             os.close(descriptor)
@@ -173,6 +166,6 @@ def write_lock(path: Path) -> Iterator[None]:
 def _is_at(descriptor: int, path: Path) -> bool:
     """Whether an open file is still the one at `path`."""
     try:
-        return os.path.samestat(os.fstat(descriptor), os.stat(path, follow_symlinks=False))
+        return os.path.samestat(os.fstat(descriptor), os.stat(path))
     except FileNotFoundError:
         return False

@@ -18,7 +18,6 @@ from kerv_cli.base.registry import METHOD_KINDS, part_of
 from kerv_cli.base.settings import (
     CONSTANT,
     EXPERT,
-    MODEL,
     PROFILE,
     WAITS,
     RolloutSettings,
@@ -67,10 +66,10 @@ def _canonical(value: object) -> str:
 
 
 def work_of(settings: Plain, identity: Identity, engine: int = ENGINE) -> str:
-    """Hash of what determines the results of a setting, of this kerv or an older one, apart from task, seeds and
-    repeat. engine: version that computes them."""
+    """Hash of what determines the results of a setting, apart from task, seeds and repeat. engine: version that
+    computes them."""
     determining = without(settings, NOT_DETERMINING - {"policy", "method"})
-    policy = settings.get("policy", {}).get("kind", MODEL)
+    policy = settings["policy"]["kind"]
     return _work(_canonical(determining), _canonical(dict(identity)), policy, engine)
 
 
@@ -84,25 +83,16 @@ def _work(settings: str, identity: str, policy: str, engine: int) -> str:
 def effective(settings: Plain) -> dict[str, Any]:
     """The settings that determine a result: complete, without those that have no effect."""
     try:
-        today = settings_from(settings, tolerant=True)
+        complete = settings_from(settings)
     except KervError:  # a part that is not registered here, e.g. somebody else's: its settings as they stand
         return without(settings, NOT_DETERMINING)
-    determining = without(_filled(settings, asdict(today)), NOT_DETERMINING)
-    for key in idle_keys(today) if today.policy.kind != EXPERT else ():
+    determining = without(asdict(complete), NOT_DETERMINING)
+    for key in idle_keys(complete) if complete.policy.kind != EXPERT else ():
         _drop(determining, key.split("."))
     determining["runtime"] = without(determining["runtime"], NOT_DETERMINING_RUNTIME)
     if not stress_of(determining)["level"]:
         determining["world"] = without(determining["world"], {"stress"})  # level 0 of every kind is the same world
     return determining
-
-
-def _filled(stored: Plain, complete: Plain) -> dict[str, Any]:
-    """Stored values and, where an older file has none, the defaults of today; keys that are unknown today stay."""
-    values = {**complete, **stored}
-    for key, value in values.items():
-        if isinstance(value, Mapping) and isinstance(complete.get(key), Mapping):
-            values[key] = _filled(value, complete[key])
-    return values
 
 
 def _drop(settings: dict[str, Any], path: Sequence[str]) -> None:
@@ -111,30 +101,22 @@ def _drop(settings: dict[str, Any], path: Sequence[str]) -> None:
     settings.pop(path[-1], None)
 
 
-def complete_settings(settings: Plain) -> dict[str, Any]:
-    """Stored settings with today's defaults where an older kerv had no such setting."""
-    try:
-        return _filled(settings, asdict(settings_from(settings, tolerant=True)))
-    except KervError:
-        return dict(settings)
-
-
 def depends_on_order(settings: Plain) -> bool:
     """Whether an episode's result depends on the episodes before it in its cell: feedback moves a skip level."""
-    skip = settings.get("skip", {})
+    skip = settings["skip"]
     return any(skip.get(name) for name in ("up", "down"))
 
 
 def stress_of(settings: Plain) -> dict[str, Any]:
     """Kind and level of a setting's stress; `none` where nothing is shifted."""
-    stress = settings["world"].get("stress", {})
-    level = int(stress.get("level", 0))
+    stress = settings["world"]["stress"]
+    level = int(stress["level"])
     return {"kind": stress["kind"] if level else "none", "level": level}
 
 
 def batch_of(settings: Plain) -> int:
     """Episodes that a setting runs at the same time; with more than one they have no times."""
-    return int(settings.get("rollout", {}).get("batch", 1))
+    return int(settings["rollout"]["batch"])
 
 
 def flat(settings: Plain, prefix: str = "") -> dict[str, Any]:

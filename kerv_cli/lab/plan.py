@@ -15,9 +15,8 @@ import numpy as np
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import read_yaml, to_yaml
 from kerv_cli.base.manifests import read
-from kerv_cli.base.registry import METHOD_KINDS
 from kerv_cli.base.settings import RolloutSettings
-from kerv_cli.lab.identity import Identity, Plain, batch_of, complete_settings, hash_of, without, work_of
+from kerv_cli.lab.identity import Identity, Plain, batch_of, hash_of, without, work_of
 
 MOST_CELLS = 100_000
 """Cells of a study; more are refused before they are planned."""
@@ -301,12 +300,7 @@ def plan_from_text(text: str) -> StudyPlan:
     Raises:
         CheckpointError, ValueError: not a plan, or one that contradicts itself.
     """
-    file = read(_File, read_yaml(text), "the plan", tolerant=True)
-    for label in file.labels.values():
-        read(RolloutSettings, label.settings, "the plan", tolerant=True)
-        wrong = [kind for kind in METHOD_KINDS if not isinstance(label.settings.get(kind, {}), dict)]
-        if wrong or not label.settings.keys() & set(METHOD_KINDS):
-            raise ValueError(f"a label has no settings of {' or '.join(wrong or METHOD_KINDS)}")
+    file = read(_File, read_yaml(text), "the plan")
     unknown = {line.label for line in file.cells} - set(file.labels)
     if unknown or file.baseline not in file.labels:
         raise ValueError(f"it has no label {', '.join(sorted(unknown)) or file.baseline}")
@@ -314,14 +308,11 @@ def plan_from_text(text: str) -> StudyPlan:
 
 
 def _cells_of(file: _File) -> Iterator[Cell]:
-    complete: dict[str, dict[str, Any]] = {}
     shared: dict[tuple[str, str], dict[str, Any]] = {}  # of thousands of cells: memory
     for line in file.cells:
         label, key = file.labels[line.label], (line.label, line.task)
-        if line.label not in complete:
-            complete[line.label] = complete_settings(label.settings)
         if key not in shared:
-            shared[key] = {**complete[line.label], "task": [line.task]}
+            shared[key] = {**label.settings, "task": [line.task]}
         seeds = parse_seeds(line.seeds)
         yield Cell(line.id, line.label, label.overrides, line.task, seeds, shared[key], label.identity, line.repeat)
 

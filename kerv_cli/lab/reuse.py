@@ -26,7 +26,7 @@ NEVER, TIMED, CHANGED, ALL = "never", "timed", "changed", "all"
 @dataclass(frozen=True)
 class StockEntry:
     """A complete cell on disk, unchecked: its hashes are compared when it is used. engine: version that computed it;
-    code: hash of the source that computed it, empty in cells older than that hash."""
+    code: hash of the source that computed it."""
 
     cell: Cell
     store: StudyStore
@@ -67,12 +67,12 @@ class Stock:
         return [entry for entry in entries if not set(entry.cell.seeds).isdisjoint(cell.seeds)]
 
     def block(self, entry: StockEntry, seed: int) -> str:
-        """Name of the attempt at a block that measured the episode; in the oldest cells, which lack it, their run."""
+        """Name of the attempt at a block that measured the episode."""
         name = str(entry.store.cells / entry.cell.id)
         if name not in self._blocks:
             episodes = entry.store.read_cell(entry.cell.id).episodes
             self._blocks[name] = dict(zip(episodes["seed"], episodes["block"], strict=True))
-        return self._blocks[name].get(seed) or entry.run
+        return self._blocks[name][seed]
 
 
 def _entries(store: StudyStore) -> Iterator[StockEntry]:
@@ -81,8 +81,8 @@ def _entries(store: StudyStore) -> Iterator[StockEntry]:
             config, status = store.described(folder.name)
             values = {key: config[key] for key in ("label", "task", "settings", "identity", "repeat")}
             cell = Cell(folder.name, overrides="", seeds=tuple(config["seeds"]), **values)
-            engine, code = int(status.get("engine", 1)), str(status.get("code", ""))
-            yield StockEntry(cell, store, str(status.get("started", "")), str(status["run"]), engine, code)
+            engine, code = int(status["engine"]), str(status.get("code", ""))
+            yield StockEntry(cell, store, str(status["started"]), str(status["run"]), engine, code)
         except (CheckpointError, KeyError, TypeError, ValueError, AttributeError):
             continue  # damaged: it is named where it is read
 

@@ -19,7 +19,6 @@ import os
 import re
 import secrets
 import shlex
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
@@ -62,14 +61,6 @@ _MOST_NAME = 32  # letters of the methods in a rollout's name
 _READ_TOGETHER = 100  # cells whose columns are converted at once: many tables of a few rows take much memory
 
 
-class DamagedCell(CheckpointError):
-    """A cell whose files are not what was written."""
-
-
-class NewerCell(CheckpointError):
-    """A cell of a format that this kerv does not read."""
-
-
 @dataclass(frozen=True)
 class StoredCell:
     """A complete cell, read from its folder."""
@@ -77,7 +68,7 @@ class StoredCell:
     folder: Path
     config: dict[str, Any]  # the study's name and the fields of Cell
     status: dict[str, Any]  # provenance, run, seconds, sums
-    # columns of rows.EPISODE_SCHEMA, those of a newer kerv, and decode_seconds: per episode (decodes,) seconds
+    # columns of rows.EPISODE_SCHEMA, and decode_seconds: per episode (decodes,) seconds
     episodes: pd.DataFrame
 
     def of(self, cell: Cell) -> pd.DataFrame:
@@ -105,9 +96,6 @@ class _RunFile:
     commands: tuple[Invocation, ...]
     format: int = 1
 
-
-FORMAT = 1
-"""Of a cell's files. A cell of a higher one is of a newer kerv and is left alone."""
 
 STUDIES, ROLLOUTS = "studies", "rollouts"
 """Families of stores: what `kerv sweep` and what `kerv rollout` leaves, in the same files."""
@@ -248,16 +236,11 @@ class StudyStore:
         folder = self.cells / name
         try:
             status = read_mapping(folder / _STATUS)
-            if status.get("format", FORMAT) > FORMAT:
-                raise NewerCell(f"cell {folder} is of a newer kerv (format {status['format']}): update kerv")
-            # cells from before the seal have none
-            if status.get("sha256") not in (None, _seal(status)):
+            if status["sha256"] != _seal(status):
                 raise CheckpointError(f"{_STATUS} is not what was written")
             for file in _CELL_FILES:
                 if sha256_of(folder / file) != status["files"][file]:
                     raise CheckpointError(f"{file} is not what was written")
-        except NewerCell:
-            raise
         except (CheckpointError, KeyError, TypeError, AttributeError) as error:
             raise _damaged(folder, error) from error
         return status
@@ -293,16 +276,14 @@ class StudyStore:
             sync(self.damaged)
         return path
 
-    def damages(self) -> list[tuple[str, DamagedCell]]:
-        """Name of every cell that is not what was written -> why; one of a newer kerv is not among them."""
+    def damages(self) -> list[tuple[str, CheckpointError]]:
+        """Name of every cell that is not what was written -> why."""
         damages = []
         for folder in self.folders():
             try:
                 self.status_of(folder.name)
-            except DamagedCell as error:
+            except CheckpointError as error:
                 damages.append((folder.name, error))
-            except CheckpointError:
-                continue
         return damages
 
     def write_cell(
@@ -346,7 +327,7 @@ class StudyStore:
         files = {"config.yaml": to_yaml(config).encode()}
         files |= {name: rows.table_bytes(table) for name, table in tables.items()}
         hashes = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
-        full: dict[str, Any] = {"format": FORMAT, "state": "complete", **status, "files": hashes}
+        full: dict[str, Any] = {"state": "complete", **status, "files": hashes}
         full["sha256"] = _seal(full)
         files[_STATUS] = (json.dumps(full, indent=2, allow_nan=False) + "\n").encode()
 
@@ -360,7 +341,7 @@ class StudyStore:
         """A complete cell.
 
         Raises:
-            CheckpointError: it is absent or damaged, or of a newer kerv.
+            CheckpointError: it is absent or damaged.
         """
         return self._read([name])[0]
 
@@ -376,7 +357,7 @@ class StudyStore:
                 tables.append(rows.read_tables(folder))
             except (OSError, ValueError, pa.ArrowException) as error:
                 raise _damaged(folder, error) from error
-            described.append((folder, config, _interned(status)))
+            described.append((folder, config, status))
         frames = rows.frames_of(tables)
         return [StoredCell(*one, frame) for one, frame in zip(described, frames, strict=True)]
 
@@ -420,9 +401,9 @@ class StudyStore:
             self.failures.rmdir()  # refused where others are left
 
 
-def _damaged(folder: Path, error: Exception) -> DamagedCell:
+def _damaged(folder: Path, error: Exception) -> CheckpointError:
     why = str(error).replace(f"{folder}/", "")
-    return DamagedCell(f"cell {folder} is damaged ({why}): `kerv doctor --repair` sets it aside")
+    return CheckpointError(f"cell {folder} is damaged ({why}): `kerv doctor --repair` sets it aside")
 
 
 def _plan_of(study: StudySettings, cells: Sequence[Cell]) -> StudyPlan:
@@ -441,11 +422,6 @@ def _read_entry(text: str) -> dict[str, Any]:
     if not isinstance(entry, dict):
         raise ValueError(f"'{text[:40]}' is no entry")
     return entry
-
-
-def _interned(status: Mapping[str, Any]) -> dict[str, Any]:
-    """The entries with interned texts: one that thousands of cells share is in memory once."""
-    return {sys.intern(key): sys.intern(value) if isinstance(value, str) else value for key, value in status.items()}
 
 
 def is_result_of(config: Mapping[str, Any], cell: Cell) -> bool:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.files import read_mapping, regular, sha256_of, write_bytes, write_json
+from kerv_cli.base.files import read_mapping, sha256_of, write_bytes, write_json
 from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import find, load, parts
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
@@ -128,7 +128,7 @@ def load_tensors(path: Path, what: str) -> dict[str, Tensor]:
     if not path.is_file():
         raise CheckpointError(f"no {what} at {path}: train it, or name another with its folder")
     try:
-        tensors = load_file(regular(path))
+        tensors = load_file(path)
     except (SafetensorError, OSError, ValueError) as error:
         raise CheckpointError(
             f"{what} at {path} is damaged ({error}): move it aside and train or copy it again"

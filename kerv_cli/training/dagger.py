@@ -132,5 +132,4 @@ def _hash(settings: DemosSettings) -> str:
     if _is_plain(settings):
         return _artifacts(settings).description.sha256
     hashes = _artifacts(settings).check(Method.of(settings).needs)
-    chunk = [settings.chunk] if settings.chunk else []  # the hash of a recording from before it counted stays
-    return hash_of([hashes, {kind: asdict(part) for kind, part in settings.parts().items()}, *chunk])
+    return hash_of([hashes, {kind: asdict(part) for kind, part in settings.parts().items()}, settings.chunk])

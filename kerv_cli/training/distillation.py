@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import itertools
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -203,7 +202,6 @@ class EagleRun(DrafterRun):
     """`kerv train drafter`: the EAGLE-style drafter."""
 
     artifact = DrafterArtifact()
-    before: ClassVar[Mapping[str, float]] = {"width": 512, "rank": 64, "history": 2}
 
     def begin(self) -> None:
         """Chooses the device, and joins the other processes. UsageError: noise, or a batch, that they cannot share."""

@@ -5,9 +5,9 @@ Prompts are pooled to features right after encoding, so that neither frames nor 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -166,13 +166,6 @@ class EarlyRun(DrafterRun):
     """`kerv train drafter drafter=early`."""
 
     artifact = EarlyArtifact()
-    before: ClassVar[Mapping[str, float]] = {
-        "history": 0,
-        "noise": 0.0,
-        "unroll": 3,
-        "state_weight": 1.0,
-        "token_weight": 0.1,
-    }
 
     def lesson(self, progress: OnProgress) -> EarlyDistillation:
         """The target's tokens and pooled prompts."""

@@ -21,7 +21,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError, Interrupted, KervError
-from kerv_cli.base.files import regular, write_text
+from kerv_cli.base.files import write_text
 from kerv_cli.base.manifests import read
 from kerv_cli.base.places import RESUME
 from kerv_cli.base.settings import TrainSettings
@@ -88,7 +88,6 @@ class Loop:
         self.folder, self.identity, self.ranks, self.borders = folder, identity, ranks, borders
         self.step, self.best = 0, -math.inf
         self.history: list[Metrics] = []
-        self.losses: list[float] = []  # of every step; of those of an older kerv's run nan
         decay = [p for p in self.module.parameters() if p.dim() >= 2]
         rest = [p for p in self.module.parameters() if p.dim() < 2]
         groups = [{"params": decay, "weight_decay": settings.weight_decay}, {"params": rest, "weight_decay": 0.0}]
@@ -110,7 +109,6 @@ class Loop:
             while self.step < settings.steps:
                 metrics, stopping = self.update(stop)
                 self.step += 1
-                self.losses.append(metrics["loss"])
                 on_step(self.step, metrics)
                 if self.ranks.first and (self.step % settings.validate_every == 0 or self.step == settings.steps):
                     self.check(metrics)
@@ -185,7 +183,6 @@ class Loop:
         tensors |= {f"ema.{k}": v for k, v in self.ema.items()}
         for i, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{i}.{k}": v for k, v in moments.items()}
-        tensors["losses"] = torch.tensor(self.losses, dtype=torch.float64)
         best = self.best if self.history else None
         progress = RunProgress(self.identity, self.step, best, self.history)
         write_state(self.folder / RESUME, tensors, progress)
@@ -221,7 +218,6 @@ class Loop:
         self.optimiser.load_state_dict({"state": state, "param_groups": groups})
         self.step, self.history = progress.step, progress.history
         self.best = -math.inf if progress.best is None else progress.best
-        self.losses = tensors["losses"].tolist() if "losses" in tensors else [math.nan] * self.step
         self.log()  # the run may have ended before it wrote the log
 
 
@@ -235,7 +231,7 @@ def stored_identity(folder: Path) -> str | None:
     """The identity of the run in the folder, without its tensors; None: no run, or a damaged one, as `read_state` will
     say."""
     try:
-        with safe_open(regular(folder / RESUME), "pt") as file:
+        with safe_open(folder / RESUME, "pt") as file:
             return str(json.loads(json.loads((file.metadata() or {})["state"])["progress"])["identity"])
     except (SafetensorError, OSError, KeyError, TypeError, ValueError):
         return None
@@ -256,7 +252,7 @@ def read_state(path: Path) -> tuple[dict[str, Tensor], RunProgress]:
     """
     again = f"move {path.parent} aside to begin again"
     try:
-        with safe_open(regular(path), "pt") as file:
+        with safe_open(path, "pt") as file:
             state = json.loads((file.metadata() or {})["state"])
         tensors, text = load_tensors(path, "training state"), state["progress"]
         intact, value = state["sha256"] == digest(tensors, text), json.loads(text)

@@ -6,10 +6,10 @@ import functools
 import hashlib
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from torch import Tensor, nn
@@ -59,11 +59,9 @@ def run_settings(train: TrainSettings) -> dict[str, Any]:
     """The optimisation settings that identify a run. Steps and the interval of validations may change on resuming, and
     `init` is identified by the hash of its weights instead of its name."""
     free = ("steps", "validate_every", "init", "stored")
-    # settings that older runs lack -> the values that they ran with
-    later = {"balance": 0.0, "closed_loop": False, "colour": 0.0, "shift": 0, "places": "state"}
     settings = {k: v for k, v in asdict(train).items() if k not in free}
     settings["closed_loop"] = train.closed_loop > 0  # scores with and without success do not compare
-    return {k: v for k, v in settings.items() if k not in later or v != later[k]}
+    return settings
 
 
 def refuse_unused(train: TrainSettings, keys: Sequence[str], why: str) -> None:
@@ -76,7 +74,7 @@ def refuse_unused(train: TrainSettings, keys: Sequence[str], why: str) -> None:
 
 class Run(ABC):
     """A training run: `load` makes the lesson, `train` optimises its module and saves the best checkpoint in `folder`.
-    `plan` says in one line what would be done. borders: of `draw_samples`. losses: of every step, once trained."""
+    `plan` says in one line what would be done. borders: of `draw_samples`."""
 
     kind: str  # the word behind `kerv train`
     settings: TrainTargetSettings | TrainDrafterSettings
@@ -86,7 +84,6 @@ class Run(ABC):
     ranks: Ranks
     learnt: Lesson
     borders: Tensor | None = None
-    losses: Sequence[float] = ()
 
     @abstractmethod
     def identity(self) -> dict[str, Any]:
@@ -104,9 +101,7 @@ class Run(ABC):
         """
         self.learnt.module.train()
         loop = Loop(self.learnt, self.save, self.settings.train, self.folder, self.hash, self.ranks, self.borders)
-        metrics = loop.run(on_step)
-        self.losses = loop.losses
-        return metrics
+        return loop.run(on_step)
 
     @property
     def hash(self) -> str:
@@ -273,10 +268,9 @@ class TargetRun(Run):
         self.borders = task_borders(self.learnt.training.tasks, settings.train.balance)
 
     def identity(self) -> dict[str, Any]:
-        """Shapes, tasks, the views if more were recorded, and the weights to begin with."""
-        shapes = {k: v for k, v in asdict(self.settings.target).items() if (k, v) != ("norm", "group")}  # as before it
-        views = {"views": self.dataset.views} if self.dataset.views else {}
-        return {"target": shapes, "tasks": self.tasks, **views, **self.init_hash}
+        """Shapes, tasks, views and the weights to begin with."""
+        shapes = asdict(self.settings.target)
+        return {"target": shapes, "tasks": self.tasks, "views": self.dataset.views, **self.init_hash}
 
     def closed_loop(self, target: CompactTarget) -> float:
         """Success in [0, 1] of autoregressive decoding over the tasks, on selection seeds."""
@@ -304,8 +298,7 @@ class TargetRun(Run):
 class DrafterRun(Run):
     """Base of what `kerv train drafter` runs: weights that draft for a target, trained on demonstrations.
 
-    artifact: the kind of what is written. before: settings that runs of before named too, with their values: they are
-    part of a run's identity.
+    artifact: the kind of what is written.
 
     Raises:
         UsageError: `train.init` is set. CheckpointError: no such target or demonstrations, another run in the folder.
@@ -313,7 +306,6 @@ class DrafterRun(Run):
 
     kind = "drafter"
     artifact: Weights[Any]
-    before: ClassVar[Mapping[str, float]] = {}
     settings: TrainDrafterSettings
     target: ReadableTarget
 
@@ -363,11 +355,11 @@ class DrafterRun(Run):
         self.learnt = self.lesson(progress)
 
     def identity(self) -> dict[str, Any]:
-        """Shapes and the target's weights."""
+        """Shapes, the target's weights, tasks and starts."""
         s = self.settings
         tasks = list(resolve_tasks(s.task)) if s.task else []
-        covering = {"task": tasks, "starts": s.starts} if tasks or s.starts != "all" else {}
-        return {"drafter": {**self.before, **asdict(s.drafter)}, "target": self.description.sha256, **covering}
+        covering = {"task": tasks, "starts": s.starts}
+        return {"drafter": asdict(s.drafter), "target": self.description.sha256, **covering}
 
     def write(self, module: nn.Module, origin: dict[str, Any]) -> None:
         """Writes the drafter's folder."""

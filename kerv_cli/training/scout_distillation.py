@@ -6,9 +6,7 @@ observation. The first `scene_steps` train the stem and its positions alone.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -93,7 +91,6 @@ class ScoutRun(DrafterRun):
     """`kerv train drafter drafter=scout`, for a target that sees."""
 
     artifact = ScoutArtifact()
-    before: ClassVar[Mapping[str, float]] = {"history": 0}
 
     def lesson(self, progress: OnProgress) -> ScoutDistillation:
         """The target's tokens and positions."""

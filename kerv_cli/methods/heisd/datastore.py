@@ -25,7 +25,7 @@ from torch import Tensor
 
 from kerv_cli.base import registry
 from kerv_cli.base.errors import CheckpointError, UnknownName
-from kerv_cli.base.files import read_table, regular
+from kerv_cli.base.files import read_table
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.protocol import ReadableTarget
@@ -255,9 +255,9 @@ class Datastore:
 def _arrays(folder: Path, manifest: Manifest) -> dict[str, Any]:
     """Reads a datastore's files and checks them against its manifest."""
     try:
-        vectors = np.load(regular(folder / VECTORS)).astype(np.float32, copy=False)
+        vectors = np.load(folder / VECTORS).astype(np.float32, copy=False)
         payload = _read_payload(folder / PAYLOAD)
-        projection = np.load(regular(folder / PROJECTION)) if PROJECTION in manifest.files else None
+        projection = np.load(folder / PROJECTION) if PROJECTION in manifest.files else None
         rows, size = manifest.rows, manifest.chunk * manifest.actions.dofs
         fits = vectors.shape == (rows, manifest.width) and payload["tokens"].shape == (rows, size)
     except (OSError, KeyError, TypeError, ValueError, MemoryError) as error:  # pyarrow's errors are ValueErrors

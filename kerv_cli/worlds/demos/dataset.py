@@ -21,7 +21,7 @@ OnProgress = Callable[[int, int], object]
 """Called with (done, total) after every episode or batch of a long work."""
 
 FORMAT = 2
-"""Format of manifests. Format 1 did not name the environment, because Meta-World was the only one."""
+"""Format of manifests."""
 
 
 @dataclass(frozen=True)
@@ -66,16 +66,6 @@ class DemoManifest:
     episodes: int = 0
     missing: int = 0
     instructions: dict[str, str] = field(default_factory=dict)
-
-
-def with_environment(value: Mapping[str, Any]) -> dict[str, Any]:
-    """The JSON of a recording or manifest in the present format. One of format 1 is of Meta-World."""
-    if value["format"] != 1:
-        return dict(value)
-    from kerv_cli.worlds.metaworld.spec import SPEC
-
-    spaces = {"actions": SPEC.actions.as_dict(), "observation": SPEC.observation.as_dict()}
-    return {**value, "format": FORMAT, "environment": SPEC.name, **spaces}
 
 
 def episode_path(out: Path, task: str, seed: int) -> Path:
@@ -218,9 +208,8 @@ class DemoDataset:
 def _read_manifest(path: Path) -> DemoManifest:
     value = read_mapping(path)
     version = value.get("format")
-    if version not in (1, FORMAT):
-        raise CheckpointError(f"{path} has format {version}, this kerv reads {FORMAT} and 1")
-    value = with_environment(value)
+    if version != FORMAT:
+        raise CheckpointError(f"{path} has format {version}, this kerv reads {FORMAT}")
     manifest = read(DemoManifest, value, str(path))
     if manifest.sha256 != dataset_hash(value["tasks"]):
         raise CheckpointError(f"{path} is damaged: its hash does not fit its episodes")

@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import regular, write_bytes
+from kerv_cli.base.files import write_bytes
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.worlds.demos.frames import LENGTH, EncodedFrames, encode_png, header_of
 
@@ -103,7 +103,7 @@ def load_episode(path: Path, actions: ActionSpace, observation: ObservationSpace
         CheckpointError: the file is missing, damaged, of another format or of other spaces.
     """
     try:
-        with safe_open(regular(path), framework="numpy") as file:
+        with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
             if metadata.get("format") != str(FORMAT):
                 raise CheckpointError(f"{path} is not a demonstration episode of format {FORMAT}")

@@ -39,7 +39,6 @@ from kerv_cli.worlds.demos.dataset import (
     entry_of,
     episode_path,
     totals,
-    with_environment,
 )
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode, save_episode
 from kerv_cli.worlds.demos.perturbation import Perturbation, is_perturbed
@@ -255,9 +254,6 @@ def _jobs(seeds: Mapping[str, range]) -> list[tuple[str, range]]:
 def _identity(config: DemoConfig) -> dict[str, Any]:
     settings = asdict(config)
     del settings["workers"]
-    if not config.policy:
-        # recordings from before there were actors lack them and may resume
-        del settings["policy"], settings["expert_share"]
     spec = config.spec
     experts = {task: spec.experts[task] for task in config.tasks if task in spec.experts}
     if experts:
@@ -295,7 +291,7 @@ def _claim_folder(out: Path, identity: dict[str, Any]) -> None:
 
 def _comparable(identity: Mapping[str, Any], packages: Sequence[str]) -> dict[str, Any]:
     # Another Python or numpy may resume a recording; another simulator version may have other physics.
-    identity = json.loads(json.dumps(with_environment(identity)))
+    identity = json.loads(json.dumps(identity))
     keys = ("environment", "format", "actions", "observation")
     versions = {name: identity["versions"].get(name) for name in packages}
     return {**{key: identity[key] for key in keys}, **identity["config"], **versions}
