@@ -1,8 +1,8 @@
 """How often the 95 % intervals of the tables contain the truth, by simulation: `python scripts/coverage.py [STUDIES]`.
 
 A simulated study has ten tasks, or one, in three groups of difficulty, and blocks of five seeds. Tasks differ in time,
-speedup, success and risk. The speedup of a block is off by 8 % (the machine's state), that of a pair by 5 %; episodes
-that fail run to the horizon; what an episode loses resembles itself, and one trusted decode in twenty is audited.
+speedup and success. The speedup of a block is off by 8 % (the machine's state), that of a pair by 5 %; episodes
+that fail run to the horizon.
 Prints coverage in per cent, a row per interval and a column per number of blocks per task.
 """
 
@@ -17,7 +17,7 @@ from kerv_cli.report import statistics as stats
 from kerv_cli.report.statistics import Estimate
 
 BLOCKS = (1, 2, 4, 10, 50)
-SEEDS, DRIFT, NOISE, HORIZON, AUDITED = 5, 0.08, 0.05, 500, 0.05
+SEEDS, DRIFT, NOISE, HORIZON = 5, 0.08, 0.05, 500
 GROUPS = ("easy", "hard", "medium")
 Drawn = tuple[Estimate, float]
 """An interval and the truth."""
@@ -33,7 +33,6 @@ class Tasks:
         self.steps = random.lognormal(4.4, 0.4, count)
         self.lost, self.won = random.uniform(0.01, 0.06, count), random.uniform(0.01, 0.04, count)
         self.neither = random.uniform(0.0, 0.1, count)
-        self.bad = random.uniform(0.02, 0.2, count)
         self.group = np.arange(count) % min(count, len(GROUPS))
         # a macro average is one of groups, each of equal tasks
         self.macro = 1 / (np.bincount(self.group)[self.group] * len(np.unique(self.group)))
@@ -60,11 +59,6 @@ class Study:
         world = t.steps[self.task] * random.lognormal(-0.02, 0.2, n)
         self.steps_baseline = np.where(self.baseline, world * random.lognormal(-0.005, 0.1, n), HORIZON)
         self.steps_method = np.where(self.method, world * random.lognormal(-0.005, 0.1, n), HORIZON)
-        self.trusted = 1 + random.poisson(self.steps_method / 8)
-        self.audits = random.binomial(self.trusted, AUDITED)
-        episode = random.beta(0.5 * t.bad[self.task], 0.5 * (1 - t.bad[self.task]))
-        wrong = random.binomial(self.audits, episode)
-        self.losses = wrong + 0.06 * (self.audits - wrong)
 
     def micro(self, of_task: np.ndarray) -> float:
         """Mean over tasks, which have as many episodes."""
@@ -87,12 +81,6 @@ def success(study: Study, where: np.ndarray) -> Estimate:
 def difference(study: Study, where: np.ndarray) -> Estimate:
     """Paired difference with Newcombe's interval."""
     return stats.paired_difference(stats.paired_counts(study.baseline[where], study.method[where]))
-
-
-def risk(study: Study, where: np.ndarray) -> Estimate:
-    """Realised risk, per episode."""
-    loss, audits = (values / study.trusted for values in (study.losses, study.audits))
-    return stats.share(loss[where], audits[where], study.names(study.task[where]), study.names(study.seed[where]))
 
 
 def length(study: Study, where: np.ndarray) -> Estimate:
@@ -119,11 +107,10 @@ def speedup(study: Study, per_episode: bool, macro: bool) -> Drawn:
 def intervals(study: Study) -> dict[str, Drawn]:
     """Every interval of a table."""
     t, everywhere = study.tasks, np.ones(study.task.size, bool)
-    rate, gap, lost = 1 - t.lost - t.neither, t.won - t.lost, t.bad + 0.06 * (1 - t.bad)
+    rate, gap = 1 - t.lost - t.neither, t.won - t.lost
     drawn = {
         "success, Wilson": (success(study, everywhere), study.micro(rate)),
         "difference, Newcombe": (difference(study, everywhere), study.micro(gap)),
-        "realised risk": (risk(study, everywhere), study.micro(lost)) if study.audits.any() else None,
         "AL": (length(study, everywhere), 1.0),
         "speedup per step": speedup(study, False, False),
         "speedup per episode": speedup(study, True, False),
@@ -132,11 +119,10 @@ def intervals(study: Study) -> dict[str, Drawn]:
         drawn |= {
             "success, macro": (study.averaged(lambda where: success(study, where)), float((t.macro * rate).sum())),
             "difference, macro": (study.averaged(lambda where: difference(study, where)), float((t.macro * gap).sum())),
-            "risk, macro": (study.averaged(lambda where: risk(study, where)), float((t.macro * lost).sum())),
             "speedup per step, macro": speedup(study, False, True),
             "speedup per episode, macro": speedup(study, True, True),
         }
-    return {name: pair for name, pair in drawn.items() if pair is not None}
+    return drawn
 
 
 def coverage(tasks: int, blocks: int, studies: int, seed: int = 0) -> dict[str, float]:

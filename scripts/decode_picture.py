@@ -91,7 +91,7 @@ def main(folder: str, label: str, out: str) -> None:
                 if sum(bool(r.drafted) for r in rounds) >= 2 and kinds.count("relaxed") >= 2 and "rejected" in kinds:
                     title = f"{label} on {cell.task}, seed {cell.seeds[0]}, decode {number * 12 + index}"
                     figure = decode_figure(rounds, DOFS, 16, title)
-                    Path(out).write_bytes(figure_bytes(figure, "png"))
+                    Path(out).write_bytes(figure_bytes(figure))
                     return
     sys.exit(f"no such decode of {label} in {folder}")
 

@@ -56,7 +56,7 @@ def test_an_episode_runs_and_is_recorded(spec: EnvironmentSpec, tmp_path: Path) 
     assert np.abs(record.actions).max() <= np.float32(0.05)
     assert record.gripper.tolist() == [1.0] * (record.steps + 1)
     assert record.frames[0].shape == (24, 24, 3)
-    found = read_recording(save_recording(record, tmp_path / "point.rrd", method="expert", limits={}))
+    found = read_recording(save_recording(record, tmp_path / "point.rrd", method="expert"))
     assert found["timelines"]["time"] == (0, record.steps * 100_000_000)
 
 

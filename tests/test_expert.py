@@ -94,7 +94,7 @@ def test_rows_keep_it_and_measures_are_undefined_instead_of_divided_by_zero(epis
 def test_its_recording_can_be_written_and_read(episode: EpisodeRecord, tmp_path: Path, frames: bool) -> None:
     drawn = {i: np.zeros((8, 8, 3), dtype=np.uint8) for i in range(episode.steps + 1)} if frames else {}
     shown = dataclasses.replace(episode, frames=drawn)
-    found = read_recording(save_recording(shown, tmp_path / "expert.rrd", method="expert", limits={}))
+    found = read_recording(save_recording(shown, tmp_path / "expert.rrd", method="expert"))
     rows = found["entities"]
     assert rows["/actions"] == rows["/decode/phases"] == rows["/decode/table"] == episode.steps
     assert rows["/mode"] == 1

@@ -157,6 +157,6 @@ def test_an_episode_is_recorded_with_all_seven_names(tmp_path: Path) -> None:
     assert episode.success
     assert episode.actions.shape == (episode.steps, 7)
     assert (episode.gripper[0], episode.gripper[-1]) == (1.0, 0.0)
-    found = read_recording(save_recording(episode, tmp_path / "peg.rrd", method="expert", limits={}))
+    found = read_recording(save_recording(episode, tmp_path / "peg.rrd", method="expert"))
     assert found["episode"]["environment"] == "insertion"
     assert found["timelines"]["time"][1] == episode.steps * 50_000_000  # 20 Hz

@@ -28,7 +28,6 @@ ANSWERS = [
     ("rollout --method kerv", "settings have no dashes: method=VALUE"),
     ("rollout --paln", "No such option: --paln (Possible options: --plan)"),
     ("view --to", "Option '--to' requires an argument"),
-    ("view --together one.rrd", "--together shows two recordings, not 1: name two .rrd files"),
     # lists, empty values
     ("rollout reach", "'reach' is not an override: write key=value"),
     ("rollout task=reach, push", "a list without spaces: task=[reach,push]"),

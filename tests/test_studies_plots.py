@@ -113,20 +113,11 @@ def test_a_baseline_that_is_a_point_of_a_series_is_drawn_in_it(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("axis", ["boundary.kind", "rectifier.use_target_token", "no.such"])
-def test_without_numbers_on_the_axis_every_setting_is_a_row(boundaries: pd.DataFrame, axis: str) -> None:
+def test_without_numbers_on_the_axis_every_setting_is_a_point(boundaries: pd.DataFrame, axis: str) -> None:
     figures = study_figures(boundaries, axis, "Title")
-    assert set(figures) == {"", "_phases", "_tradeoff"}
+    assert set(figures) == {"_tradeoff"}
     for figure in figures.values():
         assert set(boundaries["label"]) <= texts(figure)
-
-
-def test_ceilings_are_marked(boundaries: pd.DataFrame) -> None:
-    panel = study_figures(boundaries, "", "Title")[""].axes[1]
-    known = boundaries[(boundaries["averaging"] == MICRO) & boundaries["ceiling"].notna()]["ceiling"]
-    assert len(known) == 6
-    marks = [line for line in panel.get_lines() if line.get_marker() == "|"]
-    assert [list(line.get_xdata()) for line in marks] == [list(known)]
-    assert panel.get_xlim()[1] > known.max()
 
 
 def test_a_part_gives_its_setting_a_colour_once_and_the_baseline_is_ink(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,6 @@ from kerv_cli.report.statistics import (
     paired_counts,
     paired_difference,
     pairs_to_settle,
-    share,
     speedup,
     wilson,
 )
@@ -246,12 +245,3 @@ def test_pairs_to_settle_are_just_enough(counts: tuple[int, int, int, int]) -> N
 def test_no_number_of_pairs_shows_what_is_not_so() -> None:
     assert pairs_to_settle(PairedCounts(80, 10, 5, 5), 0.03) == math.inf
     assert pairs_to_settle(PairedCounts(97, 3, 0, 0), 0.03) == math.inf
-
-
-def test_a_share_keeps_to_its_range_and_is_wilson_for_ones_and_noughts() -> None:
-    ones, tasks, seeds = np.ones(20), ["a"] * 20, list(range(20))
-    none = share(np.zeros(20), ones, tasks, seeds)
-    assert none == pytest.approx(wilson(0, 20))
-    half = share(np.tile([0.0, 1.0], 10), ones, tasks, seeds)
-    assert half.low == pytest.approx(wilson(10, 20).low, abs=0.02)
-    assert share(np.array([1.0]), np.array([1.0]), ["a"], [0]).high == 1.0

@@ -31,7 +31,7 @@ from kerv_cli.lab.execute import execute
 from kerv_cli.lab.plan import Cell, plan
 from kerv_cli.lab.rows import Circumstances
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.measures import MACRO, MICRO, _realised_risk
+from kerv_cli.report.measures import MACRO, MICRO
 from kerv_cli.report.report import report
 from kerv_cli.report.statistics import PairedCounts, mean_of, paired_difference, speedup, wilson
 from kerv_cli.report.summary import SummaryTable, not_in_turn, summary_frame
@@ -188,19 +188,6 @@ def test_every_interval_of_a_row_contains_the_row_s_own_figure(data: StudyData) 
         assert (known[name] <= known[f"{name}_high"] + 1e-12).all(), name
 
 
-def test_the_realised_risk_counts_episodes_alike_whatever_their_length() -> None:
-    """Two episodes of 4 and 40 trusted decodes, all and a tenth of which were audited, with losses of 0.1 and 0.5."""
-    episodes = pd.DataFrame({
-        "task": "a", "difficulty": ["easy", "hard"], "seed": [1, 2], "skipped_decodes": [0, 36], "audits": [4, 4],
-        "audit_loss": [0.4, 2.0],
-    })  # fmt: skip
-    alike = _realised_risk(episodes)
-    assert alike.value == pytest.approx((0.1 * 1 + 0.5 * 0.1) / (1 + 0.1))
-    same = _realised_risk(episodes.assign(skipped_decodes=[36, 36]))
-    assert same.value == pytest.approx(0.3)
-    assert 0 <= alike.low <= alike.value <= alike.high <= 1
-
-
 def test_a_row_says_everything(data: StudyData) -> None:
     row = row_of(data.table, averaging=MICRO, label="kerv")
     expected = {
@@ -263,12 +250,11 @@ def test_pairs_of_one_block_are_told_from_others(tmp_path: Path) -> None:
     for cell in cells:
         first = cell.seeds[0] == 100_000
         block = "one" if first else f"two, {cell.label}"
-        at = [Circumstances(block, i, "2026-01-01", 0.005 if first else 0.007) for i in range(2)]
+        at = [Circumstances(block, i, "2026-01-01") for i in range(2)]
         store.write_cell(cell, run_cell(cell), STATUS, at)
     store.write_plan(StudySettings("hand", "", "ar"), cells)
     row = row_of(load_study(store).per_task, label="kerv")
     assert (row["pairs"], row["same_run"], row["same_block"]) == (4, True, 0.5)
-    assert row["gauge_ms"] == pytest.approx(6.0)
 
 
 def test_repeats_are_paired_with_their_own(tmp_path: Path) -> None:
@@ -350,8 +336,7 @@ def test_summary_on_a_terminal(data: StudyData) -> None:
     lines = printed(table, 120)
     assert lines[0].strip() == "hand: 2 tasks, 5 episodes each, micro over tasks, chip, float32"
     at = next(i for i, line in enumerate(lines) if line.startswith("kerv"))
-    assert {"60", "(23–88)", "4.22", "1.86", "14/21/14/14"} <= set(lines[at].split())
-    assert "/ compensated" in " ".join(lines)
+    assert {"60", "(23–88)", "4.22", "1.86"} <= set(lines[at].split())
     assert any(line.startswith("kerv") and "1/0 of 5 1" in line for line in printed(table))  # no p without its counts
 
 
@@ -386,11 +371,7 @@ def test_report_writes_the_same_bytes_again(results: Path, written: list[Path]) 
         "report/tables/threshold.csv",
         "report/tables/threshold_per_task.csv",
         "report/plots/threshold.png",
-        "report/plots/threshold.svg",
-        "report/plots/threshold_phases.png",
-        "report/plots/threshold_phases.svg",
         "report/plots/threshold_tasks.png",
-        "report/plots/threshold_tasks.svg",
         "studies/threshold/report.html",
     ]
     before = {path: path.read_bytes() for path in written}
@@ -406,11 +387,10 @@ def test_report_writes_the_same_bytes_again(results: Path, written: list[Path]) 
 @pytest.mark.usefixtures("written")
 def test_the_page_stands_alone(results: Path) -> None:
     page = (results / "studies" / "threshold" / "report.html").read_text(encoding="utf-8")
-    assert page.count("<svg") == 3
+    page, figures = re.subn(r'src="data:image/png;base64,[^"]*"', "", page)
+    assert figures == 2
     assert "src=" not in page
-    assert "http" not in page.replace("http://www.w3.org", "").replace("http://purl.org", "").replace(
-        "http://creativecommons.org", ""
-    ).replace("https://matplotlib.org", "")
+    assert "http" not in page
     assert "1 of 12 planned cells are not complete: spec_vla r=9 on door-open-v3" in page
     assert f"Run `kerv sweep study=threshold results={results}` to run them" in page
     assert "All tasks" in page
@@ -420,7 +400,7 @@ def test_the_page_stands_alone(results: Path) -> None:
     assert page.count('<th scope="col"><button>') == page.count("<th ")  # every heading sorts
     assert 'href="../../report/tables/threshold_per_task.csv"' in page
     tables = re.findall(r"<thead><tr>(.*?)</tr>", page)
-    assert len(tables) == len(set(tables)) == 3, "a table that repeats another"
+    assert len(tables) == len(set(tables)) == 2, "a table that repeats another"
     ids = [part.split('"')[0] for part in page.split(' id="')[1:]]
     assert len(ids) == len(set(ids))
 
@@ -436,8 +416,6 @@ def test_figures_show_the_axis_and_the_references(results: Path) -> None:
     lines = {line.get_label(): list(np.atleast_1d(line.get_ydata())) for line in speedup.get_lines()}
     assert lines["spec_vla"] == list(rows[rows["method"] == "spec_vla"]["episode_speedup"])
     assert lines["ar"] == [1.0, 1.0]
-    by_setting = study_figures(table, "", "Title")[""].axes[0]
-    assert [label.get_text() for label in by_setting.get_yticklabels()] == list(rows["label"])
 
 
 def test_nothing_to_report_names_what_to_run(tmp_path: Path) -> None:

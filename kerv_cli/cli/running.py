@@ -12,7 +12,7 @@ from kerv_cli.cli.progress import ProgressDisplay
 from kerv_cli.lab.events import CellEnd, Event, Outcome
 from kerv_cli.lab.execute import execute
 from kerv_cli.lab.plan import Cell
-from kerv_cli.lab.run import CellRunner, close_worlds, reference_decode
+from kerv_cli.lab.run import CellRunner, close_worlds
 from kerv_cli.lab.store import STUDIES, StudyStore
 from kerv_cli.report.viewing import save_recording
 
@@ -38,7 +38,7 @@ def running(
         on_step = display.on_step if runtime.executor == "local" and runtime.workers == 1 else None
         runner = CellRunner(store.rollouts, save_recording, keep=not is_study, on_step=on_step)
         try:
-            yield lambda part: execute(part, runner, store, runtime, on_event, reference_decode)
+            yield lambda part: execute(part, runner, store, runtime, on_event)
         except KeyboardInterrupt:
             count, what = sum(store.has_cell(cell.id) for cell in cells), "cells" if is_study else "episodes"
             raise Interrupted(

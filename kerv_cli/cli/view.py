@@ -9,11 +9,9 @@ from typing import Annotated
 import typer
 
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.places import check_writable, results_dir
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
 
-Together = Annotated[bool, typer.Option("--together", help="Show two recordings of one seed side by side.")]
 Web = Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser here, until Ctrl-C.")]
 To = Annotated[Path | None, typer.Option("--to", help="Write a film of one recording: FILE.mp4 or FILE.gif.")]
 Summary = Annotated[bool, typer.Option("--summary", help="Print what a recording holds instead.")]
@@ -30,7 +28,6 @@ Summary = Annotated[bool, typer.Option("--summary", help="Print what a recording
 def view(
     settings: CommandSettings,
     names: list[str],
-    together: Together = False,
     web: Web = False,
     to: To = None,
     summary: Summary = False,
@@ -39,12 +36,6 @@ def view(
     from kerv_cli.report.viewing.viewer import find_recordings, open_recording, read_summary, serve_web
 
     paths = [_place(settings.results, name) for name in names] or [Path(settings.results)]
-    if together:
-        from kerv_cli.report.viewing.together import save_together
-
-        check_writable(settings.results)
-        paths = [_only(find_recordings([path]), f"--together: {path}") for path in paths]
-        paths = [save_together(paths, results_dir(settings.results) / "together")]
     recordings = find_recordings(paths)
     if summary:
         for recording in recordings:

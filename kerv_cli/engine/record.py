@@ -18,9 +18,6 @@ PARALLEL = "parallel"
 PHASES = ("vision", "prefill", "propose", "verify", "accept", "rectify", "other")
 """Phases of a decode's inference time; their seconds add up to `DecodeRecord.seconds`. vision: `Target.encode`."""
 
-SWITCH = 0.5
-"""Change of a strict DoF's normalised command, of a range of 2, that counts as a switch of the gripper."""
-
 UNTIMED = dict.fromkeys(PHASES, math.nan)
 """Phases of a decode that was computed together with others and has no time of its own."""
 
@@ -160,21 +157,3 @@ class EpisodeRecord:
     def path_length(self) -> float:
         """The end effector's way, metres."""
         return path_length(self.path)
-
-    @property
-    def jerk(self) -> float:
-        """Root mean square of the third difference of the end effector's positions, m/s³; NaN below three steps."""
-        third = np.diff(self.path.astype(np.float64), n=3, axis=0) * self.space.control_hz**3
-        return float(np.sqrt((third**2).sum(axis=1).mean())) if len(third) else math.nan
-
-    @property
-    def gripper_switches(self) -> int:
-        """How often the command of a strict DoF moved by a quarter of its range or more since its last switch."""
-        commands = self.space.normalise(self.actions)[:, self.space.is_strict]
-        switches = 0
-        for series in commands.T:
-            held = series[0]
-            for value in series[1:]:
-                if abs(value - held) >= SWITCH:
-                    held, switches = value, switches + 1
-        return switches

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-import math
 import os
 import secrets
 import time
@@ -45,10 +44,6 @@ Prepare = Callable[[Cell], RunEpisode]
 """Builds and warms up a cell's setting on its task. Picklable; loaded weights stay in its module between calls. For
 cells of a batch it has a method too, `CellRunner.together`."""
 
-Gauge = Callable[[str], float]
-"""Seconds of a fixed workload on a device. Picklable."""
-
-
 Ends = dict[str, CellEnd]
 """Ends of a block's cells by id."""
 
@@ -69,7 +64,6 @@ def execute(
     store: StudyStore,
     runtime: RuntimeSettings | None = None,
     on_event: OnEvent = lambda event: None,
-    gauge: Gauge | None = None,
 ) -> Outcome:
     """Runs the cells that are not complete yet, block by block; cells of one id run once.
 
@@ -81,16 +75,14 @@ def execute(
         StorageError: the disk refused a result; further results could not be stored either.
         UsageError: the executor cannot be used.
     """
-    return _Sweep(prepare, store, runtime or RuntimeSettings(), on_event, gauge).run(cells)
+    return _Sweep(prepare, store, runtime or RuntimeSettings(), on_event).run(cells)
 
 
 class _Sweep:
     """State of one call of `execute`."""
 
-    def __init__(
-        self, prepare: Prepare, store: StudyStore, runtime: RuntimeSettings, on_event: OnEvent, gauge: Gauge | None
-    ) -> None:
-        self.prepare, self.store, self.runtime, self.on_event, self.gauge = prepare, store, runtime, on_event, gauge
+    def __init__(self, prepare: Prepare, store: StudyStore, runtime: RuntimeSettings, on_event: OnEvent) -> None:
+        self.prepare, self.store, self.runtime, self.on_event = prepare, store, runtime, on_event
         self.options = check_executor(runtime)
         self.outcome = Outcome()
         self.run_id = new_run_id()
@@ -150,7 +142,7 @@ class _Sweep:
                 while self.waiting and len(self.running) < executor.slots:
                     block = self.waiting.popleft()
                     name = f"{self.run_id}-{secrets.token_hex(4)}"
-                    attempt = BlockRun(block, name, self.run_id, self.prepare, self.store, self.gauge, self.status)
+                    attempt = BlockRun(block, name, self.run_id, self.prepare, self.store, self.status)
                     self.on_event(BlockStarted(block))
                     self.running[executor.submit(attempt)] = attempt
                 for future in wait(self.running, timeout=_POLL_SECONDS, return_when=FIRST_COMPLETED).done:
@@ -236,7 +228,6 @@ class BlockRun:
     run: str
     prepare: Prepare
     store: StudyStore
-    gauge: Gauge | None = None
     status: dict[str, Any] = field(default_factory=dict)
 
     def __call__(self) -> Ends | None:
@@ -311,10 +302,9 @@ class _Turn:
         """Runs one episode; writes the cell after its last one."""
         note_running(self.work.store.claims, self.cell, self.work.name, order)
         started = datetime.now(UTC)
-        load = self.work.gauge(self.device) if self.work.gauge is not None else math.nan
         clock = time.perf_counter()
         record = self.run_episode(seed)
-        return self._keep(record, order, started, load, time.perf_counter() - clock)
+        return self._keep(record, order, started, time.perf_counter() - clock)
 
     def add(self, result: EpisodeRecord | Exception, order: int) -> CellEnd | None:
         """Takes an episode of a batch, in any order of seeds; writes the cell after its last one."""
@@ -322,12 +312,10 @@ class _Turn:
         if isinstance(result, Exception):
             raise result
         started = datetime.now(UTC) - timedelta(seconds=result.wall_seconds)
-        return self._keep(result, order, started, math.nan, result.wall_seconds)
+        return self._keep(result, order, started, result.wall_seconds)
 
-    def _keep(
-        self, record: EpisodeRecord, order: int, started: datetime, load: float, seconds: float
-    ) -> CellEnd | None:
-        at = Circumstances(self.work.name, order, started.isoformat(timespec="milliseconds"), load)
+    def _keep(self, record: EpisodeRecord, order: int, started: datetime, seconds: float) -> CellEnd | None:
+        at = Circumstances(self.work.name, order, started.isoformat(timespec="milliseconds"))
         self.episodes.append((record, at))
         self.seconds += seconds
         if len(self.episodes) < len(self.cell.seeds):

@@ -34,7 +34,7 @@ from kerv_cli.lab.store import StudyStore, new_run_id
 
 _ELSEWHERE = "elsewhere"
 """Mode of the one decode that stands for those of a server which is not kerv."""
-_UNKNOWN = ("path_length", "jerk", "gripper_switches", "worker_pid")
+_UNKNOWN = ("path_length", "worker_pid")
 """Columns of an episode of another server."""
 _ONE = ActionSpace(("x",), (Group("x", 1),), (), 1.0, (-1.0,), (1.0,))
 _WORLD = {"horizon": "horizon", "stress": "stress.kind", "stress_level": "stress.level", "camera": "camera.name"}
@@ -326,7 +326,7 @@ def _settings(side: Side) -> dict[str, Any]:
     plain = dataclasses.asdict(RolloutSettings()) | {"method": first.name}
     if isinstance(stored, dict):
         try:
-            plain = dataclasses.asdict(settings_from(stored, tolerant=True))
+            plain = dataclasses.asdict(settings_from(stored))
         except KervError:  # a part that is not registered here
             plain |= stored
     if str(first.config.get("benchmark", "")).startswith("kerv_cli."):

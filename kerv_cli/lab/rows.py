@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -62,7 +61,6 @@ _EPISODE: Fields = {
     "tokens": (INT, _summed(lambda decode: len(decode.tokens))),  # committed, by whatever round
     "committed": (INT, _judged(lambda one: one.committed)),  # by verifications, bonus included
     "accepted": (INT, _judged(lambda one: one.accepted)),  # draft tokens, by verifications
-    "bonus": (INT, _judged(lambda one: one.committed - one.accepted)),
     "first_rejected_sum": (INT, _summed(lambda decode: decode.first_rejected)),  # over chunks that had a verification
     "first_rejected_count": (INT, _summed(lambda decode: decode.first_rejected is not None)),
     "compensated_tokens": (INT, _summed(lambda decode: decode.compensated)),
@@ -79,8 +77,7 @@ _EPISODE: Fields = {
     "carried_steps": (INT, _delays(lambda delay: delay.carried)),  # of those: on the chunk before
     "held_steps": (INT, _delays(lambda delay: delay.held)),  # … on the last action
     "dropped_steps": (INT, _delays(lambda delay: delay.dropped)),  # actions of new chunks left out as stale
-    **_attributes("path_length", "jerk", kind=FLOAT),  # of the end effector: metres; root mean square, m/s³
-    **_attributes("gripper_switches"),
+    **_attributes("path_length", kind=FLOAT),  # of the end effector, metres
     **_attributes("wall_seconds", kind=FLOAT),
     "initial_state": (pa.list_(FLOAT), lambda episode: np.asarray(episode.initial_state, np.float64).ravel().tolist()),
 }
@@ -89,7 +86,6 @@ _CIRCUMSTANCES = {
     "block": TEXT,  # which run of which block; empty where it is not known
     "order": INT,  # episodes that the block ran before it
     "started": TEXT,  # ISO 8601
-    "gauge_seconds": FLOAT,  # of the reference decode just before the episode: the machine's load
     "worker_pid": INT,
 }
 EPISODE_SCHEMA = pa.schema({**{name: kind for name, (kind, _) in _EPISODE.items()}, **_CIRCUMSTANCES}.items())
@@ -127,17 +123,15 @@ _DECODE: Fields = {
 # index: of the decode in its episode; step: control step at which its actions begin
 _POSITION = {"task": TEXT, "seed": INT, "index": INT, "step": INT}
 DECODE_SCHEMA = pa.schema({**_POSITION, **{name: kind for name, (kind, _) in _DECODE.items()}}.items())
-_DECODE_TIMES = pa.schema([DECODE_SCHEMA.field(name) for name in ("seed", "seconds")])
 
 
 @dataclass(frozen=True)
 class Circumstances:
-    """When and in which block an episode ran, and how loaded the machine was: columns of episodes.parquet."""
+    """When and in which block an episode ran: columns of episodes.parquet."""
 
     block: str = ""
     order: int = 0
     started: str = ""
-    gauge_seconds: float = math.nan
 
 
 def episode_row(record: EpisodeRecord, at: Circumstances, repeat: int = 0) -> dict[str, Any]:
@@ -193,9 +187,8 @@ def read_tables(folder: Path) -> CellTables:
     Raises:
         OSError, ValueError, ArrowException: they are not what a kerv wrote.
     """
-    episodes = _with_columns(read_table(folder / "episodes.parquet"), EPISODE_SCHEMA)
-    decodes = _with_columns(read_table(folder / "decodes.parquet", _DECODE_TIMES.names), _DECODE_TIMES)
-    return CellTables(folder, episodes, _split_by_seed(decodes))
+    episodes = _with_columns(read_table(folder / "episodes.parquet"))
+    return CellTables(folder, episodes, _split_by_seed(read_table(folder / "decodes.parquet", ["seed", "seconds"])))
 
 
 def frames_of(cells: Sequence[CellTables]) -> list[pd.DataFrame]:
@@ -213,20 +206,16 @@ def frames_of(cells: Sequence[CellTables]) -> list[pd.DataFrame]:
     return [whole.iloc[stop - cell.episodes.num_rows : stop] for cell, stop in zip(cells, stops, strict=True)]
 
 
-def _with_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
-    """The columns of `schema` first, then those that only the table has. A column that an older table lacks is empty.
+def _with_columns(table: pa.Table) -> pa.Table:
+    """The columns of EPISODE_SCHEMA. One that the table lacks is empty: cells of version 0.1.0 lack some.
 
     Raises:
         ValueError: a column of another type.
     """
-    if table.schema.equals(schema):
-        return table
-    for field in schema:
+    for field in EPISODE_SCHEMA:
         if field.name not in table.column_names:
             table = table.append_column(field, pa.nulls(table.num_rows, field.type))
-    further = [name for name in table.column_names if name not in schema.names]
-    table = table.select([*schema.names, *further])
-    return table.cast(pa.schema([*schema, *(table.schema.field(name) for name in further)]))
+    return table.select(EPISODE_SCHEMA.names).cast(EPISODE_SCHEMA)
 
 
 def _split_by_seed(decodes: pa.Table) -> dict[int, np.ndarray]:

@@ -1,5 +1,4 @@
-"""Runs episodes in the worlds of this process: of one setting on one task, of a study's cell, or several at once; and
-gauges the machine's load.
+"""Runs episodes in the worlds of this process: of one setting on one task, of a study's cell, or several at once.
 
 Weights, datastores and worlds are shared by all settings of a process. Frames and decoders are not: a setting that got
 its frames from another would decode with warm caches, and a skip's level may follow the episodes of its own block.
@@ -10,16 +9,13 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from kerv_cli.base.settings import CameraSettings, RolloutSettings, WorldSettings, settings_from
 from kerv_cli.engine.batched import BatchDecoder
@@ -27,7 +23,7 @@ from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.lab.episode import OnStep, run_episode
 from kerv_cli.lab.plan import Cell
-from kerv_cli.lab.policy import artifacts_of, batch_decoder_for, clock_for, decoder_for
+from kerv_cli.lab.policy import batch_decoder_for, clock_for, decoder_for
 from kerv_cli.lab.together import EpisodeEnd, Request, run_together
 from kerv_cli.methods.compose import native_decoder
 from kerv_cli.worlds import spec_of
@@ -132,9 +128,8 @@ def success_of(target: Target, tasks: Iterable[str], seeds: Sequence[int], setti
 OnCellStep = Callable[[Cell, int, int], None]
 """Told the cell, the seed and the number of control steps executed, after each of them."""
 
-Save = Callable[[EpisodeRecord, Path, str, Mapping[str, float]], object]
-"""Writes a recording: the record of the episode, the .rrd file, the label of the setting, and the limits that its
-signals are compared with."""
+Save = Callable[[EpisodeRecord, Path, str], object]
+"""Writes a recording: the record of the episode, the .rrd file and the label of the setting."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +158,7 @@ class CellRunner:
             record = runner.episode(seed, cell.repeat == 0 and is_recorded(runner.settings, seed), on_step)
             if record.frames:
                 name = f"{cell.label.replace(' ', '_').replace('=', '')}-{record.task}-{seed}-{cell.id[:6]}.rrd"
-                self.save(record, self.rollouts / name, cell.label, limits_of(runner.settings, cell.task))
+                self.save(record, self.rollouts / name, cell.label)
             return dataclasses.replace(record, frames={}, places={})
 
         return episode
@@ -179,50 +174,7 @@ class CellRunner:
             yield request.key, request.seed, result
 
 
-def limits_of(settings: RolloutSettings, task: str) -> dict[str, float]:
-    """Signal of a recording -> the limit that a decision compares it with: F* of the boundary, s_min of verify-skip."""
-    limits = {}
-    if hasattr(settings.boundary, "f_star"):
-        limits["metric"] = float(settings.boundary.f_star)
-    if hasattr(settings.skip, "s_min"):
-        s_min = settings.skip.s_min
-        if s_min is None:
-            levels = artifacts_of(settings).load("calibration").skip
-            s_min = levels.tasks[task].s_min if levels is not None and task in levels.tasks else None
-        if s_min is not None:
-            limits["similarity"] = float(s_min)
-    return limits
-
-
 @functools.lru_cache(maxsize=64)
 def _runner(settings: str, task: str) -> Runner:
     """The process's runner of these settings (JSON) on a task."""
     return Runner(settings_from(json.loads(settings)), task)
-
-
-_TOKENS, _WIDTH, _LAYERS = 8, 512, 160  # of the reference decode: about 5 ms on one core, weights of one megabyte
-
-
-def reference_decode(device: str) -> float:
-    """Seconds of a fixed workload like a decode, a chain of products of few tokens with one matrix. It never changes,
-    so that a change of its time is one of the machine's load or clock."""
-    x, weights = _reference(device)
-    begin = time.perf_counter()
-    _chain(x, weights)
-    return time.perf_counter() - begin
-
-
-def _chain(x: Tensor, weights: Tensor) -> float:
-    for _ in range(_LAYERS):
-        x = torch.tanh(x @ weights)
-    return float(x[0, 0])  # waits for the device
-
-
-@functools.cache
-def _reference(device: str) -> tuple[Tensor, Tensor]:
-    """Operands (tokens, width) and (width, width), after a first run that allocates and chooses kernels."""
-    generator = torch.Generator().manual_seed(0)
-    x = torch.randn(_TOKENS, _WIDTH, generator=generator).to(device)
-    weights = (torch.randn(_WIDTH, _WIDTH, generator=generator) / _WIDTH**0.5).to(device)
-    _chain(x, weights)
-    return x, weights

@@ -52,7 +52,7 @@ def write_served(path: Path, record: EpisodeRecord, at: Circumstances, by: Mappi
     """
     row = episode_row(record, at)
     if not len(record.path):
-        row |= {"path_length": math.nan, "jerk": math.nan}
+        row |= {"path_length": math.nan}
     facts = json.dumps({"episode": row, "by": by})
     table = pa.Table.from_pylist(decode_rows(record), schema=DECODE_SCHEMA).replace_schema_metadata({_KEY: facts})
     options = pa.ipc.IpcWriteOptions(compression="zstd")

@@ -36,12 +36,6 @@ class Ceiling:
         least = self.overhead + (0.0 if self.in_prefill else self.prefill) + self.forward
         return self.chunks * baseline / least if least > 0 else math.nan
 
-    def columns(self) -> dict[str, float]:
-        """For a row of a table: the ceiling, and its times in milliseconds per decode."""
-        fields = {"overhead": "overhead", "prefill": "prefill", "one_token": "one_token", "own": "forward"}
-        parts = {f"ceiling_ms.{name}": 1000.0 * getattr(self, field) for name, field in fields.items()}
-        return {"ceiling": self.value, "ceiling_tokens": self.tokens, **parts}
-
 
 NONE = Ceiling(math.nan, math.nan, math.nan, math.nan, math.nan)
 
@@ -97,23 +91,18 @@ def _seconds(episodes: pd.DataFrame, phase: str) -> float:
 
 def is_autoregressive(settings: Plain) -> bool:
     """Whether a setting is a model that decodes token by token: nothing drafts, nothing is skipped."""
-    drafts = any(kind_of(settings, part) != "none" for part in ("prefill_draft", "proposer", "skip"))
-    return not drafts and settings["policy"].get("kind", MODEL) == MODEL
+    drafts = any(settings[part]["kind"] != "none" for part in ("prefill_draft", "proposer", "skip"))
+    return not drafts and settings["policy"]["kind"] == MODEL
 
 
 def verifies_in_prefill(settings: Plain) -> bool:
     """Whether a setting drafts before the prefill."""
-    return kind_of(settings, "prefill_draft") != "none"
-
-
-def kind_of(settings: Plain, part: str) -> str:
-    """Kind of a setting's part; `none` for stored settings that are older than that part."""
-    return str(settings.get(part, {"kind": "none"})["kind"])
+    return bool(settings["prefill_draft"]["kind"] != "none")
 
 
 def chunk_ratio(settings: Plain, baseline: Plain) -> float:
     """H over the baseline's H; NaN if only one of them is the target's default."""
-    steps, baseline_steps = settings.get("chunk") or 0, baseline.get("chunk") or 0
+    steps, baseline_steps = settings["chunk"], baseline["chunk"]
     if steps == baseline_steps:
         return 1.0
     return steps / baseline_steps if steps and baseline_steps else math.nan

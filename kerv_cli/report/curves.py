@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib as mpl
@@ -11,11 +9,10 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import MOST_TEXT, regular, write_bytes
+from kerv_cli.base.files import write_bytes
 from kerv_cli.report.drawing import COLOURS, MUTED, STYLE, entitle, figure_bytes, new_figure
 
 _COLUMNS = 3  # panels beside one another
-_FEW = 4  # validations: their curves show less than the loss of every step
 
 
 def read_log(folder: Path) -> pd.DataFrame:
@@ -26,7 +23,7 @@ def read_log(folder: Path) -> pd.DataFrame:
     """
     path = folder / "log.csv"
     try:
-        log = pd.read_csv(regular(path, MOST_TEXT))
+        log = pd.read_csv(path)
     except (OSError, ValueError) as error:
         raise CheckpointError(f"{path} cannot be read: {error}") from error
     if "step" not in log or log.empty or pd.to_numeric(log["step"], errors="coerce").isna().any():
@@ -38,8 +35,7 @@ def curves_figure(log: pd.DataFrame, title: str) -> Figure:
     """One panel per measure over steps; the best validation is marked."""
     names = [str(name) for name in log.columns if name != "step"]
     rows = -(-len(names) // _COLUMNS)
-    score = log["score"] if "score" in log else log["step"]
-    best = float(log["step"].to_numpy()[int(score.to_numpy().argmax())])
+    best = float(log["step"].to_numpy()[int(log["score"].to_numpy().argmax())])
     with mpl.rc_context(STYLE):
         figure = new_figure(11.0, 1.0 + 2.3 * rows)
         panels = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()
@@ -54,28 +50,12 @@ def curves_figure(log: pd.DataFrame, title: str) -> Figure:
     return figure
 
 
-def loss_figure(losses: Sequence[float], title: str) -> Figure:
-    """The loss of every step of a run that is too short for curves of validations."""
-    with mpl.rc_context(STYLE):
-        figure = new_figure(7.0, 3.6)
-        panel = figure.subplots()
-        panel.plot(range(1, len(losses) + 1), losses, color=COLOURS[0], linewidth=1.5)
-        panel.set(xlabel="step", ylabel="loss")
-        entitle(figure, title, f"loss per step of training, {len(losses)} steps")
-    return figure
-
-
-def save_curves(folder: Path, losses: Sequence[float]) -> Path:
-    """Writes `curves.png` beside a training's log.csv -> its path. losses: of every step; drawn where there are fewer
-    than `_FEW` validations.
+def save_curves(folder: Path) -> Path:
+    """Writes `curves.png` beside a training's log.csv -> its path.
 
     Raises:
         CheckpointError: as `read_log`. StorageError: the disk refused.
     """
     path = folder / "curves.png"
-    log, title = read_log(folder), f"{folder.parent.name} {folder.name}"
-    figure = (
-        loss_figure(losses, title) if any(map(math.isfinite, losses)) and len(log) < _FEW else curves_figure(log, title)
-    )
-    write_bytes(path, figure_bytes(figure, "png"))
+    write_bytes(path, figure_bytes(curves_figure(read_log(folder), f"{folder.parent.name} {folder.name}")))
     return path

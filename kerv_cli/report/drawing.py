@@ -6,7 +6,6 @@ import base64
 import io
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -44,8 +43,6 @@ STYLE: Any = {
     "grid.color": GRID,
     "axes.axisbelow": True,
     "legend.frameon": False,
-    "svg.hashsalt": "kerv",  # ids in the file do not change from run to run
-    "svg.fonttype": "path",
 }
 _ANGLES = (45, -45, 135, -135, 90, -90, 20, -20, 160, -160, 65, -65, 115, -115)  # of a label from its point, degrees
 _DISTANCES = (9.0, 14.0, 21.0, 30.0, 40.0, 52.0, 66.0, 82.0, 100.0)  # of its nearest edge or corner, points
@@ -154,54 +151,21 @@ def setting_colours(rows: Iterable[Row]) -> list[str]:
     return colours
 
 
-SVG_LIMIT = 100_000  # bytes; figures of many points become larger and are stored as PNG only
-
-
-@dataclass(frozen=True)
-class Plot:
-    """A figure's files, and an HTML element that holds the figure itself."""
-
-    files: tuple[Path, ...]
-    html: str
-
-
-def save_plot(figure: Figure, folder: Path, name: str) -> Plot:
-    """Writes `name`.png and, up to `SVG_LIMIT`, `name`.svg, atomically and without a date. An older `name`.svg is
-    removed where the new one would be too large.
+def save_plot(figure: Figure, path: Path) -> str:
+    """Writes a PNG file atomically and without a date -> an HTML element that holds the figure itself.
 
     Raises:
         StorageError: the disk refused.
     """
-    contents = {kind: figure_bytes(figure, kind) for kind in ("png", "svg")}
-    small = len(contents["svg"]) <= SVG_LIMIT
-    if not small:
-        del contents["svg"]
-        (folder / f"{name}.svg").unlink(missing_ok=True)
-    for kind, content in contents.items():
-        write_bytes(folder / f"{name}.{kind}", content)
-    files = tuple(folder / f"{name}.{kind}" for kind in contents)
-    return Plot(files, _inline(contents["svg"].decode(), f"{name}-") if small else _embedded(contents["png"]))
+    content = figure_bytes(figure)
+    write_bytes(path, content)
+    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(content).decode()}">'
 
 
-def _inline(svg: str, prefix: str) -> str:
-    """The <svg> element, its ids made unique: two figures of one page must not share clip paths."""
-    text = svg[svg.index("<svg") :]
-    for before in ('id="', 'xlink:href="#', "url(#"):
-        text = text.replace(before, before + prefix)
-    return text
-
-
-def _embedded(png: bytes) -> str:
-    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
-
-
-def figure_bytes(figure: Figure, kind: str) -> bytes:
-    """A figure as the bytes of an SVG file, or of a PNG file with a palette: half the size, and no other picture."""
+def figure_bytes(figure: Figure) -> bytes:
+    """A figure as the bytes of a PNG file with a palette: half the size, and no other picture."""
     buffer, small = io.BytesIO(), io.BytesIO()
-    metadata = {"Date": None} if kind == "svg" else {"Software": None}
     with mpl.rc_context(STYLE):
-        figure.savefig(buffer, format=kind, dpi=150, metadata=metadata)
-    if kind == "svg":
-        return buffer.getvalue()
+        figure.savefig(buffer, format="png", dpi=150, metadata={"Software": None})
     Image.open(buffer).convert("RGB").quantize(256).save(small, "PNG", optimize=True)
     return small.getvalue()

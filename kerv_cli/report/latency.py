@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 
 import pandas as pd
 
-from kerv_cli.base.settings import REAL, TimingSettings
+from kerv_cli.base.settings import REAL
 from kerv_cli.lab.identity import Plain
 from kerv_cli.report.ceiling import is_autoregressive
-from kerv_cli.report.measures import MICRO, Row, measure
+from kerv_cli.report.measures import MICRO, measure
 from kerv_cli.report.tables import StudyData, rows_of
 from kerv_cli.report.text import LOST_WON, Column, compared, intervals, lost_won, numbers, p_value, shares, text_frame
 
@@ -25,7 +24,7 @@ def latency_table(data: StudyData) -> pd.DataFrame | None:
     those episodes. None where every world waits, or no setting is AR."""
     settings = {cell.label: cell.settings for cell in reversed(data.plan.cells)}
     episodes = {str(label): group for label, group in data.episodes.groupby("label", sort=False)}
-    real = [label for label in data.plan.labels if label in episodes and _timing(settings[label])["clock"] == REAL]
+    real = [label for label in data.plan.labels if label in episodes and settings[label]["rollout"]["clock"] == REAL]
     references = {_key(settings[label]): label for label in reversed(real) if is_autoregressive(settings[label])}
     rows = []
     for label in real:
@@ -35,7 +34,7 @@ def latency_table(data: StudyData) -> pd.DataFrame | None:
         values = measure(episodes[label], episodes[reference], MICRO)
         ar = episodes[reference]
         head = {"study": data.plan.name, "label": label, "method": settings[label]["method"], "ar": reference}
-        timing = {f"rollout.{name}": value for name, value in _timing(settings[label]).items()}
+        timing = {f"rollout.{name}": value for name, value in settings[label]["rollout"].items()}
         latency = {"ar_latency_ms": 1000.0 * float(ar["delay_seconds"].sum() / ar["delay_decodes"].sum())}
         measures = {name: values[name] for name in (*_FELT, *_SUCCESS, *_DIFFERENCE)}
         parts = {f"{part}.kind": settings[label][part]["kind"] for part in ("prefill_draft", "proposer")}
@@ -43,13 +42,8 @@ def latency_table(data: StudyData) -> pd.DataFrame | None:
     return pd.DataFrame(rows) if rows else None
 
 
-def _timing(settings: Plain) -> Row:
-    """`rollout.*` of stored settings; the defaults where settings lack it, because they are older."""
-    return {**dataclasses.asdict(TimingSettings()), **settings.get("rollout", {})}
-
-
 def _key(settings: Plain) -> str:
-    return json.dumps(_timing(settings), sort_keys=True)
+    return json.dumps(settings["rollout"], sort_keys=True)
 
 
 def latency_summary(table: pd.DataFrame) -> pd.DataFrame:

@@ -24,7 +24,7 @@ MARGIN = 0.03  # of success: a method is non-inferior where the difference's low
 COMPARABLE = ("device", "device_name", "dtype", "threads")  # columns that must be equal for times to be comparable
 _SAME = (*COMPARABLE, "initial_state")  # columns that must be equal in the two episodes of a pair
 
-MOTION = {"steps_to_success": "steps", "path_m": "path_length", "jerk": "jerk", "gripper_switches": "gripper_switches"}
+MOTION = {"steps_to_success": "steps", "path_m": "path_length"}
 """Measure of an episode besides inference -> column of rows.EPISODE_SCHEMA."""
 
 _RATIOS = {
@@ -65,7 +65,7 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, apar
     macro = averaging == MACRO
     worlds = pairs[pairs["repeat"] == 0]  # a repeat is another time, not another world
     once = episodes[episodes["repeat"] == 0]
-    timed = pairs if apart else pairs[pairs["in_turn"]]
+    timed = pairs if apart else pairs[pairs["same_block"]]
     has_times = decodes(episodes) and is_timed(timed, "time_method") and is_timed(timed, "time_baseline")
     return {
         "successes": int(once["success"].sum()),
@@ -74,7 +74,6 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, apar
         **columns_of("episode_speedup", _speedup(timed, "seconds", macro) if has_times else stats.NO_ESTIMATE),
         **(_by_group(episodes, _means) if macro else _means(episodes)),
         **columns_of("AL", _averaged(episodes, macro, _acceptance_length)),
-        **(columns_of("realised_risk", _averaged(episodes, macro, _realised_risk)) if "audits" in episodes else {}),
         **paired_columns(
             pair_counts(worlds), _averaged(worlds, macro, lambda part: stats.paired_difference(pair_counts(part)))
         ),
@@ -90,7 +89,7 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, apar
 
 def _motion(episodes: pd.DataFrame, pairs: pd.DataFrame, macro: bool) -> dict[str, float]:
     """Of the successful episodes: the mean of every measure of `MOTION`, and its ratio to the baseline's over the pairs
-    in which both succeeded, with its interval. NaN where cells are older than a measure, without such pairs, and where
+    in which both succeeded, with its interval. NaN where a measure is unknown, without such pairs, and where
     the baseline's mean is 0."""
     successes = episodes[episodes["success"].astype(bool)]
     both = pairs[pairs["success_method"].astype(bool) & pairs["success_baseline"].astype(bool)]
@@ -132,24 +131,11 @@ def _success(episodes: pd.DataFrame) -> Estimate:
 
 
 def _acceptance_length(episodes: pd.DataFrame) -> Estimate:
-    return _per_world(episodes, stats.ratio, episodes["committed"], episodes["verifications"])
-
-
-def _realised_risk(episodes: pd.DataFrame) -> Estimate:
-    """Of episodes of the gate that kerv had (docs/methods.md §4.6): mean over episodes of the mean loss of trusted
-    decodes. An episode's audits are a fair sample of its trusted decodes, and more where these are more: each counts
-    1 ÷ that number, so that episodes count alike. audit_loss ÷ audits favours long episodes."""
-    trusted = (episodes["skipped_decodes"] + episodes["audits"]).clip(lower=1)
-    return _per_world(episodes, stats.share, episodes["audit_loss"] / trusted, episodes["audits"] / trusted)
-
-
-def _per_world(
-    episodes: pd.DataFrame, estimate: Callable[..., Estimate], above: pd.Series, below: pd.Series
-) -> Estimate:
-    """The sum of `above` over the sum of `below`, with an interval by task and seed; NaN where the latter is 0."""
-    if not below.sum():
+    """AL with an interval by task and seed; NaN without verifications."""
+    if not episodes["verifications"].sum():
         return stats.NO_ESTIMATE
-    return estimate(above.to_numpy(), below.to_numpy(), list(episodes["task"]), list(episodes["seed"]))
+    tasks, seeds = list(episodes["task"]), list(episodes["seed"])
+    return stats.ratio(episodes["committed"].to_numpy(), episodes["verifications"].to_numpy(), tasks, seeds)
 
 
 def pair_counts(pairs: pd.DataFrame) -> stats.PairedCounts:
@@ -182,8 +168,7 @@ def paired(episodes: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
     served by others than kerv name no device, have no times and pair with those of any.
 
     Columns: task, difficulty, seed, repeat; with the suffixes _baseline and _method: time (seconds per step), seconds
-    (of the episode), success, block and the columns of `MOTION`; same_run, same_block; in_turn: same_block, and where
-    the oldest episodes name no block the same run.
+    (of the episode), success, block and the columns of `MOTION`; same_run, same_block.
     """
     keys = ["task", "seed", "repeat"]
     columns = [*keys, "difficulty", "run", "block", "success", "seconds", *MOTION.values(), *_SAME]
@@ -196,9 +181,7 @@ def paired(episodes: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
         agree &= elsewhere | (both[f"{name}_method"] == both[f"{name}_baseline"])
     both = both[agree].sort_values(keys, kind="stable").reset_index(drop=True)
     both["same_run"] = both["run_method"] == both["run_baseline"]
-    both["same_block"] = (both["block_method"] == both["block_baseline"]) & (both["block_method"] != "")
-    unnamed = (both["block_method"] == "") & (both["block_baseline"] == "")
-    both["in_turn"] = both["same_block"] | (unnamed & both["same_run"])
+    both["same_block"] = both["same_run"] & (both["block_method"] == both["block_baseline"])
     return both.rename(columns={"difficulty_method": "difficulty"})
 
 
@@ -231,25 +214,13 @@ def _means(episodes: pd.DataFrame) -> dict[str, float]:
         "time_per_step_ms": float((episodes["seconds"] * per_step).mean()),
         "time_per_episode_ms": 1000.0 * float(episodes["seconds"].mean()),
         **_latencies(episodes["decode_seconds"]),
-        "gauge_ms": 1000.0 * float(episodes["gauge_seconds"].median()),
     }
     phases = episodes[[f"seconds.{phase}" for phase in PHASES]].mul(per_step, axis=0).mean()
     values |= {f"ms.{phase}": float(phases[f"seconds.{phase}"]) for phase in PHASES}
     sums = episodes[list({name: 0 for pair in _RATIOS.values() for name in pair})].sum().to_dict()
     values |= {name: float(sums[a] / sums[b]) if sums[b] else math.nan for name, (a, b) in _RATIOS.items()}
     values["felt_latency_ms"] = 1000.0 * values.pop("felt_latency")
-    values |= _alarms(episodes) if "audits" in episodes else {}
     return values | {name: float(part.built(episodes)) for name, part in registered_columns().items()}
-
-
-def _alarms(episodes: pd.DataFrame) -> dict[str, float]:
-    """Of episodes that have the columns of the gate that kerv had (docs/methods.md §4.6): the share with an alarm, and
-    the audits up to it."""
-    alarms = float(episodes["alarmed"].sum())
-    return {
-        "alarm_rate": float(episodes["alarmed"].mean()) if episodes["audits"].any() else math.nan,
-        "audits_to_alarm": float(episodes["alarm_audits"].sum()) / alarms if alarms else math.nan,
-    }
 
 
 def registered_columns() -> Mapping[str, Part]:

@@ -16,8 +16,7 @@ from kerv_cli.lab.store import StudyStore
 from kerv_cli.report import stressed
 from kerv_cli.report.decide import choices, read_verdicts, sentence
 from kerv_cli.report.measures import MACRO, MICRO, Row
-from kerv_cli.report.reprice import machine_columns
-from kerv_cli.report.summary import SPEEDS, differences, motion_frame, summary_frame
+from kerv_cli.report.summary import SPEEDS, differences, summary_frame
 from kerv_cli.report.tables import StudyData, is_baseline, is_number, rows_of
 
 LOSS = 3.0
@@ -40,7 +39,6 @@ def render(
     figures: Sequence[str],
     sections: Sequence[Section],
     files: Sequence[Path],
-    priced: pd.DataFrame | None,
     loss: float,
 ) -> str:
     """The page.
@@ -48,7 +46,6 @@ def render(
     Args:
         figures: HTML elements.
         files: the study's tables and plots; the page links the tables.
-        priced: `repriced_table` of the profiles in `on`.
         loss: points of success that the verdict allows.
     """
     template = Environment(
@@ -68,8 +65,7 @@ def render(
         absent=[f"{cell.label} on {cell.task}" for cell in data.absent],
         planned=len({cell.id for cell in data.plan.cells}),
         how_to_run=_how_to_run(store),
-        suite=_suite(data.table, priced),
-        motion=motion_frame(data.table),
+        suite=_suite(data.table),
         reasons=differences(rows_of(data.table, MICRO)),
         decisions=[] if decisions is None else rows_of(decisions),
         figures=figures,
@@ -124,13 +120,9 @@ def _about(whole: pd.DataFrame) -> str:
     )
 
 
-def _suite(whole: pd.DataFrame, priced: pd.DataFrame | None) -> pd.DataFrame:
-    """The table of all settings, pooled over tasks, with speed per episode on other machines, and the numbers that the
-    average over difficulty changes."""
+def _suite(whole: pd.DataFrame) -> pd.DataFrame:
+    """The table of all settings, pooled over tasks, with the numbers that the average over difficulty changes."""
     frame = summary_frame(whole, MICRO)
-    for number, (name, texts) in enumerate({} if priced is None else machine_columns(priced).items()):
-        at = list(frame.columns).index("per step") + 1 + number
-        frame.insert(at, name, [texts.get(label, "–") for label in frame["setting"]])
     if MACRO not in set(whole["averaging"]) or whole["difficulty"].astype(str).str.count(";").max() == 0:
         return frame
     macro = summary_frame(whole, MACRO)

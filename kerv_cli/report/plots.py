@@ -1,5 +1,5 @@
-"""Figures of a study from its tables: measures by setting, along an axis, under stress and at latencies; success
-against speed; time by phase; success task by task."""
+"""Figures of a study from its tables: measures along an axis, under stress and at latencies; success
+against speed; success task by task."""
 
 from __future__ import annotations
 
@@ -15,9 +15,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from kerv_cli.engine.record import PHASES
 from kerv_cli.report.drawing import (
-    COLOURS,
     INK,
     MUTED,
     STYLE,
@@ -31,7 +29,6 @@ from kerv_cli.report.measures import MICRO, Row
 from kerv_cli.report.stressed import by_kind, is_stressed
 from kerv_cli.report.tables import is_baseline, is_number, rows_of
 
-_PHASE_COLOURS = ("#7fb2d9", "#0b6fb8", "#e9b44c", "#d1495b", "#e8a0a8", "#2a9d6f", "#dfe5eb")
 _DASHES: Any = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (7, 2, 1.5, 2)), (0, (3, 1, 1, 1, 1, 1)))
 _DODGE = 0.012  # of an axis, between the points of two methods
 _NARROWEST = 0.05  # of an axis, between two ticks
@@ -69,13 +66,12 @@ MEASURES = (
 
 
 def study_figures(table: pd.DataFrame, axis: str, title: str) -> dict[str, Figure]:
-    """Name suffix -> figure: measures against the axis, and inference time by phase where it was measured; without an
-    axis the measures by setting, and success against speed. A study of stress has one figure, of success.
+    """Name suffix -> figure: measures against the axis; without an
+    axis success against speed, where it was measured. A study of stress has one figure, of success.
 
     Args:
         table: a study's; its rows pooled over tasks are drawn.
-        axis: column for the x axis, e.g. `threshold.r`; empty, or without a setting at two of its numbers: one row per
-            setting.
+        axis: column for the x axis, e.g. `threshold.r`; empty, or without a setting at two of its numbers: none.
         title: the study's.
     """
     rows = table[table["averaging"] == MICRO].reset_index(drop=True)
@@ -83,12 +79,9 @@ def study_figures(table: pd.DataFrame, axis: str, title: str) -> dict[str, Figur
     if is_stressed(rows):
         return {"": lines_figure(by_kind(table), "stress_level", "level", *heading)}
     numbers = any(len(group) > 1 for group in series_of(rows, axis).values())
-    figures = {"": _against_axis(rows, axis, *heading) if numbers else _by_setting(rows, *heading)}
-    if rows["time_per_step_ms"].notna().any():
-        figures["_phases"] = _phases(rows, *heading)
-    if not numbers:
-        figures["_tradeoff"] = _tradeoff(rows_of(rows), *heading)
-    return figures
+    if numbers:
+        return {"": _against_axis(rows, axis, *heading)}
+    return {"_tradeoff": _tradeoff(rows_of(rows), *heading)} if rows["episode_speedup"].notna().any() else {}
 
 
 def about(rows: pd.DataFrame, what: str = MICRO) -> str:
@@ -195,83 +188,20 @@ def _against_axis(rows: pd.DataFrame, axis: str, title: str, about: str) -> Figu
     return figure
 
 
-def _mark_baseline(panel: Axes, rows: pd.DataFrame, measure: Measure, along_x: bool = False) -> None:
+def _mark_baseline(panel: Axes, rows: pd.DataFrame, measure: Measure) -> None:
     """A dotted line at the baseline's value."""
     for row in filter(is_baseline, rows_of(rows)):
         level = measure.of(row) if measure.level is None else measure.level
-        mark = panel.axvline if along_x else panel.axhline
-        mark(level, color=INK, linewidth=1.2, linestyle=":", label=str(row["label"]))
+        panel.axhline(level, color=INK, linewidth=1.2, linestyle=":", label=str(row["label"]))
 
 
-def _limit_success(panel: Axes, rows: Iterable[Row], axis: str = "y") -> None:
-    """Limits an axis of success: from a little below the lowest interval, so that differences show, to a little above
+def _limit_success(panel: Axes, rows: Iterable[Row]) -> None:
+    """Limits the axis of success: from a little below the lowest interval, so that differences show, to a little above
     100 %, without a tick there."""
     lows = [low for row in rows if is_number(low := SUCCESS.of(row, "_low"))]
     floor = max(0.0, 5.0 * math.floor((min(lows, default=0.0) - 3.0) / 5.0))
-    panel.set(**{f"{axis}lim": (floor, 103)})
-    panel.set(**{f"{axis}ticks": [tick for tick in getattr(panel, f"get_{axis}ticks")() if floor <= tick <= 100]})
-
-
-def _by_setting(rows: pd.DataFrame, title: str, about: str) -> Figure:
-    """A panel per measure, a row per setting, its value beside the point."""
-    with mpl.rc_context(STYLE):
-        figure = new_figure(15.0, 2.0 + 0.38 * len(rows))
-        panels = figure.subplots(1, len(MEASURES), sharey=True)
-        for panel, measure in zip(panels, MEASURES, strict=True):
-            for y, row in enumerate(rows_of(rows)):
-                draw(panel, [y], [row], measure, INK if is_baseline(row) else COLOURS[0], along_x=True)
-                _write_value(panel, y, measure.of(row), measure)
-            if measure.column != "AL":
-                _mark_baseline(panel, rows, measure, along_x=True)
-            panel.set(title=measure.title, xlabel=measure.unit)
-            ceilings = rows["ceiling"].dropna()
-            if measure.column == "speedup" and len(ceilings):
-                panel.plot(ceilings, ceilings.index, "|", color=MUTED, markersize=13, markeredgewidth=1.6)
-                panel.set_xlabel(f"{measure.unit}; | ceiling")
-            if measure is SUCCESS:
-                _limit_success(panel, rows_of(rows), "x")
-            else:
-                panel.set_xlim(0, 1.08 * panel.get_xlim()[1])
-            _name_rows(panel, rows["label"])
-        entitle(figure, title, about)
-    return figure
-
-
-def _write_value(panel: Axes, y: float, value: float, measure: Measure) -> None:
-    if math.isnan(value):
-        return
-    text = f"{value:.1f}".removesuffix(".0") if measure is SUCCESS else f"{value:.2f}"
-    box = {"facecolor": "white", "edgecolor": "none", "pad": 0.4}
-    panel.annotate(text, (value, y), (0, 8), textcoords="offset points", ha="center", fontsize=8, bbox=box)
-
-
-def _name_rows(panel: Axes, names: Iterable[str]) -> None:
-    """Names along y, the first on top."""
-    names = list(names)
-    panel.set_yticks(range(len(names)), names, color=INK)
-    panel.set_ylim(len(names) - 0.5, -0.5)
-    panel.grid(axis="y", visible=False)
-
-
-def _phases(rows: pd.DataFrame, title: str, about: str) -> Figure:
-    with mpl.rc_context(STYLE):
-        figure = new_figure(10.0, 2.0 + 0.36 * len(rows))
-        panel = figure.subplots()
-        y, left = np.arange(len(rows)), np.zeros(len(rows))
-        for phase, shade in zip(PHASES, _PHASE_COLOURS, strict=True):
-            widths = rows[f"ms.{phase}"].fillna(0.0).to_numpy()
-            if widths.any():
-                panel.barh(y, widths, 0.66, left, color=shade, label=phase, edgecolor="white", linewidth=0.6)
-            left = left + widths
-        for number, total in enumerate(rows["time_per_step_ms"]):
-            text = f"  {total:.3g}" if is_number(total) else "  not timed"
-            panel.text(total if is_number(total) else 0.0, number, text, va="center", fontsize=9)
-        _name_rows(panel, rows["label"])
-        panel.set(title="Inference time by phase", xlabel="ms per control step")
-        panel.margins(x=0.08)
-        figure.legend(loc="outside lower center", ncols=len(PHASES))
-        entitle(figure, title, about)
-    return figure
+    panel.set_ylim(floor, 103)
+    panel.set_yticks([tick for tick in panel.get_yticks() if floor <= tick <= 100])
 
 
 def _tradeoff(rows: Sequence[Row], title: str, about: str) -> Figure:

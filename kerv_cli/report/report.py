@@ -51,7 +51,7 @@ def report(
     """Writes a study's files, or those of every study that has a complete cell.
 
     In report/, or to publish in the results folder itself: tables/<study>.csv and <study>_per_task.csv,
-    plots/<study>*.png and, where small, .svg; with `on`, names of profiles, tables/<study>_on.csv. Always
+    plots/<study>*.png; with `on`, names of profiles, tables/<study>_on.csv. Always
     studies/<study>/report.html, whose verdict allows `loss` points of success. The same cells give the same bytes.
 
     Raises:
@@ -98,7 +98,7 @@ def write_study(
     sections = [_machines_section(priced, files), _latency_section(data, files), _stress_section(data, files)]
     page = store.root / "report.html"
     present = [section for section in sections if section is not None]
-    write_text(page, render(store, data, plots, present, files.paths, priced, loss))
+    write_text(page, render(store, data, plots, present, files.paths, loss))
     return [*files.paths, page]
 
 
@@ -114,10 +114,9 @@ class _Files:
         self.paths.append(write_csv(table, self.folder / "tables" / f"{name}.csv"))
 
     def add_plot(self, figure: Figure, name: str) -> str:
-        """Writes plots/<name>.png and .svg -> the figure's HTML element."""
-        plot = save_plot(figure, self.folder / "plots", name)
-        self.paths.extend(plot.files)
-        return plot.html
+        """Writes plots/<name>.png -> the figure's HTML element."""
+        self.paths.append(self.folder / "plots" / f"{name}.png")
+        return save_plot(figure, self.paths[-1])
 
 
 def _machines_section(priced: pd.DataFrame | None, files: _Files) -> Section | None:

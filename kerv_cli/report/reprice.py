@@ -15,13 +15,12 @@ import pyarrow.compute as pc
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import read_table
 from kerv_cli.base.places import as_path, shipped_dir
-from kerv_cli.engine.cost import FORMAT, READ_PHASES, Profile, Work, missing, prices, read_profile, work_of
+from kerv_cli.engine.cost import READ_PHASES, Profile, Work, missing, prices, read_profile, work_of
 from kerv_cli.lab.identity import batch_of
-from kerv_cli.lab.plan import Cell
 from kerv_cli.report.measures import MICRO, Row, decodes, measure
 from kerv_cli.report.summary import SPEEDS
-from kerv_cli.report.tables import StudyData, is_baseline, rows_of
-from kerv_cli.report.text import compared, interval, intervals
+from kerv_cli.report.tables import StudyData, rows_of
+from kerv_cli.report.text import compared, intervals
 
 ASSUMES = (
     "Speed against the baseline by the cost model: the recorded decodes at a profile's costs, as if the other machine "
@@ -66,7 +65,7 @@ def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfil
                 + (f", or take one of {', '.join(shipped)}" if shipped else "")
             )
         try:
-            profiles.append(NamedProfile(name, read_profile(path, FORMAT)))
+            profiles.append(NamedProfile(name, read_profile(path)))
         except CheckpointError as error:
             raise UsageError(f"on={name}: {error}") from error
     return profiles
@@ -100,9 +99,6 @@ def repriced_table(data: StudyData, profiles: Sequence[NamedProfile]) -> pd.Data
                     "on": named.name,
                     "machine": named.title,
                     "projected": bool(named.profile.about.get("projected")),
-                    "same": _same(
-                        named.profile.about, data.complete.get(reference, data.complete[label])[0], episodes[label]
-                    ),
                     **_speeds(values, ""),
                     **{name: values[name] for name in _TIMES},
                     **_speeds(measured, "measured_"),
@@ -112,13 +108,6 @@ def repriced_table(data: StudyData, profiles: Sequence[NamedProfile]) -> pd.Data
                 }
             )
     return pd.DataFrame(rows)
-
-
-def _same(about: Mapping[str, object], cell: Cell, episodes: pd.DataFrame) -> bool:
-    """Whether a profile is of the machine that these episodes ran on, and of the target of `cell`, the baseline's."""
-    here = {name: set(episodes[name]) for name in ("device_name", "dtype", "threads")}
-    here["target"] = {cell.settings["policy"]["target"]}
-    return not about.get("projected") and all({about.get(name)} == values for name, values in here.items())
 
 
 def _speeds(values: Row, prefix: str) -> dict[str, float]:
@@ -167,15 +156,8 @@ def _work(table: pa.Table, drafter: tuple[int, int] | None) -> tuple[Work, int]:
     columns = {name: flat.field(name).to_numpy(zero_copy_only=False) for name in (*_ROUND, "committed")}
     decode = np.repeat(np.arange(len(counts)), counts)
     size = int(np.bincount(decode, columns.pop("committed")).max())
-    phases = {
-        phase: np.nan_to_num(table[f"seconds.{phase}"].to_numpy())
-        if f"seconds.{phase}" in table.column_names
-        else np.zeros(len(counts))
-        for phase in READ_PHASES
-    }
-    looked_up = np.zeros(len(counts), bool)
-    if "similarity" in table.column_names:
-        looked_up = ~np.isnan(table["similarity"].to_numpy(zero_copy_only=False).astype(float))
+    phases = {phase: np.nan_to_num(table[f"seconds.{phase}"].to_numpy()) for phase in READ_PHASES}
+    looked_up = ~np.isnan(table["similarity"].to_numpy(zero_copy_only=False).astype(float))
     return work_of(columns, counts, phases, looked_up, size, drafter), size
 
 
@@ -214,13 +196,3 @@ def repriced_summary(table: pd.DataFrame) -> pd.DataFrame:
             for name, unit in SPEEDS.items():
                 cells[f"{head}: {unit}"] = compared(intervals(f"{prefix}{name}"), "1")(row)
     return pd.DataFrame(rows.values())
-
-
-def machine_columns(table: pd.DataFrame) -> dict[str, dict[str, str]]:
-    """Heading -> label -> speed per episode there: as measured where the study ran on that machine with that target,
-    else priced, marked `≈`."""
-    columns: dict[str, dict[str, str]] = {}
-    for row in rows_of(table):
-        text = interval(row, "measured_episode_speedup") if row["same"] else f"≈ {interval(row, 'episode_speedup')}"
-        columns.setdefault(f"per episode, {row['machine']}", {})[row["label"]] = "1" if is_baseline(row) else text
-    return columns

@@ -142,19 +142,6 @@ def ratio(
     return Estimate(value, value - reach, value + reach)
 
 
-def share(parts: np.ndarray, wholes: np.ndarray, strata: Sequence[str], clusters: Sequence[str]) -> Estimate:
-    """`ratio` of parts that are at most their wholes, with Wilson's 95 % interval for as many observations as would
-    give the ratio's variance. At most one per cluster: a few small parts say little of a large one to come."""
-    value, low, high = ratio(parts, wholes, strata, clusters)
-    seen = np.asarray(wholes) > 0
-    size = float(len(set(zip(np.asarray(strata)[seen], np.asarray(clusters)[seen], strict=True))))
-    reach = (high - low) / 2
-    if reach > 0:
-        size = min(size, value * (1 - value) * (_Z / reach) ** 2)
-    bounds = wilson(value * size, size)
-    return Estimate(value, bounds.low, bounds.high)
-
-
 def pairs_to_settle(counts: PairedCounts, margin: float) -> float:
     """About how many pairs would show non-inferiority at `margin`, if the four outcomes' rates stayed as they are: the
     least that bring the lower bound of `paired_difference` above -margin. Infinite where the difference itself lies

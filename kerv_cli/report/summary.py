@@ -33,12 +33,6 @@ APART = "*"
 SPEEDS = {"episode_speedup": "per episode", "speedup": "per step"}
 """Speed against the baseline -> its heading."""
 
-_MOTION = {
-    "steps_to_success": "control steps",
-    "path_m": "path, m",
-    "jerk": "jerk, m/s³",
-    "gripper_switches": "switches",
-}
 _SHARES = {
     "skip_rate": "skipped",
     "unverified_share": "unverified",
@@ -88,13 +82,6 @@ def _columns() -> list[Column]:
     ]
 
 
-def _motion_columns() -> Iterator[Column]:
-    yield Column("setting", lambda row: str(row["label"]))
-    for name, title in _MOTION.items():
-        yield Column(title, numbers(name))
-        yield Column(f"{title}: ratio", compared(intervals(f"{name}_ratio")))
-
-
 @dataclass(frozen=True)
 class SummaryTable:
     """A study's table for the terminal: its rows pooled over tasks, with all measures that fit; a narrow one wraps
@@ -117,10 +104,6 @@ class SummaryTable:
         if "ceiling" in frame:
             yield Text("ceiling: speed per step if every chunk were accepted whole at once")
         yield from (Text(reason) for reason in differences(rows_of(self.table, MICRO)))
-        motion = motion_frame(self.table)
-        if motion is not None and _width(motion) <= options.max_width:
-            yield Text("Successful episodes, and ratios over the pairs in which both succeeded", style="bold")
-            yield _printed(motion)
 
 
 def _printed(frame: pd.DataFrame) -> Table:
@@ -148,16 +131,10 @@ def _width(frame: pd.DataFrame) -> int:
 
 
 def _fitting(frame: pd.DataFrame, width: int) -> pd.DataFrame:
-    """The columns that fit into so many characters; where not all do, the shares of decodes stand in one."""
+    """The columns that fit into so many characters."""
     if _width(frame) <= width:
         return frame
-    names = [name for name in (*_SHARES.values(), "held") if name in frame]
-    shares = " / ".join(names) + " %"
-    if names:
-        together = frame[names].apply(lambda row: "/".join(text.removesuffix(" %") for text in row), axis=1)
-        frame.insert(list(frame.columns).index(names[0]), shares, together)
-        frame = frame.drop(columns=names)
-    spares = ("per step", shares, *_SPARE)
+    spares = ("per step", *_SHARES.values(), "held", *_SPARE)
     fitting = frame.drop(columns=list(spares), errors="ignore")
     for spare in spares:
         wider = frame[[name for name in frame.columns if name in fitting or name == spare]]
@@ -169,12 +146,6 @@ def summary_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame:
     """The rows of one averaging as text: 95 % intervals in brackets, `–` for missing values; columns that no row uses
     are left out."""
     return text_frame(rows_of(table, averaging), _columns())
-
-
-def motion_frame(table: pd.DataFrame) -> pd.DataFrame | None:
-    """The measures of `measures.MOTION` as text, each with its ratio to the baseline's; None where no row has them."""
-    rows = rows_of(table, MICRO)
-    return text_frame(rows, _motion_columns()) if any(is_number(row[key]) for row in rows for key in _MOTION) else None
 
 
 def not_in_turn(table: pd.DataFrame) -> list[str]:

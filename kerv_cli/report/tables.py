@@ -13,7 +13,6 @@ import numpy as np
 import pandas as pd
 
 from kerv_cli.base.files import write_text
-from kerv_cli.base.limits import is_formula
 from kerv_cli.base.provenance import PACKAGES
 from kerv_cli.base.settings import MODEL
 from kerv_cli.lab.identity import (
@@ -42,10 +41,6 @@ from kerv_cli.worlds import specs
 _MACHINE = ("executor", "workers", "device_name", "host")
 _CODE = ("git_commit", "engine", "code", "run")
 _STATUS_COLUMNS = (*_MACHINE, *(f"{name}_version" for name in PACKAGES), "python_version", *_CODE)
-
-
-_OLDER = {"engine": 1}
-"""Values of the entries that the status of an older cell lacks."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +187,7 @@ def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataF
         "baseline": data.references[label],
     }
     best = _ceiling(data, cells[0], episodes, averaging)
-    measures = {**measure(episodes, baseline, averaging), **best.columns()}
+    measures = {**measure(episodes, baseline, averaging), "ceiling": best.value}
     return [head, measures, *_origin(data, cells)]
 
 
@@ -233,7 +228,7 @@ def _origin(data: StudyData, cells: Sequence[Cell]) -> Sections:
         "stress": stress["kind"],
         "stress_level": stress["level"],
         **without(runtime, NOT_DETERMINING_RUNTIME),
-        **{key: _joined(status.get(key, _OLDER.get(key, "")) for status in statuses) for key in _STATUS_COLUMNS},
+        **{key: _joined(status.get(key, "") for status in statuses) for key in _STATUS_COLUMNS},
         "cell": ";".join(cell.id for cell in cells),
     }
     return [{"overrides": cells[0].overrides}, flatten(parts), weights, surroundings]
@@ -254,9 +249,7 @@ def values_of(table: pd.DataFrame, column: str) -> set[str]:
 
 
 def csv_text(table: pd.DataFrame) -> str:
-    """CSV with six significant digits; empty where a value does not exist, and an apostrophe before what a spreadsheet
-    would compute."""
-    table = table.map(lambda value: f"'{value}" if isinstance(value, str) and is_formula(value) else value)
+    """CSV with six significant digits; empty where a value does not exist."""
     return table.to_csv(index=False, float_format="%.6g", lineterminator="\n")
 
 

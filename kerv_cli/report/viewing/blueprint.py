@@ -10,13 +10,6 @@ from kerv_cli.report.viewing.token_outcomes import Chunks, acceptance, threshold
 STEP, TIME = "step", "time"
 """The timelines: control steps, and simulated time."""
 
-CELL_WIDTH, CELL_HEIGHT = 60.0, 26.0
-"""A token's cell in the picture of the current chunk, in scene units."""
-KEY_ROWS = 4
-"""Least number of rows of the picture's key."""
-KEY_WIDTH = 1.95
-"""Width of an entry of the key, in cells: `~ compensated` fits."""
-
 SIGNALS = {
     "variability": "K, kinematic variability",
     "metric": "F, boundary metric",
@@ -26,9 +19,6 @@ SIGNALS = {
 }
 """Optional attributes of DecodeRecord -> titles of their views."""
 
-
-LIMITS = {"metric": "F*", "similarity": "s_min"}
-"""Signal -> name of the limit that a decision compares it with."""
 
 Parts = list[rrb.View | rrb.Container]
 
@@ -47,15 +37,14 @@ def blueprint(record: EpisodeRecord, chunks: Chunks) -> rrb.Blueprint:
         _series("ms per decode", "decode/phases", top=1100 * max(decode.seconds for decode in record.decodes)),
         _series("Actions", "actions", "gripper"),
     ]
-    steps = len(chunks[0]) // record.space.dofs if chunks else 1
     if any(token.kind not in ("target", "scripted", "dropped") for chunk in chunks for token in chunk):
         lanes = "Decodes (shades alternate), mode, and what became of each token of the chunk"
         middle = rrb.Vertical(_states(lanes, "/decodes", "/mode", "/tokens/**"))
-        right = _current_decode(record, steps, always)
+        right = _current_decode(always)
     else:
         states = _states("Decodes and mode", "/decodes", "/mode")
         middle = rrb.Vertical(states, *always, row_shares=[1.4, 2.2, 2.2])
-        right = _current_decode(record, steps, [])
+        right = _current_decode([])
     return paused(rrb.Horizontal(left, middle, right, column_shares=[3, 5, 4]))
 
 
@@ -108,19 +97,9 @@ def _per_decode(record: EpisodeRecord) -> tuple[Parts, list[float]]:
     return views, [2.2]
 
 
-def _current_decode(record: EpisodeRecord, steps: int, below: Parts) -> rrb.Vertical:
-    """The chunk of `steps` control steps in cells, the decode as a table, and the views below them."""
-    wide = (record.space.dofs + 1.3 + 2 * KEY_WIDTH) * CELL_WIDTH
-    left, above = -0.75 * CELL_WIDTH, -0.8 * CELL_HEIGHT
-    high = (max(steps, KEY_ROWS) + 0.9) * CELL_HEIGHT
-    chunk = rrb.Spatial2DView(
-        origin="/chunk",
-        name="Current chunk: draft → target token",
-        background=[13, 16, 17],
-        visual_bounds=rrb.VisualBounds2D(x_range=[left, left + wide], y_range=[above, above + high]),
-    )
-    shares = [0.9 + 0.35 * max(steps, KEY_ROWS), 5.2, *(2.2 for _ in below)]
-    return rrb.Vertical(chunk, _document("decode/table", "Current decode"), *below, row_shares=shares)
+def _current_decode(below: Parts) -> rrb.Vertical:
+    """The decode as a table, and the views below it."""
+    return rrb.Vertical(_document("decode/table", "Current decode"), *below, row_shares=[5.2, *(2.2 for _ in below)])
 
 
 def _states(name: str, *contents: str) -> rrb.StateTimelineView:

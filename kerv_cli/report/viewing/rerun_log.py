@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,11 +21,6 @@ from rerun.error_utils import catch_and_log_exceptions
 from kerv_cli.base.registry import parts
 from kerv_cli.engine.record import PHASES, DecodeRecord, EpisodeRecord
 from kerv_cli.report.viewing.blueprint import (
-    CELL_HEIGHT,
-    CELL_WIDTH,
-    KEY_ROWS,
-    KEY_WIDTH,
-    LIMITS,
     SIGNALS,
     STEP,
     TIME,
@@ -48,7 +43,6 @@ _OTHER_COLORS = (0x0072B2FF, 0xA0522DFF, 0x4C9F70FF, 0xB07AA1FF)
 _DOF_COLORS = (0xE15759FF, 0x59A14FFF, 0x4E79A7FF, 0xB6992DFF, 0x9D7660FF, 0x86BCB6FF, 0xB07AA1FF)
 _PLACE_COLORS = (0xE15759FF, 0x59A14FFF, 0xF0E442FF)
 _OPEN, _CLOSED = np.array([86.0, 180.0, 233.0]), np.array([230.0, 120.0, 0.0])
-_CELL = np.array([CELL_WIDTH, CELL_HEIGHT])
 
 
 @dataclass(frozen=True)
@@ -62,7 +56,7 @@ class Entity:
 
 
 @catch_and_log_exceptions(strict=True)  # rerun would turn exceptions into warnings and missing views
-def encode(record: EpisodeRecord, method: str, limits: Mapping[str, float]) -> bytes:
+def encode(record: EpisodeRecord, method: str) -> bytes:
     """The .rrd file's bytes of an episode; arguments as `save_recording`."""
     recording = rr.RecordingStream("kerv_" + re.sub(r"\W+", "_", method, flags=re.ASCII))
     memory = recording.memory_recording()
@@ -73,7 +67,7 @@ def encode(record: EpisodeRecord, method: str, limits: Mapping[str, float]) -> b
     recording.send_property("episode", rr.AnyValues(**facts_of(record, method)))
     size = chunk_size(record.decodes, record.space.dofs)
     chunks = [outcomes_of(d, size, record.space.dofs) for d in record.decodes]
-    for entity in _entities(record, method, chunks, limits):
+    for entity in _entities(record, method, chunks):
         for archetype in entity.static:
             recording.log(entity.path, archetype, static=True)
         if entity.steps is not None and len(entity.steps):
@@ -87,7 +81,7 @@ def _times(steps: NDArray[np.int64], control_hz: float) -> list[rr.TimeColumn]:
     return [rr.TimeColumn(STEP, sequence=steps), rr.TimeColumn(TIME, duration=nanoseconds)]
 
 
-def _entities(record: EpisodeRecord, method: str, chunks: Chunks, limits: Mapping[str, float]) -> list[Entity]:
+def _entities(record: EpisodeRecord, method: str, chunks: Chunks) -> list[Entity]:
     starts = np.asarray(record.decode_steps, dtype=np.int64)
     names = record.space.names
     return [
@@ -98,9 +92,8 @@ def _entities(record: EpisodeRecord, method: str, chunks: Chunks, limits: Mappin
         _modes(record, starts),
         _boundaries(starts),
         *_token_lanes(chunks, starts, names),
-        *_current_chunk(chunks, starts, names),
         _tables(record, chunks, starts),
-        *_series_per_decode(record, starts, limits),
+        *_series_per_decode(record, starts),
     ]
 
 
@@ -222,42 +215,6 @@ def _part(name: str) -> str:
     return re.sub(r"\W", "_", name, flags=re.ASCII)
 
 
-def _current_chunk(chunks: Chunks, starts: NDArray[np.int64], names: Sequence[str]) -> list[Entity]:
-    """A picture of the chunk that is being executed: a coloured cell per token, rows are control steps."""
-    size, dofs = len(chunks[0]) if chunks else 0, len(names)
-    centres = np.array([[i % dofs + 0.5, i // dofs + 0.5] for i in range(size)]) * _CELL
-    colors = np.array([OUTCOMES[o.kind].color for chunk in chunks for o in chunk], dtype=np.uint32)
-    labels = [o.short for chunk in chunks for o in chunk]
-    heads = [((i + 0.5, -0.45), name) for i, name in enumerate(names)]
-    heads += [((-0.4, i + 0.5), f"step {i}") for i in range(size // dofs)]
-    used = [kind for kind in OUTCOMES if any(o.kind == kind for chunk in chunks for o in chunk)]
-    rows = max(size // dofs, KEY_ROWS)  # the key stands to the right, column by column
-    keys = np.array([[dofs + 1.3 + KEY_WIDTH * (i // rows), i % rows + 0.5] for i in range(len(used))]) * _CELL
-    cells = rr.LineStrips2D.columns(colors=colors).partition([size] * len(chunks))
-    texts = rr.Points2D.columns(labels=labels).partition([size] * len(chunks))
-    return [
-        Entity("chunk/cells", (_cells(centres),), starts, cells),
-        Entity("chunk/text", (_texts(centres),), starts, texts),
-        Entity("chunk/names", (_texts(np.array([at for at, _ in heads]) * _CELL, [name for _, name in heads]),)),
-        Entity("chunk/legend", (_cells(keys, [OUTCOMES[kind].color for kind in used], KEY_WIDTH - 0.12),)),
-        Entity("chunk/legend/text", (_texts(keys, [f"{OUTCOMES[kind].symbol} {kind}" for kind in used]),)),
-    ]
-
-
-def _cells(centres: NDArray[np.float64], colors: Sequence[int] | None = None, width: float = 0.96) -> rr.LineStrips2D:
-    """Filled, rounded cells at (n, 2) centres: thick short lines, since boxes are outlines. width: in cells."""
-    radius = 0.46 * _CELL[1]
-    reach = np.array([0.5 * width * _CELL[0] - radius, 0.0])
-    strips = np.stack([centres - reach, centres + reach], axis=1)
-    return rr.LineStrips2D(strips, radii=radius, colors=None if colors is None else np.array(colors, dtype=np.uint32))
-
-
-def _texts(centres: NDArray[np.float64], labels: Sequence[str] | None = None) -> rr.Points2D:
-    """Labels in the middle of (n, 2) centres; the viewer writes them below an invisible point."""
-    above = centres - [0.0, 0.2 * _CELL[1]]
-    return rr.Points2D(above, radii=0.0, colors=[255, 255, 255], labels=labels, show_labels=True, draw_order=40.0)
-
-
 def _tables(record: EpisodeRecord, chunks: Chunks, starts: NDArray[np.int64]) -> Entity:
     decodes = zip(record.decodes, record.decode_steps, chunks, strict=True)
     names = record.space.names
@@ -266,7 +223,7 @@ def _tables(record: EpisodeRecord, chunks: Chunks, starts: NDArray[np.int64]) ->
     return Entity("decode/table", (), starts, rr.TextDocument.columns(text=texts, media_type=kinds))
 
 
-def _series_per_decode(record: EpisodeRecord, starts: NDArray[np.int64], bounds: Mapping[str, float]) -> list[Entity]:
+def _series_per_decode(record: EpisodeRecord, starts: NDArray[np.int64]) -> list[Entity]:
     """Series of numbers per decode. A decode without a value has no row, and a series without rows has no entity."""
     decodes = record.decodes
     limits, limit_names = _thresholds(decodes, record.space.names)
@@ -289,11 +246,7 @@ def _series_per_decode(record: EpisodeRecord, starts: NDArray[np.int64], bounds:
     add("decode/phases", ["total", *phases], times, [0x8C99A6FF, *_DOF_COLORS, 0xB07AA1FF])
     for signal, name in SIGNALS.items():
         values = [getattr(d, signal) for d in decodes]
-        if signal in bounds:
-            both = [() if x is None else (x, bounds[signal]) for x in values]
-            add(f"signals/{signal}", [name, LIMITS[signal]], both, [0x56B4E9FF, 0xE69F00FF])
-        else:
-            add(f"signals/{signal}", [name], [() if x is None else (x,) for x in values], None)
+        add(f"signals/{signal}", [name], [() if x is None else (x,) for x in values], None)
     return entities
 
 

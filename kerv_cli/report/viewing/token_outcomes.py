@@ -42,14 +42,6 @@ class TokenOutcome:
     limit: int | None = None  # r of this token's DoF, in bins
     round: int | None = None  # which round of the decode decided
 
-    @property
-    def short(self) -> str:
-        """`draft → target token` where they differ, else one token, or the symbol without any; at most 9 characters."""
-        if self.draft is not None and self.target is not None and self.draft != self.target:
-            return f"{self.draft} → {self.target}"
-        token = next((x for x in (self.draft, self.target, self.token) if x is not None), None)
-        return OUTCOMES[self.kind].symbol if token is None else str(token)
-
 
 Chunks = Sequence[Sequence[TokenOutcome]]
 """Outcomes of the tokens of each decode's chunk."""
