@@ -47,8 +47,8 @@ format: setup ## rewrite the code in the project's style
 	@$(BIN)/ruff check --fix --quiet $(CODE)
 	@$(BIN)/ruff format $(CODE)
 
-pages: setup ## fill the figures of README.md, results/README.md and results/LOG.md from results/tables
-	@$(BIN)/python scripts/figures.py README.md results/README.md results/LOG.md
+pages: setup ## fill the figures of README.md and results/README.md from results/tables
+	@$(BIN)/python scripts/figures.py README.md results/README.md
 
 docs: setup ## build the pages as a site in build/site; a link that leads nowhere is an error
 	@$(BIN)/python -c 'import material' 2>/dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'

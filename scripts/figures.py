@@ -3,10 +3,6 @@
     <!-- table main: setting success speedup -->      becomes a table with these columns, a row per setting
     <!-- /table -->
     <!-- figure main one_pass speedup -->2.04 (1.97–2.11)<!-- /figure -->      one number within a sentence
-    <!-- errors prediction_mt10-vision -->           becomes a table of the predictors' errors by steps ahead
-    <!-- /errors -->
-    <!-- replay replay_main_vla-150m 16 -->         becomes a table of replayed decodes of N tokens
-    <!-- /replay -->
 
 A study's name is that of `results/tables/<study>.csv`. Behind it `macro` takes the average over difficulty groups
 instead of tasks, and `only=a,b` takes these settings, which are written with `_` for a space. A column `NAME@PROFILE`
@@ -25,8 +21,6 @@ from pathlib import Path
 TABLES = Path(__file__).resolve().parent.parent / "results" / "tables"
 _TABLE = re.compile(r"(<!-- table (\S+)((?: \S+)*?): ([^>]*?) -->\n)(.*?)(<!-- /table -->)", re.DOTALL)
 _FIGURE = re.compile(r"(<!-- figure (\S+)( macro)? (\S+) (\S+) -->)(.*?)(<!-- /figure -->)", re.DOTALL)
-_ERRORS = re.compile(r"(<!-- errors (\S+) -->\n)(.*?)(<!-- /errors -->)", re.DOTALL)
-_REPLAY = re.compile(r"(<!-- replay (\S+) (\d+) -->\n)(.*?)(<!-- /replay -->)", re.DOTALL)
 
 Row = Mapping[str, str]
 
@@ -78,12 +72,6 @@ def _lost_won(row: Row) -> str:
     return f"{row['only_baseline']} / {row['only_method']}, {'<0.001' if p < 0.001 else f'{p:.2g}'}"
 
 
-def _rate(row: Row) -> str:
-    """Decodes per second that the 95th percentile of the latency allows."""
-    latency = _number(row, "latency_p95_ms", ".6f")
-    return f"{1000 / float(latency):.0f}" if latency and float(latency) else ""
-
-
 def _again(row: Row) -> str:
     value, low, high = (_number(row, f"speedup{end}_again", ".2f") for end in ("", "_low", "_high"))
     return f"{value} ({low}–{high})"
@@ -96,35 +84,16 @@ COLUMNS: dict[str, tuple[str, Callable[[Row], str]]] = {
     "lost/won": ("lost / won, p", _own(_lost_won)),
     "difference": ("difference, points", _own(lambda row: _interval(row, "difference", "+.1f", 100, " to "))),
     "non-inferior": ("non-inferior", _own(lambda row: {"True": "yes", "False": "no"}.get(row["non_inferior"], ""))),
-    "pairs": ("pairs to settle", _own(lambda row: _number(row, "pairs_to_settle", ".0f").replace("inf", "∞"))),
     "speedup": ("speedup", lambda row: _ratio(row, "speedup")),
     "per-episode": ("per episode", lambda row: _ratio(row, "episode_speedup")),
-    "ceiling": ("ceiling", lambda row: _number(row, "ceiling", ".1f")),
-    "ms": ("ms per step", lambda row: _number(row, "time_per_step_ms", ".2f")),
-    "ms-episode": ("ms per episode", lambda row: _number(row, "time_per_episode_ms", ".0f")),
-    "p50": ("p50, ms", lambda row: _number(row, "latency_p50_ms", ".1f")),
     "p95": ("p95, ms", lambda row: _number(row, "latency_p95_ms", ".1f")),
-    "worst": ("worst, ms", lambda row: _number(row, "latency_worst_ms", ".0f")),
-    "rate": ("chunks per s at p95", _rate),
     "AL": ("AL", lambda row: _number(row, "AL", ".1f")),
     "steps": ("control steps to success", lambda row: _number(row, "steps_to_success", ".0f")),
-    "path": ("path, against AR", _own(lambda row: _interval(row, "path_m_ratio", ".2f"))),
     "forwards": ("forwards per step", lambda row: _number(row, "forwards_per_step", ".2f")),
-    "skipped": ("skipped", lambda row: _number(row, "skip_rate", ".0f", 100, " %")),
     "unverified": ("unverified", lambda row: _number(row, "unverified_share", ".0f", 100, " %")),
-    "compensated": ("compensated", lambda row: _number(row, "compensation_rate", ".0f", 100, " %")),
-    "retrieved": ("retrieved", lambda row: _number(row, "retrieval_share", ".0f", 100, " %")),
-    "deviation": ("deviation", lambda row: _number(row, "deviation", ".4f")),
-    # of an agreement table
-    "risk": ("realised risk", lambda row: _interval(row, "realised_risk", ".2f") if row.get("realised_risk") else ""),
-    "alarms": ("episodes with an alarm", lambda row: _number(row, "alarm_rate", ".0f", 100, " %")),
-    "to-alarm": ("audits to it", lambda row: _number(row, "audits_to_alarm", ".1f")),
     "felt": ("a decode takes, ms", lambda row: _number(row, "felt_latency_ms", ".0f")),
-    "felt-steps": ("control steps", lambda row: _number(row, "felt_latency_steps", ".1f")),
     "held": ("steps on a held action", lambda row: _number(row, "held_share", ".0f", 100, " %")),
     "again": ("again", _again),
-    "ratio": ("difference, %", lambda row: f"{100 * (float(row['ratio']) - 1):+.1f}"),
-    "overlap": ("intervals overlap", lambda row: {"True": "yes", "False": "no"}[row["overlap"]]),
 }
 
 
@@ -166,46 +135,6 @@ def figure(study: str, macro: bool, label: str, column: str) -> str:
     return _column(column, study)[1](found[0])
 
 
-def error_table(name: str) -> str:
-    """Mean errors by predictor and steps ahead, over all tasks and the DoFs in which some predictor differs from hold,
-    with their share of hold's."""
-    rows = table_of(name, macro=False)
-    dofs = {row["dof"] for row in rows if row["error"] != row["hold_error"]}
-    errors: dict[str, dict[str, list[float]]] = {}
-    for row in rows:
-        if row["dof"] in dofs:
-            errors.setdefault(row["predictor"], {}).setdefault(row["steps_ahead"], []).append(float(row["error"]))
-    means = {name: {step: sum(x) / len(x) for step, x in steps.items()} for name, steps in errors.items()}
-    lines = [["predictor", *(f"{step} ahead" for step in means["hold"])], ["---"] * (1 + len(means["hold"]))]
-    for predictor, steps in means.items():
-        shares = {step: f" ({100 * x / means['hold'][step]:.0f} %)" for step, x in steps.items() if predictor != "hold"}
-        lines.append([predictor, *(f"{x:.4f}{shares.get(step, '')}" for step, x in steps.items())])
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
-def _steps_per_decode(study: str) -> dict[str, float]:
-    """Control steps that a setting executes per decode, by label: a method that drops the rest of a chunk has fewer."""
-    return {row["label"]: float(row["steps"]) / float(row["decodes"]) for row in table_of(study, macro=False)}
-
-
-def replay_table(name: str, tokens: str) -> str:
-    """Decodes of whole chunks, N tokens, that `kerv bench replay` executed: a row per setting. A ratio per control step
-    is the one per decode times the setting's control steps per decode in the replayed study, relative to AR's."""
-    titles = ["setting", "forwards", "ms per decode", "per control step", "per decode", "cost model, per decode"]
-    lines = [titles, ["---"] * len(titles)]
-    for row in (row for row in table_of(name, macro=False) if row["tokens"] == tokens):
-        steps = _steps_per_decode(row["study"])
-        texts = []
-        for scale in (steps[row["label"]] / steps["ar"], 1.0):
-            value, low, high = (_number(row, end, ".2f", scale) for end in ("speedup", "low", "high"))
-            texts.append("1" if row["label"] == "ar" else f"{value} ({low}–{high})")
-        times = [_number(row, "forwards", ".2f"), _number(row, "seconds", ".1f", 1000)]
-        lines.append([row["label"], *times, *texts, _number(row, "model", ".2f")])
-    if len(lines) == 2:
-        raise BadReference(f"{name} has no decodes of {tokens} tokens")
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
 def filled(text: str) -> str:
     """A page with its tables and figures renewed.
 
@@ -213,8 +142,6 @@ def filled(text: str) -> str:
         BadReference: a table, setting or column that does not exist.
     """
     text = _TABLE.sub(lambda m: m[1] + markdown_table(m[2], m[3].split(), m[4].split()) + m[6], text)
-    text = _ERRORS.sub(lambda m: m[1] + error_table(m[2]) + m[4], text)
-    text = _REPLAY.sub(lambda m: m[1] + replay_table(m[2], m[3]) + m[5], text)
     return _FIGURE.sub(lambda m: m[1] + figure(m[2], bool(m[3]), m[4], m[5]) + m[7], text)
 
 

@@ -212,8 +212,6 @@ def test_the_help_shows_the_defaults_that_hold() -> None:
     shown = kerv("train", "drafter", "--help").stdout
     assert "  train.steps=4000 " in shown  # of conf/train/drafter.yaml
     assert "  runtime.device=auto " in shown
-    assert "  starts=all " in shown
-    assert "all | half: " in shown
 
 
 def test_a_sweep_without_a_study_lists_the_studies_with_their_sizes(tmp_path: Path) -> None:

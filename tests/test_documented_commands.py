@@ -8,9 +8,10 @@ import shlex
 from pathlib import Path
 
 import pytest
+from loaded import module_of
 from typer.testing import CliRunner
 
-from kerv_cli.base.config import groups
+from kerv_cli.base.config import conf_dir, groups
 from kerv_cli.cli.app import app
 from kerv_cli.lab.resolve import resolve
 
@@ -52,13 +53,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-def test_every_target_of_a_study_is_shipped_or_made_by_a_documented_command() -> None:
-    studies = "\n".join(path.read_text() for path in (ROOT / "conf/study").glob("*.yaml"))
-    shipped = {path.parent.name for path in (ROOT / "results/pretrained").glob("*/target")}
-    made = set(re.findall(r"\bname=(\S+)", "\n".join(commands())))
-    docs = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
-    for name in set(re.findall(r"policy\.target=([\w-]+)", studies)) - shipped - made:
-        assert f"`{name}`" in docs or f"artifacts/target/{name}" in docs, name
+def test_every_choice_that_a_page_a_preset_or_a_help_text_names_is_there() -> None:
+    known = groups()
+    del known["target"]  # in other commands a policy's name, or a family of policies
+    texts = {page.name: page.read_text(encoding="utf-8") for page in [*PAGES, *conf_dir().rglob("*.yaml")]}
+    made = set(re.findall(r"\bname=(\w+)", "\n".join(texts.values()))) | {"NAME", "S"}
+    plugins = "\n".join(path.read_text() for path in (ROOT / "tests/examples").rglob("*.py"))
+    texts["help"] = module_of(ROOT / "scripts/docs.py").reference()
+    choice = re.compile(rf"(?<![\w.])({'|'.join(known)})=([\w,.-]*\w)")
+    for place, text in texts.items():
+        for group, names in choice.findall(text):
+            for name in {*names.split(",")} - {*known[group]} - made:
+                shown = name.endswith(".yaml") and f"# {name}\n" in text
+                assert shown or f'add("{group}", "{name}"' in plugins, f"{place}: {group}={name}"
 
 
 def test_the_pages_show_commands() -> None:

@@ -11,7 +11,7 @@ import pytest
 from loaded import module_of
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = ("README.md", "results/README.md", "results/LOG.md")
+PAGES = ("README.md", "results/README.md")
 
 
 @pytest.fixture
@@ -62,29 +62,6 @@ def test_tables_and_figures_are_filled_and_stay_as_they_are_then(figures: Any) -
     assert "-->3.00 (2.00–4.00)<!--" in filled
     assert "old" not in filled
     assert figures.filled(filled) == filled
-
-
-def test_errors_are_averaged_over_the_dofs_that_differ(figures: Any, tmp_path: Path) -> None:
-    rows = (
-        "predictor,dof,steps_ahead,error,hold_error",
-        *("hold,dx,1,0.2,0.2", "hold,dy,1,0.4,0.4", "hold,grip,1,9,9"),
-        *("line,dx,1,0.1,0.2", "line,dy,1,0.2,0.4", "line,grip,1,9,9"),
-    )
-    (tmp_path / "errors.csv").write_text("\n".join(rows), encoding="utf-8")
-    filled = figures.filled("<!-- errors errors -->\n<!-- /errors -->")
-    assert "| hold | 0.3000 |\n| line | 0.1500 (50 %) |\n" in filled
-
-
-def test_replayed_decodes_of_one_length(figures: Any, tmp_path: Path) -> None:
-    head = "tokens,label,study,forwards,seconds,speedup,low,high,model"
-    rows = (head, "7,ar,played,7,0.2,1,1,1,1", "16,sd,played,2,0.05,4,3.5,4.5,3.9")
-    (tmp_path / "replay.csv").write_text("\n".join(rows), encoding="utf-8")
-    (tmp_path / "played.csv").write_text("label,steps,decodes\nar,40,10\nsd,40,20", encoding="utf-8")
-    filled = figures.filled("<!-- replay replay 16 -->\n<!-- /replay -->")
-    assert "| sd | 2.00 | 50.0 | 2.00 (1.75–2.25) | 4.00 (3.50–4.50) | 3.90 |\n" in filled
-    assert "| ar |" not in filled
-    with pytest.raises(figures.BadReference, match="no decodes of 5 tokens"):
-        figures.filled("<!-- replay replay 5 -->\n<!-- /replay -->")
 
 
 def test_only_some_settings(figures: Any) -> None:

@@ -15,7 +15,7 @@ from studies_synthetic import IDENTITY, settings_of, threshold_settings, thresho
 import kerv_cli
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.settings import RolloutSettings
-from kerv_cli.lab.code import _meaning, code_hash
+from kerv_cli.lab.code import code_hash
 from kerv_cli.lab.identity import ENGINE, hash_of, work_of
 from kerv_cli.lab.plan import (
     StudyPlan,
@@ -161,13 +161,6 @@ def test_the_code_below_the_commands_counts_and_nothing_else(tmp_path: Path, mon
     assert len({before, *computing}) == 4
 
 
-def test_docstrings_and_layout_do_not_make_other_code() -> None:
-    first = b'def f(x):\n    """Doubles."""\n    return 2*x\n'
-    assert _meaning(first) == _meaning(b"# doubles\ndef f( x ):\n\n    return (2 * x)\n")
-    assert _meaning(first) != _meaning(b"def f(x):\n    return 3 * x\n")
-    assert _meaning(first) != _meaning(b'def f(x):\n    return "Doubles."\n')
-
-
 def test_settings_may_have_weights_of_their_own() -> None:
     settings = {"a": settings_of("ar"), "b": settings_of("ar")}
     settings["b"].policy.target = "other"
@@ -198,11 +191,6 @@ def test_plan_file_holds_the_plan() -> None:
     text = plan_text(original)
     assert plan_from_text(text) == original
     json.dumps(original.cells[0].settings)  # plain values only
-
-
-def test_sweeps_that_share_the_tasks_end_in_one_plan() -> None:
-    merged = merge_plans(study_plan(["reach-v3"]), study_plan(["push-v3"]))
-    assert {c.id for c in merged.cells} == {c.id for c in study_plan(["reach-v3", "push-v3"]).cells}
 
 
 def test_a_plan_with_fewer_episodes_keeps_those_of_the_tasks_that_it_does_not_name() -> None:

@@ -180,7 +180,6 @@ DEMOS = "demonstrations, by name"
 TARGET_DEMOS = f"{DEMOS}; empty: those that the target was trained on"
 TRACKERS = ("none", "trackio", "wandb", "tensorboard")
 LOG = "where the curves are drawn while it trains"
-STARTS = "half: of every task, the episodes that begin on one side"
 FIRST_EPISODES = "per task, the first ones by seed; 0: all"
 
 
@@ -210,7 +209,7 @@ class RolloutSettings(MethodSettings, TaskSettings):
     """`kerv rollout`: episodes of one method."""
 
     # the method's parts are overridden by its file, so that it comes last
-    groups: ClassVar = {"policy": "vision", "world": "default", "runtime": "cpu", "cover": "all", "method": "ar"}
+    groups: ClassVar = {"policy": "vision", "world": "default", "runtime": "cpu", "method": "ar"}
 
     episodes: int = number(3, 1, 1_000_000, help="episodes per task")
     # in every setting: that is the pairing
@@ -423,9 +422,8 @@ class TrainDrafterSettings(DemonstrationSettings):
     """`kerv train drafter`: policy.target is imitated; policy.drafter, policy.early: name of the new one."""
 
     # drafter=early has optimisation settings of its own, so that it comes behind train
-    groups: ClassVar = {"policy": "vision", "cover": "all", "train": "drafter", "drafter": "eagle", "runtime": "auto"}
+    groups: ClassVar = {"policy": "vision", "train": "drafter", "drafter": "eagle", "runtime": "auto"}
 
-    starts: str = choice("all", "all", "half", help=STARTS)
     log: str = choice("none", *TRACKERS, help=LOG)
     drafter: Any = setting(chosen("drafter", "eagle"), "its shapes and loss: eagle, early, scout")
     train: TrainSettings = setting(TrainSettings, "optimisation")
@@ -527,11 +525,10 @@ class BuildDrafterSettings(RunSettings):
 class BuildDatastoreSettings(DemonstrationSettings):
     """`kerv build datastore` (docs/methods.md §4.1): policy.target gives the features and the tokens."""
 
-    groups: ClassVar = {"policy": "vision", "cover": "all", "runtime": "cpu"}
+    groups: ClassVar = {"policy": "vision", "runtime": "cpu"}
 
     name: str | None = setting(None, "default: datastore/ beside the target")
     episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)
-    starts: str = choice("all", "all", "half", help=STARTS)
     stride: int = number(1, 1, 10_000, help="every so many of an episode's observations become entries")
     half: bool = setting(False, "keys on disk in float16: half the size, for shipping")
     components: int = number(0, 0, 65_536, help="directions that keys are projected onto; 0: keys stay as they are")
@@ -569,7 +566,7 @@ class CalibrateSettings(DemonstrationSettings):
 
 @dataclass
 class CalibrateSuccessSettings(SweepSettings):
-    """`kerv calibrate success` (docs/methods.md §4.7): all words but these go to the study's settings."""
+    """`kerv calibrate success` (docs/methods.md §4.6): all words but these go to the study's settings."""
 
     groups: ClassVar = {"study": "certify"}
 

@@ -81,7 +81,7 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
         )
     composer = Composer("rollout", RolloutSettings)
     settings = {label: composer.compose([*common, *words]) for label, words in points.items()}
-    narrows = any(key.startswith("policy") for key in keys) and not keys & {"task", "cover"}  # to the policy named
+    narrows = any(key.startswith("policy") for key in keys) and "task" not in keys  # to the policy named
     _settle(settings.values(), settings[study.baseline], narrows)
     texts = {label: " ".join(words) for label, words in points.items()}
     return ResolvedStudy(sweep, settings, texts, tuple(of_settings))

@@ -11,7 +11,6 @@ from typing import Any, Generic, TypeVar
 
 from torch import nn
 
-from kerv_cli.base.config import groups
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import sha256_of
 from kerv_cli.base.manifests import check_files, read_file
@@ -279,7 +278,7 @@ class Artifacts:
         target, name = f"policy.target={self.policy.target}", getattr(self.policy, files.kind, None)
         if name is None or "/" in name:
             return "prepare", target
-        return *files.command, target, f"cover={name}" if name in groups()["cover"] else f"policy.{files.kind}={name}"
+        return *files.command, target, f"policy.{files.kind}={name}"
 
     def load(self, kind: str) -> Any:
         """The artifact, for the loaded target; one object per process.

@@ -1,4 +1,4 @@
-"""Issues the certificate of success from a study's paired episodes (docs/methods.md §4.7, ours)."""
+"""Issues the certificate of success from a study's paired episodes (docs/methods.md §4.6, ours)."""
 
 from __future__ import annotations
 

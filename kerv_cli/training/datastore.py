@@ -34,7 +34,7 @@ from kerv_cli.methods.heisd.datastore import (
     projected,
     prompt_key,
 )
-from kerv_cli.training.demonstrations import demos_for, subset
+from kerv_cli.training.demonstrations import demos_for
 from kerv_cli.training.imitation import WITHIN
 from kerv_cli.training.observations import observations_of, prompts_of, read_chunks, steps_of
 from kerv_cli.training.skip_levels import neighbours_elsewhere
@@ -94,7 +94,7 @@ class DatastoreBuild:
 
     def __init__(self, settings: BuildDatastoreSettings) -> None:
         settings, dataset = demos_for(settings)
-        self.settings, self.dataset = settings, subset(dataset, (), settings.starts)
+        self.settings, self.dataset = settings, dataset
         tasks = sorted(resolve_tasks(settings.task or list(self.dataset.manifest.tasks)))
         self.device, _ = set_up(settings.runtime)
         self.artifacts = Artifacts(settings.results, settings.policy, device=self.device, dtype=settings.runtime.dtype)

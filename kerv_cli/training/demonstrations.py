@@ -1,5 +1,4 @@
-"""The demonstrations that a command learns from: one dataset, or several that add up, of some of the tasks or of one
-side of the initial range."""
+"""The demonstrations that a command learns from: one dataset, or several that add up, of all tasks or some."""
 
 from __future__ import annotations
 
@@ -8,9 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
-
-from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.places import artifact, find_target, results_dir
 from kerv_cli.base.settings import DEFAULT_TASKS, DemonstrationSettings
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
@@ -21,7 +18,6 @@ from kerv_cli.worlds.demos.dataset import DemoDataset
 
 S = TypeVar("S", bound=DemonstrationSettings)
 """Settings of what is made for a target from demonstrations."""
-ALL, HALF = "all", "half"
 
 
 def name_of(tasks: Sequence[str]) -> str:
@@ -132,32 +128,14 @@ def seen_by(dataset: DemoDataset, camera: str, who: str, remedy: str) -> DemoDat
     raise CheckpointError(f"the demonstrations in {dataset.path} show camera {recorded}, {who} {camera}: {remedy}")
 
 
-def subset(dataset: DemoDataset, tasks: Sequence[str], starts: str) -> DemoDataset:
-    """The dataset with only the episodes of `tasks` (tasks and suites; none: all), and with starts=half only those that
-    begin on one side.
+def subset(dataset: DemoDataset, tasks: Sequence[str]) -> DemoDataset:
+    """Return the dataset with only the episodes of `tasks` (tasks and suites). No tasks: the whole dataset.
 
     Raises:
         UnknownName: no such task. CheckpointError: the dataset has none of a task.
     """
-    if not tasks and starts == ALL:
+    if not tasks:
         return dataset
-    names = resolve_tasks(tasks) if tasks else tuple(dataset.manifest.tasks)
+    names = resolve_tasks(tasks)
     check_tasks(dataset, names)
-    chosen = [index for index, entry in enumerate(dataset.episodes) if entry.task in names]
-    if starts == HALF:
-        chosen = _one_side(dataset, chosen)
-    return replace(dataset, episodes=[dataset.episodes[index] for index in chosen])
-
-
-def _one_side(dataset: DemoDataset, chosen: Sequence[int]) -> list[int]:
-    """The episodes in which the observation's first place, as a rule the object, begins at or below its median x over
-    the chosen episodes of the task."""
-    places = dataset.manifest.observation.places
-    if not places:
-        raise UsageError("starts=half: these demonstrations name no place that begins on one side")
-    begins = {index: float(dataset.load(index).states[0][places[0].first]) for index in chosen}
-    by_task: dict[str, list[float]] = {}
-    for index, x in begins.items():
-        by_task.setdefault(dataset.episodes[index].task, []).append(x)
-    medians = {task: float(np.median(values)) for task, values in by_task.items()}
-    return [index for index, x in begins.items() if x <= medians[dataset.episodes[index].task]]
+    return replace(dataset, episodes=[entry for entry in dataset.episodes if entry.task in names])

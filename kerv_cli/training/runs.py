@@ -321,7 +321,7 @@ class DrafterRun(Run):
         self.folder = self.artifact.path(settings.results, name, self.target_folder)
         check_not_shipped(self.folder, f"policy.{self.artifact.kind}")
         self.settings, dataset = demos_for(settings)
-        self.dataset = subset(dataset, self.settings.task, settings.starts)
+        self.dataset = subset(dataset, self.settings.task)
         self.description = read_target(self.target_folder)
         self.description.check_autoregressive(
             f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
@@ -355,11 +355,10 @@ class DrafterRun(Run):
         self.learnt = self.lesson(progress)
 
     def identity(self) -> dict[str, Any]:
-        """Shapes, the target's weights, tasks and starts."""
+        """Return the shapes, the target's weights and the tasks."""
         s = self.settings
         tasks = list(resolve_tasks(s.task)) if s.task else []
-        covering = {"task": tasks, "starts": s.starts}
-        return {"drafter": asdict(s.drafter), "target": self.description.sha256, **covering}
+        return {"drafter": asdict(s.drafter), "target": self.description.sha256, "task": tasks}
 
     def write(self, module: nn.Module, origin: dict[str, Any]) -> None:
         """Writes the drafter's folder."""

@@ -1,4 +1,4 @@
-"""Success, certified (docs/methods.md §4.7, ours): trusts drafts on the tasks that a certificate covers. Settings and
+"""Success, certified (docs/methods.md §4.6, ours): trusts drafts on the tasks that a certificate covers. Settings and
 registration."""
 
 from __future__ import annotations

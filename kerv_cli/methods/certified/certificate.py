@@ -1,4 +1,4 @@
-"""The certificate of success, and what deploys it (docs/methods.md §4.7, ours).
+"""The certificate of success, and what deploys it (docs/methods.md §4.6, ours).
 
 Decoders are put together for one task, so whether the certificate covers the task is decided there, once, and the parts
 that come of it are ordinary ones.

@@ -26,7 +26,7 @@ class DrafterSettings:
 @dataclass
 class DrafterProposerSettings:
     """EAGLE-style drafter (§2.2). The default is a greedy chain as deep as the chunk: on a CPU it beats a tree, because
-    relaxed acceptance accepts most of what siblings would catch, and every verified node costs time (study=tree)."""
+    relaxed acceptance accepts most of what siblings would catch, and every verified node costs time."""
 
     kind: str = "drafter"
     depth: int = number(15, 1, MOST_TOKENS)  # tokens
