@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from kerv_cli.bench import phases as measuring
 from kerv_cli.bench.ceilings import ceilings
 from kerv_cli.bench.machine import Machine
 from kerv_cli.bench.model import layer_weights, open_model
-from kerv_cli.bench.phases import Dummy, Laps, Phase, costs_of, decoders, flipped
+from kerv_cli.bench.phases import Laps, Phase, costs_of, decoders, flipped
 from kerv_cli.bench.profile import profile_of, projected, shares
 from kerv_cli.cli.app import app
 from kerv_cli.engine.cost import READ_PHASES, Profile, Work, prices, read_profile, work_of
@@ -124,13 +123,6 @@ def test_decodes_of_all_sizes_show_what_each_part_costs() -> None:
     assert {("draft", 14), ("draft", 3), ("feed", length), ("feed", 4)} <= shown
 
 
-def test_a_dummy_drafts_a_chain_and_puts_what_has_no_room_at_the_root() -> None:
-    chunk: Any = dataclasses.make_dataclass("Chunk", ["tokens"])([7])
-    tree = Dummy(5).propose(chunk, 3).tree
-    assert (tree.depths, tree.parents) == ((0, 1, 2, 0, 0), (-1, 0, 1, -1, -1))
-    assert Dummy(9, (4, 5, 6)).propose(chunk, 9).tree.tokens == (5, 6)
-
-
 def profile() -> Profile:
     """A prefill of 31 costs four tokens, as the shipped policy's does; every drafted row a hundredth."""
 
@@ -220,9 +212,6 @@ def test_the_command_ends_with_one_document(tmp_path: Path) -> None:
     ("words", "message"),
     [
         (["target=vla-15m"], "did you mean vla-150m"),
-        (["target=nano", "dtype=int4"], "dtype=int4: known are auto"),
-        (["repeats=1"], "repeats=1: from 3 to 100000"),
-        (["tokens=[1]"], "tokens=1: from 4 to 256"),
         (["tokens=[]"], "tokens=[]: name at least one N"),
         (["target=openvla-7b", "dtype=float32"], "GB are free on cpu"),
         (["projections.mine=[1]"], "GB/s and TFLOP/s"),

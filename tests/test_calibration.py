@@ -16,7 +16,7 @@ import torch
 from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
-from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
+from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import read_json, sha256_of, write_json
 from kerv_cli.base.places import find_target
 from kerv_cli.base.registry import find
@@ -128,7 +128,7 @@ def settings(results: Path, *overrides: str, target: str = "nano-state") -> Cali
 
 def test_windows_lie_where_they_should() -> None:
     episode = made_up_episode("reach-v3", 0)
-    past, future = episode_windows(episode, SPACE, "labels", 10, 4)
+    past, future = episode_windows(episode, SPACE, 10, 4)
     assert past.shape == (STEPS - 10, 10, 4)
     assert future.shape == (STEPS - 10, 4, 4)
     for i in (0, 7, STEPS - 11):
@@ -136,27 +136,20 @@ def test_windows_lie_where_they_should() -> None:
         np.testing.assert_allclose(future[i], episode.labels[i + 10 : i + 14], atol=1e-6)
 
 
-def test_windows_of_what_was_executed_look_forward_to_the_labels() -> None:
-    episode = made_up_episode("reach-v3", 1)
-    past, future = episode_windows(episode, SPACE, "executed", 10, 2)
-    np.testing.assert_allclose(past[3], episode.executed[3:13], atol=1e-6)
-    np.testing.assert_allclose(future[3], episode.labels[13:15], atol=1e-6)
-
-
 def test_windows_are_normalised_as_the_target_does() -> None:
     episode = made_up_episode("reach-v3", 0)
     narrow = dataclasses.replace(SPACE, low=(-0.5,) * 4, high=(0.5,) * 4)
-    past, _ = episode_windows(episode, narrow, "labels", 10, 4)
+    past, _ = episode_windows(episode, narrow, 10, 4)
     np.testing.assert_allclose(past[0], np.clip(2 * episode.labels[:10], -1, 1), atol=1e-6)
 
 
 def test_short_episodes_have_no_window_and_short_tails_are_refused() -> None:
     episode = made_up_episode("reach-v3", 0)
-    past, future = episode_windows(episode, SPACE, "labels", STEPS, 4)
+    past, future = episode_windows(episode, SPACE, STEPS, 4)
     assert past.shape == (0, STEPS, 4)
     assert future.shape == (0, 4, 4)
     with pytest.raises(CheckpointError, match="8 labels behind an episode's end, predictions of 10 steps need 9"):
-        episode_windows(episode, SPACE, "labels", 10, 10)
+        episode_windows(episode, SPACE, 10, 10)
 
 
 @pytest.mark.parametrize("ratio", [0.01, 1.0])
@@ -367,16 +360,12 @@ def test_a_missing_calibration_names_the_command(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("override", "kind", "says"),
     [
-        ("history=lables", UnknownName, "did you mean labels"),
         ("window=3", UsageError, "window=3"),
         ("decodes=-1", UsageError, "decodes=-1"),
         ("held_out=0", UsageError, "held_out=0"),
-        ("episodes=-2", UsageError, "episodes=-2"),
         ("epsilon=0", UsageError, "epsilon=0"),
-        ("confidence=0.4", UsageError, "confidence=0.4"),
         ("confidence=1", UsageError, "confidence=1"),
         ("boundary_windows=[2]", UsageError, "boundary_windows=2"),
-        ("fit_steps=5", UsageError, "the target's chunk of 4"),
         ("proposer=none", UsageError, "drafts nothing to compare"),
         ("task=push", CheckpointError, "no episode of push-v3"),
         ("demos=absent", CheckpointError, "kerv demos"),
@@ -413,6 +402,5 @@ def test_the_command_prints_what_it_found(results: Path) -> None:
     assert "s_min" not in done.output
     assert (results / "artifacts/calibration/without/calibration.json").is_file()
     assert "tested on 4" in CliRunner().invoke(app, [*common, "--plan"]).output
-    assert "history: labels" in CliRunner().invoke(app, [*common, "--cfg"]).output
-    refused = CliRunner().invoke(app, [*common, "history=none"])
+    refused = CliRunner().invoke(app, [*common, "window=none"])
     assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)

@@ -113,7 +113,7 @@ def test_doctor_checks_a_policy_on_disk(policies: Path) -> None:
 def test_insertion_keeps_the_protocol() -> None:
     found = check_environment(INSERTION, 100_000)
     assert failures(found) == {}
-    assert len(found) == 8
+    assert len(found) == 5
 
 
 class Noisy(InsertionWorld):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -63,24 +61,3 @@ def test_an_episode_runs_and_is_recorded(spec: EnvironmentSpec, tmp_path: Path) 
 def test_an_environment_may_have_no_experts(spec: EnvironmentSpec) -> None:
     with pytest.raises(UsageError, match="point-mass has no scripted experts"):
         dataclasses.replace(spec, expert_class="").expert("push-point")
-
-
-@pytest.mark.parametrize(
-    ("plugin", "suite", "tasks"),
-    [
-        ("examples.point_mass", "POINT", "push-point"),
-        ("examples.insertion", "INSERTION", "insert-peg fetch-peg"),
-    ],
-)
-def test_a_plugin_is_named_by_an_environment_variable(plugin: str, suite: str, tasks: str) -> None:
-    code = f"from kerv_cli.worlds import resolve_tasks; print(*resolve_tasks(['{suite}']))"
-    paths = os.pathsep.join([str(TESTS), str(TESTS.parent), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "KERV_PLUGINS": plugin, "PYTHONPATH": paths}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
-    assert (done.stdout, done.stderr) == (f"{tasks}\n", "")
-
-
-def test_rollouts_do_not_need_rerun() -> None:
-    modules = "kerv_cli.lab.run, kerv_cli.lab.expert"
-    code = f"import sys, {modules}; sys.exit('rerun' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

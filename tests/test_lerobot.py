@@ -18,7 +18,6 @@ from typer.testing import CliRunner
 from kerv_cli.base.settings import CameraSettings
 from kerv_cli.cli.app import app
 from kerv_cli.worlds.demos.dataset import DemoDataset
-from kerv_cli.worlds.demos.lerobot.reading import _groups
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 
 SIZE = 56
@@ -130,15 +129,12 @@ def edited(results: Path, tmp_path: Path, **changes: Any) -> Path:
     ("changes", "words", "said"),
     [
         ({}, [], "source=DIR: name the folder"),
-        ({}, ["source=/nowhere"], "/nowhere/meta/info.json is missing"),
         ({"codebase_version": "v2.1"}, ["SOURCE"], "is of version v2.1, v3.x is read"),
         ({"features": {"action": {"dtype": "float32", "shape": [7]}}}, ["SOURCE"], "has no images or no action"),
         ({}, ["SOURCE", "camera=side"], "unknown camera 'side': known: front"),
         ({}, ["SOURCE", "strict=[jaw]"], "unknown strict DoF 'jaw'"),
         ({}, ["SOURCE", "dofs=six"], "unknown dofs 'six': known: own, openvla"),
-        ({}, ["SOURCE", "format=hdf5"], "unknown format 'hdf5': known: lerobot"),
         ({}, ["SOURCE", "name=pegs", "RESULTS"], "exists: give the new demonstrations another name"),
-        ({}, ["SOURCE", "tail=-1"], "tail=-1"),
     ],
 )
 def test_an_import_refuses_in_one_line(
@@ -159,22 +155,6 @@ def test_a_truncated_table_is_refused(results: Path, tmp_path: Path) -> None:
     code, line = kerv("demos", "import", f"source={source}", f"results={tmp_path}")
     assert code == 1
     assert "file-000.parquet is missing or damaged" in line
-
-
-def test_without_its_episodes_or_with_a_folder_for_a_file_it_is_refused(results: Path, tmp_path: Path) -> None:
-    import_it = ["demos", "import", f"source={tmp_path}/set", "name=bad", f"results={tmp_path}"]
-    for name in ("meta/episodes", "meta/tasks.parquet", "meta/info.json", "data/chunk-000/file-000.parquet"):
-        shutil.rmtree(tmp_path / "set", ignore_errors=True)
-        shutil.copytree(results / "lerobot/pegs", tmp_path / "set")
-        path = tmp_path / "set" / name
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
-        for _ in range(2):  # missing, then a folder
-            code, text = kerv(*import_it)
-            assert code == 1, text
-            assert "internal error" not in text
-            assert str(tmp_path / "set") in text
-            path.mkdir(exist_ok=True)
-    assert list((tmp_path / "artifacts/demos").glob("*")) == []
 
 
 def test_a_dataset_with_videos_is_read(results: Path, tmp_path: Path) -> None:
@@ -215,10 +195,3 @@ def test_a_dataset_with_videos_is_read(results: Path, tmp_path: Path) -> None:
     code, line = kerv("demos", "import", f"source={source}", "name=cut", f"results={tmp_path}")
     assert code == 1
     assert "file-000.mp4 is missing or damaged" in line
-
-
-def test_groups_of_dofs() -> None:
-    names = ["a", "b", "left_gripper", "c", "right_gripper"]
-    found = _groups(names, ["left_gripper", "right_gripper"])
-    assert [group.size for group in found] == [2, 1, 1, 1]
-    assert len({group.name for group in found}) == 4

@@ -16,7 +16,6 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import check_label, check_settings
 from kerv_cli.base.places import artifact, find_target, results_dir
 from kerv_cli.base.registry import SETTINGS_GROUPS, parts
-from kerv_cli.lab.resolve import resolve
 from kerv_cli.methods.kinematics.prediction import MINIMUM
 
 SCHEMAS = {name.replace(" ", "_"): part.settings for name, part in parts("command").items()}
@@ -45,8 +44,6 @@ def test_every_number_has_limits_and_its_default_lies_within_them() -> None:
 
 WRONG = [
     ("rollout", "task={a:1}", "task="),
-    ("rollout", "task=[[reach]]", "task="),
-    ("rollout", "task=glob(*)", "task="),
     ("rollout", "=1", "'=1' is not an override"),
     ("rollout", "~method", "'~method' is not an override"),
     ("rollout", "+foo=1", "unknown key 'foo'"),
@@ -54,10 +51,8 @@ WRONG = [
     ("rollout", "runtime.threads=99999", "runtime.threads=99999: from 1 to 256"),
     ("rollout", "runtime.dtype=float64", "unknown runtime.dtype 'float64'"),
     ("rollout", "world.camera.fovy=nan", "world.camera.fovy=nan: above 0, at most 179"),
-    ("rollout", "record=-7", "record=-7"),
     ("rollout", "policy.others={a:[1]}", "policy.others="),
     ("train_target", "train.steps=0", "train.steps=0: from 1 to"),
-    ("train_target", "train.batch=0", "train.batch=0"),
     ("train_target", "target.width=33", "target.width=33 must be a multiple of 2 x target.heads=6"),
     ("train_target", "target.image_size=90", "target.image_size=90 must be a multiple of 8 x target.grid=4"),
     ("sweep", "study.block=0", "study.block=0"),
@@ -85,14 +80,10 @@ def test_a_parts_numbers_have_ranges_too(override: str) -> None:
     [
         "seed=range(0,100000000)",
         "seed=range(0,200) record=range(0,200)",
-        "seed=shuffle(range(0,100000000))",
         "seed=range(0,10,0)",
         "seed=range(0,inf)",
-        "seed=interval(0,1)",
         "seed=glob(*)",
-        "study.common=\\",
         "seed='1",
-        "seed=range(0,5,-1)",
     ],
 )
 def test_a_grid_is_counted_before_it_is_expanded(grid: str) -> None:
@@ -106,12 +97,6 @@ def test_a_grid_is_counted_before_it_is_expanded(grid: str) -> None:
 def test_a_grid_as_large_as_allowed_is_expanded() -> None:
     assert len(expand(f"seed=range(0,{MOST_POINTS})")) == MOST_POINTS
     assert expand("seed=range(3,0,-1)") == [["seed=3"], ["seed=2"], ["seed=1"]]
-
-
-@pytest.mark.parametrize("word", ["study.common=\\\\", "study.settings={a:'seed=range(0,1e9)'}"])
-def test_a_study_that_cannot_be_read_is_refused(word: str) -> None:
-    with pytest.raises(UsageError):
-        resolve([word])
 
 
 @pytest.mark.parametrize("name", ["..", ".", "", ".hidden", "a b", "a\0b", "n" * 300, "n" * 300 + "/x", "/a\0b"])

@@ -13,9 +13,8 @@ from kerv_cli.base.settings import RolloutSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.lab.policy import check
 from kerv_cli.worlds.demos.recording import DemoConfig, _identity
-from kerv_cli.worlds.metaworld.experts import OURS, VERSION, HandlePullSide
+from kerv_cli.worlds.metaworld.experts import VERSION, HandlePullSide
 from kerv_cli.worlds.metaworld.spec import SPEC
-from kerv_cli.worlds.metaworld.world import MetaWorldExpert
 from kerv_cli.worlds.spec import World
 
 NAME = "handle-pull-side-v3"
@@ -67,13 +66,6 @@ def slip(world: World, seed: int) -> Observation:
     return observation
 
 
-def test_the_environment_asks_for_ours() -> None:
-    assert set(OURS) <= set(SPEC.tasks)
-    for name, expert in OURS.items():
-        assert type(MetaWorldExpert(SPEC, name)._policy) is expert
-    assert "handle_pull_v3" in type(MetaWorldExpert(SPEC, "handle-pull")._policy).__module__
-
-
 def test_the_handle_is_pulled_sooner_than_by_metaworlds_expert(world: World) -> None:
     for seed in SEEDS:
         ours, pressed = solve(world, world.reset(seed), SPEC.expert(NAME))
@@ -90,13 +82,6 @@ def test_after_a_slip_it_grips_again_instead_of_pressing(world: World) -> None:
     steps, pressed = solve(world, slip(world, SEEDS[0]), metaworlds(NAME))
     assert steps > 200
     assert pressed > 0.04
-
-
-def test_an_action_depends_on_the_state_alone(world: World) -> None:
-    observation = slip(world, SEEDS[1])
-    used, fresh = SPEC.expert(NAME), SPEC.expert(NAME)
-    used(world.reset(SEEDS[0]))
-    assert (used(observation) == fresh(observation)).all()
 
 
 def test_the_peg_is_carried_without_being_dragged() -> None:

@@ -20,7 +20,7 @@ from test_decoding_lossless import assert_adds_up, plain_greedy, random_prompt, 
 from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
-from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.settings import RolloutSettings, TrainDrafterSettings, settings_from
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
@@ -91,18 +91,6 @@ def test_it_is_lossless_wherever_it_drafts(
         assert_adds_up(result)
 
 
-def test_the_table_holds_what_most_often_followed() -> None:
-    space = SPEC.actions
-    episodes = [
-        np.array([[7, 1, 2, 0], [9, 1, 3, 0], [7, 1, 2, 0], [9, 1, 5, 0]]),
-        np.array([[7, 8, 2, 0], [8, 8, 3, 0]]),
-    ]
-    follows = FollowTable.fit(episodes, space).follows
-    assert [int(follows[0, t]) for t in (7, 9, 8)] == [9, 7, 8]
-    assert [int(follows[2, t]) for t in (2, 3, 5)] == [3, 2, 5]
-    assert int(follows[1, 200]) == 200
-
-
 def test_a_perfect_table_drafts_the_whole_chunk_in_one_forward() -> None:
     target = MockTarget(SEVEN, chunk=2)
     prompt = torch.randn(1, 5, target.width, generator=torch.Generator().manual_seed(3)).double()
@@ -146,40 +134,10 @@ def test_every_place_loads_its_weights_once_and_decodes_ars_tokens(
     assert any(r.proposer == "follow" or r.proposer == "merged" for r in record.rounds)
 
 
-def damage(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[:-9])
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        (lambda folder: shutil.rmtree(folder), "no table in"),
-        (lambda folder: damage(folder / "model.safetensors"), "does not match its description"),
-        (lambda folder: damage(folder / "follow.json"), "cannot be read as JSON"),
-    ],
-)
-def test_what_is_missing_or_damaged_gets_one_line(results: Path, change: Any, says: str) -> None:
-    change(results / "artifacts/follow/mine")
-    with pytest.raises(CheckpointError, match=says) as refused:
-        files_of(settings_of(results)).check(["follow"])
-    assert "\n" not in str(refused.value)
-
-
 def test_its_weights_are_a_run_of_the_results_folder(results: Path) -> None:
     (run,) = matching(find_runs(results), {"kind": "follow"})
     assert (run.id, run.state, run.is_training) == ("follow/mine", "complete", True)
     assert set(run.made_from) == {"target"}
-
-
-def test_a_table_of_another_target_or_action_space_is_refused(results: Path) -> None:
-    files = files_of(settings_of(results, "policy.target=nano-vision"))
-    with pytest.raises(CheckpointError, match="was trained for target"):
-        files.check(["follow"])
-    own = files_of(settings_of(results)).description
-    other = dataclasses.replace(own, actions=dataclasses.replace(own.actions, control_hz=3.0))
-    FollowArtifact().save(results / "artifacts/follow/slow", FollowTable(4, 255), MadeFor.of(other), {})
-    with pytest.raises(CheckpointError, match="control_hz 3"):
-        files_of(settings_of(results, name="slow")).check(["follow"])
 
 
 def test_it_is_trained_from_the_command_line_and_drafts_in_a_rollout(results: Path) -> None:

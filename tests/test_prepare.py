@@ -214,9 +214,3 @@ def test_prepare_refuses_what_cannot_be(words: list[str], says: str) -> None:
 @pytest.mark.parametrize("command", ["prepare", "build datastore", "calibrate", "train drafter", "rollout", "serve"])
 def test_a_wrong_target_is_noticed_before_anything_else(command: str) -> None:
     assert "no target 'min'" in kerv(*command.split(), "policy.target=min", code=2)
-
-
-def test_a_plan_to_record_refuses_what_cannot_be_recorded() -> None:
-    line = ("demos", "task=reach", "name=visited", "--plan")
-    assert "no target 'min'" in kerv(*line, "policy=vision", "policy.target=min", code=2)
-    assert "100 episodes" in kerv(*line, "policy=vision", "episodes=100")

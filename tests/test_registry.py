@@ -62,21 +62,6 @@ def test_a_name_belongs_to_one_piece_of_code(shelf: dict[str, dict[str, Part]]) 
     assert list(parts("proposer"))[-1] == "mine"  # in the order of registration
 
 
-@pytest.mark.parametrize(
-    ("part", "says"),
-    [
-        (Part("propser", "mine", "one:build"), "unknown kind of part 'propser': did you mean proposer"),
-        (Part("proposer", "mine", "one:build"), "proposer 'mine' lacks the trait when"),
-        (Part("threshold", "mine", "one:build", traits={"when": PREFILL}), "unknown trait when: this kind has none"),
-        (Part("threshold", "mine", "one:build", settings=int), "its settings int must be a dataclass with a"),
-    ],
-)
-def test_a_part_that_is_not_of_its_kind_is_refused(shelf: dict[str, dict[str, Part]], part: Part, says: str) -> None:
-    with pytest.raises(UsageError, match=says):
-        register(part)
-    assert part.name not in shelf.get(part.kind, {})
-
-
 def test_an_unknown_name_lists_the_near_ones() -> None:
     with pytest.raises(UnknownName, match="unknown acceptance 'relaxd': did you mean relaxed"):
         find("acceptance", "relaxd")

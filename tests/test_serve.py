@@ -337,19 +337,6 @@ def test_a_client_that_says_nothing_loses_its_seat(policy: Policy) -> None:
             first.infer(seen(0))
 
 
-def test_a_newer_client_takes_the_seat_where_that_is_set(policy: Policy) -> None:
-    with serving(policy, takeover=True) as (port, log):
-        lost = silent(port)
-        until(lambda: any("connected" in line for line in log))  # a handshake ends before its seat is taken
-        first = Client(port)
-        second = Client(port)
-        assert second.infer(seen(0))["actions"].shape == (4, 4)
-        with pytest.raises(ConnectionClosed, match="a newer client took the seat"):
-            first.infer(seen(0))
-        until(lambda: sum("disconnected" in line for line in log) == 2)
-        lost.close()
-
-
 def test_two_hundred_quick_reconnects_are_all_served(policy: Policy) -> None:
     with serving(policy) as (port, log):
         for _ in range(200):

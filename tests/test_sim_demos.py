@@ -1,7 +1,6 @@
 """Recorded demonstrations on real Meta-World: contents, resuming, refusals, damage."""
 
 import hashlib
-import itertools
 import json
 import shutil
 from dataclasses import replace
@@ -75,23 +74,6 @@ def test_an_episode_can_be_replayed_from_its_seed(recorded, index):
     assert np.asarray(episode.frames).tobytes() == np.stack(frames).tobytes()
 
 
-def test_an_episodes_arrays_fit_together(recorded):
-    dataset = DemoDataset.open(recorded)
-    assert [(entry.task, entry.seed) for entry in dataset.episodes] == [("reach-v3", seed) for seed in range(6)]
-    assert [entry.perturbed for entry in dataset.episodes] == [False, True] * 3
-    for index, entry in enumerate(dataset.episodes):
-        episode = dataset.load(index)
-        assert (episode.task, episode.seed, episode.steps) == (entry.task, entry.seed, entry.steps)
-        assert episode.frame_steps.tolist() == list(range(0, episode.steps, 10))
-        assert episode.frames.shape == (len(episode.frame_steps), 24, 24, 3)
-        assert episode.states.shape == (episode.steps, 39)
-        assert episode.labels.shape == (episode.steps + 5, 4)
-        assert episode.executed.shape == (episode.steps, 4)
-        assert episode.end_effector.shape == (episode.steps, 3)
-        assert np.abs(episode.labels).max() <= 1.0
-        assert np.abs(episode.executed).max() <= 1.0
-
-
 def test_noise_moves_the_hand_and_never_the_gripper(recorded):
     dataset = DemoDataset.open(recorded)
     for index, entry in enumerate(dataset.episodes):
@@ -100,19 +82,6 @@ def test_noise_moves_the_hand_and_never_the_gripper(recorded):
         assert difference[:, 3].max() == 0.0
         assert (difference[:, :3].mean() > 0.05) == entry.perturbed
         assert (difference.max() > 0.0) == entry.perturbed
-
-
-def test_the_manifest_tells_what_was_recorded(recorded):
-    manifest = DemoDataset.open(recorded).manifest
-    assert manifest.environment == "metaworld"
-    assert (manifest.actions, manifest.observation) == (SPEC.actions, SPEC.observation)
-    assert manifest.config["tasks"] == ["reach-v3"]
-    assert (manifest.config["camera"]["name"], manifest.config["horizon"]) == ("corner4", 500)
-    assert manifest.seeds == {"first": 0, "last": 5}
-    assert (manifest.episodes, manifest.missing) == (6, 0)
-    assert set(manifest.versions) == {"metaworld", "mujoco", "numpy", "python"}
-    task = manifest.tasks["reach-v3"]
-    assert task.mean_steps == pytest.approx(np.mean([entry.steps for entry in task.episodes]), abs=0.01)
 
 
 @pytest.mark.bits
@@ -172,29 +141,14 @@ def test_an_expert_that_never_succeeds_ends_the_recording(tmp_path):
     ("change", "message"),
     [
         ({"first_seed": 49_998}, "seed 50003 is for selection"),
-        ({"first_seed": 100_000}, "seed 100000 is for evaluation"),
-        ({"first_seed": -1}, "seed -1"),
         ({"tasks": ("reach", "insert-peg")}, "cannot be mixed"),
         ({"camera": CameraSettings("front")}, "unknown camera"),
-        ({"tasks": ()}, "at least one task"),
-        ({"episodes": 0}, "episodes"),
-        ({"perturbed": 1.5}, "perturbed"),
-        ({"noise_low": 0.7}, "noise_low"),
-        ({"burst_probability": -0.1}, "burst_probability"),
-        ({"frame_stride": 0}, "frame_stride"),
-        ({"tail": 500}, "tail"),
-        ({"workers": 0}, "workers"),
         ({"horizon": 501}, "horizon"),
     ],
 )
 def test_impossible_settings_are_refused(change, message):
     with pytest.raises(UsageError, match=message):
         replace(CONFIG, **change)
-
-
-def test_no_seed_beyond_the_training_range_is_ever_tried():
-    assert replace(CONFIG, first_seed=49_990).seed_limit == 50_000
-    assert CONFIG.seed_limit == 2 * 6 + 20
 
 
 def test_damage_is_found(copied, tmp_path):
@@ -215,33 +169,10 @@ def test_damage_is_found(copied, tmp_path):
     (copied / "manifest.json").write_text(json.dumps(manifest))
     with pytest.raises(CheckpointError, match="hash does not fit"):
         DemoDataset.open(copied)
-    manifest["tasks"]["reach-v3"]["episodes"][0]["steps"] = "many"
-    (copied / "manifest.json").write_text(json.dumps(manifest))
-    with pytest.raises(CheckpointError, match=r"damaged: tasks\.reach-v3\.episodes\.0\.steps"):
-        DemoDataset.open(copied)
-    for text in ("{}", "[]", "{", '{"format": 1, "tasks": 3}'):
+    for text in ("{}", "{", '{"format": 2, "tasks": 3}'):
         (copied / "manifest.json").write_text(text)
         with pytest.raises(CheckpointError, match="manifest"):
             DemoDataset.open(copied)
-
-
-def as_format_1(folder):
-    """Rewrites a dataset's JSON as it was before environments had names."""
-    for name in ("manifest.json", "recording.json"):
-        value = json.loads((folder / name).read_text())
-        for key in ("environment", "actions", "observation"):
-            del value[key]
-        (folder / name).write_text(json.dumps({**value, "format": 1}))
-
-
-def test_a_dataset_of_experts_with_several_ways_is_read_and_not_gone_on_with(copied):
-    for name in ("manifest.json", "recording.json"):
-        value = json.loads((copied / name).read_text())
-        value["config"]["ways"] = ["left", "right"]
-        (copied / name).write_text(json.dumps(value))
-    assert DemoDataset.open(copied).load(0).steps
-    with pytest.raises(UsageError, match=r"ways=\['left', 'right'\], not None: give these another name="):
-        record(CONFIG, copied)
 
 
 @pytest.mark.bits
@@ -257,18 +188,3 @@ def test_noisy_episodes_are_spread_evenly(fraction):
     noisy = [is_perturbed(seed, fraction) for seed in range(1000)]
     assert sum(noisy) == pytest.approx(1000 * fraction, abs=1)
     assert all(abs(sum(noisy[start : start + 10]) - 10 * fraction) <= 1 for start in range(990))
-
-
-def test_bursts_last_three_to_eight_steps_in_one_direction():
-    perturb = Perturbation("reach-v3", 7, SPEC.actions, (0.2, 0.6), burst_probability=0.1)
-    executed = [perturb(np.array([0.1, 0.2, 0.3, 0.5])) for _ in range(3000)]
-    runs = [1]
-    for last, now in itertools.pairwise(executed):
-        if np.array_equal(last, now):
-            runs[-1] += 1
-        else:
-            runs.append(1)
-    lengths = {run for run in runs if run > 1}
-    assert lengths == {3, 4, 5, 6, 7, 8}
-    assert 0.2 <= perturb.sigma <= 0.6
-    assert all(action[3] == 0.5 for action in executed)

@@ -4,7 +4,6 @@ import os
 import pickle
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -155,16 +154,6 @@ def test_the_first_frame_shows_the_poses_of_this_episode(world):
     assert np.abs(world.frame().astype(int) - at_reset).mean() < 0.5
 
 
-def test_other_views_get_their_own_camera(world):
-    world.reset(0)
-    usual = world.frame()
-    hand = world.frame(CameraSettings("gripperPOV", size=40, supersample=1))
-    wide = world.frame(CameraSettings(fovy=60.0))
-    assert hand.shape == (40, 40, 3)
-    assert np.abs(wide.astype(int) - usual).mean() > 5
-    assert world.frame().tobytes() == usual.tobytes()
-
-
 def test_images_are_drawn_only_for_the_cameras_asked_for(world):
     world.reset(0)
     seen = world.observe(["corner4", "gripperPOV"])
@@ -177,21 +166,6 @@ def test_images_are_drawn_only_for_the_cameras_asked_for(world):
         world.observe(["front"])
 
 
-def test_impossible_views_are_refused():
-    wrong_name = CameraSettings("corner44")
-    with pytest.raises(UnknownName, match="corner4"):
-        SPEC.open_world(TASK, wrong_name)
-    for wrong in ({"fovy": 0.0}, {"fovy": 180.0}, {"size": 0}, {"supersample": 17}):
-        with pytest.raises(UsageError, match="camera"):
-            SPEC.open_world(TASK, CameraSettings(**wrong))
-
-
-def test_every_model_has_the_cameras(world):
-    world.reset(0)
-    model = world._env.model
-    assert {model.camera(index).name for index in range(model.ncam)} == set(SPEC.cameras)
-
-
 def test_supersampling_is_a_rounded_box_mean(world):
     pixels = np.random.default_rng(0).integers(0, 256, (12, 18, 3), dtype=np.uint8)
     for factor in (1, 2, 3):
@@ -201,18 +175,6 @@ def test_supersampling_is_a_rounded_box_mean(world):
     world.reset(0)
     fine = world.frame(CameraSettings(size=192, supersample=1))
     np.testing.assert_array_equal(world.frame(), box_average(fine, 2))
-
-
-def test_frames_are_fast(world):
-    """About 10 ms on one core; 100 ms with MuJoCo's default shadows and multisampling."""
-    world.reset(0)
-    world.frame()
-    times = []
-    for _ in range(9):
-        start = time.process_time()  # not wall time: other work on the machine must not fail this
-        world.frame()
-        times.append(time.process_time() - start)
-    assert np.median(times) < 0.04
 
 
 @pytest.mark.bits
@@ -303,16 +265,3 @@ print(world.frame().shape)
 """
     result = run_python(code)
     assert (result.returncode, result.stdout, result.stderr) == (0, "(96, 96, 3)\n[None]\n", "")
-
-
-def test_shadows_reflections_and_multisampling_are_off(world):
-    world.reset(0)
-    world.frame()
-    quality = world._env.model.vis.quality
-    assert (quality.offsamples, quality.shadowsize) == (0, 0)
-    import mujoco
-
-    (camera, *_) = world._cameras.values()
-    flags = camera._renderer.scene.flags
-    assert not flags[mujoco.mjtRndFlag.mjRND_SHADOW]
-    assert not flags[mujoco.mjtRndFlag.mjRND_REFLECTION]

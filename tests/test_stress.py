@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,20 +13,18 @@ import pytest
 from examples.insertion import SPEC as INSERTION
 from typer.testing import CliRunner
 
-from kerv_cli.base import registry
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.registry import Part, parts
-from kerv_cli.base.settings import MOST_STRESS, CameraSettings, RolloutSettings, StressSettings, settings_from
+from kerv_cli.base.settings import CameraSettings, RolloutSettings, StressSettings, settings_from
 from kerv_cli.cli.app import app
 from kerv_cli.lab.identity import stress_of, work_of
 from kerv_cli.lab.policy import check
 from kerv_cli.lab.run import Runner, close_worlds
 from kerv_cli.worlds import stress as stressing
+from kerv_cli.worlds.demos.dataset import register_recorded
 from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD
-from kerv_cli.worlds.recorded import register_recorded
 from kerv_cli.worlds.spec import EnvironmentSpec
-from kerv_cli.worlds.stress.base import Draws, Spells, objects
+from kerv_cli.worlds.stress.base import objects
 from kerv_cli.worlds.stress.colour import scenery_of
 from kerv_cli.worlds.world import MujocoWorld
 
@@ -81,15 +78,6 @@ def model_of(world: MujocoWorld) -> dict[str, np.ndarray]:
     head = model.vis.headlight
     own = {name: np.array(getattr(model, name)) for name in names}
     return own | {f"head {name}": np.array(getattr(head, name)) for name in ("ambient", "diffuse", "specular")}
-
-
-def test_every_kind_is_a_part_and_has_numbers_for_every_level() -> None:
-    assert set(parts("stress")) == {*KINDS, "none"}
-    for kind in KINDS:
-        module = __import__(parts("stress")[kind].build.partition(":")[0], fromlist=["LEVELS"])
-        assert len(module.LEVELS) == MOST_STRESS
-        rows = [dataclasses.astuple(level) if dataclasses.is_dataclass(level) else (level,) for level in module.LEVELS]
-        assert (np.diff(np.array(rows), axis=0) > 0).all(), kind  # every number grows with the level
 
 
 @pytest.mark.bits
@@ -208,24 +196,6 @@ def test_a_push_drives_the_hand_off_for_a_tenth_of_a_second_in_one_direction(met
 
 
 @pytest.mark.bits
-def test_what_a_policy_does_changes_neither_pushes_nor_noise() -> None:
-    def executed(kind: str, wanted: float) -> np.ndarray:
-        stress = stressing.build(StressSettings(kind, 1))
-        stress.begin("push-v3", SEED, METAWORLD.actions)
-        return np.array([stress.act(np.full(4, wanted), step)[:3] for step in range(400)])
-
-    one, other = executed("push", 0.0), executed("push", 0.1)
-    pushed = (one != 0.0).any(axis=1)
-    assert 0 < pushed.sum() < 400
-    assert (one[pushed] == other[pushed]).all()
-    assert (other[~pushed] == 0.1).all()
-    shift = executed("actuation", 0.1) - executed("actuation", 0.0)
-    gain = np.median(shift, axis=0)  # a stuck axis does not shift, and neither does one at its limit
-    assert (np.isclose(shift, gain).mean(axis=0) > 0.8).all()
-    assert ((gain > 0.08) & (gain < 0.12)).all()
-
-
-@pytest.mark.bits
 def test_a_picture_depends_on_the_control_step_and_not_on_how_often_the_policy_looked(insertion: MujocoWorld) -> None:
     camera = INSERTION.cameras[0]
 
@@ -313,18 +283,6 @@ def test_worlds_are_shared_between_stressed_and_plain_settings() -> None:
     assert first.initial_state.tobytes() != shifted.initial_state.tobytes()
 
 
-def test_draws_and_spells() -> None:
-    same = [Draws("reach-v3", 7, "push", 2).random().random() for _ in range(2)]
-    assert same[0] == same[1]
-    others = (Draws("push-v3", 7, "push", 2), Draws("reach-v3", 8, "push", 2), Draws("reach-v3", 7, "push", 3))
-    assert len({same[0], *(draws.random().random() for draws in others)}) == 4
-    spells, random = Spells.per_second(4.0, 0.1, 80.0), np.random.default_rng(0)
-    told = np.array([spells.goes_on(random) for _ in range(80_000)])
-    free = (~told[:, 0]).sum() + told[:, 1].sum()
-    assert told[:, 0].sum() == pytest.approx(8 * told[:, 1].sum(), abs=8)
-    assert told[:, 1].sum() / free == pytest.approx(4 / 80, rel=0.1)
-
-
 def settings(*words: str) -> RolloutSettings:
     return compose("rollout", ["policy=expert", "task=insert-peg", *words], RolloutSettings)
 
@@ -394,37 +352,3 @@ def test_the_command_line_stresses_and_records_it_in_every_row(tmp_path: Path) -
     assert [(row["stress"], row["stress_level"]) for row in rows] == [("none", 0), ("push", 2)]
     wrong = CliRunner().invoke(app, ["rollout", *WORDS, "world.stress.level=5", f"results={tmp_path}"])
     assert (wrong.exit_code, wrong.stderr) == (2, "kerv: world.stress.level=5: from 0 to 4\n")
-
-
-def test_the_plan_and_the_figures_say_which_stress_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from kerv_cli.cli.rollout import rollout
-
-    words = [*WORDS, "world.stress.level=2", f"results={tmp_path}"]
-    rollout(words, plan=True)
-    assert capsys.readouterr().out.startswith("expert, stress push 2: 1 tasks, 2 episodes")
-    rollout(words)
-    assert "stress push 2" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("traits", "builds", "says"),
-    [
-        (
-            {},
-            "Drift",
-            "needs the trait needed, a tuple of actions, position, images, model, range: it is None",
-        ),
-        ({"needed": ("wings",)}, "Drift", "it is ('wings',)"),
-        ({"needed": "actions"}, "Drift", "it is actions"),
-        ({"needed": ()}, "LEVELS.count", "stress 'odd' builds int, which is no subclass of Stress"),
-    ],
-)
-def test_a_kind_that_does_not_fit_gets_one_line(
-    traits: dict[str, Any], builds: str, says: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    odd = Part("stress", "odd", f"examples.own_stress:{builds}", traits=traits)
-    monkeypatch.setitem(registry._PARTS, "stress", {**parts("stress"), "odd": odd})
-    refuse = stressing.build if builds == "LEVELS.count" else lambda asked: stressing.check(asked, METAWORLD)
-    with pytest.raises(UsageError, match=re.escape(says)) as refused:
-        refuse(StressSettings("odd", 1))
-    assert "\n" not in str(refused.value)

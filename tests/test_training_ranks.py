@@ -28,7 +28,7 @@ from kerv_cli.training.dagger import PolicyActs
 from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.imitation import task_borders
 from kerv_cli.training.loop import draw_samples
-from kerv_cli.training.ranks import Ranks, join
+from kerv_cli.training.ranks import join
 from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.recording import DemoConfig, record, run_expert
@@ -46,13 +46,6 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, task in (("few", "drawer-close-v3"), ("more", "reach-v3")):
         record(DemoConfig((task,), 4, camera=SHORT, frame_stride=8, workers=1), folder / "artifacts/demos" / name)
     return folder
-
-
-def test_the_shares_of_all_ranks_are_the_batch() -> None:
-    batch = torch.arange(12)
-    parts = [Ranks(rank, 3).share(batch) for rank in range(3)]
-    assert sorted(torch.cat(parts).tolist()) == batch.tolist()
-    assert {len(part) for part in parts} == {4}
 
 
 def test_a_batch_that_cannot_be_divided_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

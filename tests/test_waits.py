@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from pretended_device import DEVICE, Device, There, move
+from pretended_device import DEVICE, Device, move
 from test_decoding_lossless import random_prompt, random_target
 from test_proposers import HELD, D, situation, stored
 
@@ -24,25 +24,6 @@ from kerv_cli.methods.merged.proposer import MergedProposer
 from kerv_cli.targets.compact.trunk import LayerStack
 
 CHUNK = 2
-
-
-def test_the_device_counts_what_waits() -> None:
-    with torch.inference_mode(), Device() as device:
-        there = torch.arange(4, device=DEVICE)
-        index = torch.ones(2, dtype=torch.long).to(DEVICE, non_blocking=True)
-        assert isinstance(there, There)
-        doubled, chosen = 2 * there, there[index]
-        assert not device.waits
-        assert doubled.tolist() == [0, 2, 4, 6]
-        assert chosen.cpu().tolist() == [1, 1]
-        assert [int(there[3]), float(there.sum()), bool(there[0] == 0)] == [3, 6.0, True]
-        torch.zeros(2).to(DEVICE)
-        there[there > 1]
-        assert len(device.waits) == 7
-        with pytest.raises(AssertionError, match="mixes"):
-            there + torch.arange(4)
-        with pytest.raises(AssertionError, match="waits"):
-            there + torch.tensor([1], device=DEVICE)
 
 
 def parts_of(family: str, target: Any, prompt: torch.Tensor, truth: list[int]) -> Parts:

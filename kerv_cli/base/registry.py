@@ -25,7 +25,7 @@ from kerv_cli.base.limits import check_settings
 PLUGINS = "KERV_PLUGINS"
 
 MODULES = (
-    "kerv_cli.worlds.registration",
+    "kerv_cli.worlds",
     "kerv_cli.targets",
     "kerv_cli.methods.ar",
     "kerv_cli.methods.spec_vla",
@@ -41,7 +41,7 @@ MODULES = (
     "kerv_cli.methods.jacobi",
     "kerv_cli.methods.merged",
     "kerv_cli.methods.certified",
-    "kerv_cli.lab.executors.registration",
+    "kerv_cli.lab.executors",
 )
 """Modules that register kerv's own parts when they are imported, as plugins do; none imports anything heavy. Messages
 list parts in this order."""
@@ -57,24 +57,6 @@ SETTINGS_GROUPS = (*PART_GROUPS, "drafter")
 
 PREFILL, STATES = "prefill", "states"
 """When a proposer can draft: before the prefill, or only behind it because it reads the target's hidden states."""
-
-
-TRAITS: Mapping[str, tuple[str, ...]] = {
-    **dict.fromkeys(("acceptance", "threshold", "rectifier", "datastore", "drafter", "column"), ()),
-    "artifact": ("sees", "by_task"),
-    "proposer": ("when", "chains", "sides"),
-    "boundary": ("chooses",),
-    "skip": ("takes_draft", "merges", "parallel"),
-    "predictor": ("fitted",),
-    "target": ("weights", "importer", "images_alone"),
-    "environment": ("names",),
-    "stress": ("needed",),
-    "executor": ("package", "extra"),
-    "command": ("help", "keys", "examples", "names", "typed", "writes", "each", "lists"),
-}
-"""Every kind of part -> the traits that one may have."""
-REQUIRED = {"proposer": "when", "stress": "needed"}
-"""Kind -> the trait that each must have."""
 
 
 @dataclass
@@ -133,33 +115,13 @@ def register(part: Part) -> Part:
     """Adds a part. The same code can register a name again, e.g. when a module is reloaded.
 
     Raises:
-        UsageError: another part of that kind has the name; no such kind, or its traits are not those of its kind.
+        UsageError: another part of that kind has the name.
     """
-    check_traits(part)
     other = _PARTS.setdefault(part.kind, {}).get(part.name)
     if other is not None and other.build != part.build:
         raise UsageError(f"{part.kind} '{part.name}' is registered twice: {other.build} and {part.build}")
     _PARTS[part.kind][part.name] = part
     return part
-
-
-def check_traits(part: Part) -> None:
-    """Refuses a part of an unknown kind, or whose traits are not those of its kind.
-
-    Raises:
-        UnknownName: no such kind. UsageError: a trait is unknown or missing, or settings have no `kind`.
-    """
-    if part.kind not in TRAITS:
-        raise UnknownName("kind of part", part.kind, TRAITS)
-    what, traits = f"{part.kind} '{part.name}'", TRAITS[part.kind]
-    has = f"the traits of this kind are {', '.join(traits)}" if traits else "this kind has none"
-    unknown, required = [name for name in part.traits if name not in traits], REQUIRED.get(part.kind)
-    if unknown:
-        raise UsageError(f"{what} has an unknown trait {unknown[0]}: {has}")
-    if required is not None and required not in part.traits:
-        raise UsageError(f"{what} lacks the trait {required}: {has}")
-    if part.kind in SETTINGS_GROUPS and "kind" not in getattr(part.settings, "__dataclass_fields__", ()):
-        raise UsageError(f"{what}: its settings {part.settings.__name__} must be a dataclass with a field kind")
 
 
 def add(

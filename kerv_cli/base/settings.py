@@ -119,7 +119,7 @@ class RuntimeSettings:
     threads: int = number(1, 1, 256, help="torch's threads in each process")
     executor: str = setting("local", "sweeps: what runs the blocks: local (processes here), slurm, ray")
     workers: int = number(1, 1, 4096, help="sweeps: blocks that run at the same time")
-    executor_options: dict[str, Any] = setting({}, "see kerv_cli/lab/executors/registration.py")
+    executor_options: dict[str, Any] = setting({}, "see kerv_cli/lab/executors/__init__.py")
 
 
 @dataclass(kw_only=True)
@@ -242,7 +242,6 @@ class ServeSettings(MethodSettings):
     task_name: str = setting("", "the task, for parts whose levels differ between tasks; empty: vla_eval's clients say")
     batch: int = number(1, 1, 1024, help="clients that are decoded together; above 1: without times")
     seats: int = number(0, 0, 4096, help="clients at a time; 0: 1 with openpi, 64 with vla_eval")
-    takeover: bool = setting(False, "a newer client takes the seat of the one that was silent longest")
     ping_s: float = number(
         0.0, 0, 86_400, help="a client that answers no ping for so long is gone; 0: 10, vla_eval none"
     )
@@ -341,7 +340,6 @@ class TrainSettings:
         "state", "state", "path", help="positions learnt: of object and goal; path: of the hand, later in the episode"
     )
     colour: float = number(0.0, 0, 3, help="random light on the images (target only): spread of its logarithm")
-    shift: int = number(0, 0, 64, help="most pixels by which a view is moved at random (target only)")
     scene_steps: int = number(0, 0, 10**9, help="first steps that train only the vision encoder, on positions")
     held_out: float = number(0.1, above=0, most=0.5, help="share of episodes kept for validation")
     validate_every: int = number(2_000, 1, 10**9, help="steps between two validations")
@@ -542,10 +540,7 @@ class CalibrateSettings(DemonstrationSettings):
     name: str | None = setting(None, "default: beside the target")
     episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)
     held_out: float = number(0.1, above=0, most=0.5, help="share of episodes that the errors are measured on")
-    # labels: clean; executed: noisy in perturbed episodes
-    history: str = choice("labels", "labels", "executed", help="what predictions are made from")
     window: int = number(10, 4, 10_000, help="control steps of history; predictors need four")
-    fit_steps: int = number(0, 0, 1024, help="steps ahead whose mean error is fitted; 0: the target's chunk")
     epsilon: float = number(
         0.1, above=0, most=1e6, help="verify-skip: mean abs error of a chunk that is good enough, normalised units"
     )

@@ -1,7 +1,6 @@
 """The views of a frame: one camera, or several views side by side, named by the cameras joined with `+`.
 
-`corner4+gripperPOV:75` is two cameras, the second with a field of view of its own; `corner4+corner4@4` is one, now and
-four control steps ago: a policy's history.
+`corner4+gripperPOV:75` is two cameras, the second with a field of view of its own.
 """
 
 from __future__ import annotations
@@ -13,16 +12,15 @@ from kerv_cli.base.errors import UsageError
 
 VIEWS = "+"
 """Between the cameras of a joined name."""
-_PART = re.compile(r"(?P<camera>[^:@]+)(:(?P<fovy>\d{1,3}(\.\d{1,3})?))?(@(?P<delay>[1-9]\d{0,2}))?", re.ASCII)
+_PART = re.compile(r"(?P<camera>[^:@]+)(:(?P<fovy>\d{1,3}(\.\d{1,3})?))?", re.ASCII)
 
 
 @dataclass(frozen=True)
 class View:
-    """One part of a frame: what `camera` showed `delay` control steps ago. fovy: degrees; None: as all others."""
+    """One part of a frame. fovy: degrees; None: as all others."""
 
     camera: str
     fovy: float | None = None
-    delay: int = 0
 
     @property
     def name(self) -> str:
@@ -34,7 +32,7 @@ def views_of(name: str) -> tuple[View, ...]:
     """The views of a frame of that name, from left to right; of the empty name one, of the environment's first camera.
 
     Raises:
-        UsageError: a part without a camera, an impossible field of view, or a delay that is none.
+        UsageError: a part without a camera, or an impossible field of view.
     """
     return tuple(_view(part, name) for part in name.split(VIEWS)) if name else (View(""),)
 
@@ -49,7 +47,7 @@ def _view(part: str, name: str) -> View:
     fovy = float(match["fovy"]) if match and match["fovy"] else None
     if match is None or (fovy is not None and not 0 < fovy < 180):
         raise UsageError(
-            f"camera name '{name}': '{part}' is no view; write NAME, NAME:DEGREES (above 0, below 180) or NAME@STEPS "
-            "(1 to 999), joined with +, e.g. front+wrist:75+front@4"
+            f"camera name '{name}': '{part}' is no view; write NAME or NAME:DEGREES (above 0, below 180), joined "
+            "with +, e.g. front+wrist:75"
         )
-    return View(match["camera"], fovy, int(match["delay"] or 0))
+    return View(match["camera"], fovy)

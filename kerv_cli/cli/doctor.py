@@ -158,11 +158,7 @@ def _policies(settings: DoctorSettings) -> list[Finding]:
             findings.append(Finding(f"policy {name}", True, f"{size}{described.sha256[:12]}"))
         except KervError as error:
             findings.append(Finding(f"policy {name}", False, str(error)))
-    return findings or [
-        Finding(
-            "policies", False, "none here: install kerv from its wheel or run it in a checkout, both bring mt10-vision"
-        )
-    ]
+    return findings
 
 
 def _disk(settings: DoctorSettings) -> Finding:

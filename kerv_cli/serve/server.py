@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 Log = Callable[[str], None]
 PROTOCOLS = {"openpi": "kerv_cli.serve.openpi:OpenPi", "vla_eval": "kerv_cli.serve.vla_eval:VlaEval"}
 HEALTH = ("/healthz", "/health")
-BUSY, GONE, TAKEN = 1013, 1001, 4000
-"""Websocket close codes: try again later; going away; a newer client has the seat."""
+BUSY, GONE = 1013, 1001
+"""Websocket close codes: try again later; going away."""
 LONGEST = 500
 """Letters of an error: a client's own words may be longer."""
 PATIENCE = 1.0
@@ -100,42 +100,32 @@ class Latencies:
 
 
 class Seats:
-    """The connections that are served. takeover: a newcomer gets the seat of the one that was silent longest."""
+    """The connections that are served."""
 
-    def __init__(self, count: int, takeover: bool) -> None:
-        self.count, self.takeover = count, takeover
+    def __init__(self, count: int) -> None:
+        self.count = count
         self._changed = threading.Condition()
-        self._heard: dict[ServerConnection, float] = {}  # connection -> when it was last heard
+        self._seated: list[ServerConnection] = []
 
-    def take(self, connection: ServerConnection) -> tuple[bool, ServerConnection | None]:
-        """Whether the connection gets a seat, and the connection that loses its own to it, or None."""
+    def take(self, connection: ServerConnection) -> bool:
+        """Whether the connection gets a seat."""
         with self._changed:
-            lost = None
-            if self.takeover and len(self._heard) >= self.count:
-                lost = min(self._heard, key=self._heard.__getitem__)
-                del self._heard[lost]
-            elif not self._changed.wait_for(lambda: len(self._heard) < self.count, PATIENCE):
-                return False, None
-            self._heard[connection] = time.monotonic()
-            return True, lost
-
-    def heard(self, connection: ServerConnection) -> None:
-        """Notes that the client sent a frame."""
-        with self._changed:
-            if connection in self._heard:
-                self._heard[connection] = time.monotonic()
+            if not self._changed.wait_for(lambda: len(self._seated) < self.count, PATIENCE):
+                return False
+            self._seated.append(connection)
+            return True
 
     def leave(self, connection: ServerConnection) -> None:
-        """Frees the connection's seat, unless another one took it."""
+        """Frees the connection's seat."""
         with self._changed:
-            self._heard.pop(connection, None)
+            self._seated.remove(connection)
             self._changed.notify_all()
 
     @property
     def connections(self) -> list[ServerConnection]:
         """The connections that have a seat."""
         with self._changed:
-            return list(self._heard)
+            return list(self._seated)
 
 
 class PolicyServer:
@@ -144,7 +134,7 @@ class PolicyServer:
     def __init__(self, policy: Policy, settings: ServeSettings, log: Log) -> None:
         self.policy, self.settings, self.log = policy, settings, log
         self.protocol: type[Conversation] = load(PROTOCOLS[settings.protocol])
-        self.seats = Seats(settings.seats or self.protocol.seats, settings.takeover)
+        self.seats = Seats(settings.seats or self.protocol.seats)
         self.ping_s = settings.ping_s or self.protocol.ping_s
         self.idle_s = settings.idle_s or self.protocol.idle_s
 
@@ -185,14 +175,11 @@ class PolicyServer:
         from websockets.exceptions import ConnectionClosed
 
         who = _address(connection)
-        seated, lost = self.seats.take(connection)
-        if not seated:
+        if not self.seats.take(connection):
             self.log(f"{who} refused: {self._full}")
             with contextlib.suppress(ConnectionClosed):
                 connection.close(BUSY, f"{self._full}: try again later")
             return
-        if lost is not None:
-            _close(lost, TAKEN, "a newer client took the seat")
         latencies, why = Latencies(), ""
         try:
             self.log(f"{who} connected")
@@ -220,7 +207,6 @@ class PolicyServer:
                 connection.send(greeting)
             while True:
                 frame = connection.recv(timeout=self.idle_s)
-                self.seats.heard(connection)
                 self.reply(connection, conversation, frame, latencies)
 
     def reply(

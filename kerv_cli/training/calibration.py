@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from kerv_cli.base.errors import CheckpointError, KervError, UsageError
+from kerv_cli.base.errors import CheckpointError, KervError
 from kerv_cli.base.files import read_mapping, write_json
 from kerv_cli.base.places import artifact, check_not_shipped
 from kerv_cli.base.provenance import provenance_of
@@ -89,11 +89,6 @@ class CalibrationRun:
         self.artifacts = Artifacts(settings.results, settings.policy, device=settings.runtime.device)
         self.description = self.artifacts.description
         self.description.check_autoregressive("kerv calibrate", "there is no draft to calibrate")
-        if settings.fit_steps > self.description.chunk:
-            longest = self.description.chunk
-            raise UsageError(
-                f"fit_steps={settings.fit_steps}: at most the target's chunk of {longest}, 0 for all of it"
-            )
         self.path = self.artifacts.path("calibration")
         if settings.name is not None:
             self.path = artifact(settings.results, "calibration", settings.name) / self.path.name
@@ -119,10 +114,8 @@ class CalibrationRun:
 
     def load(self, progress: OnProgress) -> None:
         """Reads the actions and paths of the chosen episodes."""
-        s = self.settings
-        self.windows = read_windows(
-            self.dataset, self.chosen, self.description.actions, s.history, s.window, self.description.chunk, progress
-        )
+        space, window, chunk = self.description.actions, self.settings.window, self.description.chunk
+        self.windows = read_windows(self.dataset, self.chosen, space, window, chunk, progress)
 
     def boundary(self, progress: OnProgress) -> BoundarySection:
         """Ranges of R and D over every window of every training episode, in metres; none is left out.
@@ -194,7 +187,7 @@ class CalibrationRun:
         """
         assert self.windows is not None
         space, chunk = self.description.actions, self.description.chunk
-        noise = fit_filters(self.windows, self.settings.fit_steps or chunk, space.is_strict)
+        noise = fit_filters(self.windows, chunk, space.is_strict)
         provenance = provenance_of("kerv calibrate", self.settings, self.settings.runtime.device)
         sections, earlier = self._fill_empty({"variability": variability, "boundary": boundary, "skip": skip})
         calibration = Calibration(

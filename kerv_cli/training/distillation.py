@@ -16,7 +16,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.decoder import Decoder, Parts
@@ -135,17 +134,17 @@ class Distillation:
         losses: list[Tensor] = []
         metrics: Metrics = {}
         for states in self.states.parts(indices):
-            loss, measured = self.unrolled(states, step)
+            loss, measured = self.unrolled(states)
             losses.append(loss * len(states) / len(indices))
             metrics |= measured
         return torch.stack(losses).sum(), metrics
 
-    def unrolled(self, states: TeacherStates, step: int) -> tuple[Tensor, Metrics]:
+    def unrolled(self, states: TeacherStates) -> tuple[Tensor, Metrics]:
         """Mean loss over the unrolled passes for states of one prompt length, and the token loss of each pass."""
         prompt, hidden = states.prompt.to(self.device).float(), states.hidden.to(self.device).float()
         tokens = states.tokens.to(self.device)
         total, metrics = hidden.new_zeros(()), {}
-        inputs = self.noisy(hidden[:, :-1], step)
+        inputs = hidden[:, :-1]
         for number in range(self.settings.unroll):
             predicted = self.predict(prompt, inputs, tokens)
             state_loss, token_loss = self.compare(predicted, hidden, prompt.shape[1])
@@ -155,14 +154,6 @@ class Distillation:
             start = prompt.shape[1]
             inputs = torch.cat([inputs[:, :start], predicted[:, start - 1 : -1]], 1)
         return total / self.settings.unroll, metrics
-
-    def noisy(self, hidden: Tensor, step: int) -> Tensor:
-        """hidden with uniform noise of ± settings.noise; the noise depends on `step` alone."""
-        if not self.settings.noise:
-            return hidden
-        generator = torch.Generator(self.device).manual_seed(step)
-        noise = torch.rand(hidden.shape, generator=generator, device=self.device) * 2 - 1
-        return hidden + self.settings.noise * noise
 
     def predict(self, prompt: Tensor, hidden: Tensor, tokens: Tensor) -> Tensor:
         """hidden (B, P + N − 2, E) at positions 0 … -> predictions of positions 1 … P + N − 2, same shape."""
@@ -202,15 +193,6 @@ class EagleRun(DrafterRun):
     """`kerv train drafter`: the EAGLE-style drafter."""
 
     artifact = DrafterArtifact()
-
-    def begin(self) -> None:
-        """Chooses the device, and joins the other processes. UsageError: noise, or a batch, that they cannot share."""
-        super().begin()
-        noise = self.settings.drafter.noise
-        if noise and self.ranks.size > 1:
-            raise UsageError(
-                f"drafter.noise={noise} is drawn for a whole batch: train with one process, or without noise"
-            )
 
     def lesson(self, progress: OnProgress) -> Distillation:
         """The target's states of training and validation."""

@@ -124,22 +124,6 @@ def lit(images: Tensor, indices: Tensor, step: int, spread: float) -> Tensor:
     return (images * light).round_().clamp_(0, 255).to(torch.uint8)
 
 
-def moved(images: Tensor, indices: Tensor, step: int, most: int) -> tuple[Tensor, Tensor]:
-    """images (B, 3, size, size x views) uint8 with the contents of each view moved by up to `most` pixels, its edge
-    repeated, and by how much (B, views, 2) to the right and down, in units of image points. Drawn as in `lit`."""
-    size, views = images.shape[-2], images.shape[-1] // images.shape[-2]
-    draws = [np.random.default_rng((step, index, 1)) for index in indices.tolist()]
-    shifts = torch.from_numpy(np.stack([r.integers(-most, most + 1, (views, 2)) for r in draws])).to(images.device)
-    line = torch.arange(size, device=images.device)
-    rows, columns = ((line - shifts[..., axis, None]).clamp(0, size - 1) for axis in (1, 0))  # (B, views, size) each
-    each = torch.arange(len(images), device=images.device)[:, None, None]
-    parts = [
-        view[each, :, rows[:, i, :, None], columns[:, i, None, :]].permute(0, 3, 1, 2)
-        for i, view in enumerate(images.split(size, -1))
-    ]
-    return torch.cat(parts, -1), shifts.float() / (size / 2 - 1)
-
-
 class Imitation:
     """Losses and metrics of one training run. closed_loop: a target's success in [0, 1], which then dominates the
     score; None: not measured."""
@@ -181,9 +165,6 @@ class Imitation:
         inputs = self.training.inputs(indices, self.device)
         if self.settings.colour and inputs.images is not None:
             inputs = replace(inputs, images=lit(inputs.images, indices, step, self.settings.colour))
-        if self.settings.shift and inputs.images is not None:
-            images, distances = moved(inputs.images, indices, step, self.settings.shift)
-            inputs = replace(inputs, images=images, moved=distances)
         scene = self.settings.scene_weight if self.module.cameras else 0.0
         with self.precision():
             places = self.training.places[indices].to(self.device)

@@ -43,11 +43,11 @@ class Windows:
 
 
 def episode_windows(
-    episode: DemoEpisode, actions: ActionSpace, history: str, window: int, horizon: int
+    episode: DemoEpisode, actions: ActionSpace, window: int, horizon: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """(past (n, window, D), future (n, horizon, D)) of every moment of an episode that has a full window behind it.
 
-    history: the past is the clean `labels` or the `executed` actions. The future is always the labels.
+    Both are the clean labels.
 
     Raises:
         CheckpointError: too few labels were recorded beyond the episode's end.
@@ -55,11 +55,10 @@ def episode_windows(
     steps = len(episode.executed)
     check_tail(episode, horizon, f"predictions of {horizon} steps")
     labels = actions.normalise(episode.labels)
-    source = labels[:steps] if history == "labels" else actions.normalise(episode.executed)
     if steps <= window:
-        dofs = source.shape[1]
+        dofs = labels.shape[1]
         return np.zeros((0, window, dofs)), np.zeros((0, horizon, dofs))
-    past = np.lib.stride_tricks.sliding_window_view(source[: steps - 1], window, axis=0)
+    past = np.lib.stride_tricks.sliding_window_view(labels[: steps - 1], window, axis=0)
     future = np.lib.stride_tricks.sliding_window_view(labels[window : steps + horizon - 1], horizon, axis=0)
     return past.swapaxes(1, 2), future.swapaxes(1, 2)
 
@@ -68,7 +67,6 @@ def read_windows(
     dataset: DemoDataset,
     chosen: Mapping[int, bool],
     actions: ActionSpace,
-    history: str,
     window: int,
     horizon: int,
     on_progress: OnProgress,
@@ -83,7 +81,7 @@ def read_windows(
     parts, labels, masks, paths = [], [], [], []
     for done, (index, held_out) in enumerate(chosen.items(), 1):
         episode = dataset.load(index)
-        past, future = episode_windows(episode, actions, history, window, horizon)
+        past, future = episode_windows(episode, actions, window, horizon)
         parts.append((past.astype(np.float32), future.astype(np.float32)))
         labels.append(np.full(len(past), tasks.index(episode.task)))
         masks.append(np.full(len(past), held_out))

@@ -201,7 +201,7 @@ class TargetRun(Run):
                 "cannot be trained on them"
             )
         if self.settings.target.observation == "state":
-            refuse_unused(train, ("colour", "shift", "places"), " is of images, target.observation=state has none")
+            refuse_unused(train, ("colour", "places"), " is of images, target.observation=state has none")
         recordings = [manifest.config, *manifest.config.get("joined", ())]
         if train.places == "path" and train.scene_weight and any(one.get("policy") for one in recordings):
             raise UsageError(
@@ -310,11 +310,9 @@ class DrafterRun(Run):
     target: ReadableTarget
 
     def __init__(self, settings: TrainDrafterSettings) -> None:
-        if settings.train.init is not None:
-            raise UsageError(f"train.init={settings.train.init}: only 'kerv train target' begins with given weights")
         if settings.train.freeze:
             raise UsageError(f"train.freeze={settings.train.freeze}: only 'kerv train target' keeps weights")
-        of_targets = ("balance", "closed_loop", "colour", "shift", "places")
+        of_targets = ("init", "balance", "closed_loop", "colour", "places")
         refuse_unused(settings.train, of_targets, ": only the training of a target has this setting")
         self.target_folder = find_target(settings.results, settings.policy.target)
         name = settings.policy.named(self.artifact.kind)

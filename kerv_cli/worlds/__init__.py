@@ -1,4 +1,4 @@
-"""The registered environments, their tasks and suites.
+"""The registered environments, their tasks and suites. Registers kerv's own environment and its kinds of stress.
 
 Imports nothing heavy until a spec is asked for: a spec imports numpy, a world its simulator.
 """
@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.registry import load, parts
+from kerv_cli.base.registry import add, load, parts
 
 if TYPE_CHECKING:
     from kerv_cli.base.settings import WorldSettings
@@ -93,3 +93,17 @@ def settled(world: W, spec: EnvironmentSpec) -> W:
     """
     camera = replace(world.camera, name=spec.camera_name(world.camera.name))
     return replace(world, camera=camera, horizon=spec.control_steps(world.horizon))
+
+
+add("environment", "metaworld", "kerv_cli.worlds.metaworld.spec:SPEC", names="kerv_cli.worlds.metaworld.tasks:NAMES")
+for _name, _made_by, _needed in (
+    ("push", "push:Push", ("actions", "position")),
+    ("actuation", "actuation:Actuation", ("actions",)),
+    ("sensor", "sensor:Sensor", ("images",)),
+    ("light", "light:Light", ("model",)),
+    ("colour", "colour:Colour", ("model",)),
+    ("camera", "camera:CameraJitter", ("model",)),
+    ("object", "objects:Objects", ("model", "range")),
+):
+    add("stress", _name, f"kerv_cli.worlds.stress.{_made_by}", needed=_needed)
+add("stress", "none", needed=())

@@ -149,12 +149,8 @@ class Camera:
         Returns:
             (size, size, 3) uint8 RGB, upright: images of views that are upside down are turned by 180 degrees (flipping
             one axis would mirror them).
-
-        Raises:
-            RenderingUnavailable: the camera was closed.
         """
-        if self._renderer is None:
-            raise RenderingUnavailable(f"camera '{self.config.name}' was closed")
+        assert self._renderer is not None
         fovy = self._model.cam_fovy[self._camera]
         self._model.cam_fovy[self._camera] = self.config.fovy  # views of one model may differ in fovy: set per frame
         try:

@@ -5,7 +5,6 @@ Imports nothing heavy, so that completion can read the tables of tasks.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
@@ -40,19 +39,11 @@ class Task:
 class Seeds:
     """Three disjoint ranges of episode seeds, so that training, tuning and reported episodes never share an initial
     state.
-
-    Raises:
-        ValueError: two ranges overlap.
     """
 
     training: range = range(50_000)
     selection: range = range(50_000, 100_000)
     evaluation: range = range(100_000, 2**31)
-
-    def __post_init__(self) -> None:
-        ordered = sorted((self.training, self.selection, self.evaluation), key=lambda seeds: seeds.start)
-        if any(a.stop > b.start for a, b in itertools.pairwise(ordered)):
-            raise ValueError(f"ranges of seeds overlap: {ordered}")
 
     def check(self, seeds: Iterable[int], purpose: str, what: str) -> None:
         """Refuses seeds that are not for `purpose`: training, selection or evaluation. what: their name in the message.

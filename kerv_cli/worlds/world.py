@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.settings import CameraSettings
 from kerv_cli.base.spaces import Observation
-from kerv_cli.base.views import View, views_of
+from kerv_cli.base.views import views_of
 from kerv_cli.worlds.camera import Camera
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.stress.base import NO_STRESS, Model, ModelChanges, Stress
@@ -43,8 +43,6 @@ class EpisodeWorld(ABC):
         self.steps, self.success, self.succeeded = 0, False, False
         self.stress: Stress = NO_STRESS
         self._observation: Observation | None = None
-        # of delayed views: control steps and images
-        self._past: dict[tuple[CameraSettings, View, bool], list[tuple[int, NDArray[np.uint8]]]] = {}
 
     @abstractmethod
     def _start(self, seed: int) -> NDArray[np.float64]:
@@ -92,7 +90,6 @@ class EpisodeWorld(ABC):
         if seed < 0:
             raise UsageError(f"episode seed must be 0 or more, not {seed}")
         self.stress.begin(self.task, seed, self.spec.actions)
-        self._past.clear()
         state = self._start(seed)
         self.steps, self.success, self.succeeded = 0, False, False
         return self._observe_state(state)
@@ -141,34 +138,19 @@ class EpisodeWorld(ABC):
         return self.observation.with_images(images)
 
     def _picture(self, config: CameraSettings, observed: bool) -> NDArray[np.uint8]:
-        """A frame: its views side by side. observed: for a policy, so that a stress changes the image of each camera.
-        Frames for recordings have their own delayed images."""
+        """A frame: its views side by side. observed: for a policy, so that a stress changes each camera's image."""
         views = views_of(config.name)
         images = {
             view.name: self._draw(replace(config, name=view.camera, fovy=view.fovy or config.fovy)) for view in views
         }
         if observed:
             images = {camera: self.stress.see(camera, image, self.steps) for camera, image in images.items()}
-        parts = [self._at((config, view, observed), images[view.name]) for view in views]
+        parts = [images[view.name] for view in views]
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
-
-    def _at(self, key: tuple[CameraSettings, View, bool], now: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The image of one view. now: the present image of its camera. A delayed view shows the newest image that is at
-        least `delay` control steps old; until there is one, the episode's first."""
-        delay = key[1].delay
-        if not delay:
-            return now
-        past = self._past.setdefault(key, [])
-        if not past or past[-1][0] < self.steps:
-            past.append((self.steps, now))
-        while len(past) > 1 and past[1][0] <= self.steps - delay:
-            past.pop(0)
-        return past[0][1]
 
     def close(self) -> None:
         """Ends the episode; a subclass also frees its simulator."""
         self._observation = None
-        self._past.clear()
 
     def __enter__(self) -> Self:
         return self

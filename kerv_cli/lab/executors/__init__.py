@@ -10,12 +10,13 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable
 from concurrent.futures import Future
+from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
-from kerv_cli.base.limits import check_settings
+from kerv_cli.base.limits import check_settings, number
 from kerv_cli.base.manifests import read
-from kerv_cli.base.registry import find
+from kerv_cli.base.registry import add, find
 from kerv_cli.base.settings import RuntimeSettings
 
 T = TypeVar("T")
@@ -61,3 +62,33 @@ def check_executor(runtime: RuntimeSettings) -> Any:
         return read(part.settings, runtime.executor_options, "runtime.executor_options")
     except CheckpointError as error:
         raise UsageError(str(error).replace(" is damaged", "")) from None
+
+
+@dataclass
+class LocalOptions:
+    """The local executor has no `runtime.executor_options`."""
+
+
+@dataclass
+class SlurmOptions:
+    """`runtime.executor_options` of slurm: a block is a job."""
+
+    cluster: str = "slurm"  # slurm | local (submitit's own processes on this machine)
+    partition: str = ""  # empty: the cluster's default
+    minutes: int = number(120, 1, 100_000)  # longest time of a job
+    memory_gb: int = number(8, 1, 100_000)
+    gpus: int = number(0, 0, 1024)
+    setup: list[str] = field(default_factory=list)  # shell lines before the job's Python starts
+
+
+@dataclass
+class RayOptions:
+    """`runtime.executor_options` of ray: a block is a task."""
+
+    address: str = ""  # of a running cluster, e.g. auto or ray://host:10001; empty: a Ray of its own on this machine
+    gpus: float = number(0.0, 0, 1024)  # per block
+
+
+add("executor", "local", "kerv_cli.lab.executors.local:build", LocalOptions)
+add("executor", "slurm", "kerv_cli.lab.executors.slurm:build", SlurmOptions, package="submitit", extra="slurm")
+add("executor", "ray", "kerv_cli.lab.executors.ray:build", RayOptions, package="ray", extra="ray")

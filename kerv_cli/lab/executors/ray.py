@@ -14,8 +14,7 @@ from typing import Any, TypeVar
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.processes import guard
-from kerv_cli.lab.executors import THREAD_VARIABLES, Executor, WorkerLost
-from kerv_cli.lab.executors.registration import RayOptions
+from kerv_cli.lab.executors import THREAD_VARIABLES, Executor, RayOptions, WorkerLost
 
 T = TypeVar("T")
 

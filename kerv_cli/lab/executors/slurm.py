@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.lab.executors import THREAD_VARIABLES, Executor, WorkerLost
-from kerv_cli.lab.executors.registration import SlurmOptions
+from kerv_cli.lab.executors import THREAD_VARIABLES, Executor, SlurmOptions, WorkerLost
 
 T = TypeVar("T")
 

@@ -16,7 +16,6 @@ class DrafterSettings:
 
     kind: str = "eagle"
     layers: int = number(1, 0, 1024)
-    noise: float = number(0.0, 0, 100)  # uniform noise on the input states, training only
     unroll: int = number(3, 1, 64)  # passes fed with its own predicted states, as drafting does; 1: the paper's
     samples: int = number(12_000, 1, 10**8)  # observations whose greedy decodes it is trained on
     state_weight: float = number(1.0, 0, 1e6)  # smooth-L1 on the hidden state

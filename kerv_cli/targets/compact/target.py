@@ -43,14 +43,12 @@ from kerv_cli.targets.compact.vision import VisionEncoder
 @dataclass(frozen=True)
 class Inputs:
     """A batch of observations as tensors. images (B, 3, size, size x views) uint8 or None, proprioception (B, p) and
-    states (B, s) float32, words (B, L) int64. A vision policy does not read `states`. moved (B, views, 2): by how much
-    each view's contents were moved to the right and down (augmentation), in units of image points; None: not at all."""
+    states (B, s) float32, words (B, L) int64. A vision policy does not read `states`."""
 
     images: Tensor | None
     proprioception: Tensor
     states: Tensor
     words: Tensor
-    moved: Tensor | None = None
 
 
 class CompactTarget(Packable):
@@ -203,8 +201,6 @@ class CompactTarget(Packable):
         images = inputs.images.split(self.settings.image_size, -1)
         views = [encoder(image) for encoder, image in zip(self.encoders, images, strict=True)]
         tokens, points = torch.cat([one for one, _ in views], 1), torch.cat([one for _, one in views], -1)
-        if inputs.moved is not None:  # points stay where they were: of each view K columns, then K rows
-            points = points - inputs.moved.flatten(1).repeat_interleave(self.settings.keypoints, 1)
         # bfloat16 would round image points to a fifth of a cell: millimetres matter here
         with torch.autocast(points.device.type, enabled=False):
             features = torch.cat([points, hand, words.mean(1)], -1).to(self.head.weight.dtype)

@@ -6,22 +6,27 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import read_mapping, sha256_of
 from kerv_cli.base.manifests import read
+from kerv_cli.base.registry import Part, register
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.worlds import stands_for_tasks
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode
 from kerv_cli.worlds.demos.frames import EncodedFrames
-from kerv_cli.worlds.recorded import register_recorded
+from kerv_cli.worlds.spec import EnvironmentSpec, Task
 
 OnProgress = Callable[[int, int], object]
 """Called with (done, total) after every episode or batch of a long work."""
 
 FORMAT = 2
 """Format of manifests."""
+
+SPECS = SimpleNamespace()
+"""The specification of every recorded environment, an attribute of its name."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,19 @@ class DemoManifest:
     episodes: int = 0
     missing: int = 0
     instructions: dict[str, str] = field(default_factory=dict)
+
+
+def register_recorded(
+    name: str, actions: ActionSpace, observation: ObservationSpace, instructions: Mapping[str, str], camera: str
+) -> EnvironmentSpec:
+    """Registers the environment of a dataset that exists only as a recording: nothing can be rolled out in it. name: an
+    identifier; instructions: task -> instruction."""
+    tasks = {task: Task(task, instruction, "recorded") for task, instruction in instructions.items()}
+    suite = {name.upper(): tuple(tasks)}
+    spec = EnvironmentSpec(name, actions, observation, tasks, suite, ("recorded",), 10_000, (camera,))
+    setattr(SPECS, name, spec)
+    register(Part("environment", name, f"{__name__}:SPECS.{name}"))
+    return spec
 
 
 def episode_path(out: Path, task: str, seed: int) -> Path:
@@ -207,9 +225,8 @@ class DemoDataset:
 
 def _read_manifest(path: Path) -> DemoManifest:
     value = read_mapping(path)
-    version = value.get("format")
-    if version != FORMAT:
-        raise CheckpointError(f"{path} has format {version}, this kerv reads {FORMAT}")
+    if value.get("format") != FORMAT:
+        raise CheckpointError(f"{path} has format {value.get('format')}, this kerv reads {FORMAT}")
     manifest = read(DemoManifest, value, str(path))
     if manifest.sha256 != dataset_hash(value["tasks"]):
         raise CheckpointError(f"{path} is damaged: its hash does not fit its episodes")

@@ -90,10 +90,6 @@ class DemoConfig:
         object.__setattr__(self, "camera", self.spec.camera(self.camera))
         object.__setattr__(self, "horizon", self.spec.control_steps(self.horizon))
         check_settings(self, "demonstrations")
-        if self.noise_low > self.noise_high:
-            raise UsageError("demonstrations: noise must satisfy noise_low <= noise_high")
-        if self.tail >= self.spec.horizon:
-            raise UsageError(f"demonstrations: tail={self.tail}: an episode has {self.spec.horizon} control steps")
         ends = self.first_seed, self.first_seed + self.episodes - 1
         self.spec.seeds.check(ends, "training", "demonstrations")
 

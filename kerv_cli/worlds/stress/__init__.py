@@ -36,26 +36,12 @@ def build(settings: StressSettings) -> Stress:
     """The stress of these settings; level 0 is none.
 
     Raises:
-        UnknownName: no such kind. UsageError: what it builds is no stress.
+        UnknownName: no such kind.
     """
     if not settings.active:
         return NO_STRESS
-    built = find(KIND, settings.kind).built(settings.level)
-    if not isinstance(built, Stress):
-        raise UsageError(f"stress '{settings.kind}' builds {type(built).__name__}, which is no subclass of Stress")
+    built: Stress = find(KIND, settings.kind).built(settings.level)
     return built
-
-
-def needs_of(kind: str) -> tuple[str, ...]:
-    """What a kind of stress needs of an environment.
-
-    Raises:
-        UsageError: its part does not say, or names a need that no environment can meet.
-    """
-    needs = find(KIND, kind).traits.get(NEEDED)
-    if not isinstance(needs, tuple) or not set(needs) <= set(_MISSING):
-        raise UsageError(f"stress '{kind}' needs the trait {NEEDED}, a tuple of {', '.join(_MISSING)}: it is {needs}")
-    return needs
 
 
 def check(settings: StressSettings, spec: EnvironmentSpec) -> None:
@@ -69,6 +55,6 @@ def check(settings: StressSettings, spec: EnvironmentSpec) -> None:
     able = set(getattr(load(spec.world_class), STRESSABLE, ())) if spec.world_class else set()
     if any(group.name == "position" for group in spec.actions.groups):
         able.add("position")
-    for need in needs_of(settings.kind):
+    for need in find(KIND, settings.kind).traits[NEEDED]:
         if need not in able:
             raise UsageError(f"world.stress.kind={settings.kind}: not possible in {spec.name}: {_MISSING[need]}")
