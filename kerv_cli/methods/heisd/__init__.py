@@ -24,10 +24,20 @@ class RetrievalProposerSettings:
     nodes: int = number(50, 1, MOST_TOKENS)  # tree nodes
 
 
+@dataclass
+class QdrantSearchSettings:
+    """Search by Qdrant (the extra: pip install 'kerv[qdrant]'). Without url and path: in memory."""
+
+    kind: str = "qdrant"
+    url: str | None = None  # a server, e.g. http://localhost:6333
+    path: str | None = None  # a folder of qdrant-client's local mode, for one process at a time
+
+
 add("artifact", "datastore", _DATASTORE + "DatastoreArtifact", by_task=True)
 _retrieval = (_RULES + "RetrievalProposer.build", RetrievalProposerSettings, ("datastore",))
 add("proposer", "retrieval", *_retrieval, colour=0x009E73, when=PREFILL, chains=True)
 add("datastore", "exact", _DATASTORE + "ExactIndex")
+add("datastore", "qdrant", "kerv_cli.methods.heisd.qdrant:QdrantIndex", QdrantSearchSettings)
 
 
 @dataclass
