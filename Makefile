@@ -32,10 +32,8 @@ test-cpus: setup ## run the tests of equal bits and tokens under four kinds of C
 demo: setup ## run the demo study; ends with its verdict, its page and a recording
 	@$(BIN)/kerv sweep study=demo
 
-torture: export OMP_NUM_THREADS := 1
-
-torture: setup ## kill commands, break their disk, damage files: at most 15 minutes (MINUTES=), 2 with SHORT=1; see docs/torture.md
-	@$(BIN)/python scripts/torture.py --minutes $(or $(MINUTES),$(if $(SHORT),2,15)) $(if $(SHORT),--short)
+torture: setup ## kill commands, break their disk, damage their files, at random (MINUTES=1)
+	@$(BIN)/python -m pytest -s tests/reliability/torture.py
 
 lint: setup ## check style, types and which room imports which
 	@$(BIN)/ruff check $(CODE)

@@ -6,7 +6,6 @@ import json
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from kerv_cli.base.files import read_json, sha256_of, write_json
 from kerv_cli.base.settings import EVALUATION_SEED, BuildDatastoreSettings, PolicySettings
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.cli.app import app
-from kerv_cli.engine.tree import ROOT, TokenTree, merge
+from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.methods.heisd.datastore import Datastore, Manifest, Shard, check_seeds, prompt_key
 from kerv_cli.methods.heisd.rules import neighbour_tree
 from kerv_cli.targets.checkpoint import TargetDescription, load_target
@@ -245,13 +244,6 @@ def test_the_key_pools_the_named_parts_of_the_prompt(results: Path) -> None:
         prompt_key(prompt, state, ["vision"])
 
 
-def test_fewer_entries_than_asked_for_are_all_given(results: Path) -> None:
-    store, _, _ = opened(results)
-    rows = sum(LENGTHS.values())
-    assert len(store.query(store.vectors[0], TASKS[0], 1000)) == rows
-    assert len(store.query(store.vectors[0], TASKS[0], 1000, without=7)) == rows - LENGTHS[7]
-
-
 def test_the_first_episodes_and_tasks_can_be_asked_for(copy: Path) -> None:
     store = DatastoreBuild(asked(copy, task=["reach"], episodes=2, name="small", key=["proprioception"])).build()
     assert set(entries(store)) == {("reach-v3", s, t) for s in (0, 1) for t in range(LENGTHS[s])}
@@ -363,32 +355,19 @@ def cut(path: Path) -> None:
     [
         (lambda m: m.update(target="f" * 64), "was built for target ffffffffffff, not for"),
         (lambda m: m["actions"].update(low=[-2, -1, -1, -1]), "an action space with low -2, -1, -1, -1"),
-        (lambda m: m["actions"].update(names=["dx", "dy", "yaw", "gripper"]), "with names dx, dy, yaw, gripper"),
-        (lambda m: m["actions"].update(strict=[]), "with strict none"),
         (lambda m: m.update(chunk=8), "was built for chunks of 8 steps, not of 4"),
         (lambda m: m["tasks"]["reach-v3"]["seeds"].append(EVALUATION_SEED), "holds seed 100000 of reach-v3"),
         (lambda m: m.update(format=1), "manifest.json is damaged: format"),
-        (lambda m: m.update(kind="drafter"), "manifest.json is damaged: kind"),
         (lambda m: m.update(rows=3), "the rows of drawer-close-v3 are not among 3"),
         (lambda m: m.update(rows=60), "its files do not fit its manifest"),
-        (lambda m: m.update(width=3), "its files do not fit its manifest"),
-        (lambda m: m.pop("files"), "manifest.json is damaged: files"),
         (
             lambda m: m["files"].pop("vectors.npy"),
             "manifest.json is damaged: the whole: value error, a file has no hash",
         ),
-        (lambda m: m.pop("tasks"), "manifest.json is damaged: tasks"),
-        (lambda m: m.update(tasks=[]), "manifest.json is damaged: tasks"),
-        (lambda m: m["tasks"]["reach-v3"].pop("rows"), "manifest.json is damaged: tasks.reach-v3.rows"),
         (
             lambda m: m["tasks"]["reach-v3"].update(rows=[0, 9999]),
             "manifest.json is damaged: the whole: value error, the rows of",
         ),
-        (
-            lambda m: m["tasks"]["reach-v3"].update(rows=[9, 3]),
-            "manifest.json is damaged: the whole: value error, the rows of",
-        ),
-        (lambda m: m.pop("actions"), "manifest.json is damaged: actions"),
         (lambda m: m["actions"].update(high=[-9] * 4), "manifest.json is damaged: actions"),
     ],
 )
@@ -404,10 +383,8 @@ def test_a_datastore_that_does_not_belong_here_is_refused(copy: Path, change: Ch
     ("damage", "says"),
     [
         (lambda f: cut(f / "vectors.npy"), "vectors.npy does not match its manifest"),
-        (lambda f: cut(f / "payload.parquet"), "payload.parquet does not match its manifest"),
         (lambda f: (f / "payload.parquet").unlink(), "payload.parquet cannot be read"),
         (lambda f: cut(f / "manifest.json"), "cannot be read as JSON"),
-        (lambda f: (f / "manifest.json").write_text("[]"), "it holds no object; build one"),
         (lambda f: shutil.rmtree(f), "no datastore in"),
     ],
 )
@@ -487,16 +464,6 @@ def test_a_build_that_fails_leaves_what_was_there(
         assert opened(copy)[0].manifest.rows == 52
 
 
-@pytest.mark.parametrize("full", ["vectors.npy", "payload.parquet"])
-def test_a_full_disk_is_one_line(copy: Path, monkeypatch: pytest.MonkeyPatch, full: str) -> None:
-    write = Path.write_bytes
-    monkeypatch.setattr(Path, "write_bytes", lambda p, data: write(Path("/dev/full") if p.name == full else p, data))
-    with pytest.raises(StorageError, match=r"cannot write .*nano-state: the disk is full") as caught:
-        DatastoreBuild(asked(copy)).build()
-    assert "\n" not in str(caught.value)
-    assert opened(copy)[0].manifest.rows == 52
-
-
 @pytest.mark.bits
 def test_a_rebuild_replaces_the_whole_datastore_and_is_the_same(copy: Path) -> None:
     first = {p.name: p.read_bytes() for p in folder_of(copy).iterdir()}
@@ -532,67 +499,9 @@ def test_the_command_builds_and_reports(copy: Path) -> None:
     assert run.output.startswith("kerv: unknown key 'smell'")
 
 
-@st.composite
-def neighbours(draw: st.DrawFn) -> tuple[np.ndarray, ActionSpace]:
-    space = draw(st.sampled_from([SPACE, SEVEN]))
-    k, steps = draw(st.integers(1, 4)), draw(st.integers(1, 2))
-    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    return rng.integers(0, draw(st.integers(1, 3)), (k, steps * space.dofs)), space
-
-
 def leaves(tree: TokenTree) -> list[tuple[int, ...]]:
     inner = set(tree.parents)
     return [tuple(tree.tokens[i] for i in tree.path_to(n)) for n in range(len(tree)) if n not in inner]
-
-
-def combinations(chunks: np.ndarray, cuts: list[tuple[int, int, bool]]) -> set[tuple[int, ...]]:
-    """docs/methods.md §4.2: one neighbour per group; a strict group from one that gave the group before it."""
-    paths = set()
-    for owners in product(range(len(chunks)), repeat=len(cuts)):
-        parts = [tuple(chunks[i, a:b].tolist()) for i, (a, b, _) in zip(owners, cuts, strict=True)]
-        if all(
-            not gripper or n == 0 or tuple(chunks[owners[n], slice(*cuts[n - 1][:2])].tolist()) == parts[n - 1]
-            for n, (_, _, gripper) in enumerate(cuts)
-        ):
-            paths.add(tuple(token for part in parts for token in part))
-    return paths
-
-
-@settings(deadline=None)
-@given(neighbours(), st.integers(0, 13), st.integers(1, 14))
-def test_with_room_the_tree_holds_every_combination_of_groups(
-    given_: tuple[np.ndarray, ActionSpace], start: int, depth: int
-) -> None:
-    chunks, space = given_
-    cuts = list(space.segments(start, min(chunks.shape[1], start + depth)))
-    tree = neighbour_tree(chunks, start, space, nodes=100_000, depth=depth).tree
-    assert set(leaves(tree)) == (combinations(chunks, cuts) if cuts else set())
-    assert len(set(zip(tree.parents, tree.tokens, strict=True))) == len(tree)  # no twins
-    own = neighbour_tree(chunks, start, space, nodes=100_000, depth=depth, cross=0.0).tree
-    assert set(leaves(own)) == set(leaves(merge(chunks[:, start : start + depth].tolist())))
-
-
-@settings(deadline=None)
-@given(neighbours(), st.integers(0, 7), st.integers(0, 30), st.sampled_from([0.0, 0.1, 1.0]))
-def test_under_the_cap_every_path_is_made_of_whole_groups_of_the_neighbours(
-    given_: tuple[np.ndarray, ActionSpace], start: int, nodes: int, cross: float
-) -> None:
-    chunks, space = given_
-    cuts = list(space.segments(start, chunks.shape[1]))
-    tree = neighbour_tree(chunks, start, space, nodes=nodes, cross=cross).tree
-    assert len(tree) <= nodes
-    whole = {last - start: n + 1 for n, (_, last, _) in enumerate(cuts)}
-    for path in leaves(tree):
-        assert path in combinations(chunks, cuts[: whole[len(path)]])
-
-
-def test_the_nearest_neighbours_chunk_comes_first() -> None:
-    chunks = np.random.default_rng(0).integers(0, 255, (5, 16))
-    assert leaves(neighbour_tree(chunks, 1, SPACE, nodes=15).tree) == [tuple(chunks[0, 1:])]
-    more = leaves(neighbour_tree(chunks, 1, SPACE, nodes=30).tree)
-    assert {tuple(chunks[0, 1:]), tuple(chunks[1, 1:])} <= set(more)
-    assert len(neighbour_tree(chunks, 16, SPACE)) == 0
-    assert len(neighbour_tree(chunks[:0], 0, SPACE)) == 0
 
 
 def ranked_paths(
@@ -647,6 +556,10 @@ def test_a_limited_tree_holds_the_most_probable_groups(
     prefixes = {path[:n] for path in kept for n in range(1, len(path) + 1)}
     tree = neighbour_tree(chunks, start, space, len(prefixes), depth, cross).tree
     assert {tuple(tree.tokens[i] for i in tree.path_to(n)) for n in range(len(tree))} == prefixes
+    nodes = max(0, len(prefixes) - 1)  # no room for the last group: every path still ends with a whole one
+    smaller = neighbour_tree(chunks, start, space, nodes, depth, cross).tree
+    assert len(smaller) <= nodes
+    assert set(leaves(smaller)) <= {path for _, path in paths}
 
 
 def test_of_equally_probable_groups_the_better_neighbours_comes_first() -> None:
@@ -658,3 +571,4 @@ def test_of_equally_probable_groups_the_better_neighbours_comes_first() -> None:
     assert [path[-1] for path in leaves(tree) if path[0] == 1] == [9, 8]
     assert list(tree.tokens) == [0, 0, 0, 8, 1, 1, 1, 9, 8]
     assert list(tree.parents) == [ROOT, 0, 1, 2, ROOT, 4, 5, 6, 6]
+    assert len(neighbour_tree(chunks, 4, SPACE)) == len(neighbour_tree(chunks[:0], 0, SPACE)) == 0

@@ -5,7 +5,6 @@ from __future__ import annotations
 import email
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -62,12 +61,6 @@ def test_the_command_names_a_function_that_the_wheel_holds(wheel: zipfile.ZipFil
     assert f"def {function}(" in wheel.read(module.replace(".", "/") + ".py").decode()
 
 
-def test_the_wheel_states_its_licence_and_ships_the_text(wheel: zipfile.ZipFile, metadata: Message) -> None:
-    assert metadata["License-Expression"] == "Apache-2.0"
-    (licence,) = [name for name in wheel.namelist() if name.endswith("/licenses/LICENSE")]
-    assert wheel.read(licence) == (ROOT / "LICENSE").read_bytes()
-
-
 def test_the_requirements_keep_the_physics_engine_that_results_depend_on(metadata: Message) -> None:
     requirements = metadata.get_all("Requires-Dist") or []
     assert "mujoco==3.3.0" in requirements
@@ -104,7 +97,7 @@ def executable(path: Path, script: str) -> None:
     path.chmod(0o755)
 
 
-# A Python of version $KERV_TEST_VERSION. The one in its environments logs what pip is asked, fails or hangs on request,
+# A Python of version $KERV_TEST_VERSION. The one in its environments logs what pip is asked, fails on request,
 # and says that MuJoCo can draw once the file `drawable` exists.
 PYTHON = r"""
 case "$1 $2" in
@@ -114,7 +107,7 @@ case "$1 $2" in
     "-m venv") mkdir -p .venv/bin && cat "$0" > .venv/bin/python && chmod +x .venv/bin/python ;;
     "-m pip") [ "$3" = --version ] && exit 0
               [ "$3" = freeze ] && { cat frozen 2>/dev/null || true; exit 0; }
-              echo "pip ${@:3}" >> log; [ ! -e pip-hangs ] || sleep 60
+              echo "pip ${@:3}" >> log
               [[ "$*" = *torch==* && -e no-torch ]] && exit 1; [ ! -e pip-fails ] ;;
     "-I -S") [ -e drawable ] ;;
     *) echo "unexpected: $*" >&2; exit 97 ;;
@@ -244,13 +237,6 @@ def test_the_two_lock_files_differ_in_pytorch_alone_and_hold_every_requirement(m
             assert requirement.specifier.contains(pinned[requirement.name.lower()]), requirement
 
 
-def test_setup_installs_again_when_the_requirements_change(checkout: Checkout) -> None:
-    checkout.setup()
-    os.utime(checkout.root / "pyproject.toml", (time.time() + 60, time.time() + 60))
-    checkout.setup()
-    assert len(checkout.log) == 4
-
-
 def test_a_failed_installation_is_tried_again(checkout: Checkout) -> None:
     (checkout.root / "pip-fails").touch()
     assert checkout.setup().returncode != 0
@@ -258,27 +244,6 @@ def test_a_failed_installation_is_tried_again(checkout: Checkout) -> None:
     (checkout.root / "pip-fails").unlink()
     assert checkout.setup().returncode == 0
     assert checkout.stamped
-
-
-def test_an_interrupted_installation_leaves_no_stamp(checkout: Checkout) -> None:
-    (checkout.root / "pip-hangs").touch()
-    running = subprocess.Popen(
-        ["make", "setup"],
-        cwd=checkout.root,
-        env=checkout.environment(),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-        # a test run in the background of a shell ignores interrupts, and so would its children
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-    deadline = time.monotonic() + 60
-    while not checkout.log and time.monotonic() < deadline:
-        time.sleep(0.02)
-    os.killpg(running.pid, signal.SIGINT)
-    assert running.wait(timeout=180) != 0
-    assert checkout.log, "the installation never started"
-    assert not checkout.stamped
 
 
 @pytest.mark.parametrize("version", ["3, 11", "3, 13"])

@@ -19,9 +19,8 @@ from rerun.chunk import RrdReader
 from rerun_synthetic import DOFS, decode_of, episode, prefill, skipped_decode, verify
 
 from kerv_cli.base.errors import KervError, StorageError, UsageError
-from kerv_cli.base.registry import parts
 from kerv_cli.engine.record import EpisodeRecord, Round
-from kerv_cli.report.viewing import rerun_log, save_recording, viewer
+from kerv_cli.report.viewing import save_recording, viewer
 from kerv_cli.report.viewing.facts import readable
 from kerv_cli.report.viewing.film import save_film
 from kerv_cli.report.viewing.token_outcomes import chunk_size, outcomes_of
@@ -140,15 +139,6 @@ def test_a_failure_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(StorageError, match="the disk is full"):
         saved(episode("ar"), tmp_path)
-    monkeypatch.undo()
-    assert list(tmp_path.iterdir()) == []
-
-    def broken(record: EpisodeRecord, method: str) -> str:
-        raise RuntimeError("mistake")
-
-    monkeypatch.setattr(rerun_log, "summary", broken)
-    with pytest.raises(RuntimeError, match="mistake"):
-        saved(episode("ar"), tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -263,12 +253,6 @@ def test_token_lanes_and_modes(tmp_path: Path) -> None:
     for decode, step in zip(record.decodes, record.decode_steps, strict=True):
         shown = changes.get(step, shown)
         assert shown == decode.mode
-
-
-def test_a_modes_colour_is_its_proposers() -> None:
-    assert rerun_log._mode_color("drafter", 0) == parts("proposer")["drafter"].colour * 256 + 255
-    assert rerun_log._mode_color("expert", 0) != rerun_log._mode_color("ar", 0)
-    assert rerun_log._mode_color("mine", 0) != rerun_log._mode_color("mine too", 1)
 
 
 def test_optional_numbers_have_rows_only_where_they_are(tmp_path: Path) -> None:

@@ -134,8 +134,6 @@ def test_a_client_gets_the_actions_of_the_policy(policy: Policy, policies: Path)
     ("changes", "said"),
     [
         ({"observation/image": np.zeros((64, 64, 3), np.uint8)}, "(64, 64, 3) uint8, (96, 96, 3) uint8 is wanted"),
-        ({"observation/image": np.zeros((96, 96, 3), np.float32)}, "(96, 96, 3) float32"),
-        ({"observation/image": "cat"}, "observation/image is str"),
         ({"observation/state": np.array([0, np.nan, 0, 0])}, "not finite, at [1]"),
         ({"observation/state": np.zeros(5)}, "has shape (5,), 4 or 39 numbers are wanted"),
         ({"observation/state": ["a"]}, "does not hold numbers"),
@@ -166,12 +164,10 @@ BOMB = {b"__ndarray__": True, b"data": b"", b"dtype": "<f8", b"shape": [2**40]}
     ("frame", "said"),
     [
         (b"\xc1garbage", "cannot be read as msgpack"),
-        (b"", "cannot be read as msgpack"),
         ("text", "a text frame came"),
         (msgpack.packb([1, 2]), "the message is a list"),
         (msgpack.packb({"observation/image": BOMB}), "does not fit its bytes"),
         (msgpack.packb({"x": {**BOMB, b"dtype": "|O"}}), "booleans, integers and floats are accepted"),
-        (msgpack.packb({"x": {**BOMB, b"shape": [-1]}}), "at most 8 whole numbers"),
         (msgpack.packb({}), "or observation/image is wanted, the message has nothing"),
     ],
 )
@@ -255,13 +251,6 @@ def test_grippers(policy: Policy, gripper: str, values: list[float]) -> None:
     made = replace(policy.interface, gripper=gripper).converted(np.array([[0.3, 0, 0, 0.1], [0, 0, 0, 0.9]]))
     np.testing.assert_allclose(made[:, 3], values)
     np.testing.assert_allclose(made[:, 0], [0.3, 0])
-
-
-def test_messages_survive_the_way_there_and_back() -> None:
-    message = {"a": np.arange(6, dtype=np.int16).reshape(2, 3), "b": [1.5, "x", None, True], "c": np.float32(2)}
-    back = unpacked(packed(message))
-    np.testing.assert_array_equal(back["a"], message["a"])
-    assert (back["b"], back["c"], back["a"].dtype) == (message["b"], 2.0, np.int16)
 
 
 @pytest.mark.parametrize(
@@ -391,10 +380,6 @@ def test_or_the_last_action_is_held(policies: Path, tmp_path: Path) -> None:
         assert held["decode"] == {"forwards": 0, "tokens": 0, "mode": "hold"}
         assert any("out of range: x is 9" in line and line.endswith("the last action is held") for line in log)
         assert client.infer(seen(1, **near))["decode"]["forwards"] > 0
-
-
-def test_a_policy_without_a_range_is_checked_for_finite_numbers_alone(policy: Policy) -> None:
-    assert policy.range is None
 
 
 def test_no_action_follows_from_logits_that_are_not_finite(policy: Policy, monkeypatch: pytest.MonkeyPatch) -> None:
