@@ -371,7 +371,7 @@ def test_no_speedup_is_made_of_what_was_not_timed(tmp_path: Path, which: str) ->
     execute(cells, Prepared(), store)
     table = load_study(store).table
     methods = table[table["label"] != "ar"]
-    for name in ("speedup", "speedup_low", "episode_speedup", "ceiling"):
+    for name in ("speedup", "speedup_low", "episode_speedup"):
         assert methods[name].isna().all()
     assert table.loc[table["rollout.batch"] > 1, "time_per_step_ms"].isna().all()
     assert table.loc[table["rollout.batch"] > 1, "latency_p50_ms"].isna().all()

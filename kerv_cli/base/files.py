@@ -29,6 +29,7 @@ MOST_BYTES = 2**36
 _REFUSALS = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the disk quota is used up",
+    errno.EFBIG: "the file would be too large",
     errno.EIO: "the disk does not work",
     errno.EROFS: "the file system is read-only",
     errno.EACCES: "permission denied",

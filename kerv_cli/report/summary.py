@@ -42,7 +42,7 @@ _SHARES = {
 _ALIKE = 0.02
 """Lengths of episodes that differ by a smaller share are alike."""
 
-_SPARE = ("forwards / step", "felt ms", "AL", "ms / step", "ceiling", "p95 ms", "deviation", "AFEP")
+_SPARE = ("forwards / step", "felt ms", "AL", "ms / step", "p95 ms", "deviation", "AFEP")
 """Columns that a narrow terminal lacks where they do not fit, behind the speed per step and the shares, the most
 important first."""
 _LABEL = 16
@@ -66,7 +66,6 @@ def _columns() -> list[Column]:
         Column("setting", lambda row: str(row["label"])),
         Column("success %", intervals("success", 100.0, 0)),
         *(Column(title, _speed(name)) for name, title in SPEEDS.items()),
-        Column("ceiling", numbers("ceiling"), needs="ceiling"),
         Column("p95 ms", numbers("latency_p95_ms")),
         Column("ms / step", numbers("time_per_step_ms")),
         Column("AL", numbers("AL")),
@@ -101,8 +100,6 @@ class SummaryTable:
         untimed = list(dict.fromkeys(self.table.loc[self.table["time_per_step_ms"].isna(), "label"]))
         if untimed:
             yield Text(f"not timed, for success alone: {', '.join(map(str, untimed))}")
-        if "ceiling" in frame:
-            yield Text("ceiling: speed per step if every chunk were accepted whole at once")
         yield from (Text(reason) for reason in differences(rows_of(self.table, MICRO)))
 
 
@@ -119,7 +116,7 @@ def _printed(frame: pd.DataFrame) -> Table:
 
 def _heading(name: str) -> list[str]:
     """A column's heading in lines."""
-    short = name.replace("forwards", "fwd").replace(" / ", "\n/ ").replace("ceiling", "ceil-\ning")
+    short = name.replace("forwards", "fwd").replace(" / ", "\n/ ")
     return short.replace("lost/won of", "lost/won\nof").replace(": ", ":\n").split("\n")
 
 

@@ -27,15 +27,7 @@ from kerv_cli.lab.identity import (
 )
 from kerv_cli.lab.plan import Cell, StudyPlan, seeds_text
 from kerv_cli.lab.store import StoredCell, StudyStore
-from kerv_cli.report.ceiling import (
-    NONE,
-    Ceiling,
-    ceiling,
-    chunk_ratio,
-    is_autoregressive,
-    verifies_in_prefill,
-)
-from kerv_cli.report.measures import COMPARABLE, MACRO, MICRO, Row, measure
+from kerv_cli.report.measures import MACRO, MICRO, Row, measure
 from kerv_cli.worlds import specs
 
 _MACHINE = ("executor", "workers", "device_name", "host")
@@ -51,13 +43,6 @@ class StudyData:
     cells: dict[str, StoredCell]  # by id
     episodes: pd.DataFrame  # one row per label and episode
     absent: list[Cell]  # planned, not complete
-
-    @functools.cached_property
-    def autoregressive(self) -> list[Cell]:
-        """The first cell of every label that decodes autoregressively; the baseline is first if it does."""
-        first = {cell.label: cell for cell in reversed(self.plan.cells) if is_autoregressive(cell.settings)}
-        order = [label for label in self.plan.labels if label in first]
-        return [first[label] for label in sorted(order, key=lambda label: label != self.plan.baseline)]
 
     @functools.cached_property
     def references(self) -> dict[str, str]:
@@ -186,25 +171,8 @@ def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataF
         "episodes": len(episodes),
         "baseline": data.references[label],
     }
-    best = _ceiling(data, cells[0], episodes, averaging)
-    measures = {**measure(episodes, baseline, averaging), "ceiling": best.value}
+    measures = measure(episodes, baseline, averaging)
     return [head, measures, *_origin(data, cells)]
-
-
-def _ceiling(data: StudyData, cell: Cell, episodes: pd.DataFrame, averaging: str) -> Ceiling:
-    """The ceiling against autoregressive decoding of the same target on the same device: the baseline if it is that,
-    else the first such label."""
-    if is_autoregressive(cell.settings):
-        return NONE
-    target = cell.identity.get("target")
-    candidates = [other for other in data.autoregressive if other.identity.get("target") == target]
-    if not candidates:
-        return NONE
-    reference = data.episodes[data.episodes["label"] == candidates[0].label]
-    for name in ("task", *COMPARABLE):
-        reference = reference[reference[name].isin(set(episodes[name]))]
-    chunks = chunk_ratio(cell.settings, candidates[0].settings)
-    return ceiling(episodes, reference, verifies_in_prefill(cell.settings), chunks, averaging == MACRO)
 
 
 def _origin(data: StudyData, cells: Sequence[Cell]) -> Sections:
@@ -232,6 +200,12 @@ def _origin(data: StudyData, cells: Sequence[Cell]) -> Sections:
         "cell": ";".join(cell.id for cell in cells),
     }
     return [{"overrides": cells[0].overrides}, flatten(parts), weights, surroundings]
+
+
+def is_autoregressive(settings: Plain) -> bool:
+    """Whether a setting is a model that decodes token by token: nothing drafts, nothing is skipped."""
+    drafts = any(settings[part]["kind"] != "none" for part in ("prefill_draft", "proposer", "skip"))
+    return not drafts and settings["policy"]["kind"] == MODEL
 
 
 def flatten(settings: Plain) -> Row:
