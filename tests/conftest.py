@@ -24,7 +24,7 @@ ENVIRONMENTS = dict(registry.parts("environment"))
 
 
 LONGEST = (
-    *("test_documented_commands", "test_studies_executors", "test_training", "test_cli", "test_training_ranks"),
+    *("test_documented_commands", "test_studies_executors", "test_training", "test_cli", "test_dagger"),
     *("test_golden", "test_older_results", "test_extending", "test_coverage", "test_views", "test_early"),
 )
 """Files that take longest, begun first: no process is left with one of them at the end while the others idle."""

@@ -29,13 +29,6 @@ class Config:
 recording._record_seeds = sleep
 list(recording._run_jobs(Config, None, [("a", range(1)), ("b", range(1))], None))
 """
-RANK = """
-import os, sys, time
-from kerv_cli.training.ranks import join
-join("cpu", 2)
-open(sys.argv[1], "a").write(f"{os.getpid()}\\n")
-time.sleep(60)
-"""
 GUARD = """
 import os, subprocess, sys, time
 from kerv_cli.base.processes import guard
@@ -123,26 +116,6 @@ def test_what_a_library_starts_ends_with_a_killed_command(tmp_path: Path) -> Non
 def test_what_a_library_starts_ends_with_the_block(tmp_path: Path) -> None:
     subprocess.run([sys.executable, "-c", GUARD, str(tmp_path / "pids"), "0"], check=True)
     assert all(map(ends, pids(tmp_path / "pids", 1)))
-
-
-def test_a_rank_ends_with_what_started_it(tmp_path: Path) -> None:
-    starter = (
-        "import os, subprocess, sys\n"
-        "for rank in '01':\n"
-        "    at = {'RANK': rank, 'WORLD_SIZE': '2', 'MASTER_ADDR': '127.0.0.1', 'MASTER_PORT': sys.argv[3]}\n"
-        "    last = subprocess.Popen([sys.executable, '-c', sys.argv[2], sys.argv[1]], env={**os.environ, **at})\n"
-        "last.wait()"
-    )
-    assert all(map(ends, killed(starter, tmp_path / "pids", 2, RANK, str(free_port()))))
-
-
-def free_port() -> int:
-    import socket
-
-    with socket.socket() as bound:
-        bound.bind(("127.0.0.1", 0))
-        port: int = bound.getsockname()[1]
-    return port
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

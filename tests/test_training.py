@@ -103,7 +103,7 @@ def test_ctrl_c_saves_the_step_that_ran_and_the_run_goes_on_there(
 
 def test_one_request_that_arrives_twice_is_one_and_a_run_without_validation_says_so(tmp_path: Path) -> None:
     def stop(step: int, metrics: Metrics) -> None:
-        for _ in range(2):  # torchrun passes on what the process heard already
+        for _ in range(2):  # schedulers pass on what the process heard already
             os.kill(os.getpid(), signal.SIGTERM)
 
     with pytest.raises(Interrupted, match="step 1 is saved"):

@@ -70,22 +70,19 @@ def run_training(run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading
 
     def on_step(step: int, now: dict[str, float]) -> None:
         nonlocal started
-        if not started and step > 1 and run.ranks.first:
+        if not started and step > 1:
             typer.echo(f"resuming at step {step - 1}", err=True)
         started = True
         log(step, now)
         advance(step, settings.train.steps, _line(now))
 
-    tracker = settings.log if run.ranks.first else "none"
     name = f"{run.kind}/{run.folder.name}"
     with (
         without_subnormals(),
-        _live(tracker, name, run.folder, settings.train.steps, asdict(settings)) as log,
+        _live(settings.log, name, run.folder, settings.train.steps, asdict(settings)) as log,
         progress_bar(training) as advance,
     ):
         metrics = run.train(on_step)
-    if not run.ranks.first:
-        return
     from kerv_cli.report.curves import save_curves
 
     plot = save_curves(run.folder)

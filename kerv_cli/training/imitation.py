@@ -116,7 +116,7 @@ def token_loss(logits: Tensor, tokens: Tensor, labels: Tensor) -> Tensor:
 def lit(images: Tensor, indices: Tensor, step: int, spread: float) -> Tensor:
     """images (B, 3, h, w) uint8 under random light: each colour is multiplied by the exponential of a smooth field,
     whose standard deviation is drawn from 0 to `spread` per image. The field depends on the sample's index (B,) and the
-    step alone, so that the number of processes changes nothing. Places in the image stay where they are."""
+    step alone. Places in the image stay where they are."""
     draws = [np.random.default_rng((step, index)) for index in indices.tolist()]
     fields = np.stack([spread * r.uniform() * r.normal(size=(3, 3, 3)) for r in draws])
     factors = torch.from_numpy(fields).float().to(images.device).exp()

@@ -17,8 +17,8 @@ SAME_REQUEST = 2.0
 @contextmanager
 def until_interrupted() -> Iterator[threading.Event]:
     """Yields an event that the first SIGINT or SIGTERM sets (schedulers and `timeout` send the latter); a second one of
-    the same kind raises KeyboardInterrupt at once. One that follows within seconds is the same request: torchrun and
-    schedulers pass on a signal that the process has received already. Outside the main thread no signal sets it, and a
+    the same kind raises KeyboardInterrupt at once. One that follows within seconds is the same request: schedulers pass
+    on a signal that the process has received already. Outside the main thread no signal sets it, and a
     signal that is ignored stays ignored."""
     stop = threading.Event()
     first_times: dict[int, float] = {}

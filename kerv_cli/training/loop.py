@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -27,7 +26,6 @@ from kerv_cli.base.places import RESUME
 from kerv_cli.base.settings import TrainSettings
 from kerv_cli.targets.checkpoint import load_tensors, save_tensors
 from kerv_cli.training.interruption import until_interrupted
-from kerv_cli.training.ranks import ALONE, Ranks
 
 Metrics = dict[str, float]
 
@@ -72,7 +70,7 @@ class RunProgress:
 class Loop:
     """Optimises a lesson's module. save: writes the best weights, which have these metrics. folder: holds
     `resume.safetensors` and `log.csv`. identity: hash of everything that determines the run; another run is never
-    resumed. ranks: the rank of this process among those that train together. borders: of `draw_samples`."""
+    resumed. borders: of `draw_samples`."""
 
     def __init__(
         self,
@@ -81,11 +79,10 @@ class Loop:
         settings: TrainSettings,
         folder: Path,
         identity: str,
-        ranks: Ranks = ALONE,
         borders: Tensor | None = None,
     ) -> None:
         self.lesson, self.module, self.save, self.settings = lesson, lesson.module, save, settings
-        self.folder, self.identity, self.ranks, self.borders = folder, identity, ranks, borders
+        self.folder, self.identity, self.borders = folder, identity, borders
         self.step, self.best = 0, -math.inf
         self.history: list[Metrics] = []
         decay = [p for p in self.module.parameters() if p.dim() >= 2]
@@ -95,8 +92,7 @@ class Loop:
         self.ema = {k: v.detach().clone() for k, v in self.module.state_dict().items()}
 
     def run(self, on_step: Callable[[int, Metrics], None] = lambda step, metrics: None) -> Metrics:
-        """Trains to `settings.steps`, resuming what the folder holds -> metrics of the best checkpoint; empty on ranks
-        other than the first.
+        """Trains to `settings.steps`, resuming what the folder holds -> metrics of the best checkpoint.
 
         Raises:
             CheckpointError: as `restore`, or no step is left and no validation was made. KervError: training diverged.
@@ -107,20 +103,15 @@ class Loop:
         settings = self.settings
         with until_interrupted() as stop:
             while self.step < settings.steps:
-                metrics, stopping = self.update(stop)
+                metrics = self.update()
                 self.step += 1
                 on_step(self.step, metrics)
-                if self.ranks.first and (self.step % settings.validate_every == 0 or self.step == settings.steps):
+                if self.step % settings.validate_every == 0 or self.step == settings.steps:
                     self.check(metrics)
                     on_step(self.step, self.history[-1])
-                interrupted = stopping if self.ranks.size > 1 else stop.is_set()  # ranks agree on it one step later
-                if interrupted and self.step < settings.steps:
-                    if self.ranks.first:
-                        self.store()
-                    self.ranks.wait()  # a rank that ends makes torchrun end the others
+                if stop.is_set() and self.step < settings.steps:
+                    self.store()
                     raise Interrupted(f"interrupted: step {self.step} is saved, the same command goes on from there")
-        if not self.ranks.first:
-            return {}
         if not self.history:
             raise CheckpointError(
                 f"{self.folder} was interrupted at step {self.step}, before its first validation: set train.steps "
@@ -128,8 +119,8 @@ class Loop:
             )
         return max(self.history, key=lambda m: m["score"])
 
-    def update(self, stop: threading.Event) -> tuple[Metrics, bool]:
-        """One optimiser step -> loss and logged numbers, and whether any rank was asked to stop.
+    def update(self) -> Metrics:
+        """One optimiser step -> loss and logged numbers.
 
         Raises:
             KervError: the loss is not finite.
@@ -138,20 +129,20 @@ class Loop:
         for group in self.optimiser.param_groups:
             group["lr"] = settings.lr * schedule(self.step, settings)
         generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + self.step)
-        indices = self.ranks.share(draw_samples(len(self.lesson), settings.batch, generator, self.borders))
+        indices = draw_samples(len(self.lesson), settings.batch, generator, self.borders)
         loss, metrics = self.lesson.loss(indices, self.step)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        mean, stopping = self.ranks.averaged(self.module.parameters(), (loss.item(), float(stop.is_set())))
-        if not math.isfinite(mean):
-            raise KervError(f"training diverged at step {self.step} (loss {mean}): lower train.lr")
+        value = loss.item()
+        if not math.isfinite(value):
+            raise KervError(f"training diverged at step {self.step} (loss {value}): lower train.lr")
         nn.utils.clip_grad_norm_(self.module.parameters(), settings.clip)
         self.optimiser.step()
         decay = min(settings.ema, (1 + self.step) / (10 + self.step))
         live = self.module.state_dict()
         with torch.no_grad():
             torch._foreach_lerp_([self.ema[k] for k in live], list(live.values()), 1 - decay)
-        return {"loss": mean, **metrics}, stopping > 0
+        return {"loss": value, **metrics}
 
     def check(self, training: Metrics) -> None:
         """Validates the EMA weights, saves the best, writes the resume file. training: numbers of the last step.

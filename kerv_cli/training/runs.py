@@ -47,7 +47,6 @@ from kerv_cli.training.imitation import (
     vocabulary,
 )
 from kerv_cli.training.loop import Lesson, Loop, Metrics, check_same_run, stored_identity
-from kerv_cli.training.ranks import Ranks, join
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
@@ -81,7 +80,6 @@ class Run(ABC):
     dataset: DemoDataset
     folder: Path
     device: str
-    ranks: Ranks
     learnt: Lesson
     borders: Tensor | None = None
 
@@ -100,7 +98,7 @@ class Run(ABC):
             CheckpointError: the folder holds another run. KervError: training diverged. StorageError: writing failed.
         """
         self.learnt.module.train()
-        loop = Loop(self.learnt, self.save, self.settings.train, self.folder, self.hash, self.ranks, self.borders)
+        loop = Loop(self.learnt, self.save, self.settings.train, self.folder, self.hash, self.borders)
         return loop.run(on_step)
 
     @property
@@ -118,15 +116,6 @@ class Run(ABC):
         stored = stored_identity(self.folder)
         if stored is not None:
             check_same_run(self.folder, stored, self.hash, f"choose another {key}=, or {removal(kind, self.folder)}")
-
-    def begin(self) -> None:
-        """Chooses the device, and joins the other processes where torchrun started several.
-
-        Raises:
-            UsageError: no such device, or a batch that cannot be divided among them.
-        """
-        device, _ = set_up(self.settings.runtime)
-        self.device, self.ranks = join(device, self.settings.train.batch)
 
     def save(self, module: nn.Module, metrics: Metrics) -> None:
         """Writes the weights with their provenance; metrics: of their validation."""
@@ -251,7 +240,7 @@ class TargetRun(Run):
         Raises:
             CheckpointError: one of them is damaged or of another environment.
         """
-        self.begin()
+        self.device, _ = set_up(self.settings.runtime)
         settings, camera, init = self.settings, self.world.camera.name, None
         if self.init is not None:
             init, description = load_target(self.init)
@@ -346,9 +335,9 @@ class DrafterRun(Run):
 
         Raises:
             CheckpointError: target or demonstrations are damaged.
-            UsageError: no such device, or a batch that cannot be divided.
+            UsageError: no such device.
         """
-        self.begin()
+        self.device, _ = set_up(self.settings.runtime)
         self.target, _ = load_target(self.target_folder, self.device)
         self.learnt = self.lesson(progress)
 

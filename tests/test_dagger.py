@@ -1,14 +1,10 @@
-"""Training on several processes, balanced batches, datasets that add up, and DAgger."""
+"""Balanced batches, datasets that add up, and DAgger."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 from typer.testing import CliRunner
@@ -28,7 +24,6 @@ from kerv_cli.training.dagger import PolicyActs
 from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.imitation import task_borders
 from kerv_cli.training.loop import draw_samples
-from kerv_cli.training.ranks import join
 from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.recording import DemoConfig, record, run_expert
@@ -36,41 +31,15 @@ from kerv_cli.worlds.metaworld.spec import SPEC
 from kerv_cli.worlds.spec import EnvironmentSpec
 
 SHORT = CameraSettings()
-SIZES = ("target.width=16", "target.layers=1", "target.heads=2", "target.feed_forward=16")
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two small datasets of real demonstrations: `few` of one task, `more` of another."""
-    folder = tmp_path_factory.mktemp("ranks")
+    folder = tmp_path_factory.mktemp("datasets")
     for name, task in (("few", "drawer-close-v3"), ("more", "reach-v3")):
         record(DemoConfig((task,), 4, camera=SHORT, frame_stride=8, workers=1), folder / "artifacts/demos" / name)
     return folder
-
-
-def test_a_batch_that_cannot_be_divided_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("WORLD_SIZE", "3")
-    with pytest.raises(UsageError, match=r"train.batch=64 cannot be divided among 3 processes"):
-        join("cpu", 64)
-    with pytest.raises(UsageError, match="would share it"):
-        join("cuda:1", 63)
-
-
-@pytest.mark.bits
-def test_two_processes_train_what_one_does(results: Path) -> None:
-    words = ["train", "target", "task=drawer-close-v3", "demos=few", *SIZES, "train.steps=4", "train.batch=8"]
-    words += ["train.validate_every=2", "train.bf16=false", "train.warmup=1", f"results={results}"]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    script = Path(sys.executable).parent / "kerv"
-    launcher = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", str(script)]
-    alone = CliRunner().invoke(app, [*words, "name=one"])
-    assert alone.exit_code == 0, alone.output
-    done = subprocess.run([*launcher, *words, "name=two"], env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.count("best checkpoint") == 1  # the first rank alone reports
-    one, two = (pd.read_csv(results / "artifacts/target" / name / "log.csv") for name in ("one", "two"))
-    assert list(one["step"]) == [2, 4]
-    np.testing.assert_allclose(one.drop(columns="train_loss"), two.drop(columns="train_loss"), rtol=1e-3, atol=1e-4)
 
 
 def test_balanced_tasks_are_drawn_alike() -> None:
