@@ -17,7 +17,7 @@ _PER_LAYER = 15e-6  # seconds per layer and pass below which projections do not 
 _HALF = 2  # bytes of a bfloat16
 
 Document = dict[str, Any]
-"""What a bench writes, and compares, as JSON."""
+"""What a bench writes, as JSON."""
 
 
 def profile_of(phases: Sequence[Phase], tokens: int) -> Profile:

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import read_mapping
 from kerv_cli.base.settings import BenchSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import print_table
@@ -18,13 +15,8 @@ from kerv_cli.cli.common import print_table
 if TYPE_CHECKING:
     from kerv_cli.bench.ceilings import MethodCeiling
     from kerv_cli.bench.phases import Phase
-    from kerv_cli.bench.profile import Document
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the whole result as JSON in the last line.")]
-Compare = Annotated[
-    tuple[Path, Path] | None,
-    typer.Option("--compare", metavar="A B", help="Compare two results instead of measuring one."),
-]
 
 
 @command(
@@ -34,12 +26,9 @@ Compare = Annotated[
     examples=("kerv bench", "kerv bench target=vla-150m dtype=bfloat16 projected=openvla-7b"),
     typed={"target": "model"},  # to Hydra target= would be a choice among the files of conf/target
 )
-def bench(settings: BenchSettings, as_json: AsJson = False, compare: Compare = None) -> None:
+def bench(settings: BenchSettings, as_json: AsJson = False) -> None:
     """Measure what a target's decodes cost, against the device's limits; target= is a policy or a shape: vla-150m,
     smolvla, openvla-7b. 'kerv report study=NAME on=PROFILE' prices a study's decodes with it."""
-    if compare is not None:
-        _compare(*compare)
-        return
     from kerv_cli.bench.run import card_of, open_timed, run, write
 
     model, machine, opened = open_timed(settings)
@@ -58,15 +47,6 @@ def bench(settings: BenchSettings, as_json: AsJson = False, compare: Compare = N
         typer.echo(str(path))
     if as_json:
         typer.echo(json.dumps(done.document(), allow_nan=False))
-
-
-def _compare(a: Path, b: Path) -> None:
-    documents = {path: read_mapping(path) for path in (a, b)}
-    for path, document in documents.items():
-        if not {"phases", "target", "dtype"} <= set(document):
-            raise CheckpointError(f"{path} is no result of 'kerv bench'")
-    names = [f"{documents[path]['target']} {documents[path]['dtype']} ms" for path in (a, b)]
-    print_table(("phase", *names, "ratio"), _comparison_rows(documents[a], documents[b]), f"{a} and {b}")
 
 
 def _card_rows(card: Mapping[str, float]) -> list[tuple[str, str]]:
@@ -106,14 +86,3 @@ def _ceiling_rows(by_tokens: Mapping[int, Sequence[MethodCeiling]]) -> list[tupl
             row = by_method.setdefault(ceiling.method, [])
             row += [ceiling.how, f"{ceiling.free:.2f}", f"{ceiling.drafted:.2f}"]
     return [(method, *row) for method, row in by_method.items()]
-
-
-def _comparison_rows(a: Document, b: Document) -> list[tuple[str, ...]]:
-    """Phases that both documents have: medians in milliseconds and a over b."""
-    other = {phase["name"]: phase for phase in b["phases"]}
-    rows: list[tuple[str, ...]] = []
-    for phase in a["phases"]:
-        if phase["name"] in other:
-            mine, theirs = phase["seconds"], other[phase["name"]]["seconds"]
-            rows.append((phase["name"], f"{1e3 * mine:.2f}", f"{1e3 * theirs:.2f}", f"{mine / theirs:.2f}"))
-    return rows
