@@ -203,12 +203,3 @@ def test_what_cannot_compensate_is_refused(values: dict[str, Any], error: type[E
         find("rectifier", "compensate").check_settings(CompensateSettings(**values), "rectifier")
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_an_in_prefill_draft_that_needs_states_is_refused() -> None:
-    class Late(Proposer):
-        name = "late"
-        needs_states = True
-
-    with pytest.raises(UsageError, match="'late' reads the target's states"):
-        Decoder(TARGET, Parts(prefill_draft=Late()))  # type: ignore[arg-type]

@@ -27,7 +27,7 @@ from kerv_cli.methods.heisd.datastore import Datastore, Manifest, Shard, check_s
 from kerv_cli.methods.heisd.rules import neighbour_tree
 from kerv_cli.targets.checkpoint import TargetDescription, load_target
 from kerv_cli.training import datastore as datastore_build
-from kerv_cli.training.datastore import DatastoreBuild, directions, leave_one_out
+from kerv_cli.training.datastore import DatastoreBuild, directions
 from kerv_cli.worlds.demos.dataset import FORMAT, dataset_hash, episode_path
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, save_episode
 from kerv_cli.worlds.metaworld.spec import SPEC
@@ -248,8 +248,6 @@ def test_the_first_episodes_and_tasks_can_be_asked_for(copy: Path) -> None:
     store = DatastoreBuild(asked(copy, task=["reach"], episodes=2, name="small", key=["proprioception"])).build()
     assert set(entries(store)) == {("reach-v3", s, t) for s in (0, 1) for t in range(LENGTHS[s])}
     assert store.manifest.tasks == {"reach-v3": Shard((0, 15), (0, 1))}
-    figures = leave_one_out(store)
-    assert 0 < figures["token_agreement"] <= figures["within_9"] <= 1
 
 
 @pytest.mark.parametrize(("name", "frames"), [("nano-state", 1), ("nano-vision", 2)])
@@ -492,7 +490,6 @@ def test_the_command_builds_and_reports(copy: Path) -> None:
     shutil.rmtree(folder_of(copy))
     run = CliRunner().invoke(app, words)
     assert run.exit_code == 0, run.output
-    assert "token_agreement" in run.output
     assert opened(copy)[0].manifest.rows == 52
     run = CliRunner().invoke(app, [*words, "key=[smell]"])
     assert run.exit_code == 2

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 
 import numpy as np
 import pytest
@@ -11,14 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from kerv_cli.base.errors import UsageError
 from kerv_cli.engine.chunk import WINDOW, ActionHistory
 from kerv_cli.methods.kinematics.prediction import (
     FILTERS,
     HORIZON,
     PREDICTORS,
     Hold,
-    Kalman,
     Linear,
     Noise,
     Predictor,
@@ -162,28 +159,3 @@ def test_known_steps_of_the_chunk_take_the_newest_places() -> None:
     np.testing.assert_allclose(history.values()[:, 0], [0.0, 0.1, 0.2])
     history = ActionHistory(DOFS, window=3)
     np.testing.assert_allclose(history.values(np.full((1, DOFS), 0.9)), np.full((1, DOFS), 0.9))
-
-
-@pytest.mark.parametrize("action", [np.zeros(3), np.zeros((1, 4)), np.array([0, 0, 0, np.nan])])
-def test_a_damaged_action_is_refused(action: np.ndarray) -> None:
-    with pytest.raises(ValueError, match="4 finite numbers"):
-        ActionHistory(DOFS).append(action)
-
-
-@pytest.mark.parametrize(
-    ("q", "r", "damping"), [(-1.0, 1.0, 1.0), (1.0, 0.0, 1.0), (math.nan, 1.0, 1.0), (1.0, 1.0, 1.1)]
-)
-def test_impossible_noise_is_refused(q: float, r: float, damping: float) -> None:
-    with pytest.raises(UsageError, match="kinematics"):
-        noise_of(q, r, damping)
-
-
-def test_wrong_requests() -> None:
-    with pytest.raises(UsageError, match="one number per DoF"):
-        Noise((1.0,), (1.0, 1.0), (1.0,))
-    with pytest.raises(UsageError, match="minimum history"):
-        Kalman(np.array(HELD), NOISE["kalman"], minimum=1)
-    with pytest.raises(UsageError, match="minimum history"):
-        Hold(np.array(HELD), minimum=WINDOW + 1)
-    with pytest.raises(ValueError, match="9 steps of 4"):
-        Kalman(np.array(HELD), NOISE["kalman"]).predict(np.zeros((5, DOFS)), HORIZON + 1)

@@ -181,7 +181,7 @@ def test_garbage_gets_an_error_frame_and_the_server_goes_on(policy: Policy, fram
 
 
 def test_whoever_leaves_in_mid_message_leaves_the_server_running(policy: Policy) -> None:
-    with serving(policy, max_mb=1) as (port, log):
+    with serving(policy) as (port, log):
         client = Client(port)
         raw: socket.socket = client.connection.socket
         raw.sendall(b"\x82\xfe\xff\xff")  # the beginning of a frame of 65535 bytes
@@ -189,7 +189,7 @@ def test_whoever_leaves_in_mid_message_leaves_the_server_running(policy: Policy)
         until(lambda: any("disconnected" in line for line in log))
         large = Client(port)
         with pytest.raises(ConnectionClosed):
-            large.send(bytes(2**21))  # more than a MiB
+            large.send(bytes(2**24 + 1))  # more than 16 MiB
         until(lambda: sum("disconnected" in line for line in log) == 2)
         assert Client(port).infer(seen(1))["actions"].shape == (4, 4)
 
@@ -306,8 +306,9 @@ def silent(port: int) -> socket.socket:
     return raw
 
 
-def test_a_client_that_answers_no_ping_loses_its_seat(policy: Policy) -> None:
-    with serving(policy, ping_s=0.3) as (port, log):
+def test_a_client_that_answers_no_ping_loses_its_seat(policy: Policy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(OpenPi, "ping_s", 0.3)
+    with serving(policy) as (port, log):
         lost = silent(port)
         until(lambda: any("connected" in line for line in log))
         began = time.monotonic()
@@ -317,8 +318,9 @@ def test_a_client_that_answers_no_ping_loses_its_seat(policy: Policy) -> None:
         lost.close()
 
 
-def test_a_client_that_says_nothing_loses_its_seat(policy: Policy) -> None:
-    with serving(policy, idle_s=0.3) as (port, log):
+def test_a_client_that_says_nothing_loses_its_seat(policy: Policy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(OpenPi, "idle_s", 0.3)
+    with serving(policy) as (port, log):
         first = Client(port)
         until(lambda: any("disconnected: no message for 0.3 s" in line for line in log))
         assert _accepted(port)

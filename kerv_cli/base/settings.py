@@ -236,16 +236,12 @@ class ServeSettings(MethodSettings):
     )
     host: str = setting("127.0.0.1", "address to listen on; there is no password")
     port: int = number(8000, 0, 65_535, help="port to listen on; 0: a free one")
-    max_mb: int = number(16, 1, 4096, help="largest message, MiB")
     log_every: int = number(100, 0, 10**9, help="answers between two lines of latencies; 0: at a connection's end only")
-    gripper: str = setting("as_is", "how strict DoFs (0 closed to 1 open) are sent: as_is, signed, signed_inverted")
+    gripper: str = choice(
+        "as_is", "as_is", "signed", "signed_inverted", help="how strict DoFs (0 closed to 1 open) are sent"
+    )
     task_name: str = setting("", "the task, for parts whose levels differ between tasks; empty: vla_eval's clients say")
     batch: int = number(1, 1, 1024, help="clients that are decoded together; above 1: without times")
-    seats: int = number(0, 0, 4096, help="clients at a time; 0: 1 with openpi, 64 with vla_eval")
-    ping_s: float = number(
-        0.0, 0, 86_400, help="a client that answers no ping for so long is gone; 0: 10, vla_eval none"
-    )
-    idle_s: float = number(0.0, 0, 86_400, help="a client without a message for so long is gone; 0: 120, vla_eval 1800")
     origins: list[str] = setting([], "web pages that may connect; programs, which name no origin, always may")
     outside: str = choice(
         "refuse", "refuse", "hold", help="a state that the policy was not trained on: an error, or the last action"
@@ -400,7 +396,7 @@ class DemosImportSettings(CommandSettings):
     name: str | None = setting(None, "default: the folder's")
     camera: str = setting("", "which of its images; empty: the first")
     episodes: int = number(0, 0, 1_000_000, help="the first ones; 0: all")
-    dofs: str = setting("own", "names of the DoFs: own, openvla")
+    dofs: str = choice("own", "own", "openvla", help="names of the DoFs")
     strict: list[str] | None = setting(None, "DoFs that are never relaxed; null: those with gripper in their name")
     tail: int = number(8, 0, 1024, help="copies of the last action behind an episode, for chunks at its end")
 
@@ -455,7 +451,14 @@ class BenchSettings(RunSettings):
     """`kerv bench`: how far a target is from what the device can do."""
 
     model: str = setting("mt10-vision", "a policy, or a shape of conf/target with random weights")
-    dtype: str = setting("auto", "of a shape: float32, bfloat16, auto (the faster one); a policy has runtime.dtype")
+    dtype: str = choice(
+        "auto",
+        "auto",
+        "float32",
+        "bfloat16",
+        "float16",
+        help="of a shape; auto: the faster one",
+    )
     repeats: int = number(30, 3, 100_000, help="of every measurement, for medians and 95th percentiles")
     tokens: list[int] = setting([7, 16], "N, tokens of a chunk; of a shape: at most", **limits(4, 256))
     projected: str = setting("", "a shape of conf/target whose profiles on `projections` are written too")
@@ -490,7 +493,7 @@ class BuildTargetSettings(RunSettings):
     environment: str | None = setting(None, "whose DoFs, control rate and camera it has; null: OpenVLA's own")
     control_hz: float = number(5.0, above=0, most=10_000, help="control steps per second, without an environment")
     camera: str = setting("", "image it is shown; empty: the environment's first camera, else primary")
-    prompt: str = setting("openvla", "openvla or openvla_v01")
+    prompt: str = choice("openvla", "openvla", "openvla_v01", help="text around the instruction")
     crop: bool = setting(False, "show the central 90 %: for checkpoints fine-tuned with augmented images (LIBERO's)")
     libero: bool = setting(False, "before that a JPEG round trip and Lanczos, as OpenVLA's evaluation on LIBERO does")
     int8: bool = setting(False, "the language model's layers with one byte per weight")
@@ -513,8 +516,8 @@ class BuildDrafterSettings(RunSettings):
 
     policy: PolicySettings = setting(PolicySettings, POLICY)
     checkpoint: str = setting("", "folder with config.json and model.safetensors")
-    positions: str = setting("sequence", "sequence or text (docs/methods.md §2.2)")
-    mask: str = setting("causal", "causal or prompt")
+    positions: str = choice("sequence", "sequence", "text", help="docs/methods.md §2.2")
+    mask: str = choice("causal", "causal", "prompt", help="docs/methods.md §2.2")
 
 
 @dataclass

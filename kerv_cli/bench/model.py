@@ -180,8 +180,6 @@ def open_model(settings: BenchSettings) -> Model:
 
 
 def _shape(settings: BenchSettings) -> Model:
-    if settings.dtype not in ("auto", *DTYPES):
-        raise UsageError(f"dtype={settings.dtype}: known are auto, {', '.join(DTYPES)}")
     shape = shape_of(settings.model, max(settings.tokens))
     device, _ = set_up(settings.runtime)
     dtype = DTYPES[settings.dtype] if settings.dtype != "auto" else fastest(torch.device(device))

@@ -80,12 +80,12 @@ def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
 )
 def datastore(settings: BuildDatastoreSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Store the demonstrations' action chunks under the target's own features, for retrieval."""
-    from kerv_cli.training.datastore import DatastoreBuild, leave_one_out
+    from kerv_cli.training.datastore import DatastoreBuild
 
     run = DatastoreBuild(settings)
     if plan:
         print_plan(run.plan(), as_json)
     with progress_bar("encoding demonstrations") as advance:
         store = run.build(advance)
-    figures = {"entries": len(store.vectors), "tasks": len(store.shards), **leave_one_out(store)}
-    print_figures("datastore, nearest neighbour in another episode", figures, run.folder, as_json)
+    figures = {"entries": len(store.vectors), "tasks": len(store.shards)}
+    print_figures("datastore", figures, run.folder, as_json)

@@ -16,7 +16,7 @@ from kerv_cli.cli.common import ShowPlan, print_plan
 @command(
     "serve",
     ServeSettings,
-    keys="protocol policy method task host port gripper batch seats idle_s",
+    keys="protocol policy method task host port gripper batch origins",
     examples=(
         "kerv serve policy=vision method=one_pass",
         "kerv serve protocol=vla_eval policy=state method=spec_vla",

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.acceptance import Acceptance, Strict
 from kerv_cli.engine.chunk import ActionHistory, Chunk, Clock, Rejection, Situation, steps_of
@@ -64,12 +63,10 @@ class Decoder:
         """chunk: H, control steps decoded at once; 0: as many as the target was trained for.
 
         Raises:
-            UsageError: a longer chunk, or an in-prefill draft that reads the target's states.
+            UsageError: a longer chunk.
         """
         self.target, self.parts = target, parts or Parts()
         draft = self.parts.prefill_draft
-        if draft is not None and draft.needs_states:
-            raise UsageError(f"prefill_draft '{draft.name}' reads the target's states, which come after it")
         self.steps = steps_of(chunk, target.chunk)
         self.acceptance: Acceptance = self.parts.acceptance or Strict(target.actions)
         self.threshold: Threshold = self.parts.threshold or Fixed(0)

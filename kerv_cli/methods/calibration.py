@@ -11,8 +11,8 @@ from typing import Any, Literal
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.methods.artifacts import Artifact, MadeFor, check_sources
-from kerv_cli.methods.heisd.rules import LEAST, BoundaryRanges
-from kerv_cli.methods.kinematics.prediction import FILTERS, MINIMUM, Noise
+from kerv_cli.methods.heisd.rules import BoundaryRanges
+from kerv_cli.methods.kinematics.prediction import Noise
 
 FILE = "calibration.json"
 NEVER = 1.01  # s_min of a task that never skips: cosines do not exceed 1
@@ -39,10 +39,6 @@ class Variability:
     p75: float
     p90: float
 
-    def __post_init__(self) -> None:
-        if not self.k_s > 0:
-            raise ValueError(f"the reference level {self.k_s} is not above 0")
-
 
 @dataclass(frozen=True)
 class BoundarySection:
@@ -50,11 +46,6 @@ class BoundarySection:
 
     episodes: int
     windows: dict[str, BoundaryRanges]
-
-    def __post_init__(self) -> None:
-        wrong = [window for window in self.windows if not window.isdigit() or int(window) < LEAST]
-        if wrong:
-            raise ValueError(f"boundary window {wrong[0]}")
 
 
 @dataclass(frozen=True)
@@ -70,10 +61,6 @@ class SkipLevel:
     entries: int
     within: float | None = None
     error: float | None = None
-
-    def __post_init__(self) -> None:
-        if not -NEVER <= self.low <= self.s_min <= self.high <= NEVER:
-            raise ValueError("the skip levels are not in order")
 
 
 @dataclass(frozen=True)
@@ -101,14 +88,6 @@ class Calibration:
     provenance: dict[str, Any] = field(default_factory=dict)
     format: Literal[2] = 2
     kind: Literal["calibration"] = "calibration"
-
-    def __post_init__(self) -> None:
-        if not set(FILTERS) <= set(self.noise):
-            raise ValueError("the noise of a filter is missing")
-        if any(len(noise.q) != self.target.actions.dofs for noise in self.noise.values()):
-            raise ValueError("the noise is not that of the action space")
-        if self.window < MINIMUM:
-            raise ValueError(f"window {self.window}")
 
     def k_s(self, task: str) -> float:
         """The task's reference level K_S, normalised action units.

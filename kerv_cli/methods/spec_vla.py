@@ -53,12 +53,7 @@ class FixedThresholdSettings:
 
 
 def fixed(settings: FixedThresholdSettings, context: Context) -> Fixed:
-    """threshold=fixed.
-
-    Raises:
-        UsageError: a radius above the largest distance of two tokens.
-    """
-    context.check_radius("r", settings.r)
+    """threshold=fixed."""
     return Fixed(settings.r)
 
 

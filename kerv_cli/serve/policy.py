@@ -23,7 +23,7 @@ from kerv_cli.lab.episode import Follower
 from kerv_cli.lab.policy import artifacts_of, warm_up
 from kerv_cli.methods.compose import Method
 from kerv_cli.serve.guard import HOLD, Finite, StateRange
-from kerv_cli.serve.session import GRIPPERS, Interface, Session
+from kerv_cli.serve.session import Interface, Session
 from kerv_cli.worlds import specs
 
 VLA_EVAL = "vla_eval"
@@ -44,8 +44,6 @@ class Policy:
     """
 
     def __init__(self, settings: ServeSettings) -> None:
-        if settings.gripper not in GRIPPERS:
-            raise UnknownName("gripper", settings.gripper, GRIPPERS)
         if settings.policy.kind != "model":
             raise UsageError(f"policy={settings.policy.kind}: it acts in the simulator's worlds and cannot be served")
         self.settings = settings

@@ -33,6 +33,8 @@ PROTOCOLS = {"openpi": "kerv_cli.serve.openpi:OpenPi", "vla_eval": "kerv_cli.ser
 HEALTH = ("/healthz", "/health")
 BUSY, GONE = 1013, 1001
 """Websocket close codes: try again later; going away."""
+LARGEST_MESSAGE = 16 * 2**20
+"""Bytes of a message."""
 LONGEST = 500
 """Letters of an error: a client's own words may be longer."""
 PATIENCE = 1.0
@@ -50,11 +52,11 @@ class Reply:
 
 
 class Conversation(abc.ABC):
-    """One client, in the words of its protocol. seats, ping_s, idle_s: where the settings leave them to the
-    protocol."""
+    """One client, in the words of its protocol. seats: clients at a time. A client is gone after `ping_s` seconds
+    without an answer to a ping (None: no pings are sent), or after `idle_s` without a message."""
 
     seats: int
-    ping_s: float
+    ping_s: float | None
     idle_s: float
 
     def __init__(self, policy: Policy, session: Session) -> None:
@@ -134,9 +136,7 @@ class PolicyServer:
     def __init__(self, policy: Policy, settings: ServeSettings, log: Log) -> None:
         self.policy, self.settings, self.log = policy, settings, log
         self.protocol: type[Conversation] = load(PROTOCOLS[settings.protocol])
-        self.seats = Seats(settings.seats or self.protocol.seats)
-        self.ping_s = settings.ping_s or self.protocol.ping_s
-        self.idle_s = settings.idle_s or self.protocol.idle_s
+        self.seats = Seats(self.protocol.seats)
 
     @contextlib.contextmanager
     def listening(self, host: str, port: int) -> Iterator[Server]:
@@ -155,11 +155,11 @@ class PolicyServer:
                 host,
                 port,
                 compression=None,
-                max_size=self.settings.max_mb * 2**20,
+                max_size=LARGEST_MESSAGE,
                 process_request=_health,
                 origins=[None, *self.settings.origins],  # a web page names its own
-                ping_interval=self.ping_s or None,
-                ping_timeout=self.ping_s or None,
+                ping_interval=self.protocol.ping_s,
+                ping_timeout=self.protocol.ping_s,
                 close_timeout=FAREWELL,
                 logger=_lines(self.log),
             )
@@ -188,7 +188,7 @@ class PolicyServer:
             frame = error.rcvd or error.sent
             why = f": {frame.reason}" if frame and frame.reason else ""
         except TimeoutError:
-            why = f": no message for {self.idle_s:g} s"
+            why = f": no message for {self.protocol.idle_s:g} s"
             _close(connection, GONE, why[2:])
         finally:
             self.seats.leave(connection)
@@ -206,7 +206,7 @@ class PolicyServer:
             if (greeting := conversation.greeting()) is not None:
                 connection.send(greeting)
             while True:
-                frame = connection.recv(timeout=self.idle_s)
+                frame = connection.recv(timeout=self.protocol.idle_s)
                 self.reply(connection, conversation, frame, latencies)
 
     def reply(

@@ -100,7 +100,7 @@ class VlaEval(Conversation):
     """One client, a shard of a benchmark. It is silent while it builds a world, and its pings wait as long: none are
     sent."""
 
-    seats, ping_s, idle_s = 64, 0.0, 1800.0
+    seats, ping_s, idle_s = 64, None, 1800.0
 
     def __init__(self, policy: Policy, session: Session) -> None:
         super().__init__(policy, session)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -35,15 +34,12 @@ from kerv_cli.methods.heisd.datastore import (
     prompt_key,
 )
 from kerv_cli.training.demonstrations import demos_for
-from kerv_cli.training.imitation import WITHIN
 from kerv_cli.training.observations import observations_of, prompts_of, read_chunks, steps_of
-from kerv_cli.training.skip_levels import neighbours_elsewhere
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 BATCH = 128  # observations encoded at once
-TESTED = 200  # entries per task
 KEYS = ("vision", "scene", "proprioception")
 """Parts of the prompt that can be part of a key. The instruction is none: it is the same for all entries of a task."""
 
@@ -201,27 +197,3 @@ class DatastoreBuild:
             provenance=provenance_of("kerv build datastore", self.settings, self.device),
         )
         write_json(folder / "manifest.json", asdict(manifest))
-
-
-def leave_one_out(store: Datastore) -> dict[str, float]:
-    """How well the nearest neighbours in other episodes predict the chunks of TESTED entries of each task: shares
-    of equal tokens and of those within WITHIN bins, the median similarity, and the median time of a search for five
-    neighbours in ms. Empty where no task has two episodes."""
-    gaps, similarities, seconds = [], [], []
-    for name in store.shards:
-        rows, similarity, chunks = neighbours_elsewhere(store, name, TESTED)
-        gaps.append(np.abs(chunks - store.tokens[rows]))
-        similarities.append(similarity)
-        for row in rows:
-            began = time.perf_counter()
-            store.query(store.vectors[row], name, 5)
-            seconds.append(time.perf_counter() - began)
-    if not seconds:
-        return {}
-    gap = np.concatenate(gaps)
-    return {
-        "token_agreement": float((gap == 0).mean()),
-        f"within_{WITHIN}": float((gap <= WITHIN).mean()),
-        "similarity": float(np.median(np.concatenate(similarities))),
-        "query_ms": 1000 * float(np.median(seconds)),
-    }

@@ -20,12 +20,12 @@ def import_drafter(settings: BuildDrafterSettings) -> tuple[Path, dict[str, Any]
     """Writes the drafter's folder -> the folder, and figures for the user.
 
     Raises:
-        UsageError: no checkpoint. UnknownName: no such convention. CheckpointError: no such target, an incomplete,
+        UsageError: no checkpoint. CheckpointError: no such target, an incomplete,
             damaged or pickled drafter, or one of another width.
     """
     if not settings.checkpoint:
         raise UsageError("checkpoint=DIR: name the folder of a drafter (config.json, model.safetensors)")
-    convention = Convention(settings.positions, settings.mask).check()
+    convention = Convention(settings.positions, settings.mask)
     device, _ = set_up(settings.runtime)
     artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
     target: Any = artifacts.target

@@ -14,17 +14,16 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kerv_cli.base.errors import CheckpointError, UnknownName
+from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import read_json
 from kerv_cli.base.manifests import read
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.targets.attention import Cache, attention_mask
 from kerv_cli.targets.checkpoint import WEIGHTS, load_tensors
 from kerv_cli.targets.openvla.config import CONFIG, Language
-from kerv_cli.targets.openvla.loading import SINGLE, Sizes, check_layout, conversion, open_shards, sizes_of
+from kerv_cli.targets.openvla.loading import SINGLE, Sizes, check_layout, open_shards, sizes_of
 from kerv_cli.targets.openvla.trunk import LlamaLayer, run_layers
 
-POSITIONS, MASKS = ("sequence", "text"), ("causal", "prompt")
 EMBEDDING = "embed_tokens.weight"
 
 
@@ -40,13 +39,6 @@ class Convention:
 
     positions: str = "sequence"
     mask: str = "causal"
-
-    def check(self) -> Convention:
-        """This convention. Raises UnknownName for a choice that does not exist."""
-        for what, name, names in (("positions", self.positions, POSITIONS), ("mask", self.mask, MASKS)):
-            if name not in names:
-                raise UnknownName(what, name, names)
-        return self
 
 
 @dataclass(frozen=True)
@@ -122,20 +114,18 @@ def read_public(folder: Path, target: ReadableTarget, convention: Convention) ->
 
     Raises:
         CheckpointError: an incomplete, damaged or pickled folder, or a drafter of another width than the target's.
-        UnknownName: no such convention.
     """
     config, pickled = folder / CONFIG, folder / "pytorch_model.bin"
     language = read(Language, read_json(config), str(config), tolerant=True)
     if not (folder / SINGLE).is_file() and pickled.is_file():
         raise CheckpointError(
-            f"{pickled} is pickled and can run code when it is opened: convert it where you trust it: "
-            f"{conversion(str(pickled), str(folder / SINGLE))}"
+            f"{pickled} is pickled and can run code when it is opened: convert it to {SINGLE} where you trust it"
         )
     if language.hidden_size != target.width:
         raise CheckpointError(f"the drafter in {folder} is {language.hidden_size} wide, the target {target.width}")
     shards = open_shards(folder)
     skipped = target.segments["vision"] if "vision" in target.segments else slice(0, 0)
-    shape = PublicShape(language, "fc.bias" in shards.shapes, convention.check(), skipped.stop - skipped.start)
+    shape = PublicShape(language, "fc.bias" in shards.shapes, convention, skipped.stop - skipped.start)
     layout = {name: sizes for name, sizes in shards.shapes.items() if name != EMBEDDING}
     check_layout(layout, layout_of(shape), folder)
     return shape, {name: tensor for name, tensor in shards.items() if name != EMBEDDING}

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import NoSettings, find
 from kerv_cli.engine.chunk import WINDOW, Chunk
 from kerv_cli.engine.proposer import ChainProposer
@@ -35,22 +34,11 @@ class Noise:
     q: variance of the random acceleration in one step. r: variance of the observation. Only their ratio matters,
     because the prior is scaled by r. damping: share of the velocity that is left after one step; 1 is the paper's
     constant velocity, less is *ours*.
-
-    Raises:
-        UsageError: a number out of range, or another count of numbers.
     """
 
     q: tuple[float, ...]
     r: tuple[float, ...]
     damping: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        if not len(self.q) == len(self.r) == len(self.damping):
-            raise UsageError("kinematics: q, r and damping need one number per DoF")
-        if any(not (np.isfinite(x) and x >= 0) for x in self.q) or any(not (np.isfinite(x) and x > 0) for x in self.r):
-            raise UsageError("kinematics: q must be 0 or more and r above 0")
-        if any(not 0 <= x <= 1 for x in self.damping):
-            raise UsageError("kinematics: damping must lie between 0 and 1")
 
     @classmethod
     def uniform(cls, dofs: int, q: float) -> Noise:
@@ -101,13 +89,7 @@ class Predictor:
     least = 1  # actions without which the weights are not defined
 
     def __init__(self, held: np.ndarray, minimum: int = MINIMUM, window: int = WINDOW, horizon: int = HORIZON) -> None:
-        """held: (D,) bool, DoFs that are never extrapolated. minimum: actions without which predict() gives None.
-
-        Raises:
-            UsageError: minimum or window out of range.
-        """
-        if not self.least <= minimum <= window:
-            raise UsageError(f"{self.name}: a minimum history of {minimum} does not lie in {self.least}…{window}")
+        """held: (D,) bool, DoFs that are never extrapolated. minimum: actions without which predict() gives None."""
         self.held, self.dofs = np.asarray(held, dtype=bool), len(held)
         self.minimum, self.window, self.horizon = minimum, window, horizon
         self.tables = {m: self._table(m) for m in range(minimum, window + 1)}
@@ -127,9 +109,6 @@ class Predictor:
         """history (m, D) in [-1, 1], oldest first, its last `window` count -> (steps, D) in [-1, 1].
 
         None when the history is shorter than `minimum`.
-
-        Raises:
-            ValueError: more steps than `horizon`, or another number of DoFs.
         """
         if len(history) < self.minimum:
             return None
@@ -137,9 +116,6 @@ class Predictor:
 
     def predict_many(self, histories: np.ndarray, steps: int) -> np.ndarray:
         """(B, m, D) with m ≥ `minimum` -> (B, steps, D)."""
-        if not 0 <= steps <= self.horizon or histories.shape[-1] != self.dofs:
-            request = f"{steps} steps of {histories.shape[-1]} DoFs"
-            raise ValueError(f"{self.name}: {request}; weights are for {self.horizon} of {self.dofs}")
         past = histories[:, -self.window :]
         table = self.tables[past.shape[1]][:, :steps]
         predicted: np.ndarray = np.einsum("dhm,bmd->bhd", table, past)
@@ -209,7 +185,7 @@ def build_predictor(
     horizon: int = HORIZON,
 ) -> Predictor:
     """The predictor `kind`; held: (D,) bool, DoFs that keep their last value; `noise` holds the fitted noise of each
-    kind of filter. Raises UsageError: a number out of range.
+    kind of filter.
     """
     if kind in PLAIN:
         return PLAIN[kind](held, minimum, window, horizon)

@@ -32,7 +32,7 @@ class Residual(nn.Module):
 
 class VisionEncoder(Packable):
     """The convolutional stem. size: of a view, pixels. grid: vision tokens per side. keypoints: K. channels: of the
-    first stage. width: E. norm: of its residual blocks. Raises ValueError where size and grid do not fit."""
+    first stage. width: E. norm: of its residual blocks."""
 
     columns: Tensor
     packed: Callable[[Tensor], tuple[Tensor, Tensor]] | None
@@ -40,8 +40,6 @@ class VisionEncoder(Packable):
     def __init__(self, size: int, grid: int, keypoints: int, channels: int, width: int, norm: str = "group") -> None:
         super().__init__()
         c, coarse = channels, size // 8
-        if size % 8 or coarse % grid:
-            raise ValueError(f"image size {size} must be a multiple of 8 and {size} / 8 a multiple of the grid {grid}")
         self.fine = nn.Sequential(nn.Conv2d(3, c, 5, stride=2, padding=2), Residual(c, norm))
         self.middle = nn.Sequential(nn.Conv2d(c, 2 * c, 3, stride=2, padding=1), Residual(2 * c, norm))
         self.coarse = nn.Sequential(nn.Conv2d(2 * c, 4 * c, 3, stride=2, padding=1), Residual(4 * c, norm))

@@ -114,28 +114,6 @@ class Shape:
         """Vision tokens of the prompt."""
         return self.towers[0].patches
 
-    def check(self, where: Path) -> Shape:
-        """This shape, if its numbers fit together.
-
-        Raises:
-            CheckpointError: they do not.
-        """
-        language, towers = self.language, self.towers
-        wrong = {
-            "two towers with different numbers of patches": towers[0].patches != towers[1].patches,
-            "a tower whose width is no multiple of its heads": any(t.width % t.heads for t in towers),
-            "an image that is no multiple of its patches": any(t.image % t.patch for t in towers),
-            "a hidden_size that is no multiple of 2 x num_attention_heads": language.hidden_size
-            % (2 * language.num_attention_heads),
-            "attention heads that are no multiple of key and value heads": language.num_attention_heads
-            % language.key_value_heads,
-            "fewer token ids than action bins": self.vocabulary <= self.bins,
-        }
-        faults = [what for what, is_wrong in wrong.items() if is_wrong]
-        if faults:
-            raise CheckpointError(f"{where} describes {faults[0]}: it is not a checkpoint of OpenVLA")
-        return self
-
 
 def read_shape(folder: Path) -> Shape:
     """The shape that `config.json` in `folder` describes.
@@ -154,7 +132,7 @@ def read_shape(folder: Path) -> Shape:
     towers = _towers(value, path)
     numbers = {"padding": value.get("pad_to_multiple_of", 64), "bins": value.get("n_action_bins", 256)}
     plain = {"towers": [asdict(t) for t in towers], "language": asdict(language), **numbers}
-    return read(Shape, plain, str(path)).check(path)
+    return read(Shape, plain, str(path))
 
 
 def read_config(folder: Path) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_json
 from kerv_cli.base.places import artifact
 from kerv_cli.base.provenance import provenance
@@ -17,7 +17,7 @@ from kerv_cli.targets.checkpoint import FORMAT, target_fields
 from kerv_cli.targets.openvla.config import action_space, read_shape, read_statistics
 from kerv_cli.targets.openvla.image import read_normalisations
 from kerv_cli.targets.openvla.loading import check_finite, check_layout, digest_of, layout, open_shards
-from kerv_cli.targets.openvla.prompt import PROMPTS, Prompter
+from kerv_cli.targets.openvla.prompt import Prompter
 from kerv_cli.targets.openvla.target import OpenVLASettings
 
 NO_STATE = ObservationSpace(proprioception=(), state=0, places=(), centre=(0.0, 0.0, 0.0))
@@ -27,13 +27,11 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
     """Writes target.json for the checkpoint -> its folder, and figures for the user. Every number is read once.
 
     Raises:
-        UsageError: no checkpoint, an unknown prompt, several statistics and none chosen. UnknownName: no such
+        UsageError: no checkpoint, several statistics and none chosen. UnknownName: no such
             statistics or environment. CheckpointError: the folder is incomplete, damaged, pickled or another model's.
     """
     if not settings.checkpoint:
         raise UsageError("checkpoint=DIR: name the folder of a Hugging Face OpenVLA checkpoint")
-    if settings.prompt not in PROMPTS:
-        raise UnknownName("prompt", settings.prompt, PROMPTS)
     source = Path(settings.checkpoint).expanduser().resolve()
     shape = read_shape(source)
     spec = None if settings.environment is None else load(find("environment", settings.environment).build)

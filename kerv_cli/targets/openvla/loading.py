@@ -100,16 +100,7 @@ def _no_weights(folder: Path) -> str:
         return f"no safetensors in {folder}: name the folder of a Hugging Face OpenVLA checkpoint"
     return (
         f"{folder} holds pickled weights ({pickled[0]}), which can run code when they are opened, and no safetensors: "
-        f"convert them where you trust them: {conversion(pickled[0], SINGLE)}"
-    )
-
-
-def conversion(source: str, target: str) -> str:
-    """The command that turns a pickled file of tensors into safetensors without running its code."""
-    return (
-        'python -c "import torch; from safetensors.torch import save_file; '
-        f"save_file({{k: v.contiguous().clone() for k, v in "
-        f"torch.load('{source}', map_location='cpu', weights_only=True).items()}}, '{target}')\""
+        "convert them to safetensors where you trust them"
     )
 
 

@@ -273,10 +273,7 @@ def _claim_folder(out: Path, identity: dict[str, Any]) -> None:
         return
     stored = read_json(path)
     packages = spec_of(identity["config"]["tasks"][0]).packages
-    try:
-        new, old = _comparable(identity, packages), _comparable(stored, packages)
-    except (KeyError, TypeError) as error:
-        raise CheckpointError(f"{path} is damaged: {error} is not in it") from error
+    new, old = _comparable(identity, packages), _comparable(stored, packages)
     if new != old:
         key = next(key for key in [*new, *old] if new.get(key) != old.get(key))
         raise UsageError(

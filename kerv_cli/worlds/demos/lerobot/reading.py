@@ -213,8 +213,6 @@ def action_space(source: Source, settings: DemosImportSettings, actions: np.ndar
         if len(names) != len(OPENVLA):
             raise UsageError(f"dofs=openvla: the dataset has {len(names)} DoFs ({', '.join(names)}), OpenVLA has 7")
         names = OPENVLA
-    elif settings.dofs != "own":
-        raise UnknownName("dofs", settings.dofs, ("own", "openvla"))
     strict = tuple(settings.strict or (name for name in names if "gripper" in name.lower()))
     unknown = [name for name in strict if name not in names]
     if unknown:
