@@ -1,4 +1,4 @@
-"""Relaxed and hybrid acceptance through the whole decode loop, against a loop that forwards every prefix anew.
+"""Relaxed, sequence and hybrid acceptance through the decode loop, against a loop that forwards every prefix anew.
 
 The oracle knows no cache, no mask and no tree forward: it walks down the drafted trees, asks the target for one token
 at a time, and decides by the definitions of docs/methods.md §2.1.
@@ -116,7 +116,7 @@ class Oracle:
 
     def verify(self, tree: TokenTree, name: str, size: int) -> None:
         """Commit the longest allowed path, of those the nearest, of those the first; then the token behind it."""
-        by_group = self.kind == "hybrid" and name == "retrieval"
+        by_group = self.kind == "sequence" or (self.kind == "hybrid" and name == "retrieval")
         paths = [tuple(tree.tokens[i] for i in tree.path_to(node)) for node in range(len(tree))]
         good = [p for p in paths if self.allowed(p, by_group)]
         best = min(good, key=lambda p: (-len(p), self.distance(p)), default=())
@@ -173,7 +173,7 @@ cases = {
 @pytest.mark.bits
 @settings(max_examples=60, deadline=None)
 @given(space=st.sampled_from([SEVEN, SPEC.actions]), **cases)
-@pytest.mark.parametrize("kind", ["relaxed", "hybrid"])
+@pytest.mark.parametrize("kind", ["relaxed", "sequence", "hybrid"])
 def test_the_loop_accepts_by_definition(
     kind: str, space: ActionSpace, seed: int, chunk: int, r: int, strict_dofs: bool, inside: bool, nodes: int
 ) -> None:
@@ -185,7 +185,7 @@ def test_the_loop_accepts_by_definition(
 @pytest.mark.bits
 @settings(max_examples=10, deadline=None)
 @given(**{**cases, "chunk": st.sampled_from([1, 2])})
-@pytest.mark.parametrize("kind", ["relaxed", "hybrid"])
+@pytest.mark.parametrize("kind", ["relaxed", "sequence", "hybrid"])
 def test_the_loop_accepts_by_definition_on_a_transformer(
     kind: str, seed: int, chunk: int, r: int, strict_dofs: bool, inside: bool, nodes: int
 ) -> None:
@@ -193,7 +193,7 @@ def test_the_loop_accepts_by_definition_on_a_transformer(
     assert_same(target, random_prompt(target, seed), kind, r, strict_dofs, seed, inside, nodes)
 
 
-@pytest.mark.parametrize("kind", ["relaxed", "hybrid"])
+@pytest.mark.parametrize("kind", ["relaxed", "sequence", "hybrid"])
 def test_the_trees_hold_tokens_that_only_a_limit_accepts(kind: str) -> None:
     """Otherwise the comparison would prove no more than that of strict decoding."""
     total = 0

@@ -87,16 +87,6 @@ def store_of(similar: np.ndarray, tokens: np.ndarray, seeds: np.ndarray, space: 
     return Datastore(manifest, vectors, tokens.astype(np.uint8), seeds, rows, rows, {"a": slice(0, len(rows))})
 
 
-def test_the_lowest_level_by_hand() -> None:
-    similarity = np.array([0.5, 0.9, 0.7, 0.8, 0.6], np.float32)
-    good = np.array([True, True, False, True, True])  # from the top: 1, 1, 2/3, 3/4, 4/5
-    assert lowest_level(similarity, good, 0.9, least=1) == pytest.approx(0.8)
-    assert lowest_level(similarity, good, 0.75, least=1) == pytest.approx(0.5)
-    assert lowest_level(similarity, good, 0.9, least=3) is None
-    assert lowest_level(np.full(4, 0.9, np.float32), np.array([True, True, True, False]), 0.9, least=1) is None
-    assert lowest_level(np.zeros(0, np.float32), np.zeros(0, bool), 0.5, least=1) is None
-
-
 @hypothesis_settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 60), st.sampled_from([0.5, 0.7, 0.9, 0.97]), st.integers(1, 25))
 def test_the_lowest_level_is_the_definitions(seed: int, n: int, confidence: float, least: int) -> None:
@@ -250,12 +240,7 @@ def test_a_datastore_of_another_target_is_refused_before_anything_is_read(copy: 
 def test_the_command_prints_ranges_and_levels(copy: Path) -> None:
     done = CliRunner().invoke(app, ["calibrate", *words(copy, "epsilon=1.9", "confidence=0.5")])
     assert done.exit_code == 0, done.output
-    for word in (
-        "s_min",
-        "would be skipped",
-        "error ≤ 1.9",
-        "144",
-    ):
+    for word in ("s_min", "would be skipped", "error ≤ 1.9", "144"):
         assert word in done.output
     assert "skip levels from" in CliRunner().invoke(app, ["calibrate", *words(copy, "--plan")]).output
     never = CliRunner().invoke(app, ["calibrate", *words(copy, "epsilon=0.0001")])

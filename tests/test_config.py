@@ -58,12 +58,6 @@ def test_every_config_of_a_part_composes(row: int) -> None:
         assert name in parts(part.kind) or (conf_dir() / group / f"{name}.yaml").is_file()
 
 
-def test_a_method_is_a_composition_whose_parts_can_be_replaced() -> None:
-    method = compose("rollout", ["method=spec_vla", "acceptance=strict", "threshold.r=4"], s.RolloutSettings)
-    assert (method.proposer.kind, method.acceptance.kind, method.threshold.r) == ("drafter", "strict", 4)
-    assert compose("rollout", ["method=ar"], s.RolloutSettings).proposer.kind == "none"
-
-
 @pytest.mark.parametrize(
     ("overrides", "says"),
     [

@@ -17,7 +17,6 @@ from kerv_cli.lab.episode import run_episode
 from kerv_cli.lab.expert import ExpertDecoder
 from kerv_cli.report.viewing import save_recording
 from kerv_cli.report.viewing.viewer import read_recording
-from kerv_cli.worlds import resolve_tasks, spec_of, task_names
 from kerv_cli.worlds.spec import EnvironmentSpec
 
 TESTS = Path(__file__).parent
@@ -31,14 +30,6 @@ def spec(monkeypatch: pytest.MonkeyPatch) -> EnvironmentSpec:
     module = importlib.import_module("examples.point_mass")
     found: EnvironmentSpec = module.SPEC
     return found
-
-
-def test_it_is_found_beside_the_others(spec: EnvironmentSpec) -> None:
-    assert spec_of("push-point") is spec
-    assert resolve_tasks(["point"]) == ("push-point",)
-    assert {"POINT", "push-point", "MT10"} <= set(task_names())
-    with pytest.raises(UsageError, match="tasks of metaworld and point-mass cannot be mixed"):
-        resolve_tasks(["MT10", "push-point"])
 
 
 def test_an_episode_runs_and_is_recorded(spec: EnvironmentSpec, tmp_path: Path) -> None:

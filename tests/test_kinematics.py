@@ -91,17 +91,6 @@ def test_predict_goes_on_along_the_newest_actions_most_probable_path_clipped(his
             np.testing.assert_allclose(ahead[:, dof], np.clip(expected, -1, 1), atol=1e-9)
 
 
-@settings(deadline=None)  # the machine is shared
-@given(st.sampled_from(PREDICTORS), st.floats(-1, 1), st.integers(4, WINDOW))
-def test_a_constant_is_held(kind: str, value: float, length: int) -> None:
-    ahead = predictor(kind).predict(np.full((length, DOFS), value), HORIZON)
-    np.testing.assert_allclose(ahead, value, atol=1e-9)
-
-
-def test_only_the_ratio_of_the_noises_counts() -> None:
-    np.testing.assert_allclose(kalman_weights(3.0, 1.0, 10, 4), kalman_weights(0.06, 0.02, 10, 4), rtol=1e-9)
-
-
 def test_hold_and_linear() -> None:
     history = np.array([[0.9, 0.0, 0.1, 1.0], [0.2, 0.0, 0.2, 1.0], [0.3, 0.5, 0.1, -1.0]])
     held = Hold(np.array(HELD), minimum=1).predict(history, 2)

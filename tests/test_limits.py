@@ -69,12 +69,6 @@ def test_what_is_out_of_range_is_refused_in_one_line(command: str, override: str
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("override", ["boundary.f_star=nan", "boundary.window=2", "skip.up=nan", "skip.up=inf"])
-def test_a_parts_numbers_have_ranges_too(override: str) -> None:
-    with pytest.raises(UsageError, match=override.partition("=")[0]):
-        compose("rollout", ["method=heisd", override], s.RolloutSettings)
-
-
 @pytest.mark.parametrize(
     "grid",
     [

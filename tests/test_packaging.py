@@ -7,7 +7,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 import zipfile
 from configparser import ConfigParser
 from email.message import Message
@@ -331,18 +330,3 @@ def test_the_graphics_check_agrees_that_this_machine_can_draw() -> None:
     check = subprocess.run(command, capture_output=True, text=True, check=False)
     assert check.returncode == 0
     assert check.stdout.strip() in {"egl", "osmesa"}
-
-
-# --- this checkout ---
-
-
-def test_make_setup_here_does_nothing_and_is_quick() -> None:
-    outer = {"MAKEFLAGS", "MFLAGS", "MAKELEVEL"}  # of the `make test` that runs this
-    environment = {name: value for name, value in os.environ.items() if name not in outer}
-    current = subprocess.run(["make", "--question", STAMP], cwd=ROOT, env=environment, capture_output=True, check=False)
-    if current.returncode:
-        pytest.skip("this checkout's .venv was not made by `make setup`, or pyproject.toml changed since")
-    began = time.monotonic()
-    again = subprocess.run(["make", "setup"], cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
-    assert (again.returncode, again.stdout, again.stderr) == (0, "", "")
-    assert time.monotonic() - began < 5

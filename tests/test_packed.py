@@ -6,7 +6,6 @@ import copy
 import pickle
 
 import numpy as np
-import plain_decoder
 import pytest
 import torch
 from hypothesis import given, settings
@@ -18,8 +17,6 @@ from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter
-from kerv_cli.targets.compact import packed as packing
-from kerv_cli.targets.compact.kernels import FastLinear
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
@@ -133,16 +130,6 @@ def test_the_packed_trunk_takes_batches(tokens: int) -> None:
     assert close(*outputs)
 
 
-@pytest.mark.parametrize("rows", [1, 3, 64])
-def test_both_layouts_of_a_weight_give_its_product(rows: int) -> None:
-    weight, x, other = torch.randn(300, 100), torch.randn(rows, 100), torch.randn(rows, 300)
-    fast = FastLinear(weight)
-    assert fast.rows == 20  # one row and three take the plain product, 64 the blocked one
-    with torch.inference_mode():
-        assert torch.allclose(fast(x), x @ weight.t(), atol=1e-4)
-        assert torch.allclose(fast.added_to(other, x), other + x @ weight.t(), atol=1e-4)
-
-
 @settings(max_examples=10, deadline=None)
 @given(
     seed=st.integers(0, 10_000),
@@ -247,15 +234,6 @@ def test_what_trains_is_not_packed_and_gets_its_gradients() -> None:
     assert close(x.grad, twin.grad)
 
 
-def test_one_row_goes_through_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, trunk = both_trunks(6, 3, 2, 8)
-    products, plain = [], packing.row_product
-    monkeypatch.setattr(packing, "row_product", lambda *both: products.append(both) or plain(*both))
-    with torch.inference_mode():
-        trunk(torch.randn(1, 1, 16), torch.tensor([0]), trunk.new_cache(1, 1))
-    assert len(products) == 3 * 4, "of every layer qkv, out, gate and up, down"
-
-
 def test_one_row_behind_a_mask_sees_what_the_modules_see() -> None:
     plain, packed = both_trunks(3, 2, 2, 8)
     x, seen = torch.randn(1, 6, 16), np.array([[True, False, True, True]])
@@ -266,8 +244,3 @@ def test_one_row_behind_a_mask_sees_what_the_modules_see() -> None:
             trunk(x[:, :5], torch.arange(5), cache)
             outputs.append(trunk(x[:, 5:], torch.tensor([4]), cache, seen))
     assert close(*outputs)
-
-
-def test_a_plain_decoder_in_numpy_gives_the_shipped_policys_tokens(capsys: pytest.CaptureFixture[str]) -> None:
-    assert plain_decoder.main("mt10-vision", 3)
-    assert "ratio" in capsys.readouterr().out

@@ -64,12 +64,6 @@ def test_tables_and_figures_are_filled_and_stay_as_they_are_then(figures: Any) -
     assert figures.filled(filled) == filled
 
 
-def test_only_some_settings(figures: Any) -> None:
-    filled = figures.filled("<!-- table small only=one_pass: setting -->\n<!-- /table -->")
-    assert "one pass" in filled
-    assert "| ar |" not in filled
-
-
 @pytest.mark.parametrize(
     ("page", "says"),
     [

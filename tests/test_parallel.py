@@ -76,15 +76,6 @@ def test_all_tokens_come_from_one_forward_in_which_they_see_each_other(packed: b
     assert record.phases["prefill"] > record.phases["propose"]
 
 
-@torch.inference_mode()
-def test_a_later_query_changes_the_first_token_s_logits() -> None:
-    policy = target("target.parallel=true")
-    prompt = policy.encode(some_observation())
-    before = policy.parallel_pass(prompt)[0, 0].clone()
-    policy.queries[-1] += 1.0
-    assert not torch.allclose(before, policy.parallel_pass(prompt)[0, 0])
-
-
 @pytest.mark.bits
 def test_training_shows_it_no_action_token() -> None:
     policy = target("target.parallel=true")

@@ -28,7 +28,7 @@ from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.methods.scout.drafter import Scout, ScoutArtifact, ScoutProposer, check_sees
 from kerv_cli.methods.streak import StreakSkip, StreakSkipSettings
 from kerv_cli.methods.unverified import AlwaysSkip
-from kerv_cli.report.certificate import _needed, _values, folder_of
+from kerv_cli.report.certificate import folder_of
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.target import CompactTarget
@@ -302,10 +302,3 @@ def test_settings_of_other_conditions_get_no_certificate(
 def test_the_shipped_study_of_certificates_passes(policies: Path) -> None:
     words = ["study=certify", "proposer=none", "policy.target=nano-vision", "policy.certificate=mine"]
     assert folder_of(resolve([*words, f"results={policies}"])) == policies / "artifacts/certificate/mine"
-
-
-def test_pairs_that_are_missing_are_counted() -> None:
-    same = np.array([(1.0, 1.0)] * 30)
-    assert 0 < _needed(same, 5.0, 0.1) < 200
-    assert _needed(np.array([(1.0, 1.0), (1.0, 0.0)] * 20), 5.0, 0.1) == -1
-    assert sorted(_values(np.array([(1.0, 0.0), (0.0, 1.0), (1.0, 1.0)]))) == [0.0, 0.5, 1.0]

@@ -4,20 +4,14 @@ from __future__ import annotations
 
 from itertools import groupby
 
-import numpy as np
 import pytest
-import torch
 from examples.own_target import SEVEN, MockTarget
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kerv_cli.base.registry import find
 from kerv_cli.base.spaces import ActionSpace, Group
-from kerv_cli.engine.acceptance import Acceptance, Strict, accept_by_group
-from kerv_cli.engine.chunk import Chunk
-from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.engine.draft import Draft
-from kerv_cli.engine.proposer import Proposer
+from kerv_cli.engine.acceptance import Acceptance, accept_by_group
 from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.methods.context import Context
 from kerv_cli.worlds.metaworld.spec import SPEC
@@ -105,19 +99,10 @@ def judge(tokens: list[int], start: int = 0, wanted: int = 100) -> int:
         ([110, 110, 111, 100], 0, 0),  # 31: the whole group goes, its good tokens too
         ([115, 85, 100, 100], 0, 4),  # signs do not cancel, but 15 + 15 = 30
         ([116, 100, 100, 100], 0, 0),  # one token beyond 15
-        ([100, 100, 116, 100], 0, 0),
         ([110, 110, 110, 101], 0, 3),  # the gripper is exact and a group of its own
         ([100, 100, 100, 100, 110, 110, 111], 0, 4),  # the sum starts anew with every group …
-        ([110, 110, 110, 100, 110, 110, 110], 0, 7),
         ([100, 100, 100, 100, 100, 100], 0, 4),  # leaves the tree inside a group
-        ([100, 100], 0, 0),
         ([115, 115, 100], 1, 3),  # begun by the bonus: two tokens remain, 30
-        ([115, 116, 100], 1, 0),
-        ([115, 100], 2, 2),
-        ([100, 110, 110, 111], 3, 1),
-        ([101], 3, 0),
-        ([100] * 15, 1, 15),
-        ([], 0, 0),
     ],
 )
 def test_groups_are_accepted_or_rejected_whole(tokens: list[int], start: int, accepted: int) -> None:
@@ -168,9 +153,7 @@ def test_hybrid_judges_retrieved_drafts_by_group_and_all_others_by_distance() ->
         assert rule(kind).of_drafts_from("retrieval") == rule(kind)
 
 
-def test_groups_cover_the_action_in_order() -> None:
-    assert POSITION_GRIPPER.bounds == ((0, 3), (0, 3), (0, 3), (3, 4))
-    assert SEVEN.bounds == ((0, 3),) * 3 + ((3, 6),) * 3 + ((6, 7),)
+def test_groups_that_do_not_cover_the_action_are_refused() -> None:
     for sizes in ((3,), (3, 2), (4, 0), ()):
         groups = tuple(Group("group", size) for size in sizes)
         with pytest.raises(ValueError, match="do not cover the 4 DoFs in order"):
@@ -186,48 +169,3 @@ def test_segments_cut_a_stretch_of_the_chunk_at_the_groups(space: ActionSpace, s
     ]
     assert [list(range(first, last)) for first, last, _ in cut] == expected
     assert [strict for _, _, strict in cut] == [name[g[0] % dofs] == len(space.groups) - 1 for g in expected]
-
-
-class Shifted(Proposer):
-    """Drafts AR's own chunk, shifted by a few bins, so that whole groups are accepted and rejected."""
-
-    name = "shifted"
-
-    def __init__(self, truth: list[int], seed: int) -> None:
-        self.truth, self.rng = truth, np.random.default_rng(seed)
-
-    def propose(self, chunk: Chunk, depth: int) -> Draft:
-        ahead = np.array(self.truth[len(chunk.tokens) :][:depth])
-        return Draft.of([int(t) for t in np.clip(ahead + self.rng.integers(-1, 2, len(ahead)), 0, 254)])
-
-
-def test_in_the_loop_paths_end_with_groups_and_a_begun_group_has_one_verdict() -> None:
-    target = MockTarget(POSITION_GRIPPER, chunk=4)
-    accepted = 0
-    for seed in range(20):
-        prompt = torch.randn(1, 5, target.width, generator=torch.Generator().manual_seed(seed)).double()
-        truth = Decoder(target).decode_prompt(prompt).tokens
-        chunk = Decoder(target, Parts(rule("sequence"), proposer=Shifted(truth, seed))).decode_prompt(prompt)
-        assert len(chunk.tokens) == 16
-        for r in chunk.rounds:
-            if r.mode == "verify":
-                assert (r.start + r.accepted) % 4 in (0, 3) or r.accepted == 0
-                assert r.threshold == LIMITS
-                accepted += r.accepted
-    assert accepted > 20
-
-
-class Anything(Strict):
-    """A rule of somebody else's: every token will do."""
-
-    def limits(self, r: int) -> tuple[int, ...]:
-        return (self.space.tokens,) * self.space.dofs
-
-
-def test_the_loop_asks_a_rule_that_is_not_kervs() -> None:
-    target = MockTarget(POSITION_GRIPPER, chunk=4)
-    prompt = torch.randn(1, 5, target.width, generator=torch.Generator().manual_seed(0)).double()
-    drafted = [7] * 15
-    chunk = Decoder(target, Parts(Anything(POSITION_GRIPPER), proposer=Shifted(drafted, 0))).decode_prompt(prompt)
-    assert chunk.rounds[-1].accepted == len(chunk.rounds[-1].drafted) == 14
-    assert set(chunk.tokens[1:-1]) <= {6, 7, 8}

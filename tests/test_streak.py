@@ -10,7 +10,6 @@ import torch
 from examples.own_target import MockTarget
 from test_unverified import SHOWN, Near
 
-from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.parts import Fixed
 from kerv_cli.methods.merged.proposer import MergedProposer
@@ -115,16 +114,3 @@ def test_another_sources_accepted_chain_does_not_count() -> None:
     record = decoder.decode(SHOWN)
     assert record.forwards == 1  # the right one was accepted whole
     assert modes(decoder, 2) == "vv"
-
-
-@torch.inference_mode()
-def test_the_distance_is_the_mean_difference_and_infinite_where_a_strict_dof_flips() -> None:
-    target = MockTarget()
-    space, truth = target.actions, np.array(near(target).drafted)
-    chunk = Chunk(torch.zeros(1, 1, 1), target.chunk, space, target.new_cache(1, 1), Situation("t", ActionHistory(4)))
-    strict = space.strict_tokens(len(truth))
-    off = np.where(strict, truth, np.where(truth + 4 < space.tokens, truth + 4, truth - 4))
-    assert chunk.distance(off, truth) == pytest.approx(4 * 2 / space.tokens * (~strict).mean())
-    flipped = truth.copy()
-    flipped[np.flatnonzero(strict)[0]] ^= 1
-    assert chunk.distance(flipped, truth) == np.inf

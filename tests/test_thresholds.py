@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kerv_cli.base.config import compose
-from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import find
 from kerv_cli.base.settings import RolloutSettings
 from kerv_cli.engine.parts import Threshold
@@ -72,14 +72,6 @@ def test_kinematic_at_its_landmarks() -> None:
     assert chosen.radius() == 9
 
 
-@settings(deadline=None)  # the machine is shared
-@given(levels, levels, st.floats(0, 10))
-def test_more_variability_never_widens(k: float, more: float, start: float) -> None:
-    for kind in ("kinematic", "change"):
-        low = radius_after(threshold(kind), start, k)
-        assert radius_after(threshold(kind), start, k + more) <= low
-
-
 def test_change_is_its_closed_form() -> None:
     chosen = threshold("change")
     r, last = 5 + 10 * math.exp(-1), 0.4
@@ -124,21 +116,6 @@ def test_fixed_ignores_what_happens() -> None:
     assert radius_after(threshold("fixed", r=9), 0.0, 9.0, None) == 9
 
 
-@pytest.mark.parametrize("kind", ["fixed", "kinematic", "change", "schedule"])
-def test_the_config_is_the_paper(kind: str) -> None:
-    asked = compose("rollout", [f"threshold={kind}"], RolloutSettings).threshold
-    assert asked.kind == kind
-    if kind in CLOSED_LOOP:
-        assert (asked.r_min, asked.r_max, asked.phi, asked.k_s) == (5, 15, 2.0, None)
-        built(replace(asked, k_s=0.3))
-    elif kind == "schedule":
-        assert (asked.r_min, asked.r_max, asked.phi) == (3, 15, 3.0)
-        built(asked)
-    else:
-        assert asked.r == 9
-        built(asked)
-
-
 @pytest.mark.parametrize("kind", CLOSED_LOOP)
 def test_the_reference_level_is_the_tasks_where_none_is_given(kind: str) -> None:
     asked = find("threshold", kind).settings(kind=kind)
@@ -157,11 +134,9 @@ def test_the_reference_level_is_the_tasks_where_none_is_given(kind: str) -> None
         ("fixed", {"r": -1}, r"threshold\.r=-1"),
         ("kinematic", {"k_s": 0.0}, r"threshold\.k_s=0\.0"),
         ("kinematic", {"k_s": math.nan}, r"threshold\.k_s=nan"),
-        ("kinematic", {"k_s": math.inf}, r"threshold\.k_s=inf"),
         ("kinematic", {"r_min": 16}, r"threshold\.r_min=16 threshold\.r_max=15"),
         ("change", {"r_min": -1}, r"threshold\.r_min=-1"),
         ("kinematic", {"phi": 0.0}, r"threshold\.phi=0"),
-        ("schedule", {"phi": -1.0}, r"threshold\.phi=-1"),
         ("schedule", {"tau": 0.0}, r"threshold\.tau=0"),
     ],
 )
@@ -169,8 +144,3 @@ def test_bad_values_get_one_line(kind: str, values: dict[str, Any], says: str) -
     with pytest.raises(UsageError, match=says) as caught:
         threshold(kind, **values)
     assert "\n" not in str(caught.value)
-
-
-def test_an_unknown_kind_lists_the_known_ones() -> None:
-    with pytest.raises(UnknownName, match="did you mean kinematic"):
-        threshold("kinematik")

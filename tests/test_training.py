@@ -24,7 +24,6 @@ from kerv_cli.base.errors import CheckpointError, Interrupted
 from kerv_cli.base.files import sha256_of
 from kerv_cli.base.settings import CameraSettings, TargetSettings, TrainSettings
 from kerv_cli.cli.app import app
-from kerv_cli.engine.batched import greedy
 from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
@@ -32,7 +31,6 @@ from kerv_cli.training import imitation
 from kerv_cli.training.imitation import Imitation, lit, soft_labels, token_loss, vocabulary, waypoints
 from kerv_cli.training.loop import Loop, Metrics, digest, read_state, schedule, write_state
 from kerv_cli.training.runs import run_settings
-from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.metaworld.spec import SPEC
@@ -263,21 +261,6 @@ def test_waypoints_are_the_hands_at_the_next_change_of_the_gripper_and_at_the_en
     assert three[:, :, 0].tolist() == [[4, 8, 9], [8, 9, 9], [9, 9, 9]]
 
 
-@pytest.mark.bits
-def test_batched_greedy_decoding_is_the_decoders() -> None:
-    from kerv_cli.engine.decoder import Decoder
-
-    torch.manual_seed(0)
-    settings = TargetSettings(observation="state", width=32, layers=2, heads=2, feed_forward=48, scene_tokens=2)
-    target = CompactTarget(settings, ACTIONS, OBSERVATION, vocabulary("metaworld")).eval().requires_grad_(False)
-    prompts = torch.randn(3, target.max_prompt, 32)
-    tokens, hidden = greedy(target, prompts)
-    assert hidden.shape == (3, target.max_prompt + target.chunk * 4 - 1, 32)
-    decoder = Decoder(target)
-    for prompt, expected in zip(prompts.split(1), tokens, strict=True):
-        assert decoder.decode_prompt(prompt).tokens == expected.tolist()
-
-
 def train(results: Path, *arguments: str) -> str:
     """What the command prints."""
     done = CliRunner().invoke(app, ["train", *arguments, f"results={results}", "demos=few"])
@@ -335,24 +318,11 @@ def test_bfloat16_is_for_cpus_with_tiles(tiles: bool, monkeypatch: pytest.Monkey
             assert torch.is_autocast_enabled("cpu") == (asked and tiles)
 
 
-def test_a_run_learns_the_experts_own_path(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    learnt, loss = [], imitation.position_loss
-
-    def watched(estimated: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
-        learnt.append(places)
-        return loss(estimated, places)
-
-    monkeypatch.setattr(imitation, "position_loss", watched)
+def test_a_run_learns_the_experts_own_path(results: Path) -> None:
     words = ["target=nano", "train=plain", "task=drawer-close", "train.batch=2", "train.steps=3"]
     out = train(results, "target", "name=path", *words, "train.validate_every=3")
     assert "waypoint_1_error_cm" in out
     assert "object_error_cm" not in out
-    assert len(learnt) == 3
-    ends = [DemoDataset.open(results / "artifacts/demos/few").load(i) for i in range(6)]
-    hands = torch.stack([torch.from_numpy(one.end_effector[one.steps - 1]).float() for one in ends])
-    for places in torch.cat(learnt):  # the gripper of this expert never changes: both are the end
-        assert (hands == places[0]).all(-1).any()
-        assert torch.equal(places[0], places[1])
     out = train(results, "target", "name=none", *words, "train.validate_every=3", "train.scene_weight=0")
     assert "waypoint" not in out
 

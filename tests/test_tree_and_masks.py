@@ -48,21 +48,6 @@ def test_ancestors_are_the_transitive_closure_of_parents(tree: TokenTree) -> Non
     assert tree.depths == tuple(int(row.sum()) - 1 for row in ancestors_of(tree.parents))
 
 
-@given(trees(), st.integers(0, 6))
-def test_a_node_sees_what_stands_before_its_ancestors_and_itself(tree: TokenTree, prompt: int) -> None:
-    seen, n = visible(tree, prompt), len(tree)
-    assert (seen.dtype, seen.shape) == (np.dtype(bool), (prompt + n, prompt + n))
-    assert (seen[:prompt, :prompt] == np.tri(prompt, dtype=bool)).all()
-    assert not seen[:prompt, prompt:].any()
-    assert seen[prompt:, :prompt].all()
-    assert (seen[prompt:, prompt:] == reachable(tree)).all()
-    verified = visible(tree, 1)
-    assert verified.shape == (1 + n, 1 + n)
-    assert verified[:, 0].all()
-    assert not verified[0, 1:].any()
-    assert (verified[1:, 1:] == reachable(tree)).all()
-
-
 @given(trees(), st.integers(0, 9), st.integers(1, 6), st.booleans())
 def test_the_mask_shows_the_cache_what_stands_before_and_the_ancestors(
     tree: TokenTree, cached: int, before: int, fixed: bool
