@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.registry import find
 from kerv_cli.engine.chunk import Choice
 from kerv_cli.engine.parts import Boundary
@@ -203,22 +203,3 @@ def test_random_keeps_its_share_and_repeats_itself() -> None:
 
 def test_always_chooses_nothing() -> None:
     assert boundary_of("always") is None
-
-
-@pytest.mark.parametrize(
-    ("kind", "values", "error", "says"),
-    [
-        ("fusd", {}, UnknownName, "unknown boundary 'fusd': did you mean fused"),
-        ("fused", {"window": 2}, UsageError, "boundary.window=2: from 3 to"),
-        ("fused", {"alpha": 1.5}, UsageError, "boundary.alpha=1.5: from 0 to 1"),
-        ("fused", {"f_star": math.nan}, UsageError, "boundary.f_star=nan"),
-        ("random", {"p": -0.1}, UsageError, "boundary.p=-0.1: from 0 to 1"),
-    ],
-)
-def test_what_cannot_be_built_gets_one_line(
-    kind: str, values: dict[str, Any], error: type[Exception], says: str
-) -> None:
-    with pytest.raises(error) as caught:
-        boundary_of(kind, **values)
-    assert says in str(caught.value)
-    assert "\n" not in str(caught.value)

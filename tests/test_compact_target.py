@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,14 +14,11 @@ from hypothesis import strategies as st
 
 from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.places import shipped_dir
-from kerv_cli.base.settings import PolicySettings, TargetSettings, TrainDrafterSettings, TrainSettings
+from kerv_cli.base.settings import TargetSettings
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
-from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.artifacts import Request
-from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.drafter import DrafterArtifact, DrafterProposer
-from kerv_cli.methods.early import EarlySettings
-from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyProposer
+from kerv_cli.methods.eagle.drafter import DrafterArtifact
+from kerv_cli.methods.early.drafter import EarlyArtifact
 from kerv_cli.targets.attention import attention_mask
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.captured import CapturedCache, bucket
@@ -31,11 +27,6 @@ from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Trunk
-from kerv_cli.training import runs
-from kerv_cli.training.imitation import Imitation, load_samples, new_target
-from kerv_cli.training.loop import Loop
-from kerv_cli.worlds.demos.dataset import DemoDataset, DemoEntry
-from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 ARM = ObservationSpace(
@@ -161,73 +152,6 @@ def test_an_observation_of_another_environment_is_refused() -> None:
         target.encode(Observation(np.zeros(4), np.zeros(39), "insert"))
     with pytest.raises(CheckpointError, match="camera 'front'"):
         seeing.encode(Observation(np.zeros(8), np.zeros(14), "insert"))
-
-
-# seven DoFs from demonstrations to decodes
-
-
-class Demos:
-    """Six made-up episodes of a task with seven DoFs."""
-
-    sha256, path = "e" * 64, Path("demos")
-    manifest = SimpleNamespace(config={}, environment="insertion", actions=SEVEN, observation=ARM, tasks={})
-    episodes = tuple(DemoEntry(seed, bool(seed % 2), 9, 0, "", "insert-peg", Path()) for seed in range(6))
-
-    def load(self, index: int) -> DemoEpisode:
-        random = np.random.default_rng(index)
-        labels = np.tanh(random.normal(size=(20, 7))).astype(np.float32)
-        states = random.normal(0, 0.1, (9, 14)).astype(np.float32)
-        nothing = np.zeros((1, 8, 8, 3), np.uint8), np.zeros(1, np.int64)
-        return DemoEpisode("insert-peg", index, bool(index % 2), 9, *nothing, states, labels, labels[:9], np.zeros(3))
-
-
-@pytest.fixture
-def seven(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A results folder with a trained target, drafter and early drafter of seven DoFs."""
-    monkeypatch.setattr(DemoDataset, "open", classmethod(lambda cls, folder: Demos()))
-    monkeypatch.setattr("kerv_cli.training.observations.instruction_of", lambda name: "insert the peg")
-    train = TrainSettings(steps=4, batch=4, warmup=1, validate_every=2, held_out=0.34, bf16=False)
-    dataset, settings = Demos(), nano().settings
-    words = WordTokenizer.build(["insert the peg"])
-    samples = load_samples(dataset, settings, words, ("insert-peg",))  # type: ignore[arg-type]
-    target = new_target(settings, dataset, samples, words, "front", 0)  # type: ignore[arg-type]
-    folder = tmp_path / "artifacts/target/arm"
-    metrics = Loop(
-        Imitation(target, samples, train),
-        lambda module, metrics: save_target(folder, module, "insertion", {}),  # type: ignore
-        *(train, folder, "seven"),
-    ).run()
-    assert {f"l1_{name}" for name in SEVEN.names} <= metrics.keys()
-    for drafter in (
-        DrafterSettings(samples=12, unroll=2),
-        EarlySettings(layers=1, width=16, rank=4, samples=30),
-    ):
-        asked = TrainDrafterSettings(
-            policy=PolicySettings(target="arm"), drafter=drafter, train=train, results=str(tmp_path)
-        )
-        made = runs.drafter_run(asked)
-        made.load(lambda done, total: None)
-        made.train(lambda step, metrics: None)
-    return tmp_path
-
-
-@pytest.mark.bits
-def test_a_policy_of_seven_dofs_is_trained_and_decodes_with_its_drafters(seven: Path) -> None:
-    target, description = load_target(seven / "artifacts/target/arm")
-    target.actions.check_same(SEVEN, "the target", "the arm")
-    request = Request(description, target)
-    drafter = DrafterArtifact().load(seven / "artifacts/drafter/arm", request)
-    early = EarlyArtifact().load(seven / "artifacts/early/arm", request)
-    assert early.strict.tolist() == [dof == 6 for dof in range(7)] * 2
-    random = np.random.default_rng(0)
-    shown = Observation(random.normal(0, 0.1, 8), random.normal(0, 0.1, 14), "insert the peg")
-    plain = Decoder(target).decode(shown)
-    assert plain.actions.shape == (2, 7)
-    for parts in (
-        Parts(proposer=DrafterProposer(drafter, target, 5, 3, 12)),
-        Parts(prefill_draft=EarlyProposer(early, target)),
-    ):
-        assert Decoder(target, parts).decode(shown).tokens == plain.tokens
 
 
 @pytest.mark.parametrize("tokens", [1, 3, 16, 17, 33])

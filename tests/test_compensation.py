@@ -193,8 +193,6 @@ def test_without_a_gripper_to_hold_the_drafts_is_taken(wrong: int) -> None:
     [
         ({"predictor": "draft", "use_target_token": False}, UsageError, "leave rectifier.use_target_token=true"),
         ({"predictor": "kalmann"}, UnknownName, "unknown rectifier.predictor 'kalmann': did you mean kalman"),
-        ({"steps": 0}, UsageError, "rectifier.steps=0: from 1 to"),
-        ({"rest": -1}, UsageError, "rectifier.rest=-1: from 0 to"),
         ({"min_verified": -1}, UsageError, "rectifier.min_verified=-1: from 0 to"),
     ],
 )

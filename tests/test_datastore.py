@@ -28,7 +28,7 @@ from kerv_cli.methods.heisd.datastore import Datastore, Manifest, Shard, check_s
 from kerv_cli.methods.heisd.rules import neighbour_tree
 from kerv_cli.targets.checkpoint import TargetDescription, load_target
 from kerv_cli.training import datastore as datastore_build
-from kerv_cli.training.datastore import DatastoreBuild, directions
+from kerv_cli.training.datastore import DatastoreBuild
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.metaworld.spec import SPEC
 
@@ -243,17 +243,6 @@ def test_a_thinned_datastore_of_half_the_bytes_holds_every_so_many_entry(copy: P
     assert np.load(folder_of(copy, name) / "vectors.npy").dtype == np.float16
 
 
-def test_the_directions_hold_the_keys_squared_length() -> None:
-    """Against the singular vectors of the keys."""
-    rng = np.random.default_rng(0)
-    keys = (rng.normal(size=(400, 6)) * [9, 7, 5, 0.2, 0.1, 0.1]) @ np.linalg.qr(rng.normal(size=(6, 6)))[0]
-    basis = directions(keys.astype(np.float32), 3)
-    assert (basis.shape, basis.dtype) == ((6, 3), np.float32)
-    expected = np.linalg.svd(keys, full_matrices=False)[2][:3].T
-    assert np.abs((basis * expected).sum(0)) == pytest.approx(np.ones(3), abs=1e-5)
-    assert basis.T @ basis == pytest.approx(np.eye(3), abs=1e-6)
-
-
 def test_projected_keys_find_nearly_always_the_same_neighbour_in_a_smaller_file(copy: Path) -> None:
     write_demos(copy / "artifacts/demos/few", LENGTHS, make=smooth)
     DatastoreBuild(asked(copy)).build()
@@ -365,8 +354,6 @@ def test_a_damaged_datastore_is_refused(copy: Path, damage: Callable[[Path], Non
         ({"key": ["scen"]}, UnknownName, "unknown key 'scen': did you mean scene"),
         ({"key": []}, UsageError, "name at least one part"),
         ({"task": ["push"]}, CheckpointError, "hold no episode of push-v3"),
-        ({"demos": "none"}, CheckpointError, "no demonstrations in"),
-        ({"policy": PolicySettings(target="none")}, UsageError, "no target 'none'"),
     ],
 )
 def test_what_cannot_be_built_is_refused_at_once(
@@ -438,26 +425,14 @@ def test_a_rebuild_replaces_the_whole_datastore_and_is_the_same(copy: Path) -> N
 
 
 def test_the_command_builds_and_reports(copy: Path) -> None:
-    words = [
-        "build",
-        "datastore",
-        "policy.target=nano-state",
-        "demos=few",
-        "task=reach,drawer-close",
-        f"results={copy}",
-    ]
-    run = CliRunner().invoke(app, [*words, "--cfg"])
-    assert run.exit_code == 0, run.output
-    assert "\n- scene" in run.output
+    words = ["build", "datastore", "policy.target=nano-state", "demos=few", "task=reach,drawer-close"]
+    words.append(f"results={copy}")
     run = CliRunner().invoke(app, [*words, "--plan"])
     assert "6 demonstrations of 2 tasks, 52 control steps" in run.output
     shutil.rmtree(folder_of(copy))
     run = CliRunner().invoke(app, words)
     assert run.exit_code == 0, run.output
     assert opened(copy)[0].manifest.rows == 52
-    run = CliRunner().invoke(app, [*words, "key=[smell]"])
-    assert run.exit_code == 2
-    assert run.output.startswith("kerv: unknown key 'smell'")
 
 
 def leaves(tree: TokenTree) -> list[tuple[int, ...]]:

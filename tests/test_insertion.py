@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from examples.insertion import SPEC
 
 from kerv_cli.base.settings import CameraSettings
-from kerv_cli.lab.episode import run_episode
-from kerv_cli.lab.expert import ExpertDecoder
-from kerv_cli.report.viewing import save_recording
-from kerv_cli.report.viewing.viewer import read_recording
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.spec import World
@@ -49,21 +43,6 @@ def test_nobody_succeeds_who_does_not_turn(task: str) -> None:
             assert states[:, 2].min() > 0.03  # the hand was never pushed through anything
 
 
-@pytest.mark.bits
-@pytest.mark.parametrize("task", TASKS)
-def test_a_seed_names_one_episode_to_the_last_bit(task: str) -> None:
-    with SPEC.open_world(task, SMALL) as world:
-        first = outcome(world, 7)[1]
-        assert outcome(world, 8)[1][0].tolist() != first[0].tolist()
-        start = world.reset(7)
-        assert start.state.tobytes() == first[0].tobytes()
-        assert world.initial_state.shape == (15,)
-        for state in first[1:10]:  # drawing changes nothing
-            world.observe(["front", "wrist"])
-            start = world.step(SPEC.expert(task)(start))
-            assert start.state.tobytes() == state.tobytes()
-
-
 @pytest.fixture(scope="module")
 def demonstrations(tmp_path_factory: pytest.TempPathFactory) -> DemoDataset:
     out = tmp_path_factory.mktemp("insertion")
@@ -92,14 +71,3 @@ def test_demonstrations_carry_their_spaces(demonstrations: DemoDataset) -> None:
         noise = np.abs(episode.executed - episode.labels[: entry.steps])
         assert noise[:, 6].max() == 0.0  # the gripper stays clean
         assert (noise[:, ROTATION].max() > 0.01) == entry.perturbed
-
-
-def test_an_episode_is_recorded_with_all_seven_names(tmp_path: Path) -> None:
-    with SPEC.open_world("fetch-peg") as world:
-        episode = run_episode(world, ExpertDecoder(), 100_000)
-    assert episode.success
-    assert episode.actions.shape == (episode.steps, 7)
-    assert (episode.gripper[0], episode.gripper[-1]) == (1.0, 0.0)
-    found = read_recording(save_recording(episode, tmp_path / "peg.rrd", method="expert"))
-    assert found["episode"]["environment"] == "insertion"
-    assert found["timelines"]["time"][1] == episode.steps * 50_000_000  # 20 Hz

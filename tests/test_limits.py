@@ -47,6 +47,12 @@ WRONG = [
     ("rollout", "=1", "'=1' is not an override"),
     ("rollout", "~method", "'~method' is not an override"),
     ("rollout", "+foo=1", "unknown key 'foo'"),
+    ("rollout", "method=spec_vl", "unknown method 'spec_vl': did you mean spec_vla"),
+    ("rollout", "threshold.rr=3", "unknown key 'threshold.rr': did you mean threshold.r"),
+    ("rollout", "thresold.r=3", "did you mean threshold.r"),
+    ("rollout", "threshold.phi=3", "unknown key 'threshold.phi'"),  # of another threshold
+    ("rollout", "episodes=many", "episodes: Value 'many' of type 'str' could not be converted to Integer"),
+    ("rollout", "method=spec_vla proposer.depth=1.5", "proposer.depth: Value '1.5'"),
     ("rollout", "seed=4294967296", "seed=4294967296: from 0 to 2147483647"),
     ("rollout", "runtime.threads=99999", "runtime.threads=99999: from 1 to 256"),
     ("rollout", "runtime.dtype=float64", "unknown runtime.dtype 'float64'"),
@@ -62,11 +68,20 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("command", "override", "says"), WRONG)
-def test_what_is_out_of_range_is_refused_in_one_line(command: str, override: str, says: str) -> None:
+def test_what_is_wrong_or_out_of_range_is_refused_in_one_line(command: str, override: str, says: str) -> None:
     with pytest.raises(UsageError) as refused:
-        compose(command, [override], SCHEMAS[command])
+        compose(command, override.split(), SCHEMAS[command])
     assert says in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["boundary.f_star=nan", "boundary.window=2", "boundary.alpha=1.5", "boundary.alpha=nan", "skip.up=inf"],
+)
+def test_a_parts_numbers_have_ranges_too(override: str) -> None:
+    with pytest.raises(UsageError, match=override.partition("=")[0]):
+        compose("rollout", ["method=heisd", override], s.RolloutSettings)
 
 
 @pytest.mark.parametrize(

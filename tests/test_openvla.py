@@ -22,10 +22,11 @@ from safetensors.torch import load_file, save_file
 from test_decoding_lossless import RandomTrees, assert_adds_up, decode, plain_greedy
 from typer.testing import CliRunner
 
+from kerv_cli.base.errors import KervError
 from kerv_cli.base.settings import BuildTargetSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
-from kerv_cli.engine.decoder import Decoder
+from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
 from kerv_cli.methods.jacobi import JacobiProposer
@@ -354,8 +355,6 @@ def test_strict_decoding_equals_ar(
         truth = plain_greedy(target, prompt)
     trees = RandomTrees(truth, seed, nodes, target.actions.tokens)
     first = RandomTrees(truth, seed + 1, nodes, target.actions.tokens) if inside else None
-    from kerv_cli.engine.decoder import Parts
-
     result = Decoder(target, Parts(prefill_draft=first, proposer=trees)).decode_prompt(prompt)
     assert result.tokens == truth
     assert result.size == 7
@@ -523,23 +522,15 @@ def test_weights_that_changed_after_the_import_are_refused(checkpoint: Path, tmp
 
 
 @pytest.mark.parametrize(
-    ("image", "said"),
+    ("image", "words", "said"),
     [
-        (np.zeros((56, 56, 3), np.float32), "type float32"),
-        (np.zeros((3, 56, 56), np.uint8), r"shape \(3, 56, 56\)"),
-        (None, "whose image was not drawn"),
+        (np.zeros((56, 56, 3), np.float32), "open", "type float32"),
+        (np.zeros((3, 56, 56), np.uint8), "open", r"shape \(3, 56, 56\)"),
+        (None, "open", "whose image was not drawn"),
+        (np.zeros((56, 56, 3), np.uint8), "turn " * 90, "at most 120 are taken"),
     ],
 )
-def test_a_wrong_image_is_refused(target: OpenVLATarget, image: np.ndarray | None, said: str) -> None:
-    from kerv_cli.base.errors import KervError
-
+def test_a_wrong_observation_is_refused(target: OpenVLATarget, image: np.ndarray | None, words: str, said: str) -> None:
     images = {} if image is None else {"primary": image}
     with pytest.raises(KervError, match=said):
-        target.encode(Observation(np.zeros(0), np.zeros(0), "open", images))
-
-
-def test_too_long_an_instruction_is_refused(target: OpenVLATarget) -> None:
-    from kerv_cli.base.errors import UsageError
-
-    with pytest.raises(UsageError, match="at most 120 are taken"):
-        target.encode(shown(0, "turn " * 90))
+        target.encode(Observation(np.zeros(0), np.zeros(0), words, images))

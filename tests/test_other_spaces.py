@@ -5,10 +5,16 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
-from typer.testing import CliRunner
+from test_openvla import kerv
 
-from kerv_cli.cli.app import app
+from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.methods.artifacts import Request
+from kerv_cli.methods.eagle.drafter import DrafterArtifact, DrafterProposer
+from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyProposer
+from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 
 TARGET = "policy.target=nano-state"
@@ -16,10 +22,9 @@ TARGET = "policy.target=nano-state"
 
 def refusal(*words: str) -> str:
     """The one line of a command that exits with code 1."""
-    run = CliRunner().invoke(app, [*words])
-    lines = [line for line in run.output.splitlines() if line.startswith("kerv:")]
-    assert (run.exit_code, len(lines)) == (1, 1), run.output
-    return lines[0]
+    code, line = kerv(*words)
+    assert code == 1, line
+    return line
 
 
 @pytest.fixture(scope="module")
@@ -59,3 +64,26 @@ def test_a_fine_tuned_target_must_be_of_the_demonstrations_environment(results: 
     words = ["train", "target", "task=insert-peg", "name=new", "target=nano", "target.observation=state"]
     words += ["train.init=nano-state", "demos=pegs", "world.camera.name=front", f"results={results}"]
     assert "the target in" in refusal(*words)
+
+
+@pytest.mark.bits
+@pytest.mark.usefixtures("few_validations")
+def test_a_policy_of_seven_dofs_is_trained_and_decodes_with_its_drafters(results: Path) -> None:
+    common = ["demos=pegs", "train.steps=4", "train.batch=4", "train.validate_every=2", "train.held_out=0.34"]
+    common.append(f"results={results}")
+    words = ["task=insert-peg", "name=arm", "target=nano", "target.observation=state", "world.camera.name=front"]
+    assert kerv("train", "target", *words, *common) == (0, "")
+    for kind in ("eagle", "early"):
+        words = [f"drafter={kind}", "policy.target=arm", "drafter.samples=12"]
+        assert kerv("train", "drafter", *words, *common) == (0, "")
+    target, description = load_target(results / "artifacts/target/arm")
+    request = Request(description, target)
+    drafter = DrafterArtifact().load(results / "artifacts/drafter/arm", request)
+    early = EarlyArtifact().load(results / "artifacts/early/arm", request)
+    assert early.strict.tolist() == [dof == 6 for dof in range(7)] * target.chunk
+    shown = Observation(np.full(7, 0.1), np.full(19, 0.1), "turn the peg and push it into the tilted slot")
+    plain = Decoder(target).decode(shown)
+    assert plain.actions.shape == (target.chunk, 7)
+    tree = Parts(proposer=DrafterProposer(drafter, target, 5, 3, 12))
+    for parts in (tree, Parts(prefill_draft=EarlyProposer(early, target))):
+        assert Decoder(target, parts).decode(shown).tokens == plain.tokens

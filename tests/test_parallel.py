@@ -13,7 +13,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.settings import RolloutSettings, TargetSettings, TrainDrafterSettings, TrainTargetSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.lab.policy import check, decoder_for
+from kerv_cli.lab.policy import check
 from kerv_cli.methods.parallel import ParallelPass
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.packed import pack
@@ -130,10 +130,3 @@ def test_no_drafter_is_distilled_from_it(results: Path, monkeypatch: pytest.Monk
     settings = compose("train_drafter", [f"results={results}", "policy.target=parallel"], TrainDrafterSettings)
     with pytest.raises(UsageError, match="no greedy decodes to imitate"):
         drafter_run(settings)
-
-
-def test_a_rollout_of_it_is_composed_by_name(results: Path) -> None:
-    words = [f"results={results}", "task=drawer-open-v3", "policy.target=parallel", "method=parallel"]
-    settings = compose("rollout", words, RolloutSettings)
-    check(settings)
-    assert decoder_for(settings, "drawer-open-v3").cameras == ()

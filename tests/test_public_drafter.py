@@ -142,10 +142,8 @@ def test_a_drafter_that_does_not_fit_is_refused_in_one_line(
     words = [f"checkpoint={folder}"]
     if harm == "rename":
         tensors = load_file(folder / "model.safetensors")
-        save_file(
-            {("fx.weight" if k == "fc.weight" else k): v.clone() for k, v in tensors.items()},
-            folder / "model.safetensors",
-        )
+        renamed = {k.replace("fc.weight", "fx.weight"): v.clone() for k, v in tensors.items()}
+        save_file(renamed, folder / "model.safetensors")
     elif harm == "width":
         (folder / "config.json").write_text(json.dumps({**asdict(LANGUAGE), "hidden_size": 128}))
     elif harm == "pickle":

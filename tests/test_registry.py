@@ -152,8 +152,9 @@ def test_an_installed_package_registers_by_an_entry_point(
 
 
 def test_parts_are_known_without_anything_heavy() -> None:
-    heavy = "{'torch', 'mujoco', 'numpy', 'pyarrow', 'hydra', 'pydantic'}"
+    heavy = "{'torch', 'mujoco', 'metaworld', 'numpy', 'pyarrow', 'hydra', 'pydantic'}"
     asked = "import sys; from kerv_cli.base.registry import parts; assert len(parts('proposer')) > 9; "
+    asked += "from kerv_cli.worlds import task_names; assert len(list(task_names())) > 50; "
     done: Any = subprocess.run(
         [sys.executable, "-c", f"{asked}print(*({heavy} & set(sys.modules)))"],
         env={**os.environ, "KERV_PLUGINS": ""},

@@ -136,9 +136,7 @@ def test_it_is_trained_from_the_command_line_for_its_target_alone(results: Path)
     target, description = load_target(results / "artifacts/target/nano-vision")
     files, folder = ScoutArtifact(), results / "artifacts/scout/mine"
     assert files.load(folder, Request(description, target)).settings.width == 24
-    state, other = load_target(results / "artifacts/target/nano-state")
-    with pytest.raises(CheckpointError, match="was trained for target"):
-        files.checked(folder, other)
+    state = load_target(results / "artifacts/target/nano-state")[0]
     with pytest.raises(CheckpointError, match="looks through the camera"):
         check_sees(state)
     rollout = ["rollout", "method=scout_unverified", f"task={TASK}", "episodes=1", "record=0", "world.horizon=12"]
@@ -221,9 +219,6 @@ def test_a_certificate_of_another_draft_method_chunk_format_or_world_is_refused(
     issued.check_world({"camera": {"size": 96}, "horizon": 500, "stress": {"kind": "push"}})
     with pytest.raises(UsageError, match=r"world.horizon=120: the certificate is of 500"):
         issued.check_world({"camera": {"size": 96}, "horizon": 120})
-    issued.check_environment("metaworld")
-    with pytest.raises(UsageError, match=r"with a policy of libero: the certificate is of metaworld"):
-        issued.check_environment("libero")
 
 
 def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results: Path) -> None:
@@ -276,10 +271,7 @@ def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results: Pat
     ("ar", "scout", "common", "says"),
     [
         ("", "chunk=2", "", "setting 'scout' differs in chunk=: a certificate is of settings that differ in"),
-        ("", "policy.scout=other", "", "setting 'scout' differs in policy="),
-        ("", "threshold.r=5", "", "setting 'scout' differs in threshold="),
         ("", "runtime.dtype=bfloat16", "", "setting 'scout' differs in runtime.dtype="),
-        ("", "episodes=5", "", "setting 'scout' differs in episodes="),
         ("world.horizon=9", "", "", "setting 'ar' differs in world="),
         ("proposer=drafter", "", "", "'ar' has proposer=drafter: a certificate compares with AR, set proposer=none"),
         ("", "", "world.stress.kind=push world.stress.level=1", "says nothing of a stressed world"),

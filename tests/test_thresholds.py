@@ -72,33 +72,20 @@ def test_kinematic_at_its_landmarks() -> None:
     assert chosen.radius() == 9
 
 
-def test_change_is_its_closed_form() -> None:
+@settings(deadline=None)  # the machine is shared
+@given(st.lists(st.one_of(st.none(), levels, st.floats(0, 1)), max_size=20))
+def test_change_is_its_closed_form(history: list[float | None]) -> None:
     chosen = threshold("change")
     r, last = 5 + 10 * math.exp(-1), 0.4
-    assert chosen.radius() == rounded(r)
-    for k in (0.5, 0.45, None, 0.2, 0.1, 0.9, 0.0):
+    assert chosen.radius() == 9
+    for k in history:
         if k is not None:
             move = 10 * (1 - math.exp(-((abs(k - last) / 0.4) ** 2)))
             r = min(15.0, max(5.0, r - move if k > last else r + move))
             last = k
-        assert radius_after(chosen, k) == rounded(r)
+        assert abs(radius_after(chosen, k) - r) <= 0.5 + 1e-9
     chosen.reset()
     assert chosen.radius() == 9
-
-
-@settings(deadline=None)  # the machine is shared
-@given(st.lists(levels, max_size=20), levels)
-def test_change_moves_against_the_change_and_stays_in_range(history: list[float], k: float) -> None:
-    chosen = threshold("change")
-    before, last = radius_after(chosen, *history), history[-1] if history else 0.4
-    after = radius_after(chosen, k)
-    assert 5 <= after <= 15
-    if k > last:
-        assert after <= before
-    elif k < last:
-        assert after >= before
-    else:
-        assert after == before
 
 
 def test_schedule_is_the_public_codes_and_open_loop() -> None:

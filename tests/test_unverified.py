@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -68,11 +67,6 @@ def test_an_in_prefill_draft_that_sleeps_is_not_the_prefills_time() -> None:
     assert (slow.calls, [r.forwards for r in records]) == (3, [1, 1, 1])
     assert min(r.phases["propose"] for r in records) >= PAUSE
     assert min(r.phases["prefill"] for r in records) < PAUSE  # a busy machine does not stop it three times
-
-
-def test_a_skipped_decodes_draft_is_in_the_clock() -> None:
-    target = MockTarget()
-    slow = Near(target, target.encode(SHOWN), pause=PAUSE)
     record = Decoder(target, Parts(prefill_draft=slow, skip=AlwaysSkip(slow))).decode(SHOWN)
     assert record.forwards == 0
     assert record.seconds >= record.phases["propose"] >= PAUSE
@@ -108,24 +102,6 @@ def test_a_target_that_sleeps_is_in_the_clock_in_its_phase(slow: str, phase: str
 
 
 # --- K
-
-
-@pytest.mark.parametrize("make", [lambda: MockTarget(SEVEN, 8), lambda: random_target(3, 2, 2, 8)])
-@pytest.mark.parametrize("before", [True, False])
-def test_variability_does_not_grow_with_the_chunk(make: Callable[[], Any], before: bool) -> None:
-    """The reference level K_S is sampled at full H and used at every H: a sum would be eight times as large."""
-    target = make()
-    prompt = target.encode(SHOWN) if isinstance(target, MockTarget) else random_prompt(target, 3)
-    found, sums = [], []
-    for steps in (1, 8):
-        near = Near(target, prompt, bins=3)
-        parts = Parts(prefill_draft=near, proposer=near) if before else Parts(proposer=near)
-        chunk = Decoder(target, parts, chunk=steps).decode_prompt(prompt)
-        assert chunk.variability is not None
-        found.append(chunk.variability)
-        sums.append(chunk.variability * sum(len(r.drafted) for r in chunk.rounds))
-    assert found[1] / found[0] == pytest.approx(1.0, abs=0.2)
-    assert sums[1] / sums[0] > 6
 
 
 # --- skip=always
