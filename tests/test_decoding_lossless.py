@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from examples.own_policy import OwnPolicy
 from examples.own_target import SEVEN, MockTarget
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -330,12 +329,3 @@ def test_a_description_without_a_chunk_gets_one_line(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"target\.json is damaged: .*settings lack chunk") as refused:
         load_target(tmp_path)
     assert "\n" not in str(refused.value)
-
-
-@pytest.mark.bits
-def test_a_target_without_a_cache_is_decoded_losslessly() -> None:
-    target = OwnPolicy()
-    prompt = target.encode(Observation(np.array([0.3]), np.zeros(0), "push the red block gently away"))
-    truth = plain_greedy(target, prompt)
-    for seed in range(5):
-        assert decode(target, RandomTrees(truth, seed, 12, 255), prompt).tokens == truth

@@ -435,10 +435,12 @@ class PrepareSettings(DemonstrationSettings):
 
 @dataclass
 class DoctorSettings(RunSettings):
-    """`kerv doctor`."""
+    """`kerv doctor`. With a target or an environment it checks that alone."""
 
     groups: ClassVar = {"world": "default", "runtime": "cpu"}
 
+    policy: PolicySettings = setting(lambda: PolicySettings(target=""), "the target to check")
+    environment: str | None = setting(None, "the environment to check")
     seed: int = number(EVALUATION_SEED, 0, 2**31 - 1, help="of the world that is drawn")
     world: WorldSettings = setting(WorldSettings, "camera and length of an episode")
 

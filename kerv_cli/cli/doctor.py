@@ -1,16 +1,17 @@
-"""`kerv doctor`: checks rendering, torch, policies and results, and names the remedy for each failure."""
+"""`kerv doctor`: checks this machine (rendering, torch, policies, disk) and names the remedy for each failure."""
 
 from __future__ import annotations
 
 import shutil
 import time
-from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kerv_cli.base.errors import KervError, StorageError
+from kerv_cli.base.errors import KervError, StorageError, UnknownName
 from kerv_cli.base.files import visible
+from kerv_cli.base.findings import Finding
 from kerv_cli.base.leftovers import left_over, remove
 from kerv_cli.base.places import check_writable, find_target, results_dir, shipped_dir
 from kerv_cli.base.settings import DoctorSettings
@@ -22,48 +23,92 @@ if TYPE_CHECKING:
 
     from kerv_cli.worlds.spec import EnvironmentSpec
 
+
 Repair = Annotated[
     bool, typer.Option("--repair", help="Remove what killed commands left in the results; set damaged cells aside.")
 ]
 
 
-class Finding(NamedTuple):
-    """The result of one check."""
-
-    what: str
-    ok: bool
-    says: str
-
-
 @command(
     "doctor",
     DoctorSettings,
-    keys="world.camera.size runtime.device runtime.threads results",
-    examples=("kerv doctor", "kerv doctor --repair"),
+    keys="target environment world.camera.size runtime.device runtime.threads results",
+    examples=("kerv doctor", "kerv doctor target=mt10-vision"),
+    # to Hydra target= would be a choice among the files of conf/target
+    typed={"target": "policy.target"},
     writes=False,
 )
 def doctor(settings: DoctorSettings, repair: Repair = False, as_json: AsJson = False) -> None:
-    """Check rendering, torch, the shipped policies and the results folder; say what to do about what is missing."""
+    """Check rendering, simulator, torch, shipped policies, disk and display; say what to do about what is missing. With
+    target=NAME or environment=NAME: whether that keeps its protocol."""
     if repair:
         _repair(settings)
         return
+    if settings.policy.target or settings.environment:
+        findings = [*_target(settings), *_environment(settings)]
+    else:
+        findings = _machine(settings)
+    if as_json:
+        print_json([asdict(finding) for finding in findings])
+    else:
+        print_table(("check", "", "finding"), ((f.what, "ok" if f.ok else "FAILS", f.says) for f in findings))
+    if not all(finding.ok for finding in findings):
+        raise typer.Exit(1)
+
+
+def _machine(settings: DoctorSettings) -> list[Finding]:
+    from kerv_cli.base.provenance import versions
+    from kerv_cli.report.viewing.viewer import has_display
     from kerv_cli.worlds import specs
 
+    numbers = ", ".join(f"{name} {number}" for name, number in versions().items())
+    display = "a display is there: kerv view opens a window" if has_display() else "none: kerv view prints the command"
     paths = _left_over(settings)
     says = f"{len(paths)} files of killed commands, kerv doctor --repair removes them" if paths else "nothing"
-    findings = [
+    return [
+        Finding("versions", True, numbers),
         *(_rendering(spec, settings) for spec in specs().values()),
         _torch(settings),
         *_policies(settings),
         _disk(settings),
         Finding("left over", True, says),
+        Finding("display", True, display),
     ]
-    if as_json:
-        print_json([finding._asdict() for finding in findings])
-    else:
-        print_table(("check", "", "finding"), ((f.what, "ok" if f.ok else "FAILS", f.says) for f in findings))
-    if not all(finding.ok for finding in findings):
-        raise typer.Exit(1)
+
+
+def _target(settings: DoctorSettings) -> list[Finding]:
+    """Whether the target keeps the protocol, on an observation of noise."""
+    if not settings.policy.target:
+        return []
+    import numpy as np
+
+    from kerv_cli.base.runtime import set_up
+    from kerv_cli.base.spaces import Observation
+    from kerv_cli.base.views import frame_shape
+    from kerv_cli.methods.artifacts import Artifacts
+    from kerv_cli.targets.conformance import check_target
+
+    device, _ = set_up(settings.runtime)
+    artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
+    described, random = artifacts.description, np.random.default_rng(settings.seed)
+    size, space = int(described.settings.get("image_size", settings.world.camera.size)), described.observation
+    images = {name: random.integers(0, 256, frame_shape(name, size), dtype=np.uint8) for name in described.cameras}
+    state = random.normal(size=space.state)
+    words = " ".join(described.words[:3]) or "move"
+    return check_target(artifacts.target, Observation(state[: len(space.proprioception)], state, words, images))
+
+
+def _environment(settings: DoctorSettings) -> list[Finding]:
+    """Whether the environment keeps the protocol, on its first task."""
+    if not settings.environment:
+        return []
+    from kerv_cli.worlds import specs
+    from kerv_cli.worlds.conformance import check_environment
+
+    environments = specs()
+    if settings.environment not in environments:
+        raise UnknownName("environment", settings.environment, environments)
+    return check_environment(environments[settings.environment], settings.seed)
 
 
 def _rendering(spec: EnvironmentSpec, settings: DoctorSettings) -> Finding:
