@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from kerv_cli.base.errors import KervError
@@ -17,21 +17,17 @@ class Finding:
     says: str
 
 
-class Failed(Exception):
-    """A check failed; the message says what was expected and what came."""
+def need(holds: object, message: str) -> None:
+    """Raises KervError with the message where `holds` is false."""
+    if not holds:
+        raise KervError(message)
 
 
-def run(checks: Iterable[tuple[str, Callable[[], str]]]) -> list[Finding]:
-    """Runs checks in order -> one finding each. A check returns what it saw; `Failed`, a KervError and any exception of
-    the code under test make it fail, and the next one runs."""
-    findings = []
-    for what, check in checks:
-        try:
-            findings.append(Finding(what, True, check()))
-        except (Failed, KervError) as error:
-            findings.append(Finding(what, False, str(error)))
-        except Exception as error:  # noqa: BLE001 - the code under test is anybody's
-            findings.append(
-                Finding(what, False, f"raises {type(error).__name__}: {' '.join(str(error).split())[:200]}")
-            )
-    return findings
+def find(what: str, check: Callable[[], str]) -> Finding:
+    """Runs a check. It returns what it saw; any exception makes it fail."""
+    try:
+        return Finding(what, True, check())
+    except KervError as error:
+        return Finding(what, False, str(error))
+    except Exception as error:  # noqa: BLE001 - the code under test is anybody's
+        return Finding(what, False, f"raises {type(error).__name__}: {' '.join(str(error).split())[:200]}")

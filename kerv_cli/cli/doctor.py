@@ -5,13 +5,14 @@ from __future__ import annotations
 import shutil
 import time
 from dataclasses import asdict, replace
+from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kerv_cli.base.errors import KervError, StorageError, UnknownName
+from kerv_cli.base.errors import StorageError, UnknownName
 from kerv_cli.base.files import visible
-from kerv_cli.base.findings import Finding
+from kerv_cli.base.findings import Finding, find, need
 from kerv_cli.base.leftovers import left_over, remove
 from kerv_cli.base.places import check_writable, find_target, results_dir, shipped_dir
 from kerv_cli.base.settings import DoctorSettings
@@ -61,16 +62,16 @@ def _machine(settings: DoctorSettings) -> list[Finding]:
     from kerv_cli.report.viewing.viewer import has_display
     from kerv_cli.worlds import specs
 
-    numbers = ", ".join(f"{name} {number}" for name, number in versions().items())
     display = "a display is there: kerv view opens a window" if has_display() else "none: kerv view prints the command"
     paths = _left_over(settings)
     says = f"{len(paths)} files of killed commands, kerv doctor --repair removes them" if paths else "nothing"
+    shipped = [path.name for path in visible(shipped_dir()) if path.is_dir()]
     return [
-        Finding("versions", True, numbers),
-        *(_rendering(spec, settings) for spec in specs().values()),
-        _torch(settings),
-        *_policies(settings),
-        _disk(settings),
+        Finding("versions", True, ", ".join(f"{name} {number}" for name, number in versions().items())),
+        *(find(f"rendering {spec.name}", partial(_rendering, spec, settings)) for spec in specs().values()),
+        find("torch", partial(_torch, settings)),
+        *(find(f"policy {name}", partial(_policy, name, settings)) for name in shipped),
+        find("results", partial(_disk, settings)),
         Finding("left over", True, says),
         Finding("display", True, display),
     ]
@@ -111,64 +112,48 @@ def _environment(settings: DoctorSettings) -> list[Finding]:
     return check_environment(environments[settings.environment], settings.seed)
 
 
-def _rendering(spec: EnvironmentSpec, settings: DoctorSettings) -> Finding:
+def _rendering(spec: EnvironmentSpec, settings: DoctorSettings) -> str:
     """Draws frames of a world and times them: a backend can load and still draw nothing."""
     from kerv_cli.worlds.camera import choose_backend
 
-    what, first = f"rendering {spec.name}", next(iter(spec.suites.values()), tuple(spec.tasks))[0]
-    try:
-        backend = choose_backend()
-        with spec.open_world(first, replace(settings.world.camera, name="")) as world:
-            world.reset(settings.seed)
-            world.frame()
-            began = time.perf_counter()
-            spread = [int(world.frame().std()) for _ in range(20)][-1]
-            milliseconds = 1000 * (time.perf_counter() - began) / 20
-    except KervError as error:
-        return Finding(what, False, str(error))
-    size = settings.world.camera.size
-    if spread == 0:
-        return Finding(what, False, f"{backend} draws empty frames: set MUJOCO_GL=osmesa and run 'kerv doctor' again")
-    return Finding(what, milliseconds < 50, f"{backend}, {milliseconds:.1f} ms a frame at {size}x{size}")
+    backend, first = choose_backend(), next(iter(spec.suites.values()), tuple(spec.tasks))[0]
+    with spec.open_world(first, replace(settings.world.camera, name="")) as world:
+        world.reset(settings.seed)
+        world.frame()
+        began = time.perf_counter()
+        spread = [int(world.frame().std()) for _ in range(20)][-1]
+        milliseconds = 1000 * (time.perf_counter() - began) / 20
+    need(spread, f"{backend} draws empty frames: set MUJOCO_GL=osmesa and run 'kerv doctor' again")
+    says = f"{backend}, {milliseconds:.1f} ms a frame at {settings.world.camera.size}x{settings.world.camera.size}"
+    need(milliseconds < 50, says)
+    return says
 
 
-def _torch(settings: DoctorSettings) -> Finding:
+def _torch(settings: DoctorSettings) -> str:
     import torch
 
     from kerv_cli.base.provenance import device_name
     from kerv_cli.base.runtime import set_up
 
-    try:
-        device, _ = set_up(settings.runtime)
-    except KervError as error:
-        return Finding("torch", False, str(error))
+    device, _ = set_up(settings.runtime)
     cuda = "CUDA available" if torch.cuda.is_available() else "no CUDA device"
-    return Finding("torch", True, f"{device}: {device_name(device)}, {torch.get_num_threads()} thread(s), {cuda}")
+    return f"{device}: {device_name(device)}, {torch.get_num_threads()} thread(s), {cuda}"
 
 
-def _policies(settings: DoctorSettings) -> list[Finding]:
+def _policy(name: str, settings: DoctorSettings) -> str:
     from kerv_cli.targets.checkpoint import read_target
 
-    findings = []
-    for name in (path.name for path in visible(shipped_dir()) if path.is_dir()):
-        try:
-            described = read_target(find_target(settings.results, name))
-            parameters = described.provenance.get("parameters")
-            size = f"{parameters / 1e6:.1f} M parameters, " if isinstance(parameters, int | float) else ""
-            findings.append(Finding(f"policy {name}", True, f"{size}{described.sha256[:12]}"))
-        except KervError as error:
-            findings.append(Finding(f"policy {name}", False, str(error)))
-    return findings
+    described = read_target(find_target(settings.results, name))
+    parameters = described.provenance.get("parameters")
+    size = f"{parameters / 1e6:.1f} M parameters, " if isinstance(parameters, int | float) else ""
+    return f"{size}{described.sha256[:12]}"
 
 
-def _disk(settings: DoctorSettings) -> Finding:
-    folder = results_dir(settings.results)
-    try:
-        parent = check_writable(settings.results)
-    except StorageError as error:
-        return Finding("results", False, str(error))
-    free = shutil.disk_usage(parent).free / 1e9
-    return Finding("results", free > 2, f"{folder.resolve()} can be written, {free:.0f} GB free")
+def _disk(settings: DoctorSettings) -> str:
+    free = shutil.disk_usage(check_writable(settings.results)).free / 1e9
+    says = f"{results_dir(settings.results).resolve()} can be written, {free:.0f} GB free"
+    need(free > 2, says)
+    return says
 
 
 def _left_over(settings: DoctorSettings) -> list[Path]:

@@ -8,15 +8,14 @@ Shapes: P prompt tokens, T tokens, E width, V action tokens.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import functools
+from collections.abc import Callable, Iterable, Sequence
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.base.findings import Failed, Finding, run
-from kerv_cli.base.spaces import ActionSpace, Observation
+from kerv_cli.base.findings import Finding, find, need
+from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.protocol import Cache, Target
@@ -27,225 +26,177 @@ MEMBERS = ("actions", "chunk", "cameras", "width", "max_prompt", "device")
 METHODS = ("encode", "embed", "new_cache", "forward", "head")
 TREE = Draft.of([0] * 7, [-1, 0, 0, 1, 1, 2, 4])
 """The shape of a draft tree; its tokens are drawn anew for every check."""
+Pairs = Iterable[tuple[Tensor, Tensor]]
+"""Hidden states (…, E) of one way to forward tokens, and of the plain way; their logits must be equal."""
 
 
 @torch.inference_mode()
 def check_target(target: Target, observation: Observation) -> list[Finding]:
     """One finding per check. observation: one that the target can encode."""
-    findings = run([("members", lambda: _members(target))])
-    if not findings[0].ok:
-        return findings
-    trial = Trial(target, observation)
-    findings += run([("encode", trial.encode), ("embed and head", trial.embed_and_head)])
-    if not all(finding.ok for finding in findings):
-        return findings
-    checks: list[tuple[str, Callable[[], str]]] = [
-        ("causality", trial.causality),
-        ("cache, token by token", lambda: trial.pieces([1] * 6, "token by token")),
-        ("cache, several tokens", lambda: trial.pieces([1, 5, 3], "several tokens")),
-        ("tree attention", trial.tree),
-        ("commit of a path", trial.commit),
-        ("draft in the prefill", trial.prefill_draft),
-        ("cache used again", trial.reused_cache),
-        ("batch", trial.batch),
-        ("greedy chunk", trial.greedy_chunk),
-    ]
-    return findings + run(checks)
+    trial, findings = Trial(target, observation), []
+    for what, fault, check in CHECKS:
+        findings.append(find(what, functools.partial(trial.compare, fault, check)))
+        if not fault and not findings[-1].ok:
+            break
+    return findings
 
 
-def _members(target: Target) -> str:
-    missing = [name for name in (*MEMBERS, *METHODS) if not hasattr(target, name)]
-    if missing:
-        raise Failed(f"{type(target).__name__} lacks {', '.join(missing)} (kerv_cli/engine/protocol.py)")
-    if not isinstance(target.actions, ActionSpace):
-        raise Failed(f"actions is {type(target.actions).__name__}, must be an ActionSpace")
-    if target.chunk < 1 or target.width < 1 or target.max_prompt < 1:
-        raise Failed(f"chunk {target.chunk}, width {target.width}, max_prompt {target.max_prompt}: at least 1 each")
-    if isinstance(target.cameras, str):
-        raise Failed(f"cameras is the text '{target.cameras}', must be a tuple of names")
-    size = target.chunk * target.actions.dofs
-    return (
-        f"{type(target).__name__}: D={target.actions.dofs}, N={size}, {target.actions.tokens} tokens, E={target.width}"
-    )
-
-
-@dataclass
 class Trial:
     """One observation's checks. Every check compares with `plain`: one causal forward without a cache."""
 
-    target: Target
-    observation: Observation
-
-    def __post_init__(self) -> None:
-        self.worst = 0.0
+    def __init__(self, target: Target, observation: Observation) -> None:
+        self.target, self.observation = target, observation
         self.random = torch.Generator().manual_seed(0)
-        size = max(len(TREE), self.target.chunk * self.target.actions.dofs) + 2
-        self.capacity = self.target.max_prompt + size + len(TREE)
 
-    def encode(self) -> str:
+    def compare(self, fault: str, check: Callable[[Trial], Pairs]) -> str:
+        """Compares a check's pairs by their logits -> the largest difference, in words. fault: what a larger difference
+        than rounding means."""
+        worst = 0.0
+        for hidden, expected in check(self):
+            a, b = self.target.head(hidden).double(), self.target.head(expected).double()
+            gap = float((a - b).abs().max() / b.std().clamp_min(1e-9))
+            allowed = gap <= TOLERANCE.get(self.prompt.dtype, 2e-4)
+            need(allowed, f"{fault}: logits differ by {gap:.2g} of their spread, rounding explains less")
+            worst = max(worst, gap)
+        return f"logits within {worst:.1g} of their spread" if worst else "as declared"
+
+    def members(self) -> Pairs:
+        """The protocol's members are there."""
+        missing = [name for name in (*MEMBERS, *METHODS) if not hasattr(self.target, name)]
+        need(not missing, f"{type(self.target).__name__} lacks {', '.join(missing)} (kerv_cli/engine/protocol.py)")
+        need(not isinstance(self.target.cameras, str), "cameras is a text, must be a tuple of names")
+        self.size = self.target.chunk * self.target.actions.dofs
+        self.capacity = self.target.max_prompt + max(len(TREE), self.size) + 2 + len(TREE)
+        return ()
+
+    def encode(self) -> Pairs:
         """The prompt: shape, length, finite, the same twice."""
-        prompt = self.target.encode(self.observation)
-        if prompt.ndim != 3 or len(prompt) != 1 or prompt.shape[2] != self.target.width:
-            raise Failed(f"encode gives {tuple(prompt.shape)}, must be (1, P, {self.target.width})")
-        if not 1 <= prompt.shape[1] <= self.target.max_prompt:
-            raise Failed(f"a prompt of {prompt.shape[1]} tokens, max_prompt is {self.target.max_prompt}")
-        if not torch.isfinite(prompt).all():
-            raise Failed("the prompt holds numbers that are not finite")
-        if not torch.equal(prompt, self.target.encode(self.observation)):
-            raise Failed("the same observation gives another prompt the second time: a module is in training mode?")
-        self.prompt = prompt
-        self.tokens = torch.randint(self.target.actions.tokens, (1, 9), generator=self.random).to(prompt.device)
-        return f"P={prompt.shape[1]} of at most {self.target.max_prompt}, {str(prompt.dtype).removeprefix('torch.')}"
+        prompt, width, longest = self.target.encode(self.observation), self.target.width, self.target.max_prompt
+        right = prompt.ndim == 3 and len(prompt) == 1 and prompt.shape[2] == width
+        need(right, f"encode gives {tuple(prompt.shape)}, must be (1, P, {width})")
+        self.prompt, self.length = prompt, prompt.shape[1]
+        need(1 <= self.length <= longest, f"a prompt of {self.length} tokens, max_prompt is {longest}")
+        need(torch.isfinite(prompt).all(), "the prompt holds numbers that are not finite")
+        same = torch.equal(prompt, self.target.encode(self.observation))
+        need(same, "the same observation gives another prompt the second time: a module is in training mode?")
+        self.tokens = self.draw(9)
+        return ()
 
-    def embed_and_head(self) -> str:
+    def embed_and_head(self) -> Pairs:
         """Shapes and formats of `embed`, `forward` and `head`, for the first and the last token."""
-        width, count = self.target.width, self.target.actions.tokens
-        tokens = torch.tensor([[0, count - 1]], device=self.prompt.device)
-        embedded = self.target.embed(tokens)
-        if embedded.shape != (1, 2, width) or embedded.dtype != self.prompt.dtype:
-            raise Failed(
-                f"embed gives {tuple(embedded.shape)} {embedded.dtype}, (1, 2, {width}) {self.prompt.dtype} wanted"
-            )
-        hidden = self.plain(self.tokens)
-        if hidden.shape != (1, self.prompt.shape[1] + 9, width):
-            raise Failed(f"forward of (1, {self.prompt.shape[1] + 9}, {width}) gives {tuple(hidden.shape)}")
+        width, count, dtype = self.target.width, self.target.actions.tokens, self.prompt.dtype
+        embedded = self.target.embed(torch.tensor([[0, count - 1]], device=self.prompt.device))
+        right = embedded.shape == (1, 2, width) and embedded.dtype == dtype
+        need(right, f"embed gives {tuple(embedded.shape)} {embedded.dtype}, (1, 2, {width}) {dtype} wanted")
+        hidden, shape = self.plain(self.tokens), (1, self.length + 9, width)
+        need(hidden.shape == shape, f"forward of {shape} gives {tuple(hidden.shape)}")
         logits = self.target.head(hidden)
-        if logits.shape != (*hidden.shape[:-1], count) or not torch.isfinite(logits).all():
-            raise Failed(f"head gives {tuple(logits.shape)}, finite (1, T, {count}) are wanted")
-        return f"{count} action tokens"
+        right = logits.shape == (*shape[:2], count) and bool(torch.isfinite(logits).all())
+        need(right, f"head gives {tuple(logits.shape)}, finite (1, T, {count}) are wanted")
+        return ()
+
+    def draw(self, count: int) -> Tensor:
+        """Random tokens (1, count)."""
+        return torch.randint(self.target.actions.tokens, (1, count), generator=self.random).to(self.prompt.device)
+
+    def positions(self, first: int, count: int) -> Tensor:
+        """first, first + 1, …"""
+        return torch.arange(first, first + count, device=self.prompt.device)
 
     def plain(self, tokens: Tensor) -> Tensor:
         """Hidden states (1, P + T, E) of prompt and tokens (1, T), forwarded at once without a cache."""
         x = torch.cat([self.prompt, self.target.embed(tokens)], 1) if tokens.shape[1] else self.prompt
-        return self.target.forward(x, torch.arange(x.shape[1], device=x.device))
+        return self.target.forward(x, self.positions(0, x.shape[1]))
 
-    def compare(self, hidden: Tensor, expected: Tensor, what: str) -> None:
-        """Compares hidden states (…, E) by their logits.
-
-        Raises:
-            Failed: they differ by more than rounding.
-        """
-        a, b = self.target.head(hidden).double(), self.target.head(expected).double()
-        gap = float((a - b).abs().max() / b.std().clamp_min(1e-9))
-        self.worst = max(self.worst, gap)
-        if not gap <= TOLERANCE.get(self.prompt.dtype, 2e-4):
-            raise Failed(f"{what}: logits differ by {gap:.2g} of their spread, rounding explains less")
-
-    def largest_gap(self) -> str:
-        """The largest difference of logits so far, in words."""
-        return f"logits within {self.worst:.1g} of their spread"
-
-    def causality(self) -> str:
+    def causality(self) -> Pairs:
         """A token must not see what comes after it."""
-        length = self.prompt.shape[1]
-        whole = self.plain(self.tokens)
-        self.compare(self.plain(self.tokens[:, :4])[:, : length + 4], whole[:, : length + 4], "a token sees later ones")
-        return self.largest_gap()
+        yield self.plain(self.tokens[:, :4]), self.plain(self.tokens)[:, : self.length + 4]
 
-    def cached(self, lengths: Sequence[int]) -> tuple[Cache, list[Tensor]]:
-        """Prompt, then the tokens in pieces of these lengths -> the cache and the pieces' hidden states."""
-        cache, length = self.target.new_cache(1, self.capacity), self.prompt.shape[1]
-        if cache.capacity < self.capacity or cache.length:
-            raise Failed(f"new_cache(1, {self.capacity}) has capacity {cache.capacity} and length {cache.length}")
-        self.target.forward(self.prompt, torch.arange(length, device=self.prompt.device), cache)
-        if cache.length != length:
-            raise Failed(f"the cache has length {cache.length} after a prompt of {length} tokens")
-        hidden, first = [], 0
-        for tokens in lengths:
-            positions = torch.arange(length + first, length + first + tokens, device=self.prompt.device)
-            piece = self.target.embed(self.tokens[:, first : first + tokens])
-            hidden.append(self.target.forward(piece, positions, cache))
-            first += tokens
-        return cache, hidden
+    def cached(self, lengths: Sequence[int]) -> tuple[Cache, Tensor]:
+        """Prompt, then the tokens in pieces of these lengths -> the cache and the tokens' hidden states."""
+        cache, first, hidden = self.target.new_cache(1, self.capacity), self.length, []
+        self.target.forward(self.prompt, self.positions(0, first), cache)
+        need(cache.length == first, f"the cache has length {cache.length} after a prompt of {first} tokens")
+        for tokens in self.tokens[:, : sum(lengths)].split(list(lengths), 1):
+            positions = self.positions(first, tokens.shape[1])
+            hidden.append(self.target.forward(self.target.embed(tokens), positions, cache))
+            first += tokens.shape[1]
+        return cache, torch.cat(hidden, 1)
 
-    def pieces(self, lengths: Sequence[int], what: str) -> str:
+    def pieces(self, *lengths: int) -> Pairs:
         """Tokens behind a cache, in pieces as decoding and verifying forward them, equal one forward."""
-        _, hidden = self.cached(lengths)
         size = sum(lengths)
-        self.compare(torch.cat(hidden, 1), self.plain(self.tokens[:, :size])[:, -size:], f"{what} behind a cache")
-        return self.largest_gap()
+        yield self.cached(lengths)[1], self.plain(self.tokens[:, :size])[:, -size:]
 
-    def draw_tokens(self) -> Tensor:
-        """Random tokens (1, n) for the nodes of TREE."""
-        drawn = torch.randint(self.target.actions.tokens, (1, len(TREE)), generator=self.random)
-        return drawn.to(self.prompt.device)
-
-    def forward_tree(self, cache: Cache) -> tuple[Tensor, Tensor]:
-        """Forwards the third token, behind two cached ones, and a tree behind it -> the tree's tokens (1, n), hidden
-        (1, 1 + n, E)."""
-        drafted = self.draw_tokens()
-        positions = TREE.positions(self.prompt.shape[1] + 2, 1, self.prompt.device)
+    def forward_tree(self) -> tuple[Cache, Tensor, Tensor]:
+        """Forwards the third token, behind two cached ones, and a tree behind it -> the cache, the tree's tokens
+        (1, n), hidden (1, 1 + n, E)."""
+        (cache, _), drafted = self.cached([1, 1]), self.draw(len(TREE))
         x = self.target.embed(torch.cat([self.tokens[:, 2:3], drafted], 1))
-        return drafted, self.target.forward(x, positions, cache, TREE.visible(1))
+        positions = TREE.positions(self.length + 2, 1, self.prompt.device)
+        return cache, drafted, self.target.forward(x, positions, cache, TREE.visible(1))
 
-    def tree(self) -> str:
+    def tree(self) -> Pairs:
         """Every node of a tree equals the last token of its own path, forwarded alone."""
-        cache, _ = self.cached([1, 1])
-        drafted, hidden = self.forward_tree(cache)
+        _, drafted, hidden = self.forward_tree()
         for node in range(len(TREE)):
             tokens = torch.cat([self.tokens[:, :3], drafted[:, TREE.tree.path_to(node)]], 1)
-            self.compare(
-                hidden[:, node + 1], self.plain(tokens)[:, -1], f"node {node} of a tree sees others than its ancestors"
-            )
-        return self.largest_gap()
+            yield hidden[:, node + 1], self.plain(tokens)[:, -1]
 
-    def commit(self) -> str:
+    def commit(self) -> Pairs:
         """Decoding goes on behind a committed path."""
-        cache, _ = self.cached([1, 1])
-        drafted, _ = self.forward_tree(cache)
-        path = TREE.tree.path_to(6)
-        start = self.prompt.shape[1] + 2
-        slots = torch.tensor([start, *(start + 1 + node for node in path)], device=self.prompt.device)
-        cache.compact(start, slots)
-        if cache.length != start + 1 + len(path):
-            raise Failed(f"compact({start}, {len(slots)} slots) leaves length {cache.length}, not {start + len(slots)}")
-        position = torch.tensor([cache.length], device=self.prompt.device)
-        hidden = self.target.forward(self.target.embed(self.tokens[:, 3:4]), position, cache)
-        tokens = torch.cat([self.tokens[:, :3], drafted[:, path], self.tokens[:, 3:4]], 1)
-        self.compare(hidden, self.plain(tokens)[:, -1:], "a token behind a committed path")
-        return self.largest_gap()
+        (cache, drafted, _), path, start = self.forward_tree(), TREE.tree.path_to(6), self.length + 2
+        cache.compact(start, torch.tensor([start, *(start + 1 + node for node in path)], device=self.prompt.device))
+        length = start + 1 + len(path)
+        need(cache.length == length, f"compact leaves length {cache.length}, not {length}")
+        last = self.tokens[:, 3:4]
+        hidden = self.target.forward(self.target.embed(last), self.positions(length, 1), cache)
+        yield hidden, self.plain(torch.cat([self.tokens[:, :3], drafted[:, path], last], 1))[:, -1:]
 
-    def prefill_draft(self) -> str:
+    def prefill_draft(self) -> Pairs:
         """Prompt and a tree in one forward, as methods that draft before the prefill do."""
-        length, drafted = self.prompt.shape[1], self.draw_tokens()
-        visible = TREE.visible(length)
-        positions = TREE.positions(0, length, self.prompt.device)
-        x = torch.cat([self.prompt, self.target.embed(drafted)], 1)
-        hidden = self.target.forward(x, positions, self.target.new_cache(1, self.capacity), visible)
+        drafted, positions = self.draw(len(TREE)), TREE.positions(0, self.length, self.prompt.device)
+        x, cache = torch.cat([self.prompt, self.target.embed(drafted)], 1), self.target.new_cache(1, self.capacity)
+        hidden = self.target.forward(x, positions, cache, TREE.visible(self.length))
         for node in (1, 3, 6):
-            expected = self.plain(drafted[:, TREE.tree.path_to(node)])[:, -1]
-            self.compare(hidden[:, length + node], expected, f"node {node} of a tree in the prefill")
-        return self.largest_gap()
+            yield hidden[:, self.length + node], self.plain(drafted[:, TREE.tree.path_to(node)])[:, -1]
 
-    def reused_cache(self) -> str:
+    def reused_cache(self) -> Pairs:
         """A cache that is set back to length 0 holds nothing of before."""
         cache, _ = self.cached([5])
         cache.length = 0
-        positions = torch.arange(self.prompt.shape[1], device=self.prompt.device)
-        self.compare(
-            self.target.forward(self.prompt, positions, cache), self.plain(self.tokens[:, :0]), "a reused cache"
-        )
-        return self.largest_gap()
+        yield self.target.forward(self.prompt, self.positions(0, self.length), cache), self.plain(self.tokens[:, :0])
 
-    def batch(self) -> str:
+    def batch(self) -> Pairs:
         """Two prompts at once, as training a drafter does."""
-        prompts = torch.cat([self.prompt, self.prompt.flip(1)])
-        positions = torch.arange(prompts.shape[1], device=prompts.device)
+        prompts, positions = torch.cat([self.prompt, self.prompt.flip(1)]), self.positions(0, self.length)
         hidden = self.target.forward(prompts, positions, self.target.new_cache(2, self.capacity))
-        for row in range(2):
-            self.compare(
-                hidden[row : row + 1], self.target.forward(prompts[row : row + 1], positions), "a batch of two"
-            )
-        return self.largest_gap()
+        for row, prompt in zip(hidden, prompts, strict=True):
+            yield row[None], self.target.forward(prompt[None], positions)
 
-    def greedy_chunk(self) -> str:
+    def greedy_chunk(self) -> Pairs:
         """Greedy decoding with a cache gives the tokens of greedy decoding without."""
-        size, device = self.target.chunk * self.target.actions.dofs, self.prompt.device
-        tokens = torch.zeros(1, 0, dtype=torch.long, device=device)
-        for _ in range(size):
+        tokens = self.tokens[:, :0]
+        for _ in range(self.size):
             tokens = torch.cat([tokens, self.target.head(self.plain(tokens)[:, -1]).argmax(-1)[None]], 1)
         decoded = greedy(self.target, self.prompt, self.target.new_cache(1, self.capacity))[0][0].tolist()
-        if decoded != tokens[0].tolist() and self.prompt.dtype in (torch.float32, torch.float64):
-            raise Failed(f"greedy decoding gives {decoded} with a cache and {tokens[0].tolist()} without")
-        values = self.target.actions.decode(np.array(decoded).reshape(-1, self.target.actions.dofs))
-        return f"{size} tokens, the first action {np.array2string(values[0], precision=3)}"
+        same = decoded == tokens[0].tolist() or self.prompt.dtype not in (torch.float32, torch.float64)
+        need(same, f"greedy decoding gives {decoded} with a cache and {tokens[0].tolist()} without")
+        return ()
+
+
+CHECKS: tuple[tuple[str, str, Callable[[Trial], Pairs]], ...] = (
+    ("members", "", Trial.members),
+    ("encode", "", Trial.encode),
+    ("embed and head", "", Trial.embed_and_head),
+    ("causality", "a token sees later ones", Trial.causality),
+    ("cache, token by token", "token by token behind a cache", lambda trial: trial.pieces(1, 1, 1, 1, 1, 1)),
+    ("cache, several tokens", "several tokens behind a cache", lambda trial: trial.pieces(1, 5, 3)),
+    ("tree attention", "a node of a tree sees others than its ancestors", Trial.tree),
+    ("commit of a path", "a token behind a committed path", Trial.commit),
+    ("draft in the prefill", "a node of a tree in the prefill", Trial.prefill_draft),
+    ("cache used again", "a reused cache", Trial.reused_cache),
+    ("batch", "a batch of two", Trial.batch),
+    ("greedy chunk", "the chunk", Trial.greedy_chunk),
+)
+"""Name, what a failure means (empty: later checks need what this one sees), and the check."""
