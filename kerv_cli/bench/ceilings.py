@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from dataclasses import dataclass
-from typing import Any
 
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.settings import EXPERT, RolloutSettings
@@ -27,16 +25,12 @@ def ceilings(profile: Profile, tokens: int) -> list[MethodCeiling]:
     """The ceilings of the methods in conf/method at N = `tokens`; the expert and methods that verify nothing have
     none."""
     names = [name for name in groups()["method"] if name != EXPERT]
-    candidates = (_ceiling(name, _settings(name), profile, tokens) for name in names)
+    candidates = (_ceiling(name, profile, tokens) for name in names)
     return [ceiling for ceiling in candidates if ceiling is not None]
 
 
-@functools.cache
-def _settings(method: str) -> RolloutSettings:
-    return compose("rollout", [f"method={method}"], RolloutSettings)
-
-
-def _ceiling(name: str, settings: RolloutSettings, profile: Profile, tokens: int) -> MethodCeiling | None:
+def _ceiling(name: str, profile: Profile, tokens: int) -> MethodCeiling | None:
+    settings = compose("rollout", [f"method={name}"], RolloutSettings)
     autoregressive, encode = profile.decode(tokens), profile.seconds("encode", 1)
     if settings.skip.kind == "always":
         return None  # drafts are executed unverified: the target's trunk does not run
@@ -53,12 +47,7 @@ def _ceiling(name: str, settings: RolloutSettings, profile: Profile, tokens: int
     free = autoregressive / least
     if settings.proposer.kind not in ("drafter", "hybrid"):
         return MethodCeiling(name, "one verification", free, free)
-    rounds, depth = _rounds(settings.proposer, tokens)
+    depth = min(int(getattr(settings.proposer, "depth", tokens)), tokens - 2)
+    rounds = math.ceil((tokens - 1) / (depth + 1))  # of chains that are always accepted whole
     decode = prefill + rounds * (profile.seconds("verify", 1 + depth) + profile.drafting(depth))
     return MethodCeiling(name, f"{rounds} × {depth} drafted", free, autoregressive / decode)
-
-
-def _rounds(proposer: Any, tokens: int) -> tuple[int, int]:
-    """Rounds of a chain of the drafter's depth that is always accepted whole, for the tokens behind the first."""
-    depth = min(int(getattr(proposer, "depth", tokens)), tokens - 2)
-    return math.ceil((tokens - 1) / (depth + 1)), depth

@@ -30,10 +30,6 @@ class Machine:
         """Seconds below which a forward of so many bytes and operations cannot come."""
         return max(read / self.bandwidth, flops / self.flops)
 
-    def best_of(self, other: Machine) -> Machine:
-        """The higher rate of two measurements: another program slows a machine down, none speeds it up."""
-        return Machine(max(self.bandwidth, other.bandwidth), max(self.flops, other.flops))
-
 
 def synchronise(device: torch.device) -> None:
     """Waits for the device's work."""

@@ -36,10 +36,12 @@ def projections(
     shape = shape_of(settings.projected, model.size)
     sizes = Sizes(shape, model.target.actions.tokens, _HALF, _HALF)
     here, prompt = min(p.rows for p in phases if p.kind == "prefill"), prompt_of(shape)
-    longer = [replace(p, rows=p.rows - here + prompt) if _counts_prompt(p, here) else p for p in phases]
-    moved = [
-        replace(p, read=read, flops=flops) for p in longer for read, flops in [sizes.needs(p.kind, p.rows, prompt)]
-    ]
+    moved = []
+    for p in phases:
+        counts_prompt = p.kind == "prefill" or (p.kind == "feed" and p.rows == here)
+        rows = p.rows - here + prompt if counts_prompt else p.rows
+        read, flops = sizes.needs(p.kind, rows, prompt)
+        moved.append(replace(p, rows=rows, read=read, flops=flops))
     for name, (bandwidth, flops) in settings.projections.items():
         device = Machine(bandwidth * 1e9, flops * 1e12)
         costs = projected(moved, shares(phases, machine), machine, device, shape.layers)
@@ -83,10 +85,6 @@ def projected(
             least = p.seconds
         projections.append(replace(p, seconds=least, p95=least, least=least, floor=there.floor(p.read, p.flops)))
     return projections
-
-
-def _counts_prompt(phase: Phase, prompt: int) -> bool:
-    return phase.kind == "prefill" or (phase.kind == "feed" and phase.rows == prompt)
 
 
 def prompt_of(shape: TargetSettings) -> int:

@@ -66,7 +66,8 @@ class Policy:
         first = self._decoder(self._any_task())
         self.chunk = first.steps
         self._together = Together(BatchDecoder(first), settings.batch) if settings.batch > 1 else None
-        self.take_back(first)
+        if not self.by_task:
+            self._idle.append(first)
 
     def _task(self) -> str:
         """The full name of the settings' task; empty: none.
@@ -130,18 +131,13 @@ class Policy:
         try:
             yield session
         finally:
-            if isinstance(session.decoder, Decoder):
-                self.take_back(session.decoder)
+            if isinstance(session.decoder, Decoder) and not self.by_task:
+                self._idle.append(session.decoder)
 
     def new_session(self) -> Session:
         """A session for one more client."""
         holds = self.settings.outside == HOLD
         return Session(self._client_decoder, self.task, self.by_task, self.range, holds, self._decode)
-
-    def take_back(self, decoder: Decoder) -> None:
-        """Keeps the decoder of a client that has left, for the next client; not one that is for a single task."""
-        if not self.by_task:
-            self._idle.append(decoder)
 
     def _client_decoder(self, task: str) -> Follower:
         if self._together is not None:

@@ -176,9 +176,11 @@ class PolicyServer:
 
         who = _address(connection)
         if not self.seats.take(connection):
-            self.log(f"{who} refused: {self._full}")
+            count = self.seats.count
+            full = "another client is being served" if count == 1 else f"{count} clients are served"
+            self.log(f"{who} refused: {full}")
             with contextlib.suppress(ConnectionClosed):
-                connection.close(BUSY, f"{self._full}: try again later")
+                connection.close(BUSY, f"{full}: try again later")
             return
         latencies, why = Latencies(), ""
         try:
@@ -189,14 +191,11 @@ class PolicyServer:
             why = f": {frame.reason}" if frame and frame.reason else ""
         except TimeoutError:
             why = f": no message for {self.protocol.idle_s:g} s"
-            _close(connection, GONE, why[2:])
+            # it may never answer, and nobody waits for it
+            threading.Thread(target=connection.close, args=(GONE, why[2:]), daemon=True).start()
         finally:
             self.seats.leave(connection)
             self.log(f"{who} disconnected{why}; {latencies}")
-
-    @property
-    def _full(self) -> str:
-        return "another client is being served" if self.seats.count == 1 else f"{self.seats.count} clients are served"
 
     def _talk(self, connection: ServerConnection, latencies: Latencies) -> None:
         """Answers frames until the connection ends. Raises ConnectionClosed, and TimeoutError for silence."""
@@ -216,11 +215,11 @@ class PolicyServer:
         began = time.perf_counter()
         try:
             reply = conversation.answer(frame)
-        except KervError as error:
-            self._refuse(connection, conversation, str(error))
-            return
         except Exception as error:  # noqa: BLE001 - whatever a client sends, the server goes on
-            self._refuse(connection, conversation, f"internal error, {type(error).__name__}: {str(error)[:200]}")
+            internal = f"internal error, {type(error).__name__}: {str(error)[:200]}"
+            line = " ".join((str(error) if isinstance(error, KervError) else internal).split())[:LONGEST]
+            self.log(f"{_address(connection)} error: {line}")
+            connection.send(conversation.fault(line))
             return
         if reply is None:
             return
@@ -232,16 +231,6 @@ class PolicyServer:
         latencies.add(1000 * reply.seconds, whole)
         if self.settings.log_every and len(latencies.whole) % self.settings.log_every == 0:
             self.log(str(latencies))
-
-    def _refuse(self, connection: ServerConnection, conversation: Conversation, reason: str) -> None:
-        line = " ".join(reason.split())[:LONGEST]
-        self.log(f"{_address(connection)} error: {line}")
-        connection.send(conversation.fault(line))
-
-
-def _close(connection: ServerConnection, code: int, reason: str) -> None:
-    """Closes a connection that may never answer, in a thread of its own: nobody waits for it."""
-    threading.Thread(target=connection.close, args=(code, reason), daemon=True).start()
 
 
 def _address(connection: ServerConnection) -> str:

@@ -60,17 +60,17 @@ class Interface:
         Raises:
             UsageError: it is of another size or type.
         """
-        shape = "(height, width, 3)" if self.images_alone else str(frame_shape(camera, self.size))
-        if not (isinstance(image, np.ndarray) and image.dtype == np.uint8 and self._fits(image.shape, camera)):
-            what = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
-            raise UsageError(f"{key} is {what}, {shape} uint8 is wanted")
+        wanted = "(height, width, 3)" if self.images_alone else str(frame_shape(camera, self.size))
+        if not isinstance(image, np.ndarray):
+            raise UsageError(f"{key} is {type(image).__name__}, {wanted} uint8 is wanted")
+        fits = image.shape == frame_shape(camera, self.size)
+        if self.images_alone:
+            fits = (
+                image.ndim == 3 and image.shape[2] == 3 and 2 <= min(image.shape[:2]) <= max(image.shape[:2]) <= LARGEST
+            )
+        if not fits or image.dtype != np.uint8:
+            raise UsageError(f"{key} is {image.shape} {image.dtype}, {wanted} uint8 is wanted")
         return image
-
-    def _fits(self, shape: tuple[int, ...], camera: str) -> bool:
-        """Whether an image of that shape can be one of the camera's."""
-        if not self.images_alone:
-            return shape == frame_shape(camera, self.size)
-        return len(shape) == 3 and shape[2] == 3 and min(shape[:2]) >= 2 and max(shape[:2]) <= LARGEST
 
     def numbers(self, values: object, key: str, message: Message) -> tuple[np.ndarray, np.ndarray]:
         """Proprioception (p,) and state (s,) from the values under `key` of a message, None where it lacks them.
