@@ -183,9 +183,8 @@ class Loop:
         """Writes `log.csv`, a row per validation; nothing before the first."""
         import pandas as pd
 
-        if not self.history:
-            return
-        write_text(self.folder / "log.csv", pd.DataFrame(self.history).to_csv(index=False, float_format="%.6g"))
+        if self.history:
+            write_text(self.folder / "log.csv", pd.DataFrame(self.history).to_csv(index=False, float_format="%.6g"))
 
     def restore(self) -> None:
         """Continues from the folder's resume file, if there is one.

@@ -127,19 +127,6 @@ class Run(ABC):
         self.write(module, provenance_of(f"kerv train {self.kind}", self.settings, self.device, **figures))
 
 
-def freeze(target: CompactTarget, names: list[str]) -> None:
-    """Keeps the weights of the named modules of a target as they are.
-
-    Raises:
-        UsageError: it has no such module.
-    """
-    modules = dict(target.named_children())
-    for name in names:
-        if name not in modules:
-            raise UnknownName("train.freeze", name, modules)
-        modules[name].requires_grad_(False)
-
-
 class TargetRun(Run):
     """`kerv train target`. The constructor checks that the run is possible.
 
@@ -251,7 +238,11 @@ class TargetRun(Run):
             target = new_target(settings.target, self.dataset, samples, words, camera, settings.train.seed)
         else:
             target = continued_target(settings.target, init, camera)
-            freeze(target, settings.train.freeze)
+            modules = dict(target.named_children())
+            for name in settings.train.freeze:
+                if name not in modules:
+                    raise UnknownName("train.freeze", name, modules)
+                modules[name].requires_grad_(False)
         closed_loop = self.closed_loop if settings.train.closed_loop else None
         self.learnt = Imitation(target.to(self.device), samples, settings.train, closed_loop)
         self.borders = task_borders(self.learnt.training.tasks, settings.train.balance)

@@ -229,7 +229,11 @@ def _collect(
     failed: dict[str, list[int]] = {task: [] for task in config.tasks}
     seeds = {task: range(config.first_seed, config.first_seed + config.episodes) for task in config.tasks}
     while any(seeds.values()):
-        for task, outcomes in _run_jobs(config, out, _jobs(seeds), make_actor):
+        starts = [
+            (task, block, first) for task, block in seeds.items() for first in range(0, len(block), _SEEDS_PER_JOB)
+        ]
+        jobs = [(task, block[first : first + _SEEDS_PER_JOB]) for task, block, first in starts]
+        for task, outcomes in _run_jobs(config, out, jobs, make_actor):
             entries[task] += [entry for entry in outcomes.values() if entry is not None]
             failed[task] += [seed for seed, entry in outcomes.items() if entry is None]
             on_progress(sum(map(len, entries.values())), config.episodes * len(config.tasks))
@@ -237,14 +241,6 @@ def _collect(
         stops = {task: block.stop + config.episodes - len(entries[task]) for task, block in seeds.items()}
         seeds = {task: range(block.stop, min(stops[task], config.seed_limit)) for task, block in seeds.items()}
     return entries, failed
-
-
-def _jobs(seeds: Mapping[str, range]) -> list[tuple[str, range]]:
-    return [
-        (task, block[start : start + _SEEDS_PER_JOB])
-        for task, block in seeds.items()
-        for start in range(0, len(block), _SEEDS_PER_JOB)
-    ]
 
 
 def _identity(config: DemoConfig) -> dict[str, Any]:
