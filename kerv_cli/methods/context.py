@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from kerv_cli.base.errors import UsageError
+
 
 @dataclass(frozen=True)
 class Context:
@@ -24,3 +26,9 @@ class Context:
     def calibration(self) -> Any:
         """The target's `Calibration`; not by its type, which the parts that it is read for would import."""
         return self.artifact("calibration")
+
+    def check_radius(self, name: str, r: int) -> None:
+        """Raises UsageError for a radius above the largest distance of two tokens. name: of the threshold's setting."""
+        most = self.target.actions.tokens - 1
+        if r > most:
+            raise UsageError(f"threshold.{name}={r}: bins from 0 to {most}")

@@ -53,7 +53,12 @@ class FixedThresholdSettings:
 
 
 def fixed(settings: FixedThresholdSettings, context: Context) -> Fixed:
-    """threshold=fixed."""
+    """threshold=fixed.
+
+    Raises:
+        UsageError: a radius above the largest distance of two tokens.
+    """
+    context.check_radius("r", settings.r)
     return Fixed(settings.r)
 
 

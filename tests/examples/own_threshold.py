@@ -38,6 +38,7 @@ class Growing:
 
 
 def build(settings: GrowingSettings, context: Context) -> Growing:
+    context.check_radius("most", settings.most)
     return Growing(settings)
 
 

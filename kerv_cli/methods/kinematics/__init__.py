@@ -118,7 +118,12 @@ class Kinematic:
 
     @classmethod
     def build(cls, settings: KinematicThresholdSettings, context: Context) -> Self:
-        """threshold=kinematic, change; K_S is the task's, from the calibration, where none is given."""
+        """threshold=kinematic, change; K_S is the task's, from the calibration, where none is given.
+
+        Raises:
+            UsageError: a radius above the largest distance of two tokens.
+        """
+        context.check_radius("r_max", settings.r_max)
         k_s = settings.k_s if settings.k_s is not None else context.calibration.k_s(context.task)
         return cls(settings.r_min, settings.r_max, settings.phi, k_s)
 
@@ -174,7 +179,8 @@ class Schedule:
 
     @classmethod
     def build(cls, settings: ScheduleThresholdSettings, context: Context) -> Schedule:
-        """threshold=schedule."""
+        """threshold=schedule; errors as `Kinematic.build`."""
+        context.check_radius("r_max", settings.r_max)
         return cls(settings.r_min, settings.r_max, settings.phi, settings.tau)
 
     def reset(self) -> None:
