@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from flips import flipped
 from typer.testing import CliRunner
 
 from kerv_cli.base.errors import CheckpointError
@@ -17,7 +18,7 @@ from kerv_cli.bench import phases as measuring
 from kerv_cli.bench.ceilings import ceilings
 from kerv_cli.bench.machine import Machine
 from kerv_cli.bench.model import layer_weights, open_model
-from kerv_cli.bench.phases import Laps, Phase, costs_of, decoders, flipped
+from kerv_cli.bench.phases import Laps, Phase, costs_of, decoders
 from kerv_cli.bench.profile import profile_of, projected, shares
 from kerv_cli.cli.app import app
 from kerv_cli.engine.cost import READ_PHASES, Profile, Work, prices, read_profile, work_of
@@ -194,7 +195,7 @@ def test_the_command_ends_with_one_document(tmp_path: Path) -> None:
     document = json.loads(told.splitlines()[-1])
     path = tmp_path / "bench/nano-float32.json"
     assert document == json.loads(path.read_text())
-    assert {"card", "cold_start", "phases", "ceilings", "ties", "profile", "git_commit"} <= set(document)
+    assert {"card", "cold_start", "phases", "ceilings", "profile", "git_commit"} <= set(document)
     assert next(p["name"] for p in document["phases"] if p["kind"] == "verify") == "one token"
     (single,) = [p["seconds"] for p in document["phases"] if p["name"] == "one token"]
     assert read_profile(path).seconds("verify", 1) == single

@@ -24,7 +24,7 @@ from kerv_cli.engine.cost import Profile
 from kerv_cli.engine.record import DecodeRecord, Delay, EpisodeRecord, Round
 from kerv_cli.lab import policy as policies_of
 from kerv_cli.lab import run
-from kerv_cli.lab.clock import RealClock, displacement, predictor, profiled, steps_of
+from kerv_cli.lab.clock import RealClock, profiled, steps_of
 from kerv_cli.lab.episode import run_episode
 from kerv_cli.lab.rows import Circumstances, decode_rows, episode_row
 from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD
@@ -80,7 +80,7 @@ def constant(steps: float, compensation: str = "none") -> RealClock:
 
 
 @pytest.mark.bits
-@pytest.mark.parametrize("compensation", ["none", "hold", "linear", "kalman", "chunk", "position"])
+@pytest.mark.parametrize("compensation", ["none", "chunk"])
 def test_without_latency_an_episode_is_the_one_in_a_waiting_world(compensation: str) -> None:
     waiting, real = point_episode(None), point_episode(constant(0, compensation))
     assert (waiting.actions == real.actions).all()
@@ -91,7 +91,7 @@ def test_without_latency_an_episode_is_the_one_in_a_waiting_world(compensation: 
 
 
 @pytest.mark.bits
-@pytest.mark.parametrize("compensation", ["none", "kalman"])
+@pytest.mark.parametrize("compensation", ["none", "chunk"])
 def test_without_latency_a_policy_is_bit_for_bit_the_same(policies: Path, compensation: str) -> None:
     real = ["rollout.clock=real", "rollout.latency=constant", f"rollout.delay_compensation={compensation}"]
     a, b = (episode_of(policies, "method=spec_vla", *words) for words in ([], real))
@@ -175,72 +175,6 @@ def test_chunk_drops_what_is_stale() -> None:
     slow = point_episode(RealClock(lambda decode: decode.seconds, SPEC.actions, "chunk"), Numbered(4, lambda n: 0.6))
     assert played(slow)[6:12] == [(1, 3)] * 6  # the last action of a chunk is always left
     assert slow.decodes[0].delay == Delay(0.6, 6, 0, carried=0, held=6, dropped=3)
-
-
-@pytest.mark.parametrize(
-    ("kind", "steps", "wanted"),
-    [
-        ("hold", 2, [(1, 2), (1, 3), (1, 3), (1, 3)]),
-        ("linear", 2, [(1, 2), (1, 3), (1, 4), (1, 5)]),
-        ("kalman", 2, [(1, 2), (1, 3), (1, 4), (1, 5)]),  # a chunk that is a line, from its first action on
-        ("linear", 6, [(1, 6), (1, 7), (1, 8), (1, 9)]),
-        ("hold", 6, [(1, 3)] * 4),
-    ],
-)
-def test_predictions_go_on_behind_the_chunk(kind: str, steps: int, wanted: list[tuple[int, int]]) -> None:
-    """Action i of a chunk is executed at the step that it is meant for; what lies behind its last is predicted."""
-    clock = constant(steps, kind)
-    decode = Numbered(4).decode(Observation(np.zeros(3), np.zeros(6)))
-    decode = dataclasses.replace(decode, delay=clock.delay(decode, 0))
-    assert decode.delay is not None
-    assert (decode.delay.dropped, decode.delay.predicted) == (min(steps, 4), min(steps, 4))
-    line = [np.array([1, -i]) / 2000 for i in range(30, 0, -1)]  # what was executed before leads up to it
-    found = clock.chunk(decode, line if kind == "kalman" else [])
-    assert found.dtype == np.float32
-    assert found * 2000 == pytest.approx(np.array(wanted), abs=0.05)
-    assert (found[: 4 - min(steps, 4)] == decode.actions[min(steps, 4) :]).all()
-
-
-def test_strict_dofs_are_held_and_far_predictions_stay_finite() -> None:
-    space = METAWORLD.actions
-    clock = RealClock(lambda decode: 3.0, space, "linear")
-    actions = np.array([[0.1, 0, 0, -1], [0.2, 0, 0, 1]], np.float32)
-    decode = DecodeRecord((), actions, 0, (), "ar", 0.0, {})
-    decode = dataclasses.replace(decode, delay=clock.delay(decode, 0))
-    assert decode.delay is not None
-    assert decode.delay.steps == 240
-    found = clock.chunk(decode, [])
-    assert found == pytest.approx(np.array([[1.0, 0, 0, 1]] * 2))  # clipped to the limits; the gripper as it was last
-
-
-def test_one_action_is_no_line() -> None:
-    clock = constant(3, "kalman")
-    decode = Numbered(1).decode(Observation(np.zeros(3), np.zeros(6)))
-    decode = dataclasses.replace(decode, delay=clock.delay(decode, 0))
-    assert clock.chunk(decode, []) == pytest.approx(decode.actions)
-
-
-def test_a_compensated_episode_executes_what_the_clock_says() -> None:
-    record = point_episode(constant(2, "hold"))
-    assert played(record)[:10] == [(0, 0)] * 2 + [(n, i) for n in (1, 2) for i in (2, 3, 3, 3)]
-
-
-def test_the_decoder_is_shown_the_end_effector_where_it_will_be() -> None:
-    uniform = np.arange(12)[:, None] * np.array([0.002, 0.0, -0.001])
-    motion = predictor("kalman", np.zeros(3, dtype=bool))
-    assert displacement(motion, uniform, 5) == pytest.approx(5 * uniform[1])
-    assert displacement(motion, uniform[:2], 5) == pytest.approx(np.zeros(3))  # one displacement is no motion
-    decoder = Numbered(1)
-    record = point_episode(constant(3, "position"), decoder)
-    for number, shown in enumerate(decoder.shown[:6]):
-        delay = record.decodes[number].delay
-        assert delay is not None
-        path = record.path[: delay.observed + 1].astype(float)
-        ahead = displacement(motion, path, 3) if number else np.zeros(3)
-        assert shown.proprioception[:3] == pytest.approx(path[-1] + ahead, abs=1e-6)
-        assert (shown.state[:3] == shown.proprioception[:3]).all()
-        assert (shown.state[3:] == record.initial_state[3:]).all()
-        assert number < 4 or np.linalg.norm(ahead) > 1e-4
 
 
 def test_before_its_first_action_a_robot_stands_still() -> None:
@@ -371,7 +305,7 @@ FROM_PROFILE = "rollout.clock=real rollout.latency=profile rollout.profile=there
             "all 4 control steps of a chunk are stale",
         ),
         (f"{CONSTANT} rollout.latency_ms=13 rollout.delay_compensation=chunk chunk=2", "all 2 control steps"),
-        (f"{CONSTANT} rollout.delay_compensation=kalmann", "did you mean kalman"),
+        (f"{CONSTANT} rollout.delay_compensation=chunks", "did you mean chunk"),
         ("rollout.clock=reel", "did you mean real"),
         ("rollout.clock=real rollout.latency=profile", "name a document of 'kerv bench"),
         (FROM_PROFILE.replace("there", "nowhere"), "rollout.profile=nowhere: no such document"),

@@ -159,7 +159,7 @@ def test_finding_and_opening(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert find_recordings([tmp_path]) == [path]
     monkeypatch.setattr(viewer, "has_display", lambda: False)
     told = open_recording([path])
-    assert "kerv view --web" in told
+    assert "rerun episode.rrd" in told
     assert path.name in told
     assert "drawer-open-v3" in read_summary(path)
 

@@ -67,9 +67,7 @@ class TimingSettings:
     ar_ms: float = number(
         0.0, 0, 600_000, help="an autoregressive decode takes so long, others in proportion; 0: as measured or profiled"
     )
-    delay_compensation: str = choice(
-        "none", "none", "chunk", "hold", "linear", "kalman", "position", help="what is executed during a decode"
-    )
+    delay_compensation: str = choice("none", "none", "chunk", help="chunk: leave a new chunk's stale actions out")
     batch: int = number(1, 1, 1024, help="episodes that are decoded together; above 1: for success, without times")
 
     def check_together(self, prefix: str) -> None:

@@ -203,19 +203,3 @@ def source_decoders(settings: BenchSettings) -> dict[str, Any]:
         }
     except KervError:
         return {}
-
-
-@torch.inference_mode()
-def flipped(model: Model, chunks: int) -> tuple[int, int]:
-    """Tokens whose argmax in one verification differs from that of single forwards, and tokens compared: ties that the
-    number format flips. The images are noise."""
-    generator, differ, compared = np.random.default_rng(0), 0, 0
-    for _ in range(chunks):
-        images = {name: generator.integers(0, 256, image.shape, np.uint8) for name, image in
-                  model.observation.images.items()}  # fmt: skip
-        observation = model.observation.with_images(images)
-        tokens = Decoder(model.target).decode(observation).tokens
-        again = Decoder(model.target, Parts(proposer=Dummy(len(tokens), tokens))).decode(observation)
-        differ += sum(one.accepted < len(one.drafted) for one in again.rounds)
-        compared += len(tokens)
-    return differ, compared

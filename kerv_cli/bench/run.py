@@ -15,25 +15,21 @@ from kerv_cli.base.settings import BenchSettings
 from kerv_cli.bench.ceilings import MethodCeiling, ceilings
 from kerv_cli.bench.machine import Machine, measure_machine, synchronise
 from kerv_cli.bench.model import Model, open_model
-from kerv_cli.bench.phases import Phase, flipped, measure
+from kerv_cli.bench.phases import Phase, measure
 from kerv_cli.bench.profile import Document, profile_of, projections
 from kerv_cli.engine.cost import Profile
 from kerv_cli.engine.decoder import Decoder
 
-FLIP_CHUNKS = 8
-
 
 @dataclass(frozen=True)
 class Bench:
-    """The results of a bench. cold: seconds of opening the model and of its first decode. ceilings: by N. ties: numbers
-    of flipped and of compared tokens."""
+    """The results of a bench. cold: seconds of opening the model and of its first decode. ceilings: by N."""
 
     model: Model
     machine: Machine
     cold: dict[str, float]
     phases: list[Phase]
     ceilings: dict[int, list[MethodCeiling]]
-    ties: tuple[int, int]
     profile: Profile
 
     @property
@@ -61,7 +57,6 @@ class Bench:
             "cold_start": self.cold,
             "phases": [phase.as_dict() for phase in self.phases],
             "ceilings": {str(n): [asdict(c) for c in rows] for n, rows in self.ceilings.items()},
-            "ties": {"flipped": self.ties[0], "compared": self.ties[1]},
             "profile": self.profile.as_dict(),
         }
 
@@ -104,7 +99,7 @@ def run(settings: BenchSettings, model: Model, machine: Machine, opened: float) 
     machine, phases = measure(model, machine, settings)
     profile = profile_of(phases, model.size)
     by_tokens = {n: ceilings(profile, n) for n in settings.tokens}
-    return Bench(model, machine, cold, phases, by_tokens, flipped(model, FLIP_CHUNKS), profile)
+    return Bench(model, machine, cold, phases, by_tokens, profile)
 
 
 def write(settings: BenchSettings, bench: Bench) -> list[Path]:

@@ -41,8 +41,6 @@ def bench(settings: BenchSettings, as_json: AsJson = False) -> None:
     print_table(_PHASE_COLUMNS, _phase_rows(done.phases), done.title)
     columns = [name for n in settings.tokens for name in (f"N = {n}", "ceiling", "with its drafter")]
     print_table(("method", *columns), _ceiling_rows(done.ceilings), "speedup if every draft were accepted whole")
-    flipped, compared = done.ties
-    typer.echo(f"{flipped} of {compared} tokens differ between one verification and single tokens ({done.dtype})")
     for path in write(settings, done):
         typer.echo(str(path))
     if as_json:

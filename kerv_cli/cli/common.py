@@ -127,10 +127,7 @@ def at_work(what: str) -> Iterator[None]:
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[..., None]]:
     """Yields `advance(done, total, text="")`: a progress bar on a terminal, elsewhere at most 10 lines (50 for totals
-    from 2000 on) with the time left. Of several processes that torchrun started, the first shows it."""
-    if os.environ.get("RANK", "0") != "0":
-        yield lambda done, total, text="": None
-        return
+    from 2000 on) with the time left."""
     if not sys.stderr.isatty():
         typer.echo(f"{title} …", err=True)
         yield _plain_lines(title)

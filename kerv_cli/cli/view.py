@@ -12,7 +12,6 @@ from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
 
-Web = Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser here, until Ctrl-C.")]
 To = Annotated[Path | None, typer.Option("--to", help="Write a film of one recording: FILE.mp4 or FILE.gif.")]
 Summary = Annotated[bool, typer.Option("--summary", help="Print what a recording holds instead.")]
 
@@ -28,12 +27,11 @@ Summary = Annotated[bool, typer.Option("--summary", help="Print what a recording
 def view(
     settings: CommandSettings,
     names: list[str],
-    web: Web = False,
     to: To = None,
     summary: Summary = False,
 ) -> None:
-    """Open recordings in the Rerun viewer; without a display, name the command that serves them."""
-    from kerv_cli.report.viewing.viewer import find_recordings, open_recording, read_summary, serve_web
+    """Open recordings in the Rerun viewer; without a display, name the command that opens them."""
+    from kerv_cli.report.viewing.viewer import find_recordings, open_recording, read_summary
 
     paths = [_place(settings.results, name) for name in names] or [Path(settings.results)]
     recordings = find_recordings(paths)
@@ -45,9 +43,6 @@ def view(
         from kerv_cli.report.viewing.film import save_film
 
         typer.echo(str(save_film(_only(recordings, f"--to {to}") if names else recordings[0], to)))
-        return
-    if web:
-        serve_web(recordings, typer.echo)
         return
     typer.echo(open_recording(recordings))
 

@@ -53,7 +53,7 @@ class Delay:
 
     observed: the step at which the observation was taken. steps: latency, rounded up. carried, held: how many of them
     executed the chunk in hand on, and held the last action; fewer than `steps` where the episode ended. dropped: first
-    actions of the new chunk that were left out. predicted: actions that were put behind its last.
+    actions of the new chunk that were left out.
     """
 
     seconds: float
@@ -62,7 +62,6 @@ class Delay:
     carried: int = 0
     held: int = 0
     dropped: int = 0
-    predicted: int = 0
 
 
 @dataclass(frozen=True)

@@ -3,37 +3,26 @@ of another model and device, compensations of the delay, and what of `rollout.*`
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import sha256_of
 from kerv_cli.base.places import results_dir
 from kerv_cli.base.settings import CONSTANT, MEASURED, PROFILE, REAL, RolloutSettings
-from kerv_cli.base.spaces import ActionSpace, Observation
+from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.cost import Profile, predicted, read_profile, work_of_record
 from kerv_cli.engine.record import DecodeRecord, Delay
 from kerv_cli.methods.compose import Method
-from kerv_cli.methods.kinematics.prediction import Noise, Predictor, build_predictor
 from kerv_cli.worlds.spec import EnvironmentSpec
 
 if TYPE_CHECKING:
     from kerv_cli.targets.checkpoint import TargetDescription
 
-CHUNK, POSITION = "chunk", "position"
-"""Compensations: drop the new chunk's stale actions; show the decoder the end effector where it will be."""
-
-AHEAD = 64
-"""Control steps that are predicted at most; later ones repeat the last of them."""
-
-_LEAST = {"hold": 1, "linear": 2, "kalman": 2}  # actions that a prediction needs
-_RATIO = 10.0  # q / r of the filter; experts' actions are predicted best with it, up to five steps ahead
-
+CHUNK = "chunk"
+"""Compensation: drop the new chunk's stale actions."""
 
 Latency = Callable[[DecodeRecord], float]
 """Seconds from a decode's observation to its first action."""
@@ -57,26 +46,13 @@ class RealClock:
     """
 
     def __init__(self, latency: Latency, space: ActionSpace, compensation: str = "none") -> None:
-        """space: the environment's. compensation: none, chunk, hold, linear, kalman or position."""
+        """space: the environment's. compensation: none or chunk."""
         self.latency, self.space, self.compensation = latency, space, compensation
-        self.stream = predictor(compensation, space.is_strict) if compensation in _LEAST else None
-        self.motion = predictor("kalman", np.zeros(3, dtype=bool)) if compensation == POSITION else None
         self.expected = 0
 
     def reset(self) -> None:
         """A new episode begins."""
         self.expected = 0
-
-    def observed(self, observation: Observation, path: Sequence[np.ndarray]) -> Observation:
-        """The observation to decode: with `position`, its end effector is moved to where it is predicted to be when the
-        decode ends. path: the measured positions (3,) in the episode, metres, oldest first."""
-        if self.motion is None or not self.expected:
-            return observation
-        ahead = displacement(self.motion, np.asarray(path), self.expected)
-        proprioception, state = observation.proprioception.copy(), observation.state.copy()
-        proprioception[:3] += ahead
-        state[:3] += ahead  # the privileged state begins with the proprioception
-        return dataclasses.replace(observation, proprioception=proprioception, state=state)
 
     def delay(self, decode: DecodeRecord, observed: int) -> Delay:
         """Of a decode whose observation was taken at control step `observed`.
@@ -86,42 +62,8 @@ class RealClock:
         """
         seconds = self.latency(decode)
         steps = self.expected = steps_of(seconds, self.space.control_hz)
-        stale = min(steps, len(decode.actions))
-        if self.compensation == CHUNK:
-            return Delay(seconds, steps, observed, dropped=min(stale, len(decode.actions) - 1))
-        if self.stream is not None:
-            return Delay(seconds, steps, observed, dropped=stale, predicted=stale)
-        return Delay(seconds, steps, observed)
-
-    def chunk(self, decode: DecodeRecord, history: Sequence[np.ndarray]) -> np.ndarray:
-        """The actions (n, D) to execute from now on, environment units: those of the decode, which has a `delay`,
-        without the dropped ones, and predicted ones behind them. history: actions that were executed up to its
-        observation, oldest first."""
-        actions, delay = decode.actions, decode.delay
-        assert delay is not None
-        if self.stream is None or not delay.predicted:
-            return actions[delay.dropped :]
-        recent = self.space.normalise(np.array([*history[-self.stream.window :], *actions]))
-        first = delay.steps + 1 - delay.predicted  # steps ahead of the chunk's end of the first predicted action
-        ahead = np.minimum(np.arange(first, delay.steps + 1), AHEAD) - 1
-        predicted = self.stream.predict(recent, AHEAD)
-        if predicted is None:
-            predicted = np.repeat(recent[-1:], AHEAD, axis=0)
-        behind = self.space.unnormalise(predicted[ahead]).astype(actions.dtype)
-        return np.concatenate([actions[delay.dropped :], behind])
-
-
-def predictor(kind: str, held: np.ndarray) -> Predictor:
-    """KERV's predictor of that kind (§3.1), up to `AHEAD` steps ahead: hold, linear, or kalman with q = 10 r."""
-    return build_predictor(kind, held, {"kalman": Noise.uniform(len(held), q=_RATIO)}, _LEAST[kind], horizon=AHEAD)
-
-
-def displacement(motion: Predictor, path: np.ndarray, steps: int) -> np.ndarray:
-    """path (m, 3), metres, newest last -> predicted displacement (3,) over the next `steps` control steps, at most
-    `AHEAD`; zero where the path is too short."""
-    moves = np.diff(path[-motion.window - 1 :], axis=0)
-    predicted = motion.predict(moves, min(steps, AHEAD))
-    return np.zeros(3) if predicted is None else predicted.sum(axis=0)
+        stale = min(steps, len(decode.actions) - 1) if self.compensation == CHUNK else 0
+        return Delay(seconds, steps, observed, dropped=stale)
 
 
 def check(settings: RolloutSettings, spec: EnvironmentSpec, target: TargetDescription | None) -> None:

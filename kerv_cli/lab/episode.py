@@ -81,13 +81,6 @@ class _Execution:
         if self.on_step is not None:
             self.on_step(len(self.actions))
 
-    def take(self, decode: DecodeRecord, clock: RealClock | None) -> None:
-        """A new chunk replaces the one in hand."""
-        if clock is None or decode.delay is None:
-            self.in_hand = deque(decode.actions)
-        else:
-            self.in_hand = deque(clock.chunk(decode, self.actions[: decode.delay.observed]))
-
     def until(self, rest: int) -> None:
         """Executes the chunk in hand until so many of its steps are left, or the episode ends."""
         while len(self.in_hand) > rest and not self.world.done:
@@ -147,14 +140,13 @@ def episode(
     if clock is not None:
         clock.reset()
     while not world.done:
-        observation = world.observe(follower.cameras)
-        decode = yield observation if clock is None else clock.observed(observation, execution.path)
+        decode = yield world.observe(follower.cameras)
         if clock is not None:
             delay = clock.delay(decode, len(execution.actions))
             decode = dataclasses.replace(decode, delay=execution.during(delay))
         decodes.append(decode)
         decode_steps.append(len(execution.actions))
-        execution.take(decodes[-1], clock)
+        execution.in_hand = deque(decode.actions[decode.delay.dropped if decode.delay else 0 :])
         execution.until(0 if clock is None else clock.expected)
     follower.finish(world.succeeded)
     return EpisodeRecord(

@@ -118,7 +118,7 @@ _DECODE: Fields = {
     **_attributes("reason", kind=TEXT),  # of a skip rule: trusted, streak; null without one that says so
     "delay_seconds": (FLOAT, _delay("seconds")),  # these: null where the world waited
     "delay_steps": (INT, _delay("steps")),
-    **{name: (INT, _delay(name)) for name in ("observed", "carried", "held", "dropped", "predicted")},
+    **{name: (INT, _delay(name)) for name in ("observed", "carried", "held", "dropped")},
 }
 # index: of the decode in its episode; step: control step at which its actions begin
 _POSITION = {"task": TEXT, "seed": INT, "index": INT, "step": INT}

@@ -71,7 +71,7 @@ def read_served(path: Path) -> Served | None:
             table = file.read_all()
         facts = json.loads((table.schema.metadata or {})[_KEY])
         table = table.replace_schema_metadata(None)
-        decodes = table if table.schema.equals(DECODE_SCHEMA) else table.cast(DECODE_SCHEMA)
+        decodes = table.select(DECODE_SCHEMA.names).cast(DECODE_SCHEMA)
         return Served(facts["episode"], facts["by"], decodes)
     except FileNotFoundError:
         return None

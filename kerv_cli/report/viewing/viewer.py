@@ -5,13 +5,11 @@ from __future__ import annotations
 import os
 import shlex
 import shutil
-import socket
 import subprocess
 import sys
 import tempfile
-import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -93,59 +91,15 @@ def viewer_command() -> list[str]:
     return [executable] if executable else [sys.executable, "-m", "rerun"]
 
 
-def serve_web(paths: Sequence[Path], tell: Callable[[str], object]) -> None:
-    """Serves the viewer with recordings to a browser until the process is interrupted; tell: takes the URL to open.
-
-    Args:
-        paths: recordings, the newest first; at most MOST_OPENED are served.
-
-    Raises:
-        KervError: a recording is damaged, or the viewer did not start.
-    """
-    chosen = [str(path) for path in paths[:MOST_OPENED]]
-    for path in chosen:
-        _reader(Path(path))
-    web, grpc = _free_port(), _free_port()
-    ports = ["--web-viewer-port", str(web), "--port", str(grpc)]
-    with tempfile.TemporaryFile() as log:
-        command = [*viewer_command(), "--serve-web", "--bind", "127.0.0.1", *ports, *chosen]
-        viewer = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
-        try:
-            while viewer.poll() is None and not _listens(web):
-                time.sleep(0.1)
-            if viewer.poll() is None:
-                tell(f"http://127.0.0.1:{web}?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{grpc}%2Fproxy")
-            if viewer.wait():
-                log.seek(0)
-                raise KervError(f"the Rerun viewer ended: {_last_line(log.read(), viewer.returncode)}")
-        finally:
-            viewer.terminate()
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
-
-
-def _listens(port: int) -> bool:
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
-
-
 def _last_line(output: bytes, status: int) -> str:
     return (output.decode(errors="replace").strip().splitlines() or [f"exit status {status}"])[-1]
 
 
 def _instructions(paths: Sequence[Path], more: str) -> str:
-    files = " ".join(shlex.quote(str(p)) for p in paths)
     return "\n".join(
         [
             f"no display here{more}: copy the files to a machine that has one (pip install 'rerun-sdk==0.41.*'):",
             f"  rerun {' '.join(shlex.quote(p.name) for p in paths)}",
-            "or serve them to a browser (over ssh: forward both ports of the URL that it prints)",
-            f"  kerv view --web {files}",
         ]
     )
 

@@ -1,0 +1,26 @@
+"""How often one verification picks other tokens than single forwards: ties that the number format flips."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from kerv_cli.bench.model import Model
+from kerv_cli.bench.phases import Dummy
+from kerv_cli.engine.decoder import Decoder, Parts
+
+
+@torch.inference_mode()
+def flipped(model: Model, chunks: int) -> tuple[int, int]:
+    """Tokens whose argmax in one verification differs from that of single forwards, and tokens compared. The images are
+    noise."""
+    generator, differ, compared = np.random.default_rng(0), 0, 0
+    for _ in range(chunks):
+        seen = model.observation.images.items()
+        images = {name: generator.integers(0, 256, image.shape, np.uint8) for name, image in seen}
+        observation = model.observation.with_images(images)
+        tokens = Decoder(model.target).decode(observation).tokens
+        again = Decoder(model.target, Parts(proposer=Dummy(len(tokens), tokens))).decode(observation)
+        differ += sum(one.accepted < len(one.drafted) for one in again.rounds)
+        compared += len(tokens)
+    return differ, compared
