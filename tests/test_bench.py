@@ -195,7 +195,7 @@ def test_the_command_ends_with_one_document(tmp_path: Path) -> None:
     document = json.loads(told.splitlines()[-1])
     path = tmp_path / "bench/nano-float32.json"
     assert document == json.loads(path.read_text())
-    assert {"card", "cold_start", "phases", "ceilings", "profile", "git_commit"} <= set(document)
+    assert {"card", "phases", "ceilings", "profile", "git_commit"} <= set(document)
     assert next(p["name"] for p in document["phases"] if p["kind"] == "verify") == "one token"
     (single,) = [p["seconds"] for p in document["phases"] if p["name"] == "one token"]
     assert read_profile(path).seconds("verify", 1) == single

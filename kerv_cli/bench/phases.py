@@ -94,19 +94,17 @@ class Laps(Clock):
 
 
 class Dummy(Proposer):
-    """Drafts so many nodes: a chain, and where that has no room for them further children of the root. tokens: of the
-    chain, by their index in the chunk; None: any."""
+    """Drafts so many nodes: a chain, and where that has no room for them further children of the root."""
 
     name = "dummy"
 
-    def __init__(self, nodes: int, tokens: Sequence[int] | None = None) -> None:
-        self.nodes, self.tokens = nodes, tokens
+    def __init__(self, nodes: int) -> None:
+        self.nodes = nodes
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
         """The dummy draft; see `Proposer.propose`."""
-        first, chain = len(chunk.tokens), min(self.nodes, depth)
-        tokens = range(self.nodes) if self.tokens is None else self.tokens[first : first + self.nodes]
-        return Draft.of(tokens, [*range(-1, chain - 1), *[ROOT] * (len(tokens) - chain)])
+        chain = min(self.nodes, depth)
+        return Draft.of(range(self.nodes), [*range(-1, chain - 1), *[ROOT] * (self.nodes - chain)])
 
 
 def decoders(model: Model) -> list[Decoder]:

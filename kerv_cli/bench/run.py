@@ -1,8 +1,7 @@
-"""One bench: the card, cold start, every phase, ceilings, and the document that holds them all."""
+"""One bench: the card, every phase, ceilings, and the document that holds them all."""
 
 from __future__ import annotations
 
-import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -13,21 +12,19 @@ from kerv_cli.base.places import results_dir
 from kerv_cli.base.provenance import stamp
 from kerv_cli.base.settings import BenchSettings
 from kerv_cli.bench.ceilings import MethodCeiling, ceilings
-from kerv_cli.bench.machine import Machine, measure_machine, synchronise
-from kerv_cli.bench.model import Model, open_model
+from kerv_cli.bench.machine import Machine
+from kerv_cli.bench.model import Model
 from kerv_cli.bench.phases import Phase, measure
 from kerv_cli.bench.profile import Document, profile_of, projections
 from kerv_cli.engine.cost import Profile
-from kerv_cli.engine.decoder import Decoder
 
 
 @dataclass(frozen=True)
 class Bench:
-    """The results of a bench. cold: seconds of opening the model and of its first decode. ceilings: by N."""
+    """The results of a bench. ceilings: by N."""
 
     model: Model
     machine: Machine
-    cold: dict[str, float]
     phases: list[Phase]
     ceilings: dict[int, list[MethodCeiling]]
     profile: Profile
@@ -54,7 +51,6 @@ class Bench:
             "threads": torch.get_num_threads(),
             **stamp(str(device)),
             "card": card_of(self.model, self.machine, max(self.ceilings)),
-            "cold_start": self.cold,
             "phases": [phase.as_dict() for phase in self.phases],
             "ceilings": {str(n): [asdict(c) for c in rows] for n, rows in self.ceilings.items()},
             "profile": self.profile.as_dict(),
@@ -82,24 +78,12 @@ def card_of(model: Model, machine: Machine, tokens: int) -> dict[str, float]:
     }
 
 
-def open_timed(settings: BenchSettings) -> tuple[Model, Machine, float]:
-    """The model, its machine's rates, and the seconds that opening the model took. Errors as `open_model`."""
-    began = time.perf_counter()
-    model = open_model(settings)
-    synchronise(model.target.device)
-    opened = time.perf_counter() - began
-    return model, measure_machine(model.target.device, model.dtype), opened
-
-
-def run(settings: BenchSettings, model: Model, machine: Machine, opened: float) -> Bench:
+def run(settings: BenchSettings, model: Model, machine: Machine) -> Bench:
     """Measures the opened model."""
-    began = time.perf_counter()
-    Decoder(model.target).decode(model.observation)
-    cold = {"open_seconds": opened, "first_decode_seconds": time.perf_counter() - began}
     machine, phases = measure(model, machine, settings)
     profile = profile_of(phases, model.size)
     by_tokens = {n: ceilings(profile, n) for n in settings.tokens}
-    return Bench(model, machine, cold, phases, by_tokens, profile)
+    return Bench(model, machine, phases, by_tokens, profile)
 
 
 def write(settings: BenchSettings, bench: Bench) -> list[Path]:

@@ -29,15 +29,15 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the whole result as 
 def bench(settings: BenchSettings, as_json: AsJson = False) -> None:
     """Measure what a target's decodes cost, against the device's limits; target= is a policy or a shape: vla-150m,
     smolvla, openvla-7b. 'kerv report study=NAME on=PROFILE' prices a study's decodes with it."""
-    from kerv_cli.bench.run import card_of, open_timed, run, write
+    from kerv_cli.bench.machine import measure_machine
+    from kerv_cli.bench.model import open_model
+    from kerv_cli.bench.run import card_of, run, write
 
-    model, machine, opened = open_timed(settings)
+    model = open_model(settings)
+    machine = measure_machine(model.target.device, model.dtype)
     card = card_of(model, machine, max(settings.tokens))
     print_table(("card", ""), _card_rows(card), f"{model.name}, {model.dtype}".replace("torch.", ""))
-    done = run(settings, model, machine, opened)
-    typer.echo(
-        f"cold start: opened in {opened:.1f} s, first prefill and token {done.cold['first_decode_seconds']:.2f} s"
-    )
+    done = run(settings, model, machine)
     print_table(_PHASE_COLUMNS, _phase_rows(done.phases), done.title)
     columns = [name for n in settings.tokens for name in (f"N = {n}", "ceiling", "with its drafter")]
     print_table(("method", *columns), _ceiling_rows(done.ceilings), "speedup if every draft were accepted whole")

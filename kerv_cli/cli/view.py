@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -42,16 +41,12 @@ def view(
     if to is not None:
         from kerv_cli.report.viewing.film import save_film
 
-        typer.echo(str(save_film(_only(recordings, f"--to {to}") if names else recordings[0], to)))
+        if names and len(recordings) > 1:
+            needed = f"one recording is needed, of {len(recordings)} name one, e.g. {recordings[0]}"
+            raise UsageError(f"--to {to}: {needed}")
+        typer.echo(str(save_film(recordings[0], to)))
         return
     typer.echo(open_recording(recordings))
-
-
-def _only(recordings: Sequence[Path], what: str) -> Path:
-    """The one recording. Raises UsageError: there are several. what: for the message."""
-    if len(recordings) > 1:
-        raise UsageError(f"{what}: one recording is needed, of {len(recordings)} name one, e.g. {recordings[0]}")
-    return recordings[0]
 
 
 def _place(results: str, name: str) -> Path:

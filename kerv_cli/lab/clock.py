@@ -42,16 +42,13 @@ def steps_of(seconds: float, control_hz: float) -> int:
 class RealClock:
     """Tells an episode how long each decode takes the world, and which actions are executed then.
 
-    expected: control steps that the next decode is expected to take: as many as the one before, 0 at the beginning.
+    expected: control steps that the next decode is expected to take: as many as the one before, 0 at the beginning
+    of an episode.
     """
 
     def __init__(self, latency: Latency, space: ActionSpace, compensation: str = "none") -> None:
         """space: the environment's. compensation: none or chunk."""
         self.latency, self.space, self.compensation = latency, space, compensation
-        self.expected = 0
-
-    def reset(self) -> None:
-        """A new episode begins."""
         self.expected = 0
 
     def delay(self, decode: DecodeRecord, observed: int) -> Delay:
@@ -165,10 +162,7 @@ def _open_profile(results: str, name: str, kinds: Sequence[str]) -> Profile:
         rows, seconds = profile.phases.get(kind, ((), ()))
         if not rows or len(rows) != len(seconds):
             raise UsageError(f"rollout.profile={name}: {path} has no phase '{kind}', which this method needs")
-        if list(rows) != sorted(set(rows)) or not all(_is_time(value) for value in seconds):
+        times = all(isinstance(value, int | float) and 0 <= value < math.inf for value in seconds)
+        if list(rows) != sorted(set(rows)) or not times:
             raise UsageError(f"rollout.profile={name}: {path} has impossible times of the phase '{kind}'")
     return profile
-
-
-def _is_time(value: object) -> bool:
-    return isinstance(value, int | float) and 0 <= value < math.inf

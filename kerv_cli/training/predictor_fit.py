@@ -56,8 +56,7 @@ def episode_windows(
     check_tail(episode, horizon, f"predictions of {horizon} steps")
     labels = actions.normalise(episode.labels)
     if steps <= window:
-        dofs = labels.shape[1]
-        return np.zeros((0, window, dofs)), np.zeros((0, horizon, dofs))
+        return np.zeros((0, window, labels.shape[1])), np.zeros((0, horizon, labels.shape[1]))
     past = np.lib.stride_tricks.sliding_window_view(labels[: steps - 1], window, axis=0)
     future = np.lib.stride_tricks.sliding_window_view(labels[window : steps + horizon - 1], horizon, axis=0)
     return past.swapaxes(1, 2), future.swapaxes(1, 2)

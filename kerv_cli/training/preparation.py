@@ -53,7 +53,10 @@ def plan(settings: PrepareSettings) -> list[Step]:
         if command[0] == "train" and settings.steps:
             command.append(f"train.steps={settings.steps}")
         state = _state(artifacts, kind, kinds)
-        steps.append(Step(kind, state, tuple(command), 0.0 if state == THERE else _seconds(kind, command)))
+        seconds = 120.0 if kind == "certificate" else 30.0
+        if command[0] == "train":
+            seconds = drafter_seconds(kind, compose("train_drafter", command[2:], TrainDrafterSettings).train.steps)
+        steps.append(Step(kind, state, tuple(command), 0.0 if state == THERE else seconds))
     if any(step.state != THERE and step.kind != "certificate" for step in steps):
         demos_for(settings)
     return steps
@@ -112,10 +115,3 @@ def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
         return MISSING if any(not getattr(described, name) for name in lacks) else THERE
     state = state_of(path, kind) if isinstance(files, Weights) else THERE
     return THERE if state == "complete" else state
-
-
-def _seconds(kind: str, command: Sequence[str]) -> float:
-    """A guess."""
-    if command[0] != "train":
-        return {"certificate": 120.0}.get(kind, 30.0)
-    return drafter_seconds(kind, compose("train_drafter", command[2:], TrainDrafterSettings).train.steps)

@@ -38,5 +38,4 @@ def import_drafter(settings: BuildDrafterSettings) -> tuple[Path, dict[str, Any]
     made_for = MadeFor.of(artifacts.description)
     shapes = asdict(DrafterSettings(kind="public", layers=shape.language.num_hidden_layers))
     DrafterArtifact().save(folder, drafter, made_for, provenance, settings=shapes, public=asdict(shape))
-    figures = {"parameters": parameters, "layers": shape.language.num_hidden_layers, **asdict(convention)}
-    return folder, figures
+    return folder, {"parameters": parameters, "layers": shape.language.num_hidden_layers, **asdict(convention)}

@@ -141,7 +141,11 @@ class Camera:
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
         self._pixels = np.empty((pixels, pixels, 3), dtype=np.uint8)
-        _close_at_exit(self)
+        # Registered after mujoco.egl was imported, so it runs before mujoco's own handler ends the display.
+        if not _open_cameras:
+            atexit.unregister(_close_all)
+            atexit.register(_close_all)
+        _open_cameras.add(self)
 
     def render(self, data: mujoco.MjData) -> NDArray[np.uint8]:
         """A frame of the state in `data`.
@@ -198,14 +202,6 @@ def box_average(pixels: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
             total += pixels[row::factor, column::factor]
     total //= factor**2
     return total.astype(np.uint8)
-
-
-def _close_at_exit(camera: Camera) -> None:
-    # Registered after mujoco.egl was imported, so it runs before mujoco's own handler ends the display.
-    if not _open_cameras:
-        atexit.unregister(_close_all)
-        atexit.register(_close_all)
-    _open_cameras.add(camera)
 
 
 def _close_all() -> None:

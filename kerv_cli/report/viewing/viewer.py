@@ -76,7 +76,9 @@ def open_recording(paths: Sequence[Path]) -> str:
         _reader(path)
     more = f" (the newest {len(chosen)} of {len(paths)})" if len(paths) > len(chosen) else ""
     if not has_display():
-        return _instructions(chosen, more)
+        command = f"rerun {' '.join(shlex.quote(path.name) for path in chosen)}"
+        remedy = "copy the files to a machine that has one (pip install 'rerun-sdk==0.41.*')"
+        return f"no display here{more}: {remedy}:\n  {command}"
     _start([*viewer_command(), "--bind", "127.0.0.1", *map(str, chosen)])
     names = chosen[0].name if len(chosen) == 1 else f"{len(chosen)} recordings"
     return f"opened {names}{more} in the Rerun viewer"
@@ -89,19 +91,6 @@ def viewer_command() -> list[str]:
         return [str(beside)]
     executable = shutil.which("rerun")
     return [executable] if executable else [sys.executable, "-m", "rerun"]
-
-
-def _last_line(output: bytes, status: int) -> str:
-    return (output.decode(errors="replace").strip().splitlines() or [f"exit status {status}"])[-1]
-
-
-def _instructions(paths: Sequence[Path], more: str) -> str:
-    return "\n".join(
-        [
-            f"no display here{more}: copy the files to a machine that has one (pip install 'rerun-sdk==0.41.*'):",
-            f"  rerun {' '.join(shlex.quote(p.name) for p in paths)}",
-        ]
-    )
 
 
 def _start(command: list[str]) -> None:
@@ -118,7 +107,8 @@ def _start(command: list[str]) -> None:
             return
         if status:
             log.seek(0)
-            raise KervError(f"the Rerun viewer ended at once: {_last_line(log.read(), status)}")
+            told = log.read().decode(errors="replace").strip().splitlines() or [f"exit status {status}"]
+            raise KervError(f"the Rerun viewer ended at once: {told[-1]}")
 
 
 def read_recording(path: Path) -> dict[str, Any]:

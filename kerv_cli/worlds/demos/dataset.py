@@ -161,12 +161,18 @@ class DemoDataset:
             CheckpointError: no dataset there, its recording was not finished, or it is damaged.
         """
         path = Path(path)
-        if not (path / "manifest.json").exists():
+        file = path / "manifest.json"
+        if not file.exists():
             command = f"'kerv demos {'task' if stands_for_tasks(path.name) else 'name'}={path.name}'"
             if (path / "recording.json").exists():
                 raise CheckpointError(f"the demonstrations in {path} are unfinished: run {command} again to go on")
             raise CheckpointError(f"no demonstrations in {path}: record them with {command}")
-        manifest = _read_manifest(path / "manifest.json")
+        value = read_mapping(file)
+        if value.get("format") != FORMAT:
+            raise CheckpointError(f"{file} has format {value.get('format')}, this kerv reads {FORMAT}")
+        manifest = read(DemoManifest, value, str(file))
+        if manifest.sha256 != dataset_hash(value["tasks"]):
+            raise CheckpointError(f"{file} is damaged: its hash does not fit its episodes")
         if manifest.instructions:
             camera, spaces = manifest.config["camera"]["name"], (manifest.actions, manifest.observation)
             register_recorded(manifest.environment, *spaces, manifest.instructions, camera)
@@ -221,13 +227,3 @@ class DemoDataset:
         if not self.views or not isinstance(frames, EncodedFrames):
             return episode
         return replace(episode, frames=frames.left(self.views * frames.size))
-
-
-def _read_manifest(path: Path) -> DemoManifest:
-    value = read_mapping(path)
-    if value.get("format") != FORMAT:
-        raise CheckpointError(f"{path} has format {value.get('format')}, this kerv reads {FORMAT}")
-    manifest = read(DemoManifest, value, str(path))
-    if manifest.sha256 != dataset_hash(value["tasks"]):
-        raise CheckpointError(f"{path} is damaged: its hash does not fit its episodes")
-    return manifest

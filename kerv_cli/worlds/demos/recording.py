@@ -98,11 +98,6 @@ class DemoConfig:
         """The tasks' environment."""
         return spec_of(self.tasks[0])
 
-    @property
-    def seed_limit(self) -> int:
-        """One past the last seed that may be tried when experts fail."""
-        return min(self.first_seed + 2 * self.episodes + _EXTRA_ATTEMPTS, self.spec.seeds.training.stop)
-
 
 class Actor(Protocol):
     """Moves the robot of a recording in the expert's place."""
@@ -185,7 +180,7 @@ def record(
 ) -> DemoManifest:
     """Records demonstrations into the folder `out`; an interrupted recording resumes.
 
-    A seed whose expert fails is replaced by the next one beyond the range, up to `config.seed_limit`. Which episodes
+    A seed whose expert fails is replaced by the next one beyond the range, up to a limit. Which episodes
     come out does not depend on the number of workers.
 
     Args:
@@ -228,6 +223,7 @@ def _collect(
     entries: dict[str, list[EpisodeEntry]] = {task: [] for task in config.tasks}
     failed: dict[str, list[int]] = {task: [] for task in config.tasks}
     seeds = {task: range(config.first_seed, config.first_seed + config.episodes) for task in config.tasks}
+    limit = min(config.first_seed + 2 * config.episodes + _EXTRA_ATTEMPTS, config.spec.seeds.training.stop)
     while any(seeds.values()):
         starts = [
             (task, block, first) for task, block in seeds.items() for first in range(0, len(block), _SEEDS_PER_JOB)
@@ -239,7 +235,7 @@ def _collect(
             on_progress(sum(map(len, entries.values())), config.episodes * len(config.tasks))
         # one new seed per failure, in order: the outcome does not depend on how the work is divided
         stops = {task: block.stop + config.episodes - len(entries[task]) for task, block in seeds.items()}
-        seeds = {task: range(block.stop, min(stops[task], config.seed_limit)) for task, block in seeds.items()}
+        seeds = {task: range(block.stop, min(stops[task], limit)) for task, block in seeds.items()}
     return entries, failed
 
 

@@ -47,18 +47,16 @@ class Objects(Stress):
         changes.keep(model.geom_size, model.geom_pos, model.geom_aabb, model.geom_rbound)
         model.geom_friction[:] *= friction
         for body in objects(model):
-            _slow(model, body, friction)
+            dofs = slice(model.body_dofadr[body], model.body_dofadr[body] + model.body_dofnum[body])
+            model.dof_damping[dofs] *= friction
+            model.dof_frictionloss[dofs] *= friction
             grown = size if _is_free_and_primitive(model, body) else 1.0
             for part in np.flatnonzero(model.body_weldid == body):
                 _scale(model, int(part), grown, moved=part != body)
                 _weigh(model, int(part), mass, grown)
-        _sum_masses(model)
-
-
-def _slow(model: Model, body: int, friction: float) -> None:
-    dofs = slice(model.body_dofadr[body], model.body_dofadr[body] + model.body_dofnum[body])
-    model.dof_damping[dofs] *= friction
-    model.dof_frictionloss[dofs] *= friction
+        model.body_subtreemass[:] = model.body_mass
+        for body in range(model.nbody - 1, 0, -1):
+            model.body_subtreemass[model.body_parentid[body]] += model.body_subtreemass[body]
 
 
 def _is_free_and_primitive(model: Model, body: int) -> bool:
@@ -89,9 +87,3 @@ def _weigh(model: Model, body: int, mass: float, size: float) -> None:
     model.body_invweight0[body] /= mass
     dofs = slice(model.body_dofadr[body], model.body_dofadr[body] + model.body_dofnum[body])
     model.dof_invweight0[dofs] /= mass
-
-
-def _sum_masses(model: Model) -> None:
-    model.body_subtreemass[:] = model.body_mass
-    for body in range(model.nbody - 1, 0, -1):
-        model.body_subtreemass[model.body_parentid[body]] += model.body_subtreemass[body]

@@ -191,7 +191,7 @@ def _manifest(
     }
     return {
         "format": FORMAT,
-        "environment": _identifier(settings.name or source.folder.name),
+        "environment": re.sub(r"\W+", "_", settings.name or source.folder.name).strip("_").lower() or "recorded",
         "actions": action_space(source, settings, actions).as_dict(),
         "observation": observation.as_dict(),
         "config": config,
@@ -242,11 +242,6 @@ def _task_names(tasks: Mapping[int, str]) -> dict[int, str]:
         name = re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:60] or f"task-{number}"
         names[number] = name if name not in names.values() else f"{name}-{number}"
     return names
-
-
-def _identifier(name: str) -> str:
-    """A registered environment's name: letters, digits and underscores."""
-    return re.sub(r"\W+", "_", name).strip("_").lower() or "recorded"
 
 
 def _table(path: Path, **options: Any) -> pa.Table:
