@@ -55,15 +55,11 @@ def store_again(run: RunEntry, results: str, cells: list[Cell]) -> StudyStore:
     ids = {cell.id for cell in cells}
     for store in stores(Path(results).expanduser(), run.folder.parent.name):
         with contextlib.suppress(KervError):
-            if store.interrupted_since(_words(run)) and {cell.id for cell in store.read_plan().cells} == ids:
+            if store.interrupted_since(["runs", "rerun", run.id]) and {c.id for c in store.read_plan().cells} == ids:
                 return store
     if run.kind == ROLLOUT:
         return new_rollout(results, cells)
     return StudyStore(results, _free(Path(results).expanduser() / STUDIES, run.id))
-
-
-def _words(run: RunEntry) -> list[str]:
-    return ["runs", "rerun", run.id]
 
 
 def run_again(run: RunEntry, store: StudyStore, cells: list[Cell]) -> RunEntry:
@@ -73,7 +69,7 @@ def run_again(run: RunEntry, store: StudyStore, cells: list[Cell]) -> RunEntry:
         KervError: a cell failed. Interrupted: Ctrl-C.
     """
     plan = store_of(run).read_plan()
-    store.begin(StudySettings(store.name, plan.title, plan.baseline, axis=plan.axis), cells, _words(run))
+    store.begin(StudySettings(store.name, plan.title, plan.baseline, axis=plan.axis), cells, ["runs", "rerun", run.id])
     with running(store, cells, RuntimeSettings()) as execute:
         failed = execute(cells).failed
     if failed:
