@@ -34,6 +34,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
             _ask_again(number)
             return
         frame = frame.f_back
+    sys.unraisablehook = _unraisable_at_the_end
     raise KeyboardInterrupt
 
 
@@ -45,8 +46,15 @@ def _unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
         sys.__unraisablehook__(unraisable)
 
 
+def _unraisable_at_the_end(unraisable: "sys.UnraisableHookArgs") -> None:
+    """After Ctrl-C, half-made objects of libraries may fail to clean up: no news to the user."""
+    if unraisable.exc_type is KeyboardInterrupt:
+        _unraisable(unraisable)
+
+
 def _ask_again(number: int) -> None:
-    timer = threading.Timer(0.05, os.kill, (os.getpid(), number))
+    # to the main thread: where it waits for an answer, a signal to another one would not wake it
+    timer = threading.Timer(0.05, signal.pthread_kill, (threading.main_thread().ident, number))
     timer.daemon = True
     timer.start()
 

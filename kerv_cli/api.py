@@ -1,8 +1,8 @@
 """The commands as Python functions: `import kerv_cli as kerv`, then `kerv.rollout(method="one_pass", task="reach")`.
 
 Settings are those of the commands: words as they are typed (`"threshold.r=5"`) and keywords, in which a list is a list,
-a mapping sets what lies below its key (`threshold={"r": 5}`) and None is null. Progress and warnings go to standard
-error, as a command's do. What kerv raises deliberately is a KervError, whose message is one line.
+a mapping sets what lies below its key (`threshold={"r": 5}`) and None is null. Nothing is printed. What kerv raises
+deliberately is a KervError, whose message is one line.
 """
 
 from __future__ import annotations
@@ -19,17 +19,18 @@ import pandas as pd
 
 from kerv_cli.base.config import as_words, compose
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
-from kerv_cli.base.places import results_dir
+from kerv_cli.base.places import results_dir, store_of_words
 from kerv_cli.base.settings import ServeSettings
-from kerv_cli.cli.rollout import planned_cells, run_cells
-from kerv_cli.cli.sweep import covered_cells, run_covered
-from kerv_cli.lab.catalogue import RunEntry, find_run, find_runs, matching, store_of
-from kerv_cli.lab.resolve import resolve, resolve_rollout, study_name
-from kerv_cli.lab.store import STUDIES, StudyStore
+from kerv_cli.catalogue.entries import RunEntry, find_run, find_runs, matching, store_of
+from kerv_cli.episodes.resolve import resolve, resolve_rollout, study_name
+from kerv_cli.lab.store import ROLLOUT, StudyStore
+from kerv_cli.lab.study import plan, plan_rollout, run
+from kerv_cli.report import decide
 from kerv_cli.report.measures import MICRO, Row
 from kerv_cli.report.report import report as write_report
 from kerv_cli.report.tables import load_study as load_data
 from kerv_cli.report.tables import rows_of
+from kerv_cli.report.viewing import save_recording
 from kerv_cli.serve.openpi import EXECUTED, RESET, OpenPi, metadata
 from kerv_cli.serve.policy import Policy as Served
 from kerv_cli.serve.wire import Message
@@ -39,7 +40,7 @@ TABLES = ("settings", "tasks", "episodes")
 
 @dataclass(frozen=True)
 class Study:
-    """The complete episodes of a sweep or a rollout. Every call reads them from disk."""
+    """The complete episodes of a sweep or a rollout. Every call reads them from the database."""
 
     store: StudyStore
 
@@ -61,7 +62,7 @@ class Study:
                 setting, task, seed and repeat: success, steps, forwards, seconds of inference, tokens, ….
 
         Raises:
-            UsageError: no such table, or no complete episode. CheckpointError: a cell is damaged.
+            UsageError: no such table, or no complete episode. CheckpointError: the database is damaged.
         """
         if table not in TABLES:
             raise UnknownName("table", table, TABLES)
@@ -82,9 +83,9 @@ class Study:
         Raises:
             UsageError: it is a rollout. KervError: as `kerv report`.
         """
-        if self.store.family != STUDIES:
+        if self.store.kind == ROLLOUT:
             raise UsageError(f"{self.name} is a rollout: kerv reports sweeps")
-        return write_report(self.folder.parent.parent, self.name).files
+        return write_report(self.store.database.results, self.name).files
 
 
 def rollout(*words: str, grid: bool = False, **settings: object) -> Study:
@@ -98,10 +99,11 @@ def rollout(*words: str, grid: bool = False, **settings: object) -> Study:
         UsageError: a setting that does not exist or cannot be. CheckpointError: no such policy, or a damaged one.
         Interrupted: Ctrl-C; complete episodes are kept. KervError: an episode failed.
     """
-    overrides = as_words(*words, **settings)
-    resolved = resolve_rollout(overrides, grid)
-    arguments = ["rollout", *(["-m"] if grid else []), *overrides]
-    return Study(run_cells(resolved, planned_cells(resolved), arguments))
+    with store_of_words(as_words(*words, **settings)) as overrides:
+        resolved = resolve_rollout(overrides, grid)
+        planned = plan_rollout(resolved, ["rollout", *(["-m"] if grid else []), *overrides])
+        run(planned, save=save_recording)
+    return Study(planned.store)
 
 
 def sweep(study: str | Path, *words: str, **settings: object) -> Study:
@@ -112,40 +114,48 @@ def sweep(study: str | Path, *words: str, **settings: object) -> Study:
         words, settings: of `kerv sweep`; they hold for each of the study's settings.
 
     Raises:
-        UsageError, CheckpointError, Interrupted: as `rollout`. KervError: cells failed; the others are kept.
+        UsageError, CheckpointError, Interrupted: as `rollout`. KervError: episodes failed; the others are kept.
     """
-    overrides = as_words(f"study={study}", *words, **settings)
-    resolved = resolve(overrides)
-    covered = covered_cells(resolved, overrides)
-    failed = run_covered(resolved, covered, overrides).failed
+    with store_of_words(as_words(f"study={study}", *words, **settings)) as overrides:
+        resolved = resolve(overrides)
+        planned = plan(resolved, ["sweep", *overrides])
+        judge = decide.judge(resolved.sweep.loss, print) if resolved.sweep.until == "decided" else None
+        failed = run(planned, save=save_recording, judge=judge).failed
     if failed:
-        cell, reason = failed[0].cell, failed[0].reason
-        raise KervError(f"{len(failed)} of {len(covered.cells)} cells failed, {cell.label} on {cell.task}: {reason}")
-    return Study(covered.store)
+        one, lost = failed[0].wanted[0], sum(len(failure.wanted) for failure in failed)
+        of_all = f"{lost} of {len(planned.study.wanted)} episodes failed"
+        raise KervError(f"{of_all}, {one.setting.label} on {one.task}: {failed[0].reason}")
+    return Study(planned.store)
 
 
-def load_study(name: str, results: str | Path = "results") -> Study:
+def load_study(name: str, results: str | Path = "results", store: str = "") -> Study:
     """A sweep or rollout of a results folder.
 
     Args:
         name: as `kerv runs show` takes it: its name, a unique part of it, `last`, or a study's file.
+        results: Folder that kerv writes to.
+        store: URL of its database; empty: KERV_STORE, else SQLite in the folder.
 
     Raises:
         UsageError: none or several have that name, or it has no episodes.
     """
-    return Study(store_of(find_run(results_dir(str(results)), study_name(name))))
+    with store_of_words([f"store={store}"] if store else []):
+        return Study(store_of(find_run(results_dir(str(results)), study_name(name))))
 
 
-def runs(results: str | Path = "results", **filters: str) -> pd.DataFrame:
+def runs(results: str | Path = "results", store: str = "", **filters: str) -> pd.DataFrame:
     """What a results folder holds, as `kerv runs list`: a row per sweep, rollout, training, …, the newest first.
 
     Args:
+        results: Folder that kerv writes to.
+        store: As for `load_study`.
         filters: kind, method, task (patterns such as `drawer*` too), state and since (ISO 8601, UTC).
 
     Raises:
         UsageError: no such filter or kind.
     """
-    there = matching(find_runs(results_dir(str(results))), filters)
+    with store_of_words([f"store={store}"] if store else []):
+        there = matching(find_runs(results_dir(str(results))), filters)
     return pd.DataFrame([asdict(run) for run in there], columns=[column.name for column in fields(RunEntry)])
 
 

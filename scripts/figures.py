@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import csv
 import functools
+import json
 import re
 import sys
 from collections.abc import Callable, Mapping
@@ -36,9 +37,21 @@ def table_of(study: str, macro: bool) -> tuple[dict[str, str], ...]:
     if not path.is_file():
         raise BadReference(f"no table {path.name} in {TABLES}")
     with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+        rows = [_further(study).get((row.get("label"), row.get("averaging")), {}) | row for row in csv.DictReader(file)]
     wanted = "macro over difficulty groups" if macro else "micro over tasks"
     return tuple(row for row in rows if row.get("averaging", wanted) == wanted)
+
+
+@functools.cache
+def _further(study: str) -> dict[tuple[str, str], dict[str, str]]:
+    """(label, averaging) -> the measures that are in `<study>.json` instead of a column; none of an older table."""
+    path = TABLES / f"{study}.json"
+    labels = json.loads(path.read_text(encoding="utf-8"))["labels"] if path.is_file() else {}
+    return {
+        (label, averaging): {name: "" if value is None else str(value) for name, value in values.items()}
+        for label, about in labels.items()
+        for averaging, values in about["measures"].items()
+    }
 
 
 def _number(row: Row, name: str, form: str, scale: float = 1.0, unit: str = "") -> str:

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
-from collections.abc import Iterator
+import secrets
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from functools import partialmethod
 from pathlib import Path
@@ -16,6 +22,7 @@ import pytest
 from kerv_cli.base import registry
 from kerv_cli.base.config import Composer, conf_dir
 from kerv_cli.base.registry import SETTINGS_GROUPS
+from kerv_cli.lab.database import VARIABLE, Database
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -24,8 +31,8 @@ ENVIRONMENTS = dict(registry.parts("environment"))
 
 
 LONGEST = (
-    *("test_documented_commands", "test_studies_executors", "test_training", "test_cli", "test_dagger"),
-    *("test_golden", "test_older_results", "test_extending", "test_coverage", "test_views", "test_early"),
+    *("test_documented_commands", "test_execute", "test_training", "test_cli", "test_database"),
+    *("test_golden", "test_import", "test_extending", "test_coverage", "test_views", "test_early"),
 )
 """Files that take longest, begun first: no process is left with one of them at the end while the others idle."""
 
@@ -118,3 +125,74 @@ def few_validations(monkeypatch: pytest.MonkeyPatch) -> None:
     from kerv_cli.training.distillation import Distillation
 
     monkeypatch.setattr(Distillation, "validate", partialmethod(Distillation.validate, observations=4))
+
+
+@contextlib.contextmanager
+def python(script: str, *arguments: object) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a script, which can import this folder's modules, until the end of the block."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    with subprocess.Popen([sys.executable, "-c", script, *map(str, arguments)], env=environment) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def raising(error: BaseException, label: str = "", seeds: Sequence[int] = ()) -> Any:
+    """Episodes of which those of a label and these seeds raise; of all labels or seeds if none is given."""
+    from studies_synthetic import episode
+
+    def prepare(setting: Any, task: str) -> Any:
+        def run(seed: int) -> Any:
+            if setting.label == (label or setting.label) and seed in (seeds or (seed,)):
+                raise error
+            return episode(setting, task, seed)
+
+        return run
+
+    return prepare
+
+
+@pytest.fixture(scope="session")
+def postgresql() -> Iterator[str]:
+    """URL of a PostgreSQL server for this session, without the name of a database."""
+    programs = sorted(Path("/usr/lib/postgresql").glob("*/bin"))
+    if not programs:
+        pytest.skip("no PostgreSQL here: apt-get install postgresql")
+    user: dict[str, Any] = {"user": 65534, "group": 65534, "extra_groups": []} if os.geteuid() == 0 else {}  # nobody
+    with tempfile.TemporaryDirectory(prefix="kerv-postgresql-") as folder, socket.socket() as free:
+        if user:
+            os.chown(folder, user["user"], user["group"])
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+        free.close()
+
+        def run(program: str, *words: str) -> None:
+            command = [programs[-1] / program, "-D", f"{folder}/data", *words]
+            subprocess.run(command, check=True, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, **user)
+
+        run("initdb", "-U", "kerv", "-A", "trust", "-E", "UTF8", "--locale=C", "--no-sync")
+        listening = f"-p {port} -c listen_addresses=127.0.0.1 -c unix_socket_directories= -c fsync=off"
+        run("pg_ctl", "start", "-w", "-l", f"{folder}/log", "-o", listening)
+        try:
+            yield f"postgresql://kerv@127.0.0.1:{port}"
+        finally:
+            run("pg_ctl", "stop", "-w", "-m", "immediate")
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def database(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Database]:
+    """The empty database of the results folder `tmp_path`: in its file, or on a server."""
+    monkeypatch.delenv(VARIABLE, raising=False)
+    if request.param == "sqlite":
+        yield Database(tmp_path)
+        return
+    psycopg = pytest.importorskip("psycopg")
+    server, name = request.getfixturevalue("postgresql"), f"kerv_{secrets.token_hex(4)}"
+    monkeypatch.setenv(VARIABLE, f"{server}/{name}")
+    with psycopg.connect(f"{server}/postgres", autocommit=True) as connection:
+        connection.execute(f"CREATE DATABASE {name}")
+        made = Database(tmp_path)
+        yield made
+        made.close()
+        connection.execute(f"DROP DATABASE {name} WITH (FORCE)")

@@ -6,17 +6,23 @@ import hashlib
 import os
 import signal
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from kerv_cli.base.registry import find
-from kerv_cli.base.settings import RolloutSettings, StudySettings
+from kerv_cli.base.settings import RolloutSettings, RuntimeSettings
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
-from kerv_cli.lab.execute import Prepare, RunEpisode
-from kerv_cli.lab.plan import Cell, plan
+from kerv_cli.lab.database import Database
+from kerv_cli.lab.events import OnEvent, Outcome
+from kerv_cli.lab.execute import Prepare, RunEpisode, execute
+from kerv_cli.lab.plan import Setting, Study, plain_settings, wanted_of
+from kerv_cli.lab.runs import Run
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.study import plan_study
 from kerv_cli.worlds import settled
 from kerv_cli.worlds.metaworld.spec import SPEC
 
@@ -59,15 +65,52 @@ def still_episode(task: str, seed: int, success: bool, decodes: Sequence[DecodeR
     )
 
 
-def threshold_study(tasks: list[str], episodes: int = 4, radii: tuple[int, ...] = (3, 9)) -> list[Cell]:
+def study_of(
+    settings: Mapping[str, RolloutSettings],
+    tasks: Sequence[str],
+    name: str = "threshold",
+    block: int = 5,
+    repeats: int = 1,
+    **about: Any,
+) -> Study:
+    """A study of these settings, by label; `ar` is the baseline."""
+    made = tuple(
+        Setting(
+            label,
+            f"method={label.replace(' ', ' threshold.')}",
+            plain_settings(asdict(one)),
+            IDENTITY,
+            name=" ".join(word for word in label.split() if "=" not in word),
+        )
+        for label, one in settings.items()
+    )
+    about = {"baseline": "ar", "title": "Acceptance threshold", "axis": "threshold.r"} | about
+    return Study(name, made, wanted_of(made, tasks, block, repeats), block=block, **about)
+
+
+def threshold_study(
+    tasks: Sequence[str], episodes: int = 4, radii: tuple[int, ...] = (3, 9), name: str = "threshold", **about: Any
+) -> Study:
     settings = {"ar": settings_of("ar", episodes=episodes), "naive_sd": settings_of("naive_sd", episodes=episodes)}
     settings |= {f"spec_vla r={r}": settings_of("spec_vla", r, episodes) for r in radii}
-    overrides = {label: f"method={label.replace(' ', ' threshold.')}" for label in settings}
-    return plan(settings, tasks, IDENTITY, baseline="ar", overrides=overrides)
+    return study_of(settings, tasks, name, **about)
 
 
-def threshold_settings() -> StudySettings:
-    return StudySettings(name="threshold", title="Acceptance threshold", baseline="ar", axis="threshold.r")
+def swept(
+    results: Path | str,
+    study: Study,
+    prepare: Prepare | None = None,
+    rerun: str = "never",
+    runtime: RuntimeSettings | None = None,
+    on_event: OnEvent = lambda event: None,
+) -> tuple[StudyStore, Outcome]:
+    """Runs what the database of a results folder lacks of a study."""
+    runtime = runtime or RuntimeSettings()
+    planned = plan_study(Database(results), study, runtime, ["sweep", f"study={study.name}"], rerun)
+    store = planned.store
+    with Run(store.database, study.kind, study.name, planned.command, alone=False) as record:
+        store.save(planned)
+        return store, execute(planned, prepare or episodes_of, store, record, runtime, on_event)
 
 
 def generator(*parts: object) -> np.random.Generator:
@@ -75,23 +118,19 @@ def generator(*parts: object) -> np.random.Generator:
     return np.random.default_rng(int.from_bytes(digest[:8], "big"))
 
 
-def run_cell(cell: Cell) -> list[EpisodeRecord]:
-    """The cell's episodes: higher r, longer acceptance, a little less success."""
-    return [episode(cell, seed) for seed in cell.seeds]
-
-
-def episode(cell: Cell, seed: int) -> EpisodeRecord:
-    world = generator(cell.task, seed)
+def episode(setting: Setting, task: str, seed: int) -> EpisodeRecord:
+    """An episode: higher r, longer acceptance, a little less success."""
+    world = generator(task, seed)
     initial_state, difficulty = world.uniform(size=3), world.uniform()
-    rng = generator(cell.task, seed, cell.label)
-    r = cell.settings["threshold"].get("r", 9)
-    slow = cell.settings["method"] == "ar"
+    rng = generator(task, seed, setting.label)
+    r = setting.settings["threshold"].get("r", 9)
+    slow = setting.settings["method"] == "ar"
     decodes = tuple(ar_decode(rng) if slow else draft_decode(rng, r) for _ in range(rng.integers(12, 25)))
     steps = 4 * len(decodes)
     return EpisodeRecord(
         environment=SPEC.name,
         space=SPEC.actions,
-        task=cell.task,
+        task=task,
         instruction="reach the goal",
         seed=seed,
         success=bool(difficulty < 0.9 - 0.015 * max(0, r - 5)),
@@ -140,18 +179,18 @@ def draft_decode(rng: np.random.Generator, r: int) -> DecodeRecord:
     return replace(decode_of(rounds, phases, "drafter"), variability=float(rng.uniform()))
 
 
-def prepare(cell: Cell) -> RunEpisode:
-    """What a sweep calls for every cell of a block."""
-    return lambda seed: episode(cell, seed)
+def episodes_of(setting: Setting, task: str) -> RunEpisode:
+    """What a sweep calls for every setting of a block."""
+    return lambda seed: episode(setting, task, seed)
 
 
 def count_calls() -> tuple[Prepare, list[str]]:
-    """prepare, and the list of the labels that it was called for."""
+    """episodes_of, and the list of the labels that it was called for."""
     calls: list[str] = []
 
-    def counted(cell: Cell) -> RunEpisode:
-        calls.append(cell.label)
-        return prepare(cell)
+    def counted(setting: Setting, task: str) -> RunEpisode:
+        calls.append(setting.label)
+        return episodes_of(setting, task)
 
     return counted, calls
 
@@ -163,37 +202,37 @@ class Odd(Exception):
         super().__init__(f"{a} and {b}")
 
 
-def misbehave(cell: Cell) -> RunEpisode:
+def misbehave(setting: Setting, task: str) -> RunEpisode:
     """Kills its process in its second episode, raises, or reports its process's thread number as wall seconds,
     depending on r."""
 
     def run(seed: int) -> EpisodeRecord:
-        r = cell.settings["threshold"]["r"]
-        if r == 1 and seed > cell.seeds[0]:
+        r = setting.settings["threshold"]["r"]
+        if r == 1 and seed > setting.settings["seed"]:
             os.kill(os.getpid(), signal.SIGKILL)
         if r == 5:
             raise Odd(1, 2)
         time.sleep(0.02)
-        return replace(episode(cell, seed), wall_seconds=float(os.environ["OMP_NUM_THREADS"]))
+        return replace(episode(setting, task, seed), wall_seconds=float(os.environ["OMP_NUM_THREADS"]))
 
     return run
 
 
-def unhurried(cell: Cell) -> RunEpisode:
+def unhurried(setting: Setting, task: str) -> RunEpisode:
     """A tenth of a second for each episode."""
 
     def run(seed: int) -> EpisodeRecord:
         time.sleep(0.1)
-        return episode(cell, seed)
+        return episode(setting, task, seed)
 
     return run
 
 
-def slow_elsewhere(cell: Cell) -> RunEpisode:
+def slow_elsewhere(setting: Setting, task: str) -> RunEpisode:
     """The first task at once, every other in a minute."""
 
     def run(seed: int) -> EpisodeRecord:
-        time.sleep(0.0 if cell.task == "reach-v3" else 60.0)
-        return episode(cell, seed)
+        time.sleep(0.0 if task == "reach-v3" else 60.0)
+        return episode(setting, task, seed)
 
     return run

@@ -60,8 +60,8 @@ def test_a_rollout_gives_its_episodes_and_is_the_commands_own(run: kerv.Study, m
     assert episode["steps"] == 6
     assert len(run.to_pandas()) == len(run.to_pandas("tasks")) == 1
     assert run.folder.parent == mine["results"] / "rollouts"
-    (command,) = json.loads((run.folder / "run.json").read_text(encoding="utf-8"))["commands"]
-    assert command["arguments"][:3] == ["rollout", "seed=100003", "method=ar"]
+    (command,) = kerv.runs(mine["results"], kind="rollout")["command"]
+    assert command[:3] == ("rollout", "seed=100003", "method=ar")
 
 
 def test_a_grid_has_a_setting_per_value(mine: dict[str, Any]) -> None:
@@ -69,15 +69,12 @@ def test_a_grid_has_a_setting_per_value(mine: dict[str, Any]) -> None:
     assert list(both.to_pandas()["label"]) == ["ar", "jacobi"]
 
 
-def test_a_study_is_run_once_reported_and_loaded(
-    study: kerv.Study, mine: dict[str, Any], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_study_is_run_once_reported_and_loaded(study: kerv.Study, mine: dict[str, Any]) -> None:
     table = study.to_pandas()
     assert list(table["label"]) == ["ar", "hold"]
     assert table["episodes"].tolist() == [1, 1]
     again = kerv.sweep(mine["results"].parent / "both.yaml", **mine)
-    assert "2 cells are complete already" in capsys.readouterr().err
-    assert again.to_pandas().equals(table)
+    assert again.to_pandas().equals(table)  # times included
     loaded = kerv.load_study("both", results=mine["results"])
     assert loaded.folder == study.folder
     files = {path.name for path in loaded.report()}
@@ -121,8 +118,8 @@ def test_a_wrong_request_is_an_exception_of_one_line(call: Any, says: str, mine:
 
 
 def test_what_a_study_or_a_policy_cannot_do_is_said(run: kerv.Study, mine: dict[str, Any]) -> None:
-    with pytest.raises(kerv.KervError, match="unknown table 'cells'"):
-        run.to_pandas("cells")
+    with pytest.raises(kerv.KervError, match="unknown table 'rows'"):
+        run.to_pandas("rows")
     with pytest.raises(kerv.KervError, match="is a rollout"):
         run.report()
     policy = kerv.load_policy(str(mine["policy"]["target"]), method="ar", results=mine["results"])
@@ -130,12 +127,12 @@ def test_what_a_study_or_a_policy_cannot_do_is_said(run: kerv.Study, mine: dict[
         policy.act({"prompt": "reach the goal"})
 
 
-def test_cells_that_fail_are_an_exception(mine: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_episodes_that_fail_are_an_exception(mine: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     def failing(*_: Any) -> None:
         raise RuntimeError("the world broke")
 
-    monkeypatch.setattr("kerv_cli.lab.run.Runner.episode", failing)
-    with pytest.raises(kerv.KervError, match=r"2 of 2 cells failed, .* on reach-v3: .*the world broke"):
+    monkeypatch.setattr("kerv_cli.episodes.runner.Runner.episode", failing)
+    with pytest.raises(kerv.KervError, match=r"2 of 2 episodes failed, .* on reach-v3: .*the world broke"):
         kerv.sweep(mine["results"].parent / "both.yaml", "seed=100050", **mine)
 
 

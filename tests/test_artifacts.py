@@ -17,8 +17,7 @@ from test_calibration import TASKS, write_dataset
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.settings import BuildDatastoreSettings, CalibrateSettings, PolicySettings, RolloutSettings
-from kerv_cli.lab.policy import check, decoder_for
-from kerv_cli.lab.resolve import unseen_tasks
+from kerv_cli.episodes.policy import check, decoder_for, unseen_tasks
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.eagle.drafter import Drafter
 from kerv_cli.methods.early import EarlySettings

@@ -16,13 +16,12 @@ import numpy as np
 import pytest
 import torch
 from examples.own_target import MockTarget
-from studies_synthetic import episode, threshold_settings, threshold_study
+from studies_synthetic import episode, swept, threshold_study
 from test_episode import settings
 from test_parallel import some_observation, target
 from typer.testing import CliRunner
 
 from kerv_cli.base.errors import KervError, UsageError
-from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.batched import BatchDecoder, Lane
@@ -30,14 +29,12 @@ from kerv_cli.engine.cost import Profile
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.record import UNTIMED, EpisodeRecord
-from kerv_cli.lab import policy as policies_of
-from kerv_cli.lab import run
-from kerv_cli.lab.claims import episodes_ended
-from kerv_cli.lab.execute import RunEpisode, execute
-from kerv_cli.lab.plan import Cell, blocks_of, make_cell
-from kerv_cli.lab.run import CellRunner
-from kerv_cli.lab.store import StudyStore
-from kerv_cli.lab.together import Request, run_together
+from kerv_cli.episodes import policy as policies_of
+from kerv_cli.episodes import runner as run
+from kerv_cli.episodes.together import Request, run_together
+from kerv_cli.lab.execute import RunEpisode
+from kerv_cli.lab.plan import Setting, Study, Wanted, blocks_of
+from kerv_cli.lab.study import EpisodeRunner
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.methods.parallel import ParallelPass
@@ -270,105 +267,89 @@ def test_what_cannot_be_batched_is_refused(policies: Path) -> None:
 # --- studies
 
 
-def batched(cell: Cell, batch: int = 4) -> Cell:
-    plain = {**cell.settings, "rollout": {**cell.settings["rollout"], "batch": batch}}
-    return make_cell(cell.label, cell.overrides, plain, cell.identity, cell.task, cell.seeds, cell.repeat)
-
-
-def untimed(cell: Cell, seed: int) -> EpisodeRecord:
-    record = episode(cell, seed)
-    return replace(record, decodes=tuple(replace(d, seconds=math.nan, phases=dict(UNTIMED)) for d in record.decodes))
+def batched(study: Study, labels: Sequence[str], batch: int = 4) -> Study:
+    """The study with these settings in batches."""
+    settings = {}
+    for one in study.settings:
+        rollout = {**one.settings["rollout"], "batch": batch if one.label in labels else 1}
+        settings[one.label] = replace(one, settings={**one.settings, "rollout": rollout})
+    wanted = tuple(replace(one, setting=settings[one.setting.label]) for one in study.wanted)
+    return replace(study, settings=tuple(settings.values()), wanted=wanted)
 
 
 class Prepared:
-    """Runs cells in turn, and those of a batch together, the last seed first."""
+    """Runs episodes in turn, and those of a batch together, the last first."""
 
     def __init__(self, broken: str = "") -> None:
         self.broken, self.groups = broken, []
 
-    def __call__(self, cell: Cell) -> RunEpisode:
-        return lambda seed: episode(cell, seed)
+    def __call__(self, setting: Setting, task: str) -> RunEpisode:
+        return lambda seed: episode(setting, task, seed)
 
-    def together(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, int, EpisodeRecord | Exception]]:
-        self.groups.append(len(cells))
+    def together(self, wanted: Sequence[Wanted]) -> Iterator[tuple[Wanted, EpisodeRecord | Exception]]:
+        self.groups.append(len(wanted))
         if self.broken == "all":
             raise KervError("no such policy")
-        for cell in reversed(cells):
-            for seed in reversed(cell.seeds):
-                yield cell, seed, KervError("it fell") if cell.task == self.broken else untimed(cell, seed)
+        for one in reversed(wanted):
+            record = episode(one.setting, one.task, one.seed)
+            untimed = [replace(decode, seconds=math.nan, phases=dict(UNTIMED)) for decode in record.decodes]
+            fell = one.task == self.broken
+            yield one, KervError("it fell") if fell else replace(record, decodes=tuple(untimed))
 
 
 TASKS = ["reach-v3", "push-v3", "drawer-open-v3"]
 
 
-def ar_cells() -> list[Cell]:
-    return [batched(cell) for cell in threshold_study(TASKS, episodes=7) if cell.label == "ar"]
+def ar_study(*tasks: str, episodes: int = 7, batch: int = 4) -> Study:
+    study = batched(threshold_study(tasks or TASKS, episodes=episodes), ["ar"], batch)
+    return replace(
+        study, settings=study.settings[:1], wanted=tuple(one for one in study.wanted if one.setting.label == "ar")
+    )
 
 
-def test_a_batch_is_another_cell_and_has_no_times(tmp_path: Path) -> None:
-    cells = ar_cells()
-    assert not {cell.id for cell in cells} & {cell.id for cell in threshold_study(TASKS, episodes=7)}
-    store, run_cells = StudyStore(tmp_path, "threshold"), Prepared()
-    outcome = execute(cells[:2], run_cells, store)
-    assert len(outcome.done) == 2
-    outcome = execute(cells, run_cells, store)
-    assert (len(outcome.reused), len(outcome.done), run_cells.groups) == (2, 4, [2, 4])
-    stored = store.read_cell(cells[0].id)
-    assert stored.status["timed"] is False
-    assert stored.status["wall_seconds"] > 0
-    assert list(stored.episodes["seed"]) == list(cells[0].seeds)
-    assert stored.episodes["seconds"].isna().all()
-    assert stored.episodes["seconds.prefill"].isna().all()
-    assert stored.episodes["order"].is_unique
-    assert (stored.episodes["forwards"] > 0).all()
-
-
-def test_a_batch_notes_how_many_of_its_episodes_have_ended(tmp_path: Path) -> None:
-    store, told = StudyStore(tmp_path, "threshold"), []
-
-    class Watched(Prepared):
-        def together(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, int, EpisodeRecord | Exception]]:
-            for end in super().together(cells):
-                (note,) = store.claims.glob("*.running")
-                told.append(episodes_ended(store.claims, note.stem))
-                yield end
-
-    execute(ar_cells()[:2], Watched(), store)
-    assert told == list(range(7))
+def test_a_batch_is_another_setting_and_has_no_times(tmp_path: Path) -> None:
+    assert ar_study().settings[0].work != threshold_study(TASKS, episodes=7).settings[0].work
+    prepared = Prepared()
+    swept(tmp_path, ar_study("reach-v3"), prepared)
+    store, outcome = swept(tmp_path, ar_study(), prepared)
+    assert (len(outcome.reused), len(outcome.done), prepared.groups) == (7, 14, [7, 14])
+    episodes = store.frame()
+    assert (episodes["wall_seconds"] > 0).all()
+    assert episodes["seconds"].isna().all()
+    assert episodes["seconds.prefill"].isna().all()
+    assert episodes.groupby("block")["order"].apply(lambda order: order.is_unique).all()
+    assert (episodes["forwards"] > 0).all()
 
 
 def test_blocks_of_a_batch_hold_many_tasks_and_share_out_over_workers() -> None:
-    cells, timed = ar_cells(), threshold_study(TASKS, episodes=7)
-    (block,) = blocks_of(cells)
-    assert {cell.task for cell in block.cells} == set(TASKS)
+    wanted, timed = ar_study().wanted, threshold_study(TASKS, episodes=7).wanted
+    (block,) = blocks_of(wanted, 5)
+    assert {one.task for one in block.wanted} == set(TASKS)
     assert "21 episodes, 4 at a time" in block.title
-    assert len(blocks_of(cells, workers=3)) == 3
-    many = [batched(cell, 2) for cell in threshold_study(TASKS, episodes=60) if cell.label == "ar"]
-    assert max(sum(len(cell.seeds) for cell in part.cells) for part in blocks_of(many)) == 30
-    mixed = blocks_of([*cells, *timed])
+    assert len(blocks_of(wanted, 5, workers=3)) == 3
+    many = ar_study(episodes=60, batch=2).wanted
+    assert max(len(block.wanted) for block in blocks_of(many, 5)) == 32
+    mixed = blocks_of([*wanted, *timed], 5)
     assert {block.batch for block in mixed} == {1, 4}
-    assert all(len({cell.settings["rollout"]["batch"] for cell in block.cells}) == 1 for block in mixed)
+    assert all(len({one.setting.settings["rollout"]["batch"] for one in block.wanted}) == 1 for block in mixed)
 
 
-def test_a_failure_in_a_batch_is_its_cells_own_unless_all_fail(tmp_path: Path) -> None:
-    cells, store = ar_cells(), StudyStore(tmp_path, "threshold")
-    outcome = execute(cells, Prepared(broken="all"), store)
-    assert [failure.reason for failure in outcome.failed] == ["no such policy"] * len(cells)
-    outcome = execute(cells, Prepared(broken="push-v3"), store)
-    assert {(failure.cell.task, failure.reason) for failure in outcome.failed} == {("push-v3", "it fell")}
-    assert {cell.task for cell in outcome.done} == {"reach-v3", "drawer-open-v3"}
-    assert len(execute(cells, Prepared(), store, RuntimeSettings()).done) == 2
+def test_a_failure_in_a_batch_is_of_its_setting_and_what_ran_is_kept(tmp_path: Path) -> None:
+    _, outcome = swept(tmp_path, ar_study(), Prepared(broken="all"))
+    assert [(failure.reason, len(failure.wanted)) for failure in outcome.failed] == [("no such policy", 7)] * 3
+    _, outcome = swept(tmp_path, ar_study(), Prepared(broken="push-v3"))
+    assert [failure.reason for failure in outcome.failed] == ["it fell"]
+    assert len(outcome.done) + len(outcome.failed[0].wanted) == 21
+    assert "push-v3" not in {one.task for one in outcome.done}
+    _, again = swept(tmp_path, ar_study(), Prepared())
+    assert (len(again.reused), len(again.done)) == (len(outcome.done), len(outcome.failed[0].wanted))
 
 
 @pytest.mark.parametrize("which", ["baseline", "method", "both"])
 def test_no_speedup_is_made_of_what_was_not_timed(tmp_path: Path, which: str) -> None:
-    cells = [
-        batched(cell) if which == "both" or (which == "baseline") == (cell.label == "ar") else cell
-        for cell in threshold_study(TASKS)
-    ]
-    store = StudyStore(tmp_path, "threshold")
-    store.write_plan(threshold_settings(), cells)
-    execute(cells, Prepared(), store)
+    study = threshold_study(TASKS)
+    labels = [one for one in study.labels if which == "both" or (which == "baseline") == (one == "ar")]
+    store, _ = swept(tmp_path, batched(study, labels), Prepared())
     table = load_study(store).table
     methods = table[table["label"] != "ar"]
     for name in ("speedup", "speedup_low", "episode_speedup"):
@@ -385,11 +366,9 @@ def test_no_speedup_is_made_of_what_was_not_timed(tmp_path: Path, which: str) ->
 
 
 def test_decodes_without_host_times_have_no_price(tmp_path: Path) -> None:
-    cells, store = ar_cells(), StudyStore(tmp_path, "threshold")
-    store.write_plan(threshold_settings(), cells)
-    execute(cells, Prepared(), store)
+    store, _ = swept(tmp_path, ar_study(), Prepared())
     with pytest.raises(UsageError, match="setting 'ar' ran 4 episodes at a time, without times"):
-        repriced_table(load_study(store), [NamedProfile("there", Profile(31, {}))])
+        repriced_table(load_study(store), store, [NamedProfile("there", Profile(31, {}))])
 
 
 # --- the command
@@ -402,17 +381,17 @@ def test_a_rollout_in_batches_prints_success_and_goes_on_where_it_was(
     shutil.copytree(policies / "artifacts", results / "artifacts")
     words = ["policy=state", "policy.target=nano-state", "task=reach-v3,push-v3", "world.horizon=8"]
     command = ["rollout", "method=ar", "episodes=3", "rollout.batch=4", *words, f"results={results}"]
-    original = CellRunner.together
+    original = EpisodeRunner.together
 
-    def interrupted(self: CellRunner, cells: Sequence[Any]) -> Iterator[Any]:
-        yield from itertools.islice(original(self, cells), 2)
+    def interrupted(self: EpisodeRunner, wanted: Sequence[Any]) -> Iterator[Any]:
+        yield from itertools.islice(original(self, wanted), 2)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(CellRunner, "together", interrupted)
+    monkeypatch.setattr(EpisodeRunner, "together", interrupted)
     stopped = CliRunner().invoke(app, command)
     assert stopped.exit_code == 130
-    assert "2 of 6 episodes are kept" in stopped.stderr
-    monkeypatch.setattr(CellRunner, "together", original)
+    assert "2 of 6 episodes of" in stopped.stderr
+    monkeypatch.setattr(EpisodeRunner, "together", original)
     again = CliRunner().invoke(app, command)
     assert again.exit_code == 0, again.output
     assert "2 of 6 episodes are there" in again.stderr

@@ -10,12 +10,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from studies_synthetic import IDENTITY, run_cell, settings_of
+from studies_synthetic import settings_of, study_of, swept
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.settings import StudySettings
-from kerv_cli.lab.plan import plan
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.study import looks_of
 from kerv_cli.report import decide
 from kerv_cli.report.decide import (
     LARGER,
@@ -150,12 +148,9 @@ def test_a_setting_is_open_until_its_interval_leaves_the_bound() -> None:
 
 def test_verdicts_come_from_the_stored_pairs_and_are_stored(tmp_path: Path) -> None:
     settings = {"ar": settings_of("ar", episodes=4), "spec_vla": settings_of("spec_vla", 9, 4)}
-    cells = plan(settings, ["reach-v3"], IDENTITY, baseline="ar", block=2)
-    store = StudyStore(tmp_path, "stopped")
-    for cell in cells:
-        store.write_cell(cell, run_cell(cell), {"run": "r1", "workers": 1, "device_name": "chip"})
-    store.write_plan(StudySettings("stopped", ""), cells)
-    assert [len(look) for look in decide.looks_of(cells, 2)] == [2, 2]
+    study = study_of(settings, ["reach-v3"], block=2)
+    store, _ = swept(tmp_path, study)
+    assert [len(look) for look in looks_of(study)] == [4, 4]
     (found,) = decide.verdicts(load_study(store), ["spec_vla"], 0.5, 2, 2)
     assert found.pairs == 4
     decide.write_verdicts(store.root, {"spec_vla": found}, 50.0, 2)

@@ -153,14 +153,12 @@ def test_sweep_resumes_and_report_writes_tables(policies: Path, tmp_path: Path) 
         f"results={results}",
     ]
     plan = kerv(*command, "--plan")
-    assert "3 cells to run, 0 reused" in plan.stdout, plan.stderr
+    assert "6 episodes to run, 0 reused" in plan.stdout, plan.stderr
     first = kerv(*command)
     assert first.returncode == 0, first.stderr
-    assert "3 cells run, 0 reused, 0 failed" in first.stdout
+    assert "6 run, 0 reused, 0 failed" in first.stdout
     assert re.search(r"\d+ episodes in \d+\.\d min: \d+ per minute", first.stdout)
-    cells = sorted((results / "studies/small/cells").iterdir())
-    shutil.rmtree(cells[0])
-    assert "1 cells run, 2 reused, 0 failed" in kerv(*command).stdout
+    assert "3 run, 6 reused, 0 failed" in kerv(*command, "episodes=3").stdout
     told = kerv("report", "study=small", f"results={results}")
     assert told.returncode == 0, told.stderr
     table = pd.read_csv(results / "report/tables/small.csv")
@@ -251,14 +249,10 @@ def test_doctor_repair_removes_what_a_killed_command_left(tmp_path: Path) -> Non
     left = of_process(tmp_path / "artifacts" / "drafter" / "a" / "drafter.json", child.pid)
     left.parent.mkdir(parents=True)
     left.touch()
-    claims = tmp_path / "studies" / "main" / "claims"
-    claims.mkdir(parents=True)
-    (claims / "old.running").write_text("x")
     run = kerv("doctor", "--repair", f"results={tmp_path}")
     assert run.returncode == 0, run.stderr
-    assert [line.split()[0] for line in run.stdout.splitlines()] == ["removed", "removed", "2"]
+    assert [line.split()[0] for line in run.stdout.splitlines()] == ["removed", "1"]
     assert not left.exists()
-    assert list(claims.iterdir()) == []
     assert kerv("doctor", "--repair", f"results={tmp_path}").stdout.startswith("0 left over files")
 
 
@@ -314,8 +308,7 @@ def test_an_interrupted_command_says_so_in_one_line(
     begun.send_signal(number)
     _, errors = begun.communicate(timeout=120)
     assert begun.returncode == 130, errors
-    (line,) = errors.splitlines()
-    assert line.startswith("kerv: interrupted")
+    assert re.fullmatch("kerv: interrupted.*\n", errors), errors
 
 
 def test_an_interrupt_that_a_library_made_another_error_of_is_an_interrupt(

@@ -14,7 +14,7 @@ from kerv_cli.base.config import compose, conf_dir, expand, groups, swept_keys, 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import description
 from kerv_cli.base.registry import PART_GROUPS, part_of, parts
-from kerv_cli.lab.resolve import resolve
+from kerv_cli.episodes.resolve import resolve
 
 SCHEMAS = {name.replace(" ", "_"): part.settings for name, part in parts("command").items()}
 # which command each group belongs to

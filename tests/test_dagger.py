@@ -19,7 +19,7 @@ from kerv_cli.base.settings import (
     WorldSettings,
 )
 from kerv_cli.cli.app import app
-from kerv_cli.lab.policy import decoder_for
+from kerv_cli.episodes.policy import decoder_for
 from kerv_cli.training.dagger import PolicyActs
 from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.imitation import task_borders

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from kerv_cli.base.config import conf_dir, groups
 from kerv_cli.cli.app import app
-from kerv_cli.lab.resolve import resolve
+from kerv_cli.episodes.resolve import resolve
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "results/README.md"]

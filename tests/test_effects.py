@@ -8,8 +8,8 @@ import pytest
 
 from kerv_cli.base.config import compose, conf_dir
 from kerv_cli.base.settings import RolloutSettings, SweepSettings
-from kerv_cli.lab.identity import effective, idle_keys, without_effect
-from kerv_cli.lab.resolve import ResolvedStudy, idle_overrides
+from kerv_cli.episodes.identity import effective, idle_keys, without_effect
+from kerv_cli.episodes.resolve import ResolvedStudy, idle_overrides
 
 
 @pytest.mark.parametrize(

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from kerv_cli.base.errors import KervError, UnknownName
 from kerv_cli.base.settings import EVALUATION_SEED
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.record import PHASES, EpisodeRecord
-from kerv_cli.lab.episode import run_episode
-from kerv_cli.lab.expert import ExpertDecoder
-from kerv_cli.lab.rows import DECODE_SCHEMA, EPISODE_SCHEMA, Circumstances, decode_rows, episode_row, table_bytes
+from kerv_cli.episodes.episode import run_episode
+from kerv_cli.episodes.expert import ExpertDecoder
+from kerv_cli.episodes.rows import decodes_blob, decodes_table, episode_row, read_decodes
 from kerv_cli.report.measures import MACRO, MICRO, measure
 from kerv_cli.report.viewing import save_recording
 from kerv_cli.report.viewing.facts import summary
@@ -65,19 +61,15 @@ def test_a_record_has_one_step_and_no_target(episode: EpisodeRecord) -> None:
         assert 0 < decode.seconds == pytest.approx(sum(decode.phases.values()))
 
 
-def written(rows: list[dict[str, Any]], schema: pa.Schema) -> pa.Table:
-    return pq.read_table(io.BytesIO(table_bytes(pa.Table.from_pylist(rows, schema=schema))))
-
-
 def test_rows_keep_it_and_measures_are_undefined_instead_of_divided_by_zero(episode: EpisodeRecord) -> None:
-    row = episode_row(episode, Circumstances())
+    row = episode_row(episode)
     assert (row["forwards"], row["verifications"], row["tokens"], row["first_rejected_count"]) == (0, 0, 0, 0)
-    decodes = decode_rows(episode)
-    stored = written(decodes, DECODE_SCHEMA).to_pylist()
-    assert stored == decodes
-    assert stored[3]["actions"] == episode.decodes[3].actions.tolist()
-    assert (stored[3]["mode"], stored[3]["tokens"], stored[3]["rounds"]) == ("expert", [], [])
-    frame = pd.DataFrame(written([row], EPISODE_SCHEMA).to_pylist())
+    stored = read_decodes(decodes_blob(episode))
+    assert stored.equals(decodes_table(episode))
+    third = stored.to_pylist()[3]
+    assert third["actions"] == episode.decodes[3].actions.tolist()
+    assert (third["mode"], third["tokens"], third["rounds"]) == ("expert", [], [])
+    frame = pd.DataFrame([row | {"task": NAME, "seed": EVALUATION_SEED, "repeat": 0, "block": "b"}])
     frame = frame.assign(difficulty=SPEC.task(NAME).difficulty, initial_state=str(row["initial_state"]), **STAMPS)
     frame["decode_seconds"] = [np.array([decode.seconds for decode in episode.decodes])]
     slow = frame.assign(seconds=frame["seconds"] * 10, success=False)

@@ -10,7 +10,7 @@ from types import ModuleType
 import pytest
 from loaded import module_of
 
-from kerv_cli.lab.identity import ENGINE
+from kerv_cli.episodes.identity import ENGINE
 
 
 @pytest.fixture(scope="module")

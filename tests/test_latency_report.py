@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 
-import pandas as pd
 import pytest
-from studies_synthetic import IDENTITY, episode, settings_of
+from studies_synthetic import episode, settings_of, study_of, swept
 
-from kerv_cli.base.settings import RolloutSettings, StudySettings, TimingSettings
+from kerv_cli.base.settings import RolloutSettings, TimingSettings
 from kerv_cli.engine.record import Delay, EpisodeRecord
-from kerv_cli.lab.execute import execute
-from kerv_cli.lab.plan import Cell, plan
+from kerv_cli.lab.execute import RunEpisode
+from kerv_cli.lab.plan import Setting
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.latency import latency_summary, latency_table
 from kerv_cli.report.plots import latency_figure
@@ -29,36 +27,35 @@ def setting(method: str, r: int, **timing: object) -> RolloutSettings:
     return chosen
 
 
-def prepare(cell: Cell) -> Callable[[int], EpisodeRecord]:
+def prepare(setting: Setting, task: str) -> RunEpisode:
     """AR takes 30 ms, or what it is asked to; where it takes 100 ms it fails."""
-    timing = cell.settings["rollout"]
+    timing, method = setting.settings["rollout"], setting.settings["method"]
 
     def run(seed: int) -> EpisodeRecord:
-        record = episode(cell, seed)
+        record = episode(setting, task, seed)
         if timing["clock"] == "waits":
             return record
-        seconds = SHARE[cell.settings["method"]] * (timing["ar_ms"] or 30.0) / 1000
+        seconds = SHARE[method] * (timing["ar_ms"] or 30.0) / 1000
         steps = int(seconds * 80) + 1
         delay = Delay(seconds, steps, 0, min(4, steps), max(0, steps - 4))
         decodes = tuple(dataclasses.replace(d, delay=delay) for d in record.decodes)
-        fails = cell.settings["method"] == "ar" and timing["ar_ms"] == 100
+        fails = method == "ar" and timing["ar_ms"] == 100
         return dataclasses.replace(record, decodes=decodes, success=not fails)
 
     return run
 
 
-@pytest.fixture
-def results(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     settings = {"ar waits": settings_of("ar")}
     for method, r in (("ar", 0), ("spec_vla", 9)):
         for ms in (0.0, 20.0, 100.0):
             for kind in ("none", "chunk"):
                 settings[f"{method} ar_ms={ms:g} {kind}"] = setting(method, r, ar_ms=ms, delay_compensation=kind)
-    cells = plan(settings, ["reach-v3", "push-v3"], IDENTITY, baseline="ar waits")
-    store = StudyStore(tmp_path, "latency")
-    store.write_plan(StudySettings(name="latency", title="Latency", baseline="ar waits", axis="rollout.ar_ms"), cells)
-    execute(cells, prepare, store)
-    return tmp_path
+    about = {"title": "Latency", "baseline": "ar waits", "axis": "rollout.ar_ms"}
+    folder = tmp_path_factory.mktemp("latency")
+    swept(folder, study_of(settings, ["reach-v3", "push-v3"], "latency", **about), prepare)
+    return folder
 
 
 def test_every_setting_stands_beside_ar_at_its_latency(results: Path) -> None:
@@ -98,11 +95,12 @@ def test_a_report_has_the_section_where_the_world_goes_on_alone(results: Path) -
     assert {"latency.csv", "latency_latency.csv", "latency_latency.png", "report.html"} <= names
     page = (results / "studies" / "latency" / "report.html").read_text(encoding="utf-8")
     assert "Success against the time that AR takes" in page
-    whole = pd.read_csv(results / "report" / "tables" / "latency.csv")
+    whole = load_study(StudyStore(results, "latency")).table
     waits = whole[whole["label"] == "ar waits"]
     assert waits["felt_latency_ms"].isna().all()
-    assert (whole[whole["label"] == "ar ar_ms=100 none"]["felt_latency_ms"] == 100.0).all()
+    felt = whole[whole["label"] == "ar ar_ms=100 none"]["felt_latency_ms"]
+    assert felt.to_list() == pytest.approx([100.0, 100.0])
     assert set(whole["rollout.delay_compensation"]) == {"none", "chunk"}
-    data = load_study(StudyStore(results, "latency"))
-    still = dataclasses.replace(data, plan=dataclasses.replace(data.plan, cells=data.plan.cells[:1]))
-    assert latency_table(still) is None or len(latency_table(still)) == 0  # type: ignore[arg-type]
+    store = StudyStore(results, "latency")
+    waiting = [one for one in store.load().wanted if "waits" in one.setting.label]
+    assert latency_table(load_study(store, waiting)) is None

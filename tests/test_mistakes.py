@@ -62,7 +62,7 @@ ANSWERS = [
     ("rollout results=file", "results=file is a file: name a folder"),
     ("view nothing.rrd", "nothing.rrd does not exist: name a recording (.rrd) or a folder of them"),
     ("view file", "file is not a recording: its name does not end in .rrd"),
-    ("report study=main", "no study 'main' in results/studies: run `kerv sweep study=main`"),
+    ("report study=main", "results/kerv.db: run `kerv sweep study=main`"),
     ("report on=h100", "on=h100: name the study whose decodes are to be priced, study=NAME"),
     ("runs compare a", "name two runs, ID or ID:SETTING: 'kerv runs list' shows them"),
     ("runs rm", "name a run: 'kerv runs list' shows them"),

@@ -23,11 +23,11 @@ from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.settings import RolloutSettings, TrainDrafterSettings, settings_from
 from kerv_cli.base.spaces import Observation
+from kerv_cli.catalogue.entries import find_runs, matching
 from kerv_cli.cli.app import app
 from kerv_cli.engine.chunk import ActionHistory, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.lab.catalogue import find_runs, matching
-from kerv_cli.lab.policy import check
+from kerv_cli.episodes.policy import check
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.kinematics.prediction import Hold, PredictionProposer

@@ -13,7 +13,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.settings import RolloutSettings, TargetSettings, TrainDrafterSettings, TrainTargetSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.lab.policy import check
+from kerv_cli.episodes.policy import check
 from kerv_cli.methods.parallel import ParallelPass
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.packed import pack

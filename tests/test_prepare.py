@@ -14,7 +14,7 @@ from test_calibration import write_dataset
 from typer.testing import CliRunner
 
 from kerv_cli.cli.app import app
-from kerv_cli.lab.resolve import resolve, resolve_rollout
+from kerv_cli.episodes.resolve import resolve, resolve_rollout
 from kerv_cli.training.preparation import needs
 
 TASK = "reach-v3"
@@ -105,6 +105,10 @@ def test_prepare_makes_what_is_missing_and_skips_what_is_there(results: Path) ->
     for place in ("early/mine/early.json", "datastore/mine/manifest.json", "calibration/mine/calibration.json"):
         assert (results / "artifacts" / place).is_file()
     assert kerv("prepare", MINE, "--plan").count("there") == 4
+    curves = results / "artifacts/early/mine/curves.png"
+    curves.unlink()  # as after a full disk
+    kerv("prepare", MINE, "for=one_pass", "steps=2")
+    assert curves.is_file()
     shutil.rmtree(results / "artifacts/datastore/mine")
     assert "missing" in kerv("prepare", MINE, "--plan")
     path = results / "artifacts/drafter/mine/drafter.json"
@@ -133,7 +137,7 @@ def test_the_remedy_for_weights_of_another_target_works_as_it_is_typed(results: 
     assert "choose another policy.drafter=, or remove it with 'kerv runs rm drafter/mine'" in another
     kerv(*remove, "--yes")
     kerv(*train, *fast)
-    assert "1 tasks" in kerv(*rollout)
+    assert "1 task, " in kerv(*rollout)
     assert "4000 steps of 64, about 3 min (a guess)" in kerv("train", "drafter", MINE, "policy.drafter=b", "--plan")
     few = kerv("train", "drafter", MINE, "policy.drafter=b", "train.steps=400", "--plan")
     assert "400 steps of 64, about 20 s (a guess)" in few

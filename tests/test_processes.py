@@ -29,6 +29,26 @@ class Config:
 recording._record_seeds = sleep
 list(recording._run_jobs(Config, None, [("a", range(1)), ("b", range(1))], None))
 """
+JOBS = """
+import os, sys, time
+from kerv_cli.lab.executors import SlurmOptions
+from kerv_cli.lab.executors.slurm import build
+def work(path):
+    open(path, "a").write(f"{os.getpid()}\\n{os.getppid()}\\n")
+    time.sleep(60)
+from functools import partial
+from pathlib import Path
+jobs = build(SlurmOptions(cluster="local"), 1, 1, Path(sys.argv[1]).with_name("jobs"))
+jobs.submit(partial(work, sys.argv[1]))
+time.sleep(60)
+"""
+RANK = """
+import os, sys, time
+from kerv_cli.training.ranks import join
+join("cpu", 2)
+open(sys.argv[1], "a").write(f"{os.getpid()}\\n")
+time.sleep(60)
+"""
 GUARD = """
 import os, subprocess, sys, time
 from kerv_cli.base.processes import guard
@@ -96,15 +116,25 @@ def pids(path: Path, count: int) -> list[int]:
 
 
 def killed(script: str, path: Path, count: int, *arguments: str) -> list[int]:
-    """Starts a script whose processes write their numbers to `path`, and kills it -> those that they were."""
+    """Start a script whose processes write their numbers to `path`, stop the first one, and kill the script -> their
+    numbers, and those of what else it started."""
     with subprocess.Popen([sys.executable, "-c", script, str(path), *arguments]) as process:
         found = pids(path, count)
+        below = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+        started = [int(pid) for pid in below.read_text().split()] if below.exists() else []
+        os.kill(found[0], signal.SIGSTOP)
         process.kill()
-    return found
+    return [*found, *started]
 
 
 def test_workers_that_record_end_with_a_killed_command(tmp_path: Path) -> None:
     assert all(map(ends, killed(DEMOS, tmp_path / "pids", 2)))
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
+def test_jobs_on_this_machine_end_with_a_killed_command(tmp_path: Path) -> None:
+    pytest.importorskip("submitit")
+    assert all(map(ends, killed(JOBS, tmp_path / "pids", 2)))
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")

@@ -22,11 +22,11 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.cost import Profile
 from kerv_cli.engine.record import DecodeRecord, Delay, EpisodeRecord, Round
-from kerv_cli.lab import policy as policies_of
-from kerv_cli.lab import run
-from kerv_cli.lab.clock import RealClock, profiled, steps_of
-from kerv_cli.lab.episode import run_episode
-from kerv_cli.lab.rows import Circumstances, decode_rows, episode_row
+from kerv_cli.episodes import policy as policies_of
+from kerv_cli.episodes import runner as run
+from kerv_cli.episodes.clock import RealClock, profiled, steps_of
+from kerv_cli.episodes.episode import run_episode
+from kerv_cli.episodes.rows import decodes_table, episode_row
 from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD
 
 HZ = SPEC.actions.control_hz
@@ -153,11 +153,14 @@ def test_an_episode_can_end_while_the_policy_decodes() -> None:
     assert record.steps == 9
     assert record.decodes[-1].delay == Delay(0.6, 6, 6, carried=3, held=0)
     assert record.decode_steps[-1] == 9
-    row = episode_row(record, Circumstances())
+    row = episode_row(record)
     assert (row["delay_decodes"], row["delay_steps"], row["carried_steps"], row["held_steps"]) == (2, 12, 3, 6)
     assert row["delay_seconds"] == pytest.approx(1.2)
-    assert [(r["observed"], r["delay_steps"], r["held"]) for r in decode_rows(record)] == [(0, 6, 6), (6, 6, 0)]
-    waited = decode_rows(point_episode(None))[0]
+    assert [(r["observed"], r["delay_steps"], r["held"]) for r in decodes_table(record).to_pylist()] == [
+        (0, 6, 6),
+        (6, 6, 0),
+    ]
+    waited = decodes_table(point_episode(None)).to_pylist()[0]
     assert waited["delay_steps"] is waited["observed"] is waited["delay_seconds"] is None
 
 
@@ -332,7 +335,7 @@ def test_what_cannot_be_is_refused_in_one_line(results: Path, words: str, messag
         ({"verify": {"rows": [1], "seconds": [float("nan")]}}, "impossible times of the phase 'verify'"),
         ({"verify": {"rows": [2, 1], "seconds": [1, 1]}}, "impossible times of the phase 'verify'"),
         ({"prefill": {"rows": [1, 2], "seconds": [1]}}, "has no phase 'prefill'"),
-        ({"prefill": {"rows": [1], "seconds": ["x"]}}, "impossible times of the phase 'prefill'"),
+        ({"prefill": {"rows": [1], "seconds": ["x"]}}, "holds no latency profile"),
         ({"prefill": 3}, "holds no latency profile"),
     ],
 )
@@ -347,7 +350,7 @@ def test_an_impossible_profile_is_refused(results: Path, phases: dict[str, Any],
 
 
 def test_settings_without_effect_are_named(policies: Path) -> None:
-    from kerv_cli.lab.identity import without_effect
+    from kerv_cli.episodes.identity import without_effect
 
     def idle(*words: str) -> list[str]:
         return list(without_effect(compose("rollout", words, RolloutSettings), words))
@@ -358,6 +361,6 @@ def test_settings_without_effect_are_named(policies: Path) -> None:
 
 
 def test_a_waiting_episode_has_no_delay_in_its_sums() -> None:
-    row = episode_row(still_episode("reach-v3", 1, True, [AR]), Circumstances())
+    row = episode_row(still_episode("reach-v3", 1, True, [AR]))
     assert [row[f"{name}_steps"] for name in ("delay", "carried", "held", "dropped")] == [0, 0, 0, 0]
     assert (row["delay_decodes"], row["delay_seconds"]) == (0, 0.0)

@@ -58,7 +58,7 @@ def test_a_policy_that_the_wheel_leaves_out_is_fetched(archive: Path, tmp_path: 
         assert "cannot be fetched" in kerv("build", "policy", f"source={address}/absent", results, code=1)
         server.shutdown()
     assert "is there already" in kerv("build", "policy", f"source={archive}", results, code=2)
-    assert "1 tasks" in kerv(*words)
+    assert "1 task, 3 episodes" in kerv(*words)
 
 
 def test_another_file_than_the_one_asked_for_is_refused(

@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from studies_synthetic import episode, prepare, still_episode, threshold_settings, threshold_study
+from studies_synthetic import episode, still_episode, swept, threshold_study
 from typer.testing import CliRunner
 
 from kerv_cli.cli.app import app
 from kerv_cli.engine.cost import Profile, predicted, work_of_record
-from kerv_cli.lab.execute import execute
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MACRO, MICRO, measure
 from kerv_cli.report.reprice import NamedProfile, open_profiles, repriced_table
@@ -41,10 +40,7 @@ ABOUT = {"target": "vla-150m", "dtype": "bfloat16", "device_name": "GPU", "kerv_
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("results")
-    cells = threshold_study(["reach-v3", "push-v3"], radii=(9,))
-    store = StudyStore(folder, "threshold")
-    store.write_plan(threshold_settings(), cells)
-    execute(cells, prepare, store)
+    swept(folder, threshold_study(["reach-v3", "push-v3"], radii=(9,)))
     return folder
 
 
@@ -61,17 +57,16 @@ def profile_file(results: Path, name: str = "there", without: str = "", **change
     (folder / f"{name}.json").write_text(json.dumps({**ABOUT, "profile": profile}))
 
 
-def test_an_episode_costs_its_decodes_at_the_profiles_costs(data: StudyData) -> None:
-    """Ratios of means over episodes and over times per step, of the very records that the cells were made of."""
-    table = repriced_table(data, [NamedProfile("there", PROFILE)]).set_index("label")
+def test_an_episode_costs_its_decodes_at_the_profiles_costs(results: Path, data: StudyData) -> None:
+    """Ratios of means over episodes and over times per step, of the very records of the sweep."""
+    table = repriced_table(data, StudyStore(results, "threshold"), [NamedProfile("there", PROFILE)]).set_index("label")
     seconds: dict[str, list[float]] = {}
     steps: dict[str, list[int]] = {}
-    for cell in data.plan.cells:
-        for seed in cell.seeds:
-            record = episode(cell, seed)
-            priced = [predicted(work_of_record(decode), PROFILE) for decode in record.decodes]
-            seconds.setdefault(cell.label, []).append(sum(priced))
-            steps.setdefault(cell.label, []).append(record.steps)
+    for one in data.study.wanted:
+        record = episode(one.setting, one.task, one.seed)
+        priced = [predicted(work_of_record(decode), PROFILE) for decode in record.decodes]
+        seconds.setdefault(one.setting.label, []).append(sum(priced))
+        steps.setdefault(one.setting.label, []).append(record.steps)
     for label in ("naive_sd", "spec_vla r=9"):
         row = table.loc[label]
         mean = {name: np.mean(values) for name, values in seconds.items()}

@@ -17,16 +17,16 @@ from typing import Any
 
 import pandas as pd
 import pytest
+import sqlalchemy as sa
 from click.testing import Result
-from studies_synthetic import prepare, threshold_study
+from studies_synthetic import swept, threshold_study
 from typer.testing import CliRunner
 
-from kerv_cli.base.settings import StudySettings
+from kerv_cli.catalogue.entries import find_runs, matching
 from kerv_cli.cli.app import app
-from kerv_cli.lab.catalogue import find_runs, matching
-from kerv_cli.lab.execute import execute
-from kerv_cli.lab.run import CellRunner
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.database import EPISODES, INTERRUPTED, RUNS, WANTED, Database
+from kerv_cli.lab.plan import Setting
+from kerv_cli.lab.study import EpisodeRunner
 from kerv_cli.report.export import TRACKERS, export
 
 FAST = ["policy=state", "policy.target=nano-state", "task=reach-v3", "world.horizon=8", "record=0"]
@@ -65,8 +65,8 @@ def test_a_grid_keeps_every_episode_and_prints_one_table(policies: Path, tmp_pat
     told = works("rollout", "-m", "method=ar,spec_vla", "episodes=2", *FAST, f"results={tmp_path}/results")
     assert told.count("success %") == 1
     assert re.search(r"^ar +", told, re.MULTILINE)
-    (folder,) = (tmp_path / "results/rollouts").iterdir()
-    assert len(list((folder / "cells").iterdir())) == 4, "one cell per setting and episode"
+    (run,) = listed(tmp_path / "results", "kind=rollout")
+    assert (run["episodes"], run["methods"]) == (4, ["ar", "spec_vla"])
 
 
 def test_recordings_of_a_grid_have_names_of_their_own(policies: Path, tmp_path: Path) -> None:
@@ -120,10 +120,7 @@ def test_a_run_is_shown_and_a_wrong_name_refused(results: Path) -> None:
 
 def test_two_runs_of_a_study_are_compared_by_their_speedups(tmp_path: Path) -> None:
     for name in ("one", "two"):
-        store = StudyStore(tmp_path, name)
-        cells = threshold_study(["reach-v3", "push-v3"])
-        store.write_plan(StudySettings(name, "", "ar"), cells)
-        execute(cells, prepare, store)
+        swept(tmp_path, threshold_study(["reach-v3", "push-v3"], name=name))
     pairs = json.loads(works("runs", "compare", "one", "two", f"results={tmp_path}", "--json"))
     assert [pair["first"].partition(":")[2] for pair in pairs] == ["ar", "naive_sd", "spec_vla r=3", "spec_vla r=9"]
     ratios = [{row["measure"]: row for row in pair["results"]}.get("per step against ar") for pair in pairs]
@@ -149,15 +146,15 @@ def test_a_rerun_repeats_the_tokens_in_a_folder_of_its_own(results: Path, tmp_pa
     copy = tmp_path / "results"
     shutil.copytree(results, copy)
     single = next(run["id"] for run in listed(copy, "method=ar"))
-    assert "2 cells, 2 episodes" in works("runs", "rerun", single, f"results={copy}", "--plan")
+    assert ": 2 episodes" in works("runs", "rerun", single, f"results={copy}", "--plan")
     told = json.loads(works("runs", "rerun", single, f"results={copy}", "--json"))
     assert (told["episodes"], told["same_tokens"]) == (2, 2)
     assert told["run"] != single
-    folder = copy / "rollouts" / told["run"]
-    noted = json.loads((folder / "run.json").read_text())
-    noted["commands"][-1]["finished"] = ""
-    (folder / "run.json").write_text(json.dumps(noted))
-    shutil.rmtree(next((folder / "cells").iterdir()))  # as a kill leaves it
+    with Database(copy).writing() as connection:  # as a kill leaves it
+        connection.execute(sa.update(RUNS).where(RUNS.c.name == told["run"]).values(status=INTERRUPTED))
+        last = sa.select(sa.func.max(EPISODES.c.id)).scalar_subquery()
+        connection.execute(sa.update(WANTED).where(WANTED.c.episode_id == last).values(episode_id=None))
+        connection.execute(sa.delete(EPISODES).where(EPISODES.c.id == last))
     assert json.loads(works("runs", "rerun", single, f"results={copy}", "--json"))["run"] == told["run"]
     assert "removed" in works("runs", "rm", told["run"], single, "--yes", f"results={copy}")
     assert listed(copy, "method=ar") == []
@@ -173,19 +170,24 @@ def test_an_interrupted_rollout_goes_on_where_it_was(
 ) -> None:
     shutil.copytree(policies / "artifacts", tmp_path / "results" / "artifacts")
     command = ["rollout", "method=ar", "episodes=3", *FAST, f"results={tmp_path}/results"]
-    original = CellRunner.__call__
+    original = EpisodeRunner.__call__
 
-    def interrupted(self: CellRunner, cell: Any) -> Callable[[int], Any]:
-        if cell.seeds[0] == 100_001:
-            raise KeyboardInterrupt
-        return original(self, cell)
+    def interrupted(self: EpisodeRunner, setting: Setting, task: str) -> Callable[[int], Any]:
+        run = original(self, setting, task)
 
-    monkeypatch.setattr(CellRunner, "__call__", interrupted)
+        def episode(seed: int) -> Any:
+            if seed == 100_001:
+                raise KeyboardInterrupt
+            return run(seed)
+
+        return episode
+
+    monkeypatch.setattr(EpisodeRunner, "__call__", interrupted)
     stopped = kerv(*command)
     assert stopped.exit_code == 130
-    assert "1 of 3 episodes are kept" in stopped.stderr
-    monkeypatch.setattr(CellRunner, "__call__", original)
-    assert listed(tmp_path / "results")[0]["state"] == "1 of 3 cells"
+    assert "1 of 3 episodes of" in stopped.stderr
+    monkeypatch.setattr(EpisodeRunner, "__call__", original)
+    assert listed(tmp_path / "results")[0]["state"] == "1 of 3 episodes"
     again = kerv(*command)
     assert again.exit_code == 0
     assert "1 of 3 episodes are there" in again.stderr
@@ -203,12 +205,12 @@ def test_results_that_cannot_be_written_are_refused_at_once(tmp_path: Path) -> N
     assert list(tmp_path.iterdir()) == [tmp_path / "file"]
 
 
-def test_a_task_that_the_policy_never_saw_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    from kerv_cli.cli.rollout import planned_cells
-    from kerv_cli.lab.resolve import resolve_rollout
+def test_a_task_that_the_policy_never_saw_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from kerv_cli.cli.episodes import planned_rollout
+    from kerv_cli.episodes.resolve import resolve_rollout
 
-    resolved = resolve_rollout(["method=ar,spec_vla", "task=coffee-button,reach"], multirun=True)
-    planned_cells(resolved)
+    words = ["method=ar,spec_vla", "task=coffee-button,reach", f"results={tmp_path}"]
+    planned_rollout(resolve_rollout(words, multirun=True), ["rollout", *words])
     line = "kerv: warning: policy mt10-vision was never trained on coffee-button-v3\n"
     assert capsys.readouterr().err.endswith(f" episodes\n{line}")
 
@@ -224,7 +226,7 @@ def test_a_task_that_the_policy_never_saw_is_named(capsys: pytest.CaptureFixture
     ],
 )  # fmt: skip
 def test_a_method_composed_on_the_command_line_is_called_what_it_is(words: list[str], labels: list[str]) -> None:
-    from kerv_cli.lab.resolve import resolve_rollout
+    from kerv_cli.episodes.resolve import resolve_rollout
 
     assert list(resolve_rollout(words, multirun=True).settings) == labels
 
@@ -309,7 +311,7 @@ def test_curves_are_drawn_beside_the_log(results: Path, tmp_path: Path) -> None:
 KILLED = """
 import os, sys
 from pathlib import Path
-from kerv_cli.lab.catalogue import find_run, remove
+from kerv_cli.catalogue.entries import find_run, remove
 
 left = int(sys.argv[3])
 
@@ -326,23 +328,20 @@ remove(run)
 """
 
 
-@pytest.mark.parametrize("moment", [0, 1, 2, 5, 9])
-def test_a_run_whose_removal_is_killed_is_whole_or_gone(results: Path, tmp_path: Path, moment: int) -> None:
+@pytest.mark.parametrize("moment", range(4))
+def test_a_removal_that_is_killed_can_be_repeated(results: Path, tmp_path: Path, moment: int) -> None:
     copy = tmp_path / "results"
     shutil.copytree(results, copy)
     name = next(run["id"] for run in listed(copy) if run["kind"] == "rollout")
-    before = sorted(path.relative_to(copy) for path in (copy / "rollouts" / name).rglob("*"))
+    (copy / "rollouts" / name / "rollouts").mkdir(parents=True)
+    (copy / "rollouts" / name / "rollouts/a.rrd").touch()
     killed = subprocess.run([sys.executable, "-c", KILLED, str(copy), name, str(moment)], check=False)
     assert killed.returncode == -9
-    names = [run["id"] for run in listed(copy)]
-    if moment == 0:
-        assert sorted(path.relative_to(copy) for path in (copy / "rollouts" / name).rglob("*")) == before
-    else:
-        assert name not in names
+    if name in [run["id"] for run in listed(copy)]:
+        works("runs", "rm", "--yes", name, f"results={copy}")
     works("doctor", "--repair", f"results={copy}")
-    (tmp_path / "one.yaml").write_text("settings: {ar: method=ar policy=state policy.target=nano-state task=reach-v3}")
-    works("sweep", f"study={tmp_path}/one.yaml", "--plan", f"results={copy}")
-    assert not [path for path in (copy / "rollouts").iterdir() if path.name.startswith(".")], "nothing hidden stays"
+    assert name not in [run["id"] for run in listed(copy)]
+    assert not list((copy / "rollouts").iterdir())
 
 
 def test_removal_refuses_links_and_parts_of_names(results: Path, tmp_path: Path) -> None:
@@ -350,12 +349,12 @@ def test_removal_refuses_links_and_parts_of_names(results: Path, tmp_path: Path)
     shutil.copytree(results, copy)
     name = next(run["id"] for run in listed(copy) if run["kind"] == "rollout")
     elsewhere = tmp_path / "elsewhere"
-    (copy / "rollouts" / name).rename(elsewhere)
+    elsewhere.mkdir()
+    (copy / "rollouts").mkdir(exist_ok=True)
     (copy / "rollouts" / name).symlink_to(elsewhere)
     refused = kerv("runs", "rm", "-y", name, f"results={copy}")
     assert refused.exit_code == 2
     assert "is a link to" in refused.stderr
-    assert (elsewhere / "plan.yaml").is_file()
     for part in (name[:8], "last"):
         refused = kerv("runs", "rm", "-y", part, f"results={copy}")
         assert refused.exit_code == 2

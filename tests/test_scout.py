@@ -18,7 +18,7 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.lab.resolve import resolve
+from kerv_cli.episodes.resolve import resolve
 from kerv_cli.methods.artifacts import Request
 from kerv_cli.methods.certified import CertifiedSkipSettings, ScopedSettings
 from kerv_cli.methods.certified.certificate import Candidate, Certificate, certified, scoped

@@ -17,9 +17,9 @@ from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.settings import CameraSettings, RolloutSettings, StressSettings, settings_from
 from kerv_cli.cli.app import app
-from kerv_cli.lab.identity import stress_of, work_of
-from kerv_cli.lab.policy import check
-from kerv_cli.lab.run import Runner, close_worlds
+from kerv_cli.episodes.identity import stress_of, work_of
+from kerv_cli.episodes.policy import check
+from kerv_cli.episodes.runner import Runner, close_worlds
 from kerv_cli.worlds import stress as stressing
 from kerv_cli.worlds.demos.dataset import register_recorded
 from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD

@@ -7,19 +7,19 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from studies_synthetic import run_cell, settings_of
+from studies_synthetic import episode, settings_of, study_of, swept
 
 from kerv_cli.base.config import compose
-from kerv_cli.base.settings import RolloutSettings, StressSettings, StudySettings, SweepSettings
-from kerv_cli.engine.record import EpisodeRecord
-from kerv_cli.lab.identity import stress_of
-from kerv_cli.lab.plan import Cell, plan
-from kerv_cli.lab.resolve import resolve
+from kerv_cli.base.settings import RolloutSettings, StressSettings, SweepSettings
+from kerv_cli.episodes.identity import stress_of
+from kerv_cli.episodes.resolve import resolve
+from kerv_cli.lab.execute import RunEpisode
+from kerv_cli.lab.plan import Setting
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.page import verdict as page_verdict
 from kerv_cli.report.plots import study_figures
 from kerv_cli.report.report import report
-from kerv_cli.report.stressed import by_kind, is_stressed, stem, summed_table, verdict
+from kerv_cli.report.stressed import by_kind, is_stressed, summed_table, verdict
 from kerv_cli.report.tables import StudyData, load_study, rows_of
 
 TASKS = ["reach-v3", "push-v3"]
@@ -38,22 +38,17 @@ def settings() -> dict[str, RolloutSettings]:
     return found
 
 
-def episodes(cell: Cell) -> list[EpisodeRecord]:
+def prepare(setting: Setting, task: str) -> RunEpisode:
     """Pushes of level 4 let half of everything fail; light of level 4 only what is bold."""
-    stress = stress_of(cell.settings)
-    fails = stress["level"] == 4 and (stress["kind"] == "push" or cell.settings["method"] != "ar")
-    records = run_cell(cell)
-    return [replace(record, success=not (fails and record.seed % 2)) for record in records]
+    stress = stress_of(setting.settings)
+    fails = stress["level"] == 4 and (stress["kind"] == "push" or setting.settings["method"] != "ar")
+    return lambda seed: replace(episode(setting, task, seed), success=not (fails and seed % 2))
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("stress")
-    store = StudyStore(folder, "stress")
-    cells = plan(settings(), TASKS, {"target": "t"}, baseline="ar")
-    for cell in cells:
-        store.write_cell(cell, episodes(cell), {"run": "r1", "workers": 1, "device_name": "chip"})
-    store.write_plan(StudySettings("stress", "", "ar"), cells)
+    swept(folder, study_of(settings(), TASKS, "stress", title="", axis=""), prepare)
     return folder
 
 
@@ -81,7 +76,6 @@ def test_a_stressed_setting_is_compared_with_the_baseline_under_the_same_stress(
 
 
 def test_lines_begin_with_the_unstressed_setting(table: pd.DataFrame) -> None:
-    assert stem("bold, kind=push level=4") == stem("bold kind=push level=4") == stem("bold") == "bold"
     kinds = by_kind(table)
     assert list(kinds) == ["push", "light"]
     assert [row["label"] for row in kinds["light"]["bold"]] == [
@@ -148,8 +142,8 @@ def test_the_shipped_study_has_every_method_under_every_kind_and_level() -> None
     assert study.baseline == "ar"
 
 
-def test_a_level_0_of_a_kind_is_one_cell_with_no_stress(tmp_path: Path) -> None:
+def test_a_level_0_of_a_kind_means_no_stress() -> None:
     plain, zero = settings_of("ar", 0, 1), settings_of("ar", 0, 1)
     zero.world.stress = StressSettings("light", 0)
-    cells = plan({"ar": plain, "ar, kind=light level=0": zero}, ["reach-v3"], {"target": "t"}, baseline="ar")
-    assert len({cell.id for cell in cells}) == 1
+    first, second = study_of({"ar": plain, "ar, kind=light level=0": zero}, TASKS).settings
+    assert first.work == second.work

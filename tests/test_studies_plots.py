@@ -11,12 +11,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
-from studies_synthetic import IDENTITY, part, run_cell, settings_of
+from studies_synthetic import part, settings_of, study_of, swept
 
 from kerv_cli.base.registry import Part
-from kerv_cli.base.settings import RolloutSettings, StudySettings
-from kerv_cli.lab.plan import plan
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.base.settings import RolloutSettings
 from kerv_cli.report.drawing import COLOURS, INK, STYLE, new_figure, place_labels, setting_colours
 from kerv_cli.report.measures import MICRO
 from kerv_cli.report.plots import has_task_map, series_of, study_figures, task_map
@@ -32,11 +30,7 @@ def setting(method: str = "heisd", **parts: dict[str, Any]) -> RolloutSettings:
 
 
 def table_of(results: Path, settings: dict[str, RolloutSettings], baseline: str = "ar") -> pd.DataFrame:
-    cells = plan(settings, ["reach-v3"], IDENTITY, baseline=baseline)
-    store = StudyStore(results, "drawn")
-    for cell in cells:
-        store.write_cell(cell, run_cell(cell), {"run": "r1", "workers": 1, "device_name": "chip"})
-    store.write_plan(StudySettings("drawn", "", baseline), cells)
+    store, _ = swept(results, study_of(settings, ["reach-v3"], baseline=baseline))
     return load_study(store).table
 
 

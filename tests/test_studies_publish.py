@@ -2,35 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
 import pytest
-from studies_synthetic import prepare, threshold_settings, threshold_study
+from studies_synthetic import swept, threshold_study
 
-from kerv_cli.lab.execute import execute
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.database import Database
+from kerv_cli.lab.store import StudyStore, split_of
 from kerv_cli.report.publish import Unpublishable, refusals
 from kerv_cli.report.report import report
 from kerv_cli.report.tables import load_study
 
 COMMIT = "c" * 40
+STUDY = threshold_study(["reach-v3", "push-v3"])
 
 
-def begin(folder: Path, monkeypatch: pytest.MonkeyPatch, commit: str = COMMIT) -> StudyStore:
-    """A planned study whose cells say that this commit computed them."""
-    for module in ("kerv_cli.lab.execute", "kerv_cli.base.provenance"):
-        monkeypatch.setattr(f"{module}.git_commit", lambda: commit)
-    store = StudyStore(folder, "threshold")
-    store.write_plan(threshold_settings(), threshold_study(["reach-v3", "push-v3"]))
-    return store
+@pytest.fixture(autouse=True)
+def commit(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Sets the commit that computes what follows."""
+
+    def is_of(name: str) -> None:
+        monkeypatch.setattr("kerv_cli.base.provenance.git_commit", lambda: name)
+
+    is_of(COMMIT)
+    return is_of
 
 
-def test_one_run_of_one_commit_is_published_where_it_is_committed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    store = begin(tmp_path, monkeypatch)
-    execute(store.read_plan().cells, prepare, store)
+def test_one_run_of_one_commit_is_published_where_it_is_committed(tmp_path: Path) -> None:
+    swept(tmp_path, STUDY)
     draft = report(tmp_path, "threshold")
     assert not (tmp_path / "tables").exists()
     published = report(tmp_path, "threshold", publish=True)
@@ -40,25 +42,24 @@ def test_one_run_of_one_commit_is_published_where_it_is_committed(
     assert len(draft.files) == len(published.files)
 
 
-def test_what_is_missing_or_not_committed_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    store = begin(tmp_path, monkeypatch, f"{COMMIT}+changes")
-    execute(store.read_plan().cells[:-1], prepare, store)
+def test_what_is_missing_or_not_committed_is_refused(tmp_path: Path, commit: Callable[[str], None]) -> None:
+    commit(f"{COMMIT}+changes")
+    swept(tmp_path, replace(STUDY, wanted=STUDY.wanted[:-1]))
+    StudyStore(tmp_path, "threshold").save(split_of(Database(tmp_path), STUDY))
     with pytest.raises(Unpublishable) as refused:
         report(tmp_path, "threshold", publish=True)
-    assert "1 of its cells are missing" in str(refused.value)
+    assert "1 of its episodes are missing" in str(refused.value)
     assert "not committed" in str(refused.value)
     assert "\n" not in str(refused.value)
     assert not (tmp_path / "tables").exists()
 
 
-def test_sides_of_several_runs_or_commits_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    store = begin(tmp_path, monkeypatch)
-    cells = store.read_plan().cells
-    execute([cell for cell in cells if cell.label == "ar"], prepare, store)
-    begin(tmp_path, monkeypatch, "d" * 40)
-    execute(cells, prepare, store)
+def test_sides_of_several_runs_or_commits_are_refused(tmp_path: Path, commit: Callable[[str], None]) -> None:
+    swept(tmp_path, replace(STUDY, wanted=tuple(one for one in STUDY.wanted if one.setting.label == "ar")))
+    commit("d" * 40)
+    store, _ = swept(tmp_path, STUDY)
     found = refusals(load_study(store).table)
-    assert "its cells are of 2 commits" in found
+    assert "its episodes are of 2 commits" in found
     assert any(reason.startswith("not measured in one run with the baseline: naive_sd") for reason in found)
     assert any(reason.startswith("not measured in turn with the baseline") for reason in found)
 
@@ -66,5 +67,5 @@ def test_sides_of_several_runs_or_commits_are_refused(tmp_path: Path, monkeypatc
 def test_several_machines_are_refused() -> None:
     rows = {"label": ["ar", "x"], "baseline": "ar", "pairs": [0, 3], "same_run": True, "same_block": 1.0}
     table = pd.DataFrame(rows | {"git_commit": COMMIT, "host": ["a", "a;b"], "device_name": "chip", "engine": 1})
-    assert refusals(table) == ["its cells are of 2 machines"]
+    assert refusals(table) == ["its episodes are of 2 machines"]
     assert refusals(table.assign(host="a")) == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import math
 import re
 from collections.abc import Sequence
@@ -14,23 +15,14 @@ import numpy as np
 import pandas as pd
 import pytest
 from rich.console import Console
-from studies_synthetic import (
-    IDENTITY,
-    prepare,
-    run_cell,
-    settings_of,
-    still_episode,
-    threshold_settings,
-    threshold_study,
-)
+from studies_synthetic import settings_of, still_episode, study_of, swept, threshold_study
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.settings import StudySettings
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
-from kerv_cli.lab.execute import execute
-from kerv_cli.lab.plan import Cell, plan
-from kerv_cli.lab.rows import Circumstances
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.database import Database
+from kerv_cli.lab.execute import RunEpisode
+from kerv_cli.lab.plan import Setting, Study, Wanted
+from kerv_cli.lab.store import StudyStore, split_of
 from kerv_cli.report.measures import MACRO, MICRO
 from kerv_cli.report.report import report
 from kerv_cli.report.statistics import PairedCounts, mean_of, paired_difference, speedup, wilson
@@ -38,7 +30,6 @@ from kerv_cli.report.summary import SummaryTable, not_in_turn, summary_frame
 from kerv_cli.report.tables import StudyData, csv_text, load_study
 
 PREFILL = Round("prefill", "none", 0, (), (1,), 0, 1, 0, ())
-STATUS: dict[str, Any] = {"run": "r1", "workers": 1, "device_name": "chip", "torch_version": "2", "git_commit": "c"}
 
 
 def verify(start: int, drafted: Sequence[int], accepted: int, committed: int) -> Round:
@@ -75,26 +66,25 @@ EPISODES: dict[tuple[str, str], list[tuple[bool, list[DecodeRecord]]]] = {
 }
 
 
-def records_of(cell: Cell) -> list[EpisodeRecord]:
-    episodes = EPISODES[cell.task, cell.label]
-    return [still_episode(cell.task, seed, *episode) for seed, episode in zip(cell.seeds, episodes, strict=True)]
+def by_hand(setting: Setting, task: str) -> RunEpisode:
+    return lambda seed: still_episode(task, seed, *EPISODES[task, setting.label][seed - 100_000])
 
 
-def hand_cells() -> list[Cell]:
-    cells = []
-    for task, count in (("reach-v3", 2), ("push-v3", 3)):
-        settings = {"ar": settings_of("ar", episodes=count), "kerv": settings_of("kerv", 9, episodes=count)}
-        cells += plan(settings, [task], IDENTITY, baseline="ar", overrides={"kerv": "method=kerv"})
-    return cells
+def two_settings(episodes: int = 4, **about: Any) -> Study:
+    settings = {"ar": settings_of("ar", episodes=episodes), "kerv": settings_of("kerv", 9, episodes=episodes)}
+    return study_of(settings, ["reach-v3"], "hand", **about)
 
 
-@pytest.fixture
-def data(tmp_path: Path) -> StudyData:
-    store = StudyStore(tmp_path, "hand")
-    for cell in hand_cells():
-        store.write_cell(cell, records_of(cell), STATUS)
-    store.write_plan(StudySettings("hand", "By hand", "ar"), hand_cells())
-    return load_study(store, hand_cells())
+def hand_study() -> Study:
+    """Two episodes of reach and three of push; in every turn both settings."""
+    study = two_settings(3)
+    wanted = [Wanted(one.setting, task, one.seed) for task in ("reach-v3", "push-v3") for one in study.wanted]
+    return replace(study, wanted=tuple(one for one in wanted if one.task == "push-v3" or one.seed < 100_002))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> StudyData:
+    return load_study(swept(tmp_path_factory.mktemp("hand"), hand_study(), by_hand)[0])
 
 
 def row_of(table: pd.DataFrame, **wanted: str) -> dict[str, Any]:
@@ -205,68 +195,77 @@ def test_a_row_says_everything(data: StudyData) -> None:
         "target_sha256": "a" * 64,
         "drafter_sha256": "b" * 64,
         "device": "cpu",
-        "device_name": "chip",
         "dtype": "float32",
         "threads": 1,
         "workers": "1",
-        "torch_version": "2",
-        "git_commit": "c",
         "horizon": 500,
         "camera": "corner4",
-        "run": "r1",
         "same_run": True,
     }
     assert {name: row[name] for name in expected} == expected
-    assert {"metaworld_version", "mujoco_version", "numpy_version", "python_version", "kerv_version"} <= set(row)
-    assert row["cell"].split(";") == [cell.id for cell in hand_cells() if cell.label == "kerv"]
+    assert {"metaworld_version", "numpy_version", "python_version", "git_commit", "device_name", "run"} <= set(row)
 
 
-def write_reach(tmp_path: Path, **harm: Any) -> dict[str, Any]:
-    """The reach cells, the setting's harmed: status or initial_state; its row of the table."""
-    store = StudyStore(tmp_path, "hand")
-    cells = hand_cells()[:2]
-    records = records_of(cells[1])
-    if "initial_state" in harm:
-        records[0] = replace(records[0], initial_state=np.array([harm.pop("initial_state")]))
-    store.write_cell(cells[0], records_of(cells[0]), STATUS)
-    store.write_cell(cells[1], records, {**STATUS, **harm})
-    store.write_plan(StudySettings("hand", "", "ar"), cells)
-    return row_of(load_study(store).per_task, label="kerv")
+def harmed(data: StudyData, **harm: Any) -> StudyData:
+    """The study with other values of kerv's first episode of reach; strings: of all its episodes."""
+    episodes = data.episodes.copy()
+    mine = episodes.index[(episodes["label"] == "kerv") & (episodes["task"] == "reach-v3")]
+    for name, value in harm.items():
+        for index in mine if isinstance(value, str) else mine[:1]:
+            episodes.at[index, name] = value
+    return StudyData(data.study, episodes)
 
 
-def test_other_devices_are_not_compared(tmp_path: Path) -> None:
-    row = write_reach(tmp_path, device_name="another chip")
+def reach_of(data: StudyData) -> dict[str, Any]:
+    return row_of(data.per_task, label="kerv", task="reach-v3")
+
+
+def test_other_devices_are_not_compared(data: StudyData) -> None:
+    row = reach_of(harmed(data, device_name="another chip"))
     assert (row["pairs"], row["same_run"]) == (0, False)
     assert math.isnan(row["speedup"])
     assert math.isnan(row["mcnemar_p"])
     assert row["success"] == 1.0
 
 
+def test_other_initial_states_are_no_pair(data: StudyData) -> None:
+    row = reach_of(harmed(data, initial_state=(0.5,)))
+    assert row["pairs"] == 1
+    assert row["speedup"] == pytest.approx(0.3 / 0.05)
+    assert math.isnan(row["speedup_low"])
+
+
 def test_pairs_of_one_block_are_told_from_others(tmp_path: Path) -> None:
     """Two blocks of two pairs; of the second, the setting ran alone, later."""
-    store = StudyStore(tmp_path, "hand")
-    settings = {"ar": settings_of("ar"), "kerv": settings_of("kerv", 9)}
-    cells = plan(settings, ["reach-v3"], IDENTITY, baseline="ar", block=2, repeats=1)
-    for cell in cells:
-        first = cell.seeds[0] == 100_000
-        block = "one" if first else f"two, {cell.label}"
-        at = [Circumstances(block, i, "2026-01-01") for i in range(2)]
-        store.write_cell(cell, run_cell(cell), STATUS, at)
-    store.write_plan(StudySettings("hand", "", "ar"), cells)
-    row = row_of(load_study(store).per_task, label="kerv")
-    assert (row["pairs"], row["same_run"], row["same_block"]) == (4, True, 0.5)
+    study = two_settings(block=2)
+    early = [one for one in study.wanted if one.seed < 100_002 or one.setting.label == "ar"]
+    swept(tmp_path, replace(study, wanted=tuple(early)))
+    store, _ = swept(tmp_path, study)
+    table = load_study(store).table
+    row = row_of(table, label="kerv", averaging=MICRO)
+    assert (row["pairs"], row["same_run"], row["same_block"]) == (4, False, 0.5)
+    assert row["speedup"] > 1
+    alone = StudyData(store.load(), load_study(store).episodes.query("seed >= 100002"))
+    assert summary_frame(alone.table)["per step"].tolist() == ["1", "–"]  # success is compared, times are not
+    assert not_in_turn(alone.table) == ["kerv"]
+    assert row_of(alone.table, label="kerv", averaging=MICRO)["pairs"] == 2
 
 
 def test_repeats_are_paired_with_their_own(tmp_path: Path) -> None:
     """The machine was ten times slower in the second repeat: for both sides."""
-    store = StudyStore(tmp_path, "hand")
-    settings = {"ar": settings_of("ar", episodes=2), "kerv": settings_of("kerv", 9, episodes=2)}
-    cells = plan(settings, ["reach-v3"], IDENTITY, baseline="ar", repeats=2)
-    for cell in cells:
-        one = ar(0.4) if cell.label == "ar" else ALL_ACCEPTED
-        slower = replace(one, seconds=one.seconds * (10 if cell.repeat else 1))
-        store.write_cell(cell, [still_episode(cell.task, seed, True, [slower]) for seed in cell.seeds], STATUS)
-    store.write_plan(StudySettings("hand", "", "ar"), cells)
+    ran: set[tuple[str, int]] = set()
+
+    def prepare(setting: Setting, task: str) -> RunEpisode:
+        one = ar(0.4) if setting.label == "ar" else ALL_ACCEPTED
+
+        def run(seed: int) -> EpisodeRecord:
+            slower = 10 if (setting.label, seed) in ran else 1
+            ran.add((setting.label, seed))
+            return still_episode(task, seed, True, [replace(one, seconds=one.seconds * slower)])
+
+        return run
+
+    store, _ = swept(tmp_path, two_settings(2, repeats=2), prepare)
     row = row_of(load_study(store).per_task, label="kerv")
     # a repeat is another time, not another world: successes count once
     assert (row["pairs"], row["episodes"], row["repeats"], row["seeds"]) == (2, 4, 2, "100000-100001")
@@ -274,41 +273,19 @@ def test_repeats_are_paired_with_their_own(tmp_path: Path) -> None:
     assert row["speedup"] == row["speedup_low"] == row["speedup_high"] == pytest.approx(2.0)
 
 
-def test_other_initial_states_are_no_pair(tmp_path: Path) -> None:
-    row = write_reach(tmp_path, initial_state=0.5)
-    assert row["pairs"] == 1
-    assert row["speedup"] == pytest.approx(0.3 / 0.05)
-    assert math.isnan(row["speedup_low"])
+def test_without_the_baselines_episodes_there_is_a_row_but_no_speedup(data: StudyData) -> None:
+    episodes = data.episodes
+    data = StudyData(data.study, episodes[episodes["label"] == "kerv"])
+    assert data.absent == [one for one in data.study.wanted if one.setting.label == "ar"]
+    assert list(data.table["label"]) == ["kerv", "kerv"]
+    assert data.table["speedup"].isna().all()
+    assert summary_frame(data.table)["per step"].tolist() == ["–"]
 
 
-def test_success_is_compared_with_another_run_and_times_are_not(tmp_path: Path) -> None:
-    row = write_reach(tmp_path, run="r2")
-    table = load_study(StudyStore(tmp_path, "hand")).table
-    assert summary_frame(table)["per step"].tolist() == ["1", "–"]
-    assert not_in_turn(table) == ["kerv"]
-    assert math.isnan(row["speedup"])
-    assert row["same_run"] is False
-    assert row["pairs"] == 2
-
-
-def test_without_the_baselines_cell_there_is_a_row_but_no_speedup(tmp_path: Path) -> None:
-    store = StudyStore(tmp_path, "hand")
-    cells = hand_cells()[:2]
-    store.write_cell(cells[1], records_of(cells[1]), STATUS)
-    store.write_plan(StudySettings("hand", "", "ar"), cells)
-    data = load_study(store)
-    assert data.absent == [cells[0]]
-    table = data.table
-    assert list(table["label"]) == ["kerv", "kerv"]
-    assert table["speedup"].isna().all()
-    assert summary_frame(table)["per step"].tolist() == ["–"]
-
-
-def test_two_labels_of_one_cell_are_two_rows(tmp_path: Path) -> None:
-    store = StudyStore(tmp_path, "hand")
-    cell = hand_cells()[0]
-    store.write_cell(cell, records_of(cell), STATUS)
-    store.write_plan(StudySettings("hand", "", "ar"), [cell, replace(cell, label="again")])
+def test_two_labels_of_one_setting_are_two_rows(tmp_path: Path) -> None:
+    settings = dict.fromkeys(("ar", "again"), settings_of("ar", episodes=2))
+    store, outcome = swept(tmp_path, study_of(settings, ["reach-v3"]))
+    assert len(outcome.done) == 2
     table = load_study(store).per_task
     assert list(table["label"]) == ["ar", "again"]
     assert list(table["speedup"]) == [1.0, 1.0]
@@ -334,7 +311,8 @@ def printed(table: pd.DataFrame, width: int = 80) -> list[str]:
 def test_summary_on_a_terminal(data: StudyData) -> None:
     table = data.table
     lines = printed(table, 120)
-    assert lines[0].strip() == "hand: 2 tasks, 5 episodes each, micro over tasks, chip, float32"
+    chip = data.episodes["device_name"].iloc[0]
+    assert lines[0].strip() == f"hand: 2 tasks, 5 episodes each, micro over tasks, {chip}, float32"
     at = next(i for i, line in enumerate(lines) if line.startswith("kerv"))
     assert {"60", "(23–88)", "4.22", "1.86"} <= set(lines[at].split())
     assert any(line.startswith("kerv") and "1/0 of 5 1" in line for line in printed(table))  # no p without its counts
@@ -350,12 +328,11 @@ def test_summary_leaves_out_what_no_setting_uses(results: Path) -> None:
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A threshold study over three tasks, one cell missing."""
+    """A threshold study over three tasks, three episodes missing."""
     folder = tmp_path_factory.mktemp("results")
-    store = StudyStore(folder, "threshold")
-    cells = threshold_study(["reach-v3", "push-v3", "door-open-v3"], episodes=3)
-    store.write_plan(threshold_settings(), cells)
-    execute(cells[:-1], prepare, store)
+    study = threshold_study(["reach-v3", "push-v3", "door-open-v3"], episodes=3)
+    swept(folder, replace(study, wanted=study.wanted[:-3]))
+    StudyStore(folder, "threshold").save(split_of(Database(folder), study))
     return folder
 
 
@@ -370,10 +347,15 @@ def test_report_writes_the_same_bytes_again(results: Path, written: list[Path]) 
     assert names == [
         "report/tables/threshold.csv",
         "report/tables/threshold_per_task.csv",
+        "report/tables/threshold.json",
         "report/plots/threshold.png",
         "report/plots/threshold_tasks.png",
         "studies/threshold/report.html",
     ]
+    labels = json.loads((results / "report/tables/threshold.json").read_text())["labels"]
+    assert labels["spec_vla r=3"]["settings"]["threshold"]["r"] == 3
+    assert {"micro over tasks", "reach-v3"} <= set(labels["ar"]["measures"])
+    assert len(pd.read_csv(results / "report/tables/threshold.csv").columns) <= 45
     before = {path: path.read_bytes() for path in written}
     for path in written:
         path.unlink()
@@ -391,7 +373,7 @@ def test_the_page_stands_alone(results: Path) -> None:
     assert figures == 2
     assert "src=" not in page
     assert "http" not in page
-    assert "1 of 12 planned cells are not complete: spec_vla r=9 on door-open-v3" in page
+    assert "3 of 36 episodes are missing: spec_vla r=9 on door-open-v3" in page
     assert f"Run `kerv sweep study=threshold results={results}` to run them" in page
     assert "All tasks" in page
     assert "by difficulty" in page

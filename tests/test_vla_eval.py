@@ -19,11 +19,11 @@ from typing import Any
 import anyio
 import msgpack
 import numpy as np
-import pandas as pd
 import pytest
 import vla_eval
 from examples.tiny_openvla import write_checkpoint
 from PIL import Image
+from studies_synthetic import swept, threshold_study
 from test_serve import serving
 from typer.testing import CliRunner
 from vla_eval.benchmarks.base import StepBenchmark, StepResult
@@ -44,10 +44,10 @@ from websockets.sync.client import connect
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.settings import RolloutSettings, ServeSettings
+from kerv_cli.catalogue.served import read_served
+from kerv_cli.catalogue.vla_eval import read_evaluations, sides_of
 from kerv_cli.cli.app import app
-from kerv_cli.lab.imported import read_evaluations, sides_of
-from kerv_cli.lab.run import Runner
-from kerv_cli.lab.served import read_served
+from kerv_cli.episodes.runner import Runner
 from kerv_cli.serve.policy import Policy
 from kerv_cli.serve.vla_eval import dim_specs
 from kerv_cli.worlds.vla_eval import MetaWorld
@@ -400,8 +400,8 @@ def test_evaluations_of_the_same_episodes_are_paired(results: Path, recordings: 
     assert "three" in kerv("runs", "list", f"results={results}")
     assert "success" in kerv("runs", "compare", "three:ar", "three:Scripted", f"results={results}")
     assert "three" in kerv("report", "--choose", "study=three", "loss=50", f"results={results}")
-    table = pd.read_csv(results / "report" / "tables" / "three.csv")
-    assert set(table["executor"]) == {"vla-eval"}
+    about = json.loads((results / "report/tables/three.json").read_text())["labels"].values()
+    assert {one["provenance"]["executor"] for one in about} == {"vla-eval"}
     refused = CliRunner().invoke(app, ["runs", "rerun", "three", f"results={results}"])
     assert (refused.exit_code, "was imported: run vla-eval again" in refused.output) == (2, True)
 
@@ -417,12 +417,9 @@ def test_an_import_again_replaces_the_study_and_no_other(results: Path, recordin
     for _ in range(2):
         kerv("runs", "import", str(recordings["ar"]), "name=again", "labels=mine", f"results={results}")
     assert "mine" in kerv("runs", "show", "again", f"results={results}")
-    plan = results / "studies" / "own" / "plan.yaml"
-    plan.parent.mkdir(parents=True)
-    plan.write_text((results / "studies" / "again" / "plan.yaml").read_text())
+    swept(results, threshold_study(["reach-v3"], name="own"))
     refused = CliRunner().invoke(app, ["runs", "import", str(recordings["ar"]), "name=own", f"results={results}"])
     assert "study 'own' is there and was not imported" in refused.output
-    shutil.rmtree(plan.parent)
 
 
 def test_a_killed_shard_leaves_episodes_that_are_missing_until_it_ran_again(results: Path, tmp_path: Path) -> None:
@@ -449,7 +446,7 @@ def test_a_killed_shard_leaves_episodes_that_are_missing_until_it_ran_again(resu
         patch.undo()
         words = ["runs", "import", str(tmp_path), "name=shards", f"results={results}"]
         assert "ar: 1 of 4 episodes of MetaWorld are missing" in kerv(*words)
-        assert "1 of 2 cells" in kerv("runs", "show", "shards", f"results={results}")
+        assert "3 of 4 episodes" in kerv("runs", "show", "shards", f"results={results}")
         anyio.run(Orchestrator(config, 1, 2, "shards").run)
     assert "missing" not in kerv(*words)
     assert re.search(r"state +complete", kerv("runs", "show", "shards", f"results={results}"))
@@ -475,7 +472,7 @@ def _empty(path: Path) -> None:
         (_cut, "is damaged, cut short or no recording"),
         (_no_table, "no such table: episode_results"),
         (_empty, "the recording holds no episode"),
-        (Path.unlink, "no recording of vla-eval"),
+        (Path.unlink, "does not exist"),
     ],
 )
 def test_a_harmed_recording_is_refused_in_one_line(

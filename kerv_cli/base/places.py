@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import re
 import tempfile
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from kerv_cli.base.errors import StorageError, UsageError
@@ -18,8 +22,37 @@ RELEASED = {
 }
 """Shipped policy -> SHA-256 of its target's weights. The wheel holds one of them, a checkout and a release all."""
 
+STORE = "KERV_STORE"
+"""Environment variable with the URL of the database; empty: SQLite in the results folder."""
 RESUME = "resume.safetensors"
 """The file of a training's state in the folder of what it makes; nothing that is shipped has it."""
+
+
+@contextlib.contextmanager
+def store_of_words(words: Iterable[str]) -> Iterator[list[str]]:
+    """Use the database that `store=URL` names, in this process and its workers, until the block ends.
+
+    Without such a word `KERV_STORE` stays as it is.
+
+    Args:
+        words: Overrides of a command.
+
+    Yields:
+        The same words. The URL is quoted where Hydra needs that and has lost its password, so that none is stored.
+    """
+    words, before = list(words), os.environ.get(STORE)
+    for number, word in enumerate(words):
+        if word.startswith("store="):
+            os.environ[STORE] = url = word.removeprefix("store=").strip("'\"")
+            url = re.sub(r"(://[^/@:]*):[^/@]*@", r"\1@", url)
+            words[number] = f"store={url}" if re.fullmatch(r"[\w:/@.%+-]*", url) else f"store='{url}'"
+    try:
+        yield words
+    finally:
+        if before is None:
+            os.environ.pop(STORE, None)
+        else:
+            os.environ[STORE] = before
 
 
 def results_dir(results: str) -> Path:

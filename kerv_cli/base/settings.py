@@ -128,6 +128,9 @@ class CommandSettings:
     """Groups of conf/ -> the choice without a word, in the order of composition: a later one outranks an earlier."""
 
     results: str = setting("results", "folder of everything that kerv makes")
+    store: str = setting(
+        "", "database, postgresql://USER@HOST/DB; empty: $KERV_STORE, else SQLite in the results folder"
+    )
 
 
 @dataclass(kw_only=True)
@@ -281,7 +284,7 @@ class SweepSettings(CommandSettings):
     until: str = choice(
         "done", "done", "decided", help="every planned episode, or until each setting's question is answered"
     )
-    # timed: settings whose times were not taken in turn with the baseline; changed: cells of other code
+    # timed: settings whose times were not taken in turn with the baseline; changed: episodes of other code
     rerun: str = choice("never", "never", "timed", "changed", "all", help="what is run again although it is there")
     loss: float = number(3.0, above=0, most=99.9, help="until=decided: is the loss of success below so many points?")
 

@@ -25,7 +25,7 @@ from kerv_cli.base.settings import (
 from kerv_cli.base.spaces import Observation
 from kerv_cli.bench.machine import REPEATS, product_with, timed
 from kerv_cli.engine.protocol import ReadableTarget
-from kerv_cli.lab.policy import still_observation
+from kerv_cli.episodes.policy import still_observation
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter

@@ -22,7 +22,7 @@ from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.record import Round
 from kerv_cli.engine.tree import ROOT
-from kerv_cli.lab.policy import decoder_for
+from kerv_cli.episodes.policy import decoder_for
 from kerv_cli.methods.eagle.drafter import DrafterProposer
 from kerv_cli.methods.spec_vla import Relaxed
 

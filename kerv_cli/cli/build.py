@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import typer
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.places import artifact, find_target
 from kerv_cli.base.registry import find, load, parts
 from kerv_cli.base.settings import (
     BuildDatastoreSettings,
@@ -19,7 +22,7 @@ from kerv_cli.cli.common import AsJson, ShowPlan, print_figures, print_plan, pro
 @command(
     "build target",
     BuildTargetSettings,
-    keys="target checkpoint name statistics environment camera prompt crop int8 results",
+    keys="target checkpoint name statistics environment camera prompt int8 results",
     examples=(
         "kerv build target checkpoint=models/openvla-7b name=openvla",
         "kerv build target checkpoint=models/libero name=libero statistics=libero_spatial crop=true",
@@ -32,7 +35,10 @@ def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
     importers = {name: part for name, part in parts("target").items() if "importer" in part.traits}
     if find("target", settings.family, "target family").name not in importers:
         raise UsageError(f"family={settings.family}: only {', '.join(importers)} is imported, others are trained")
-    folder, figures = load(importers[settings.family].traits["importer"])(settings)
+    from kerv_cli.lab.runs import making
+
+    with making(settings.results, "target", artifact(settings.results, "target", settings.name)):
+        folder, figures = load(importers[settings.family].traits["importer"])(settings)
     print_figures("target", figures, folder, as_json)
 
 
@@ -47,9 +53,13 @@ def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
 )
 def policy(settings: BuildPolicySettings) -> None:
     """Fetch a policy of a release, which a wheel leaves out; its hashes are checked."""
+    from kerv_cli.lab.database import Database
+    from kerv_cli.lab.runs import Run
     from kerv_cli.targets.release import install
 
-    typer.echo(f"policy in {install(settings)}")
+    with Run(Database(settings.results), "policy", Path(settings.source).name):
+        folder = install(settings)
+    typer.echo(f"policy in {folder}")
 
 
 @command(
@@ -63,9 +73,14 @@ def policy(settings: BuildPolicySettings) -> None:
 )
 def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
     """Check a drafter in the public EAGLE or Spec-VLA layout and copy it beside its target."""
+    from kerv_cli.lab.runs import making
+    from kerv_cli.methods.eagle.drafter import DrafterArtifact
     from kerv_cli.training.public_drafter import import_drafter
 
-    folder, figures = import_drafter(settings)
+    target = find_target(settings.results, settings.policy.target)
+    folder = DrafterArtifact().path(settings.results, settings.policy.drafter, target)
+    with making(settings.results, "drafter", folder):
+        folder, figures = import_drafter(settings)
     print_figures("drafter", figures, folder, as_json)
 
 
@@ -80,12 +95,16 @@ def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
 )
 def datastore(settings: BuildDatastoreSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Store the demonstrations' action chunks under the target's own features, for retrieval."""
+    from kerv_cli.lab.runs import making
     from kerv_cli.training.datastore import DatastoreBuild
 
     run = DatastoreBuild(settings)
     if plan:
         print_plan(run.plan(), as_json)
-    with progress_bar("encoding demonstrations") as advance:
+    with (
+        making(settings.results, "datastore", run.folder) as made,
+        progress_bar("encoding demonstrations", made) as advance,
+    ):
         store = run.build(advance)
     figures = {"entries": len(store.vectors), "tasks": len(store.shards)}
     print_figures("datastore", figures, run.folder, as_json)

@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 
     import numpy as np
 
+    from kerv_cli.lab.runs import Run
     from kerv_cli.methods.calibration import Calibration
+    from kerv_cli.training.calibration import CalibrationRun
 
 
 @command(
@@ -33,24 +35,31 @@ def calibrate(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
     run = CalibrationRun(settings)
     if plan:
         print_plan(run.plan())
-    with progress_bar("reading demonstrations") as advance:
-        run.load(advance)
-    variability, skip = {}, None
-    if settings.decodes:
-        with progress_bar("pre-sampling") as advance:
-            variability = run.presample(advance)
-    with progress_bar("boundary ranges") as advance:
-        boundary = run.boundary(advance)
-    if run.stored:
-        with progress_bar("skip levels") as advance:
-            skip = run.skip(advance)
-    with console(stderr=True).status("fitting the predictors"):
-        calibration = run.finish(variability, boundary, skip)
+    from kerv_cli.lab.runs import making
+
+    with making(settings.results, "calibration", run.path.parent) as record:
+        calibration = _calibrate(run, record)
     _tasks(calibration, run.path)
     _errors(calibration)
     _skip(calibration)
     for line in run.notes:
         typer.echo(line)
+
+
+def _calibrate(run: CalibrationRun, record: Run) -> Calibration:
+    with progress_bar("reading demonstrations", record) as advance:
+        run.load(advance)
+    variability, skip = {}, None
+    if run.settings.decodes:
+        with progress_bar("pre-sampling", record) as advance:
+            variability = run.presample(advance)
+    with progress_bar("boundary ranges", record) as advance:
+        boundary = run.boundary(advance)
+    if run.stored:
+        with progress_bar("skip levels", record) as advance:
+            skip = run.skip(advance)
+    with console(stderr=True).status("fitting the predictors"):
+        return run.finish(variability, boundary, skip)
 
 
 def _tasks(calibration: Calibration, path: Path) -> None:
@@ -114,8 +123,9 @@ OF_TEST = {at.name for at in fields(CalibrateSuccessSettings)} - {at.name for at
 def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Run a study's settings on selection seeds, the most cautious first, and certify which of them keep AR's success.
     Episodes that are there are reused; settle their number before you look."""
-    from kerv_cli.cli.sweep import covered_cells, print_settings, print_sweep_plan, run_covered
-    from kerv_cli.lab.resolve import resolve
+    from kerv_cli.cli.episodes import planned_study, print_settings, print_study_plan, run_study
+    from kerv_cli.episodes.resolve import resolve
+    from kerv_cli.lab.runs import making
     from kerv_cli.report.certificate import candidate_rows, certify, deployment_note, folder_of, write
 
     of_test = [word for word in words if word.split("=")[0] in OF_TEST]
@@ -134,15 +144,15 @@ def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json
     note = deployment_note(resolved)
     if note:
         typer.echo(f"note: {note}", err=True)
-    covered = covered_cells(resolved, of_study)
+    planned = planned_study(resolved, ["calibrate", "success", *words])
     if plan:
-        print_sweep_plan(covered, resolved.first.runtime.workers, as_json)
+        print_study_plan(planned, as_json)
         return
-    outcome = run_covered(resolved, covered, of_study)
-    if outcome.failed:
-        raise typer.Exit(1)
-    certificate = certify(resolved, covered.store, covered.cells, settings.margin, settings.delta)
-    path = write(folder, certificate)
+    with making(settings.results, "certificate", folder):
+        if run_study(resolved, planned).failed:
+            raise typer.Exit(1)
+        certificate = certify(resolved, planned.store, planned.study.wanted, settings.margin, settings.delta)
+        path = write(folder, certificate)
     rows = candidate_rows(certificate)
     if as_json:
         print_json({"certificate": path, "sentence": certificate.sentence(), "candidates": rows})

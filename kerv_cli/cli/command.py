@@ -7,9 +7,10 @@ The command's function takes what it names: `settings` (composed and checked), `
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import Field, fields
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -21,7 +22,7 @@ from kerv_cli.base.config import compose, conf_dir, groups, to_yaml
 from kerv_cli.base.errors import UnknownName
 from kerv_cli.base.files import read_yaml_file
 from kerv_cli.base.limits import field_of
-from kerv_cli.base.places import check_writable
+from kerv_cli.base.places import check_writable, store_of_words
 from kerv_cli.base.registry import NoSettings, Part, add, find, load, parts
 from kerv_cli.base.settings import CommandSettings, choices_of
 
@@ -41,7 +42,8 @@ def command(name: str, settings: type = CommandSettings, keys: str = "", **trait
     """
 
     def declare(run: F) -> F:
-        add("command", name, f"{run.__module__}:{run.__name__}", settings, help=run.__doc__ or "", keys=keys, **traits)
+        shown = re.sub(r"\bresults\b", "results store", keys)
+        add("command", name, f"{run.__module__}:{run.__name__}", settings, help=run.__doc__ or "", keys=shown, **traits)
         return run
 
     return declare
@@ -72,10 +74,12 @@ def typer_command(part: Part) -> TyperCommand:
 
     def callback(overrides: list[str] | None = None, cfg: bool = False, **options: object) -> None:
         words, names = _split(part, overrides or [], "names" in parameters)
-        arguments = {"words": words, "names": names, "cfg": cfg}
-        if "settings" in parameters or (cfg and "cfg" not in parameters):
-            arguments["settings"] = _settings(part, words, cfg)
-        run(**{name: value for name, value in arguments.items() if name in parameters}, **options)
+        with store_of_words(words) as words:
+            arguments = {"words": words, "names": names, "cfg": cfg}
+            if "settings" in parameters or (cfg and "cfg" not in parameters):
+                arguments["settings"] = _settings(part, words, cfg)
+            with _noted([*part.name.split(), *words, *names, *_flags(made, options)]):
+                run(**{name: value for name, value in arguments.items() if name in parameters}, **options)
 
     cfg_option = [] if part.settings is NoSettings else [_option("cfg", False, _CFG)]
     callback.__signature__ = inspect.Signature([_option("overrides", None, _words_argument(part)), *cfg_option, *more])  # type: ignore[attr-defined]
@@ -85,6 +89,25 @@ def typer_command(part: Part) -> TyperCommand:
     made: Any = typer.main.get_command(single)
     made.part = part
     return made
+
+
+@contextlib.contextmanager
+def _noted(words: list[str]) -> Iterator[None]:
+    """Note the command for the rows of what it begins; `kerv prepare` runs commands within its own."""
+    from kerv_cli.lab.runs import set_command
+
+    before = set_command(words)
+    try:
+        yield
+    finally:
+        set_command(before)
+
+
+def _flags(command: TyperCommand, options: Mapping[str, object]) -> list[str]:
+    """Return the options as they are typed, without those that are left out."""
+    names = {param.name: param.opts[0] for param in command.params}
+    given = [(names[name], value) for name, value in options.items() if value not in (None, False)]
+    return [word for name, value in given for word in ([name] if value is True else [name, str(value)])]
 
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 120}

@@ -20,6 +20,8 @@ from kerv_cli.base.errors import Interrupted, KervError, UsageError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from kerv_cli.lab.runs import Run
+
 ShowPlan = Annotated[bool, typer.Option("--plan", help="Print what would be done and how long it takes, and stop.")]
 
 
@@ -103,8 +105,8 @@ def _parse_error(error: Any, words: Sequence[str]) -> str:
 
 
 def results_word(words: Iterable[str]) -> str:
-    """` results=DIR` for the end of a command to type next, if these words name a folder; else empty."""
-    return "".join(f" {shlex.quote(word)}" for word in words if word.startswith("results="))
+    """Return ` results=DIR` and ` store=URL` for the end of a command to type next, if these words name them."""
+    return "".join(f" {shlex.quote(word)}" for word in words if word.startswith(("results=", "store=")))
 
 
 def _refuse(message: str, code: int, error: BaseException | None) -> None:
@@ -125,7 +127,20 @@ def at_work(what: str) -> Iterator[None]:
 
 
 @contextmanager
-def progress_bar(title: str) -> Iterator[Callable[..., None]]:
+def progress_bar(title: str, record: Run | None = None) -> Iterator[Callable[..., None]]:
+    """Yield `advance(done, total, text="")`, which shows progress and notes it in the row of a command."""
+    with _shown(title) as show:
+
+        def advance(done: int, total: int, text: str = "") -> None:
+            if record is not None:
+                record.beat(done, total)
+            show(done, total, text)
+
+        yield advance
+
+
+@contextmanager
+def _shown(title: str) -> Iterator[Callable[..., None]]:
     """Yields `advance(done, total, text="")`: a progress bar on a terminal, elsewhere at most 10 lines (50 for totals
     from 2000 on) with the time left."""
     if not sys.stderr.isatty():

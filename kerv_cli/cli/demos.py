@@ -25,12 +25,13 @@ if TYPE_CHECKING:
 @command(
     "demos",
     DemosSettings,
-    keys="name task episodes seed perturbed policy frame_stride world.camera.name runtime.workers results",
+    keys="name task episodes seed perturbed policy world.camera.name runtime.workers results",
     examples=("kerv demos name=mine task=MT10 episodes=100", "kerv demos name=visited policy=vision task=reach --plan"),
 )
 def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
     """Record successful expert episodes, plain and perturbed, as a dataset; with policy=vision the states that a policy
     visits by its method, labelled by the expert."""
+    from kerv_cli.lab.runs import making
     from kerv_cli.training.demonstrations import name_of
     from kerv_cli.worlds import resolve_tasks, spec_of
     from kerv_cli.worlds.demos.recording import DemoConfig, record
@@ -55,7 +56,7 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
         seconds = steps * (0.7 + 10 / settings.frame_stride) / 1000 / settings.runtime.workers
         print_plan(f"{len(tasks)} tasks x {settings.episodes} episodes -> {folder}, {about(seconds)}")
     try:
-        with progress_bar("demonstrations") as advance:
+        with making(settings.results, "demos", folder) as made, progress_bar("demonstrations", made) as advance:
             manifest = record(config, folder, advance, actor)
     except KeyboardInterrupt:
         raise Interrupted(
@@ -111,12 +112,13 @@ def export_demos(settings: DemosExportSettings) -> None:
 )
 def import_demos(settings: DemosImportSettings) -> None:
     """Read a LeRobot dataset as demonstrations."""
+    from kerv_cli.lab.runs import making
     from kerv_cli.worlds.demos.lerobot.reading import import_lerobot
 
     if not settings.source:
         raise UsageError("source=DIR: name the folder of a LeRobot dataset")
     folder = artifact(settings.results, "demos", settings.name or Path(settings.source).name)
-    with progress_bar("import") as advance:
+    with making(settings.results, "demos", folder) as made, progress_bar("import", made) as advance:
         manifest = import_lerobot(settings, folder, advance).manifest
     rows = ((name, len(row.episodes), f"{row.mean_steps:.0f}") for name, row in manifest.tasks.items())
     title = f"demonstrations in {folder}, suite {manifest.environment.upper()}"

@@ -25,9 +25,7 @@ if TYPE_CHECKING:
     from kerv_cli.worlds.spec import EnvironmentSpec
 
 
-Repair = Annotated[
-    bool, typer.Option("--repair", help="Remove what killed commands left in the results; set damaged cells aside.")
-]
+Repair = Annotated[bool, typer.Option("--repair", help="Remove what killed commands left in the results.")]
 
 
 @command(
@@ -72,6 +70,7 @@ def _machine(settings: DoctorSettings) -> list[Finding]:
         find("torch", partial(_torch, settings)),
         *(find(f"policy {name}", partial(_policy, name, settings)) for name in shipped),
         find("results", partial(_disk, settings)),
+        find("database", partial(_database, settings)),
         Finding("left over", True, says),
         Finding("display", True, display),
     ]
@@ -156,19 +155,25 @@ def _disk(settings: DoctorSettings) -> str:
     return says
 
 
-def _left_over(settings: DoctorSettings) -> list[Path]:
-    """Temporary files and folders of dead processes, and claims and notes of dead sweeps, in the results."""
-    from kerv_cli.lab.claims import void
+def _database(settings: DoctorSettings) -> str:
+    """Return which database is in use; raises KervError if it does not answer."""
+    from kerv_cli.lab.database import Database
+    from kerv_cli.lab.runs import run_rows
 
-    root = results_dir(settings.results)
-    claims = [path for folder in sorted(root.glob("[!.]*/[!.]*/claims")) for path in void(folder)]
-    return [*left_over(root), *claims]
+    database = Database(settings.results)
+    rows = len(run_rows(database))
+    what = "PostgreSQL" if database.file is None else "SQLite"
+    says = f"{rows} commands in it" if database.is_there else "made by the first command that needs it"
+    return f"{what}, {database.shown}: {says}"
+
+
+def _left_over(settings: DoctorSettings) -> list[Path]:
+    """Return temporary files and folders of dead processes in the results."""
+    return list(left_over(results_dir(settings.results)))
 
 
 def _repair(settings: DoctorSettings) -> None:
-    """Removes the files of `_left_over` and prints their names; sets damaged cells aside."""
-    from kerv_cli.lab.store import ROLLOUTS, STUDIES, stores
-
+    """Remove the files of `_left_over` and print their names."""
     paths = _left_over(settings)
     for path in paths:
         remove(path)
@@ -176,9 +181,4 @@ def _repair(settings: DoctorSettings) -> None:
     remaining = [path for path in paths if path.exists()]
     if remaining:
         raise StorageError(f"{remaining[0]} cannot be removed: permission denied?")
-    every = [store for family in (STUDIES, ROLLOUTS) for store in stores(results_dir(settings.results), family)]
-    damages = [(store, name, error) for store in every for name, error in store.damages()]
-    for store, name, error in damages:
-        typer.echo(f"{str(error).split(': `')[0]}: it lies in {store.set_aside(name)} now, {store.how_to_run()}")
-    aside = f", {len(damages)} damaged cells set aside" if damages else ""
-    typer.echo(f"{len(paths)} left over files removed{aside}; everything else is complete or absent")
+    typer.echo(f"{len(paths)} left over files removed")

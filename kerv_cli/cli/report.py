@@ -1,4 +1,4 @@
-"""`kerv report`: tables, plots and a page from the cells of a results folder."""
+"""`kerv report`: tables, plots and a page from the episodes of a results folder."""
 
 from __future__ import annotations
 
@@ -35,14 +35,13 @@ Choose = Annotated[
 )
 def report(
     settings: ReportSettings,
-    words: list[str],
     publish: Publish = False,
     choose: Choose = False,
     as_json: AsJson = False,
 ) -> None:
     """Write CSV tables (per task and aggregated), plots and an HTML page of the studies."""
-    from kerv_cli.cli.sweep import print_study, print_verdict
-    from kerv_cli.lab.resolve import study_name
+    from kerv_cli.cli.studies import print_study, print_verdict
+    from kerv_cli.episodes.resolve import study_name
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.report import report as write_report
     from kerv_cli.report.reprice import ASSUMES, repriced_summary
@@ -60,7 +59,7 @@ def report(
         print_json({"files": output.files, "studies": tables, **priced})
         return
     for name, table in output.tables.items():
-        print_study(table, StudyStore(results, name), words)
+        print_study(table, StudyStore(results, name))
     if output.priced is not None:
         summary = repriced_summary(output.priced)
         print_table(summary.columns, summary.itertuples(index=False), ASSUMES)
@@ -84,7 +83,7 @@ def _print_choice(settings: ReportSettings, as_json: bool) -> None:
         answers[name] = [choice.as_dict() for choice in groups]
         if not as_json:
             typer.echo(f"{name}, not beaten in speed and success at once: {', '.join(groups[0].front)}")
-            typer.echo(f"  {sentence(groups[0], settings.loss, data.plan.baseline)}")
+            typer.echo(f"  {sentence(groups[0], settings.loss, data.study.baseline)}")
             for choice in groups[1:]:
                 typer.echo(f"  {short_sentence(choice)}")
     if as_json:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,24 +9,21 @@ import typer
 
 from kerv_cli.base.config import to_yaml
 from kerv_cli.base.durations import about
-from kerv_cli.base.places import check_writable
 from kerv_cli.base.settings import RolloutSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import (
     AsJson,
     ShowPlan,
-    at_work,
     console,
     print_json,
     print_notes,
     print_table,
     results_word,
 )
+from kerv_cli.cli.episodes import count, planned_rollout, run_study
 
 if TYPE_CHECKING:
-    from kerv_cli.lab.identity import Plain
-    from kerv_cli.lab.plan import Cell
-    from kerv_cli.lab.resolve import ResolvedStudy
+    from kerv_cli.episodes.identity import Plain
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.measures import Row
     from kerv_cli.report.tables import StudyData
@@ -48,8 +44,8 @@ def rollout(
     words: list[str], cfg: bool = False, plan: ShowPlan = False, multirun: Many = False, as_json: AsJson = False
 ) -> None:
     """Run episodes of one method; print success, forwards, acceptance and time; write one .rrd per task."""
-    from kerv_cli.lab.identity import without_effect
-    from kerv_cli.lab.resolve import resolve_rollout
+    from kerv_cli.episodes.identity import without_effect
+    from kerv_cli.episodes.resolve import resolve_rollout
 
     resolved = resolve_rollout(words, multirun)
     if cfg:
@@ -57,75 +53,25 @@ def rollout(
         return
     for label, settings in resolved.settings.items():
         print_notes(without_effect(settings, resolved.overrides[label].split()))
-    cells = planned_cells(resolved)
+    planned = planned_rollout(resolved, ["rollout", *(["-m"] if multirun else []), *words])
     if plan:
-        total = sum(len(cell.seeds) for cell in cells)
         names = ", ".join(f"{label}{_stressed(asdict(settings))}" for label, settings in resolved.settings.items())
-        tasks = resolved.tasks
+        total, tasks = len(planned.study.wanted), resolved.tasks
         if as_json:
             print_json({"settings": list(resolved.settings), "tasks": tasks, "episodes": total, "seconds": 3 * total})
         else:
-            typer.echo(f"{names}: {len(tasks)} tasks, {total} episodes, {about(3 * total)}")
+            typer.echo(f"{names}: {count(len(tasks), 'task')}, {count(total, 'episode')}, {about(3 * total)}")
         return
-    store = run_cells(resolved, cells, ["rollout", *(["-m"] if multirun else []), *words])
-    _print_rollout(store, as_json, results_word(words))
+    run_study(resolved, planned)
+    _print_rollout(planned.store, as_json, results_word(words))
 
 
 def _stressed(settings: Plain) -> str:
     """The stress in plain RolloutSettings, as text behind a setting's label; empty without one."""
-    from kerv_cli.lab.identity import stress_of
+    from kerv_cli.episodes.identity import stress_of
 
     stress = stress_of(settings)
     return f", stress {stress['kind']} {stress['level']}" if stress["level"] else ""
-
-
-def planned_cells(resolved: ResolvedStudy) -> list[Cell]:
-    """The cells of a study. Everything that can be refused before an episode runs is refused here. Prints the number of
-    episodes, and the tasks that a policy was not trained on, to standard error."""
-    from kerv_cli.lab.executors import check_executor
-    from kerv_cli.lab.resolve import unseen_tasks
-
-    settings, first, tasks = resolved.settings, resolved.first, resolved.tasks
-    check_executor(first.runtime)
-    check_writable(first.results)
-    # before anything heavy loads
-    what = next(iter(settings)) if len(settings) == 1 else f"{len(settings)} settings"
-    whose = _few(list(dict.fromkeys(setting.policy.target for setting in settings.values())), "targets")
-    where = _few(tasks, "tasks")
-    count = len(settings) * len(tasks) * first.episodes * resolved.study.repeats
-    typer.echo(f"{what} of {whose} on {where}: {count} episodes", err=True)
-    with at_work("loading the policy"):
-        from kerv_cli.lab.policy import cells_of
-
-        cells = cells_of(resolved)
-    for target, names in dict.fromkeys((s.policy.target, tuple(unseen_tasks(s, tasks))) for s in settings.values()):
-        if names:
-            typer.echo(f"kerv: warning: policy {target} was never trained on {', '.join(names)}", err=True)
-    return cells
-
-
-def _few(names: Sequence[str], what: str) -> str:
-    """The names; from four on, how many they are."""
-    return ", ".join(names) if len(names) < 4 else f"{len(names)} {what}"
-
-
-def run_cells(resolved: ResolvedStudy, cells: list[Cell], arguments: list[str]) -> StudyStore:
-    """Runs a rollout's cells, or those that the same command left when it was interrupted -> their store.
-
-    Raises:
-        Interrupted: Ctrl-C. KervError: an episode failed.
-    """
-    from kerv_cli.cli.running import running
-    from kerv_cli.lab.reuse import cover_rollout
-
-    covered = cover_rollout(resolved.first.results, cells)
-    store, done = covered.store, len(covered.complete)
-    if done:
-        typer.echo(f"resuming {store.name}: {done} of {len(covered.cells)} episodes are there", err=True)
-    store.begin(resolved.study, covered.cells, arguments)
-    with running(store, covered.cells, resolved.first.runtime) as run:
-        run(covered.cells)
-    return store
 
 
 def _print_rollout(store: StudyStore, as_json: bool, where: str) -> None:
@@ -139,7 +85,7 @@ def _print_rollout(store: StudyStore, as_json: bool, where: str) -> None:
         print_json({"run": store.name, "folder": store.root, "settings": whole, "tasks": per_task,
                     "recordings": store.recordings})  # fmt: skip
         return
-    if len(data.plan.labels) > 1:
+    if len(data.study.labels) > 1:
         console().print(SummaryTable(data.table))
     else:
         _print_setting(data, per_task, whole[0])
@@ -152,21 +98,21 @@ def _print_rollout(store: StudyStore, as_json: bool, where: str) -> None:
 def _print_setting(data: StudyData, per_task: list[Row], whole: Row) -> None:
     """Figures of a run with one setting: by task, and time by phase."""
     from kerv_cli.engine.record import PHASES
-    from kerv_cli.lab.identity import batch_of
+    from kerv_cli.episodes.identity import batch_of
     from kerv_cli.report.measures import is_timed
 
-    episodes, cell = data.episodes, data.plan.cells[0]
+    episodes, setting = data.episodes, data.study.settings[0]
     by_task = {row["task"]: row for row in per_task}
     figures = [(task, by_task[task]) for task in dict.fromkeys(episodes["task"])]
     if len(figures) > 1:
         figures.append(("all", whole))
     headers = ("task", "success", "steps", "forwards/step", "AL", "accepted/round", "ms/step")
     seeds = f"{episodes['seed'].min()}…{episodes['seed'].max()}"
-    observation = cell.identity.get("observation", "")
-    title = f"{cell.label}, observation {observation}{_stressed(cell.settings)}, seeds {seeds}"
+    observation = setting.identity.get("observation", "")
+    title = f"{setting.label}, observation {observation}{_stressed(setting.settings)}, seeds {seeds}"
     print_table(headers, ((name, *_figures(row)) for name, row in figures), title)
     if not is_timed(episodes):
-        typer.echo(f"not timed: {batch_of(cell.settings)} episodes at a time, for success alone")
+        typer.echo(f"not timed: {batch_of(setting.settings)} episodes at a time, for success alone")
         return
     decodes, total = episodes["decodes"].sum(), episodes["seconds"].sum()
     seconds = {phase: episodes[f"seconds.{phase}"].sum() for phase in PHASES}

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kerv_cli.base.errors import Interrupted, UsageError
-from kerv_cli.base.places import results_dir
+from kerv_cli.base.errors import Interrupted, KervError, UsageError
+from kerv_cli.base.places import as_path, results_dir
 from kerv_cli.base.settings import CommandSettings, ImportSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, console, print_json, print_table, results_word
@@ -18,15 +18,15 @@ from kerv_cli.cli.common import AsJson, ShowPlan, console, print_json, print_tab
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from kerv_cli.catalogue.entries import RunEntry
     from kerv_cli.cli.command import F
-    from kerv_cli.lab.catalogue import RunEntry
     from kerv_cli.report.compare import Comparison, Difference
 
 RUNS = "NAME: runs (id, a unique part of it, or last) and results=DIR."
 FILTERS = "NAME: kind=, method=, task=, state=, since= and results=DIR narrow the list."
 
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask; names must be whole.")]
-To = Annotated[str, typer.Option("--to", help="csv, trackio, wandb (offline) or mlflow.")]
+To = Annotated[str, typer.Option("--to", help="csv, parquet, db, trackio, wandb (offline) or mlflow.")]
 Folder = Annotated[Path | None, typer.Option("--dir", help="Where it is written; default results/exports.")]
 
 
@@ -37,7 +37,7 @@ def _command_on_runs(name: str, *examples: str) -> Callable[[F], F]:
 
 def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a run") -> list[str]:
     """The names as those of runs. Raises UsageError: too few or too many."""
-    from kerv_cli.lab.resolve import study_name
+    from kerv_cli.episodes.resolve import study_name
 
     if not least <= len(names) <= most:
         raise UsageError(f"name {what}: 'kerv runs list' shows them")
@@ -49,7 +49,7 @@ def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a r
 )
 def list_(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """List the runs of a results folder, the newest first."""
-    from kerv_cli.lab.catalogue import find_runs, matching
+    from kerv_cli.catalogue.entries import find_runs, matching
 
     for word in names:
         if "=" not in word:
@@ -86,7 +86,7 @@ def _entry_row(run: RunEntry) -> dict[str, object]:
 @_command_on_runs("show", "kerv runs show last", "kerv runs show main --json")
 def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Show one run, ID or ID:SETTING: its command and figures, what it was made from, where it lies."""
-    from kerv_cli.lab.catalogue import command_of, disk_bytes, find_runs, parents, store_of
+    from kerv_cli.catalogue.entries import command_of, disk_bytes, find_runs, parents, store_of
     from kerv_cli.report.compare import sides
     from kerv_cli.report.summary import SummaryTable
     from kerv_cli.report.tables import load_study, rows_of
@@ -154,31 +154,37 @@ def rerun(
     settings: CommandSettings, names: list[str], words: list[str], plan: ShowPlan = False, as_json: AsJson = False
 ) -> None:
     """Run a run again from what it stored, into a new folder, and say whether the tokens are the same."""
-    from kerv_cli.lab.catalogue import find_run
-    from kerv_cli.lab.store import IMPORT
+    from kerv_cli.catalogue.entries import find_run
 
     results, (name,) = settings.results, _run_names(names)
     run = find_run(results, name)
     if run.is_training:
-        from kerv_cli.cli.again import training_again
-        from kerv_cli.cli.train import run_training
+        from kerv_cli.catalogue.again import again_words
+        from kerv_cli.cli.training import run_training
+        from kerv_cli.training.again import training_again
 
-        run_training(training_again(run, results), plan, as_json, "reading what it needs", "training again")
+        command = again_words(run, results)
+        run_training(training_again(run, results), plan, as_json, "reading what it needs", "training again", command)
         return
     if not run.has_episodes:
+        if run.command and run.state != "complete":
+            raise UsageError(f"{run.id} is {run.state}: go on with '{shlex.join(['kerv', *run.command])}'")
         raise UsageError(f"{run.id} is a {run.kind}: the command that makes it goes on where it is unfinished")
-    if run.command[:2] == IMPORT:
+    if run.kind == "import":
         raise UsageError(f"{run.id} was imported: run vla-eval again, then 'kerv runs import'")
-    from kerv_cli.cli.again import cells_again, run_again, store_again
+    from kerv_cli.catalogue.again import plan_of
+    from kerv_cli.cli.episodes import count, run_planned
     from kerv_cli.report.compare import same_tokens
 
-    cells = cells_again(run, results)
-    store = store_again(run, results, cells)
+    planned = plan_of(run, results)
+    name = planned.store.name
     if plan:
-        episodes = sum(len(cell.seeds) for cell in cells)
-        typer.echo(f"{run.id} again as {store.name}: {len(cells)} cells, {episodes} episodes")
+        typer.echo(f"{run.id} again as {name}: {count(len(planned.to_run), 'episode')}")
         return
-    entry = run_again(run, store, cells)
+    failed = run_planned(planned).failed
+    if failed:
+        raise KervError(failed[0].reason)
+    entry = find_run(results, name, exact=True)
     same, shared = same_tokens(run, entry)
     if as_json:
         print_json({"run": entry.id, "folder": entry.folder, "episodes": shared, "same_tokens": same})
@@ -190,7 +196,7 @@ def rerun(
 @_command_on_runs("rm", "kerv runs rm last", "kerv runs rm main --yes")
 def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
     """Remove runs and everything in their folders, after a question."""
-    from kerv_cli.lab.catalogue import check_removable, disk_bytes, find_run, remove
+    from kerv_cli.catalogue.entries import check_removable, disk_bytes, find_run, remove
 
     runs = [find_run(settings.results, name, exact=yes) for name in _run_names(names, 1, 1000)]
     for run in runs:
@@ -205,52 +211,67 @@ def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
     if not sure:
         raise typer.Exit(1)
     for run in runs:
-        remove(run)
+        remove(run, settings.results)
     typer.echo(f"removed {what}")
 
 
-@_command_on_runs("export", "kerv runs export last", "kerv runs export main --to mlflow")
+@_command_on_runs("export", "kerv runs export last", "kerv runs export main --to db")
 def export(
     settings: CommandSettings, names: list[str], to: To = "csv", folder: Folder = None, as_json: AsJson = False
 ) -> None:
-    """Hand a run to a tracker, or write its episodes or its curves as CSV."""
-    from kerv_cli.lab.catalogue import find_run
+    """Hand a run to a tracker, or write it as CSV, Parquet or a database that 'kerv runs import' reads."""
+    from kerv_cli.catalogue.entries import find_run
+    from kerv_cli.report.export import FILES
     from kerv_cli.report.export import export as hand_over
 
     (name,) = _run_names(names)
     folder = folder or results_dir(settings.results) / "exports" / to
-    run_names = hand_over(find_run(settings.results, name), to, folder)
+    written = hand_over(find_run(settings.results, name), to, folder)
     if as_json:
-        print_json({"folder": folder, "written": run_names})
+        print_json({"folder": folder, "written": written})
         return
-    for name in run_names:
+    for name in written:
         typer.echo(name)
-    typer.echo(f"{len(run_names)} runs in {folder}")
+    typer.echo(f"{len(written)} {'file' if to in FILES else 'run'}{'s' * (len(written) != 1)} in {folder}")
 
 
 @command(
     "runs import",
     ImportSettings,
-    names="NAME: recordings of vla-eval, recording-….sqlite or …_aggregate.json, or folders that hold one.",
+    names="NAME: a results folder of kerv 0.1.0, a kerv.db, vla-eval's recording-….sqlite or …_aggregate.json, "
+    "lerobot's eval_info.json, or folders that hold one.",
     keys="name baseline labels results",
     examples=(
         "kerv runs import ar/recording-1.sqlite kerv/recording-2.sqlite",
-        "kerv runs import evaluations name=libero",
+        "kerv runs import old-results",
     ),
     lists=("labels",),
 )
 def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False) -> None:
-    """Read evaluations of vla-eval as a study, whose episodes are paired as those of a sweep are."""
-    from kerv_cli.lab import imported
-    from kerv_cli.lab.store import IMPORT, StudyStore
+    """Read runs of another results folder, or evaluations of vla-eval or lerobot as a study of paired episodes."""
+    from kerv_cli.catalogue.recognise import import_evaluations, import_results, is_results
+    from kerv_cli.lab.database import Database
+    from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.summary import SummaryTable
     from kerv_cli.report.tables import load_study, rows_of
 
     if not names:
-        raise UsageError("name a recording of vla-eval: kerv runs import recording-ID.sqlite")
-    sides = imported.sides_of([imported.read_evaluations(Path(name)) for name in names], settings.labels)
-    results, name = results_dir(settings.results), settings.name or imported.study_name(sides)
-    notes = imported.write_study(results, name, sides, settings.baseline, [*IMPORT, *names])
+        raise UsageError("name what to import: kerv runs import old-results, or kerv runs import recording-ID.sqlite")
+    paths = [as_path(name) for name in names]
+    results = results_dir(settings.results)
+    folders = [path for path in paths if is_results(path)]
+    if folders:
+        if len(folders) < len(paths):
+            raise UsageError("import results folders and evaluations one after the other")
+        studies, notes = import_results(Database(results), folders, settings.name)
+        if as_json:
+            print_json({"studies": studies, "notes": notes})
+            return
+        for line in [*notes, f"imported {', '.join(studies) or 'nothing'}: kerv runs list"]:
+            typer.echo(line)
+        return
+    words = ["runs", "import", *names]
+    name, notes = import_evaluations(results, paths, settings.name, settings.labels, settings.baseline, words)
     table = load_study(StudyStore(results, name)).table
     if as_json:
         print_json({"study": name, "notes": notes, "settings": rows_of(table)})

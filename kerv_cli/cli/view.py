@@ -58,7 +58,7 @@ def _place(results: str, name: str) -> Path:
     path = Path(name).expanduser()
     if path.exists() or path.suffix == ".rrd":
         return path
-    from kerv_cli.lab.catalogue import LAST, find_run, find_runs
+    from kerv_cli.catalogue.entries import LAST, find_run, find_runs
     from kerv_cli.report.viewing.viewer import recordings_below
 
     if name == LAST:

@@ -84,7 +84,10 @@ def read_profile(path: Path) -> Profile:
     document = read_json(path)
     try:
         stored = document["profile"]
-        phases = {k: (tuple(v["rows"]), tuple(v["seconds"])) for k, v in stored["phases"].items()}
+        phases = {
+            kind: (tuple(map(int, costs["rows"])), tuple(map(float, costs["seconds"])))
+            for kind, costs in stored["phases"].items()
+        }
         about = {key: value for key, value in document.items() if isinstance(value, str | bool | int | float)}
         profile = Profile(int(stored["prompt"]), phases, int(stored["tokens"]), about)
     except (KeyError, TypeError, ValueError, AttributeError) as error:

@@ -156,3 +156,9 @@ class EpisodeRecord:
     def path_length(self) -> float:
         """The end effector's way, metres."""
         return path_length(self.path)
+
+    @property
+    def jerk(self) -> float:
+        """Root mean square of the third difference of the end effector's positions, m/s³; NaN below three steps."""
+        third = np.diff(self.path.astype(np.float64), n=3, axis=0) * self.space.control_hz**3
+        return float(np.sqrt((third**2).sum(axis=1).mean())) if len(third) else math.nan

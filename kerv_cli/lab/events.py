@@ -1,4 +1,4 @@
-"""Events of a running sweep: `execute` emits them, the progress display shows them."""
+"""Events of a running study: `execute` emits them, a display shows them."""
 
 from __future__ import annotations
 
@@ -6,41 +6,59 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from kerv_cli.base.errors import KervError
-from kerv_cli.lab.plan import Block, Cell
+from kerv_cli.lab.plan import Block, Wanted
 
 
 @dataclass(frozen=True)
-class CellEnd:
-    """The end of a cell, complete or failed; the rest of its block goes on. It is pickled: of an exception that is not
-    kerv's only the text is kept. seconds: wall time of its episodes and of preparing its setting."""
+class EpisodeEnd:
+    """The end of an episode.
 
-    cell: Cell
-    episodes: int = 0
-    successes: int = 0
+    Attributes:
+        wanted: What it means.
+        success: Whether the task was solved.
+        seconds: Wall time.
+        elsewhere: Another sweep ran it while this one ran.
+    """
+
+    wanted: Wanted
+    success: bool = False
     seconds: float = 0.0
-    reused: bool = False  # another sweep completed it while this one ran
-    reason: str = ""  # of a failure, in one line; empty: complete
+    elsewhere: bool = False
+
+
+@dataclass(frozen=True)
+class SettingFailed:
+    """A setting failed on a block of seeds; the block's other settings go on.
+
+    Attributes:
+        wanted: The episodes that it leaves out, the one that failed first.
+        reason: The error in one line.
+        trace: Its traceback.
+        error: The error, if it is one of kerv's own.
+    """
+
+    wanted: tuple[Wanted, ...]
+    reason: str
     trace: str = ""
     error: KervError | None = None
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of a sweep. Every cell of the plan is in exactly one of the three lists."""
+    """The result of `execute`. Every wanted episode is in exactly one of the three."""
 
-    done: list[Cell] = field(default_factory=list)  # run now
-    reused: list[Cell] = field(default_factory=list)  # complete before
-    failed: list[CellEnd] = field(default_factory=list)
+    done: list[Wanted] = field(default_factory=list)  # run now
+    reused: list[Wanted] = field(default_factory=list)  # there before, or run by another sweep
+    failed: list[SettingFailed] = field(default_factory=list)
     seconds: float = 0.0
 
 
 @dataclass(frozen=True)
-class SweepStarted:
-    """The sweep begins. total: cells to run. episodes: of those cells."""
+class Started:
+    """The run begins. to_run, reused: numbers of episodes."""
 
-    total: int
+    to_run: int
     reused: int
-    episodes: int
 
 
 @dataclass(frozen=True)
@@ -51,19 +69,18 @@ class BlockStarted:
 
 
 @dataclass(frozen=True)
-class BlockWaits:
-    """Another sweep computes cells of the block; `execute` looks at it again later."""
+class BlockEnded:
+    """A block is over."""
 
     block: Block
 
 
 @dataclass(frozen=True)
-class BlockRuns:
-    """A block runs in another process. ended: its episodes that have ended; its cells are told when all have."""
+class BlockWaits:
+    """Another sweep computes the block; `execute` looks at it again later."""
 
     block: Block
-    ended: int
 
 
-Event = SweepStarted | BlockStarted | BlockWaits | BlockRuns | CellEnd
+Event = Started | BlockStarted | BlockEnded | BlockWaits | EpisodeEnd | SettingFailed
 OnEvent = Callable[[Event], None]

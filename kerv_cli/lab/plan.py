@@ -1,215 +1,415 @@
-"""A study's plan: cells and blocks, what is to run in which order, and plan.yaml. What a cell means is decided in
-identity.py."""
+"""What a study wants, what the database has of it, and what is left to run, with the reason."""
 
 from __future__ import annotations
 
 import functools
 import hashlib
-import json
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import groupby
 from typing import Any
 
 import numpy as np
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.files import read_yaml, to_yaml
-from kerv_cli.base.manifests import read
-from kerv_cli.base.settings import RolloutSettings
-from kerv_cli.lab.identity import Identity, Plain, batch_of, hash_of, without, work_of
+from kerv_cli.episodes.identity import (
+    ENGINE,
+    OBSERVATION,
+    Identity,
+    Plain,
+    batch_of,
+    depends_on_order,
+    effective,
+    flat,
+    without,
+    work_of,
+)
 
-MOST_CELLS = 100_000
-"""Cells of a study; more are refused before they are planned."""
-
-MOST_SEEDS = 10_000
-"""Seeds of a cell, at most `study.block` of them."""
-
+MOST_EPISODES = 1_000_000
+"""Episodes of a study; more are refused before they are planned."""
 FULL_BATCHES = 16
-"""A block of a batch has so many times as many episodes as run at once: at its end places stay empty."""
+"""A block of a batch has at most this many times as many episodes as run at once."""
+
+NEVER, TIMED, CHANGED, ALL = "never", "timed", "changed", "all"
+"""What `rerun=` runs again: nothing; what was not timed in turn; what other code computed; everything."""
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """One row of a study's table.
+
+    Attributes:
+        label: Its name in the study.
+        overrides: The overrides that make it, as the user wrote them.
+        settings: Plain RolloutSettings, without the task.
+        identity: Hashes of the weights and data that it reads.
+        varies: Key -> value of those overrides in which the settings of a grid differ.
+        name: What the settings of a grid share; by default the label.
+    """
+
+    label: str
+    overrides: str
+    settings: Plain
+    identity: Identity
+    varies: Mapping[str, Any] = field(default_factory=dict)
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", self.name or self.label)
+
+    @functools.cached_property
+    def work(self) -> str:
+        """Hash of everything that determines a result, apart from task, seed and repeat."""
+        return work_of(self.settings, self.identity)
+
+    def on(self, task: str) -> dict[str, Any]:
+        """Return plain RolloutSettings for one task."""
+        return {**self.settings, "task": [task]}
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One setting on one task and a block of seeds, in one repeat: the unit that is stored and reused. Two labels with
-    the same settings share one id."""
+class Wanted:
+    """One episode that a study wants."""
 
-    id: str  # name of its folder: a hash of what it means, see identity.py
-    label: str  # the setting's name in the study
-    overrides: str  # of the configuration, as the user wrote them
+    setting: Setting
     task: str
-    seeds: tuple[int, ...]  # one episode each
-    settings: dict[str, Any]  # plain RolloutSettings with task = [task]
-    identity: dict[str, str] = field(default_factory=dict)  # hashes of target, drafter, ...
-    repeat: int = 0  # the same episodes are measured `study.repeats` times
+    seed: int
+    repeat: int = 0
 
-    @functools.cached_property
-    def work(self) -> tuple[str, str, int]:
-        """Setting (its hash), task and repeat: all that the cell means apart from its seeds."""
-        return work_of(self.settings, self.identity), self.task, self.repeat
+    @property
+    def key(self) -> tuple[str, str, int, int]:
+        """What the episode means: equal keys are the same episode in any study."""
+        return self.setting.work, self.task, self.seed, self.repeat
 
-    def part(self, seeds: Sequence[int], name: str = "") -> Cell:
-        """A cell of this work on these seeds. name: of its folder on disk; empty: the cell is to run."""
-        return replace(self, seeds=tuple(seeds), id=name or hash_of([*self.work, list(seeds)]))
 
-    def again(self, names: Collection[str]) -> Cell:
-        """This cell with the first id that is not among the names: `<id>-2`, `<id>-3`, …"""
-        return replace(self, id=next(n for n in (f"{self.id}-{i}" for i in range(2, 10_000)) if n not in names))
+@dataclass(frozen=True)
+class Study:
+    """A study and the episodes that it wants, in the order in which they run.
+
+    Attributes:
+        name: Its name in the database.
+        kind: sweep, rollout or import.
+        baseline: Label of the setting that the others are compared with.
+        axis: Config key of the plots' x axis; empty: none.
+        note: A sentence that says what to see.
+        block: Seeds for which the settings take turns in one process.
+    """
+
+    name: str
+    settings: tuple[Setting, ...]
+    wanted: tuple[Wanted, ...]
+    kind: str = "sweep"
+    title: str = ""
+    baseline: str = ""
+    axis: str = ""
+    note: str = ""
+    block: int = 5
+
+    @property
+    def labels(self) -> list[str]:
+        """Labels of the settings, in order."""
+        return [setting.label for setting in self.settings]
+
+    @property
+    def tasks(self) -> list[str]:
+        """Names of the tasks, in order."""
+        return list(dict.fromkeys(one.task for one in self.wanted))
+
+    def setting(self, label: str) -> Setting:
+        """Return the setting of a label."""
+        return next(setting for setting in self.settings if setting.label == label)
+
+
+def wanted_of(
+    settings: Sequence[Setting], tasks: Iterable[str], block: int = 5, repeats: int = 1
+) -> tuple[Wanted, ...]:
+    """Return every episode of these settings: repeat by repeat, task by task, block of seeds by block of seeds.
+
+    Raises:
+        UsageError: More than MOST_EPISODES.
+    """
+    tasks = list(dict.fromkeys(tasks))
+    count = len(tasks) * repeats * sum(setting.settings["episodes"] for setting in settings)
+    if count > MOST_EPISODES:
+        raise UsageError(f"the study has {count} episodes: at most {MOST_EPISODES}, plan fewer")
+    seeds = {s.label: range(s.settings["seed"], s.settings["seed"] + s.settings["episodes"]) for s in settings}
+    longest = max((len(one) for one in seeds.values()), default=0)
+    return tuple(
+        Wanted(setting, task, seed, repeat)
+        for repeat in range(repeats)
+        for task in tasks
+        for first in range(0, longest, block)
+        for setting in settings
+        for seed in seeds[setting.label][first : first + block]
+    )
+
+
+@dataclass(frozen=True)
+class Measured:
+    """An episode in the database, by what decides whether a study can use it."""
+
+    id: int
+    block: str
+    started: str  # of its block
+    code: str
+    seeds: str  # of its block
 
 
 @dataclass(frozen=True)
 class Block:
-    """Cells of one task, the same seeds and one repeat: the unit that an executor runs. Its settings take turns in one
-    process, episode by episode, so that compared episodes are measured one after the other.
+    """Episodes that one process runs: of one task and one repeat, whose settings take turns seed by seed.
 
-    Cells of a batch are of one setting instead, of any tasks and seeds; `task` and `seeds` are those of the first.
+    A block of a batch has one setting instead, and any tasks and seeds.
     """
 
-    cells: tuple[Cell, ...]  # at least one; each id once
+    wanted: tuple[Wanted, ...]  # at least one
 
     @property
     def task(self) -> str:
-        """Full task name of its cells."""
-        return self.cells[0].task
+        """Task of its first episode."""
+        return self.wanted[0].task
+
+    @functools.cached_property
+    def settings(self) -> tuple[Setting, ...]:
+        """Its settings, each once."""
+        return tuple({one.setting.work: one.setting for one in self.wanted}.values())
 
     @property
-    def seeds(self) -> tuple[int, ...]:
-        """Seeds of its episodes."""
-        return self.cells[0].seeds
-
-    @property
-    def repeat(self) -> int:
-        """Which of the study's repeats, from 0."""
-        return self.cells[0].repeat
+    def seeds(self) -> list[int]:
+        """Its seeds, each once, ascending."""
+        return sorted({one.seed for one in self.wanted})
 
     @property
     def batch(self) -> int:
         """Episodes that run at the same time."""
-        return batch_of(self.cells[0].settings)
-
-    @property
-    def title(self) -> str:
-        """Name and size of the block, for a display."""
-        if self.batch == 1:
-            return f"{self.name}: {len(self.cells)} settings in turn"
-        return f"{self.cells[0].label} from {self.name} on: {_episodes(self.cells)} episodes, {self.batch} at a time"
+        return batch_of(self.wanted[0].setting.settings)
 
     @property
     def name(self) -> str:
-        """Task, seeds and repeat, e.g. `reach-v3 100000-100004`."""
-        return f"{self.task} {seeds_text(self.seeds)}" + (f" repeat {self.repeat}" if self.repeat else "")
+        """Task and seeds, e.g. `reach-v3 100000-100004`."""
+        repeat = self.wanted[0].repeat
+        return f"{self.task} {seeds_text(self.seeds)}" + (f" repeat {repeat}" if repeat else "")
 
-    def order(self, seed: int) -> list[int]:
-        """Indices of its cells in the order in which they run the episode of `seed`: a permutation drawn from task,
-        seed and repeat."""
-        digest = hashlib.sha256(f"{self.task} {seed} {self.repeat}".encode()).digest()
-        return [int(i) for i in np.random.default_rng(list(digest)).permutation(len(self.cells))]
+    @property
+    def title(self) -> str:
+        """Name and size, for a display."""
+        if self.batch == 1:
+            return f"{self.name}: {count(len(self.settings), 'setting')} in turn"
+        label = self.wanted[0].setting.label
+        return f"{label} from {self.name} on: {count(len(self.wanted), 'episode')}, {self.batch} at a time"
 
-    def without(self, names: Collection[str]) -> Block | None:
-        """The block without the cells of those ids; None if no cell is left."""
-        cells = tuple(cell for cell in self.cells if cell.id not in names)
-        return Block(cells) if cells else None
+    def turns(self) -> Iterator[Wanted]:
+        """Yield its episodes seed by seed; the order of the settings is drawn from task, seed and repeat."""
+        for seed in self.seeds:
+            turn = [one for one in self.wanted if one.seed == seed]
+            digest = hashlib.sha256(f"{self.task} {seed} {turn[0].repeat}".encode()).digest()
+            for index in np.random.default_rng(list(digest)).permutation(len(turn)):
+                yield turn[int(index)]
 
 
-def make_cell(
-    label: str, overrides: str, settings: Plain, identity: Identity, task: str, seeds: Sequence[int], repeat: int = 0
-) -> Cell:
-    """The cell of one setting (plain RolloutSettings) on one task and some seeds.
+@dataclass
+class Split:
+    """A study, split into the episodes that the database has and those to run.
 
-    Raises:
-        ValueError: the device is still `auto`, which two machines resolve differently.
+    Attributes:
+        study: What is wanted.
+        there: Wanted episode -> its row.
+        reasons: Wanted episode to run -> why, in a few words.
+        newest: Id of the newest row that was looked at. Later ones are of sweeps that run at the same time.
     """
-    if settings["runtime"]["device"] == "auto":
-        raise ValueError(f"setting '{label}': resolve runtime.device before planning")
-    cell = Cell("", label, overrides, task, tuple(seeds), {**settings, "task": [task]}, dict(identity), repeat)
-    return cell.part(seeds)
+
+    study: Study
+    there: dict[Wanted, Measured] = field(default_factory=dict)
+    reasons: dict[Wanted, str] = field(default_factory=dict)
+    newest: int = 0
+
+    @property
+    def to_run(self) -> list[Wanted]:
+        """The episodes to run; one that two labels share runs once."""
+        return list({one.key: one for one in self.reasons}.values())
+
+    def blocks(self, workers: int = 1) -> list[Block]:
+        """Return the episodes to run as blocks, in the order of their first episodes."""
+        return blocks_of(self.to_run, self.study.block, workers)
 
 
-def plan(
-    settings_by_label: Mapping[str, RolloutSettings],
-    tasks: Sequence[str],
-    identity: Identity | Callable[[str], Identity],
-    *,
-    baseline: str | None = None,
-    overrides: Mapping[str, str] | None = None,
-    block: int = 5,
-    repeats: int = 1,
-) -> list[Cell]:
-    """The cells of every label, task and block of seeds: repeat by repeat, task by task, the baseline first.
+def split(
+    study: Study, stock: Mapping[tuple[str, str, int, int], Sequence[Measured]], rerun: str = NEVER, since: str = ""
+) -> Split:
+    """Return the plan of a study: wanted episodes minus those of the database.
 
     Args:
-        settings_by_label: resolved settings; their order is kept.
-        tasks: full task names, suites already expanded.
-        identity: hashes of the weights, one mapping for all settings or those of a label.
-        baseline: label to put first.
-        overrides: what the user wrote for each label, kept for the tables.
-        block: seeds of a cell.
-        repeats: how often everything is measured.
-
-    Raises:
-        ValueError: a device is `auto`.
-        UsageError: more than MOST_CELLS cells.
+        study: What is wanted.
+        stock: Meaning of an episode -> its rows in the database.
+        rerun: One of NEVER, TIMED, CHANGED, ALL.
+        since: With ALL, rows of blocks that began then or later count (ISO 8601): of the same command, interrupted.
     """
-    blocks = sum(-(-settings.episodes // block) for settings in settings_by_label.values())
-    tasks = list(dict.fromkeys(tasks))
-    if blocks * len(tasks) * repeats > MOST_CELLS:
-        raise UsageError(f"the study has {blocks * len(tasks) * repeats} cells: at most {MOST_CELLS}, plan fewer")
-    labels = sorted(settings_by_label, key=lambda label: label != baseline)
-    hashes = {label: identity(label) if callable(identity) else identity for label in labels}
-    plain = {label: asdict(settings) for label, settings in settings_by_label.items()}
-    seeds = {label: range(s.seed, s.seed + s.episodes) for label, s in settings_by_label.items()}
-    words = overrides or {}
-    return [
-        make_cell(label, words.get(label, ""), plain[label], hashes[label], task, seeds[label][at : at + block], repeat)
-        for repeat in range(repeats)
-        for task in tasks
-        for label in labels
-        for at in range(0, len(seeds[label]), block)
+    from kerv_cli.episodes.code import code_hash
+
+    def accepted(row: Measured) -> bool:
+        if rerun == ALL:
+            return bool(since) and row.started >= since
+        return rerun != CHANGED or row.code == code_hash()
+
+    plan = Split(study, newest=max((row.id for rows in stock.values() for row in rows), default=0))
+    known = {work: True for work, *_ in stock}
+    tasks = {(work, task) for work, task, *_ in stock}
+    usable = {one: [row for row in stock.get(one.key, ()) if accepted(row)] for one in study.wanted}
+    _only_whole_orders(usable, study.block)
+    for turn in _turns(study.wanted).values():
+        rows = {one: usable[one] for one in turn}
+        of_block = Counter(row.block for found in rows.values() for row in found)
+        chosen = {one: max(found, key=lambda row: (of_block[row.block], row.started, row.id), default=None)
+                  for one, found in rows.items()}  # fmt: skip
+        if rerun == TIMED and len({row and row.block for row in chosen.values()}) > 1:
+            chosen = dict.fromkeys(chosen)
+        for one, row in chosen.items():
+            if row is not None:
+                plan.there[one] = row
+            else:
+                plan.reasons[one] = _reason(one, stock, known, tasks, rerun)
+    _whole_orders(plan)
+    return plan
+
+
+def _turns(wanted: Iterable[Wanted]) -> dict[tuple[str, int, int], list[Wanted]]:
+    """(task, seed, repeat) -> its episodes, which take turns."""
+    turns: dict[tuple[str, int, int], list[Wanted]] = {}
+    for one in wanted:
+        turns.setdefault((one.task, one.seed, one.repeat), []).append(one)
+    return turns
+
+
+def _only_whole_orders(usable: dict[Wanted, list[Measured]], block: int) -> None:
+    """Leave episodes that depend on those before them the rows of one block that ran all their seeds, or none."""
+    sizes = Counter(row.block for rows in usable.values() for row in rows)
+    for seeds in _ordered_chunks(usable, block):
+        text = seeds_text(one.seed for one in seeds)
+        whole = [row for row in usable[seeds[0]] if row.seeds == text]
+        whole = [row for row in whole if all(any(row.block == other.block for other in usable[one]) for one in seeds)]
+        best = max(whole, key=lambda row: (sizes[row.block], row.started, row.id), default=None)
+        for one in seeds:
+            usable[one] = [row for row in usable[one] if best is not None and row.block == best.block]
+
+
+def _whole_orders(plan: Split) -> None:
+    """Run a block of seeds whole if an episode's result depends on the episodes before it."""
+    for seeds in _ordered_chunks(plan.study.wanted, plan.study.block):
+        if any(one in plan.reasons for one in seeds):
+            for one in seeds:
+                plan.there.pop(one, None)
+                plan.reasons.setdefault(one, "order of episodes")
+
+
+def _ordered_chunks(wanted: Iterable[Wanted], block: int) -> Iterator[list[Wanted]]:
+    """Yield the episodes of each setting, task and repeat that depend on their order, by blocks of seeds."""
+
+    def key(one: Wanted) -> tuple[str, str, int, int]:
+        return one.setting.work, one.task, one.repeat, (one.seed - one.setting.settings["seed"]) // block
+
+    groups: dict[tuple[str, str, int, int], list[Wanted]] = {}
+    ordered: dict[str, bool] = {}
+    for one in wanted:
+        work = one.setting.work
+        if work not in ordered:
+            ordered[work] = depends_on_order(one.setting.settings)
+        if ordered[work]:
+            groups.setdefault(key(one), []).append(one)
+    yield from groups.values()
+
+
+def blocks_of(wanted: Iterable[Wanted], block: int, workers: int = 1) -> list[Block]:
+    """Return episodes grouped into blocks.
+
+    Seeds stay together that the study runs together and that the same settings miss, or all of them if a setting
+    depends on the order of episodes. A process has one number of threads. Episodes of a batch are grouped by setting,
+    into at least as many blocks as there are workers.
+    """
+    batches: dict[tuple[str, int], list[Wanted]] = {}
+    in_turn: list[Wanted] = []
+    for one in wanted:
+        if batch_of(one.setting.settings) > 1:
+            batches.setdefault((one.setting.work, one.repeat), []).append(one)
+        else:
+            in_turn.append(one)
+    groups: dict[tuple[object, ...], list[Wanted]] = {}
+    for (task, seed, repeat), turn in _turns(in_turn).items():
+        for threads, some in groupby(sorted(turn, key=_threads), key=_threads):
+            part = list(some)
+            first = min(one.setting.settings["seed"] for one in part)
+            missing = sorted(one.setting.work for one in part)
+            ordered = sorted(one.setting.work for one in part if depends_on_order(one.setting.settings))
+            groups.setdefault((task, repeat, threads, (seed - first) // block, *(ordered or missing)), []).extend(part)
+    blocks = [Block(tuple(group)) for group in groups.values()]
+    for group in batches.values():
+        size = min(FULL_BATCHES * batch_of(group[0].setting.settings), -(-len(group) // workers))
+        blocks += [Block(tuple(group[at : at + size])) for at in range(0, len(group), size)]
+    return blocks
+
+
+def _threads(one: Wanted) -> int:
+    return int(one.setting.settings["runtime"]["threads"])
+
+
+def _reason(
+    one: Wanted,
+    stock: Mapping[Any, Sequence[Measured]],
+    known: Mapping[str, bool],
+    tasks: set[tuple[str, str]],
+    rerun: str,
+) -> str:
+    """Return why an episode is to run, in a few words."""
+    if stock.get(one.key):
+        return {TIMED: "times wanted in turn", CHANGED: "other code", ALL: "rerun=all"}.get(rerun, "order of episodes")
+    if (one.setting.work, one.task) in tasks:
+        return "new repeat" if one.repeat else "new seeds"
+    return "new task" if one.setting.work in known else NEW_SETTING
+
+
+NEW_SETTING = "new setting"
+
+
+def differences(old: Setting, work: str, new: Setting) -> str:
+    """Return what changed from a stored setting with this `work` to the one of the same label, in a few words."""
+    engine = next((one for one in range(ENGINE, 0, -1) if work_of(old.settings, old.identity, one) == work), ENGINE)
+    changes = [f"engine {engine} → {ENGINE}"] if engine != ENGINE else []
+    names = {"target": f"weights of {new.settings['policy']['target']}"}
+    changes += [
+        f"{names.get(kind, kind)} changed"
+        for kind in dict.fromkeys([*new.identity, *old.identity])
+        if kind != OBSERVATION and new.identity.get(kind) != old.identity.get(kind)
     ]
+    before, after = flat(effective(old.settings)), flat(effective(new.settings))
+    keys = [key for key in dict.fromkeys([*after, *before]) if before.get(key) != after.get(key)]
+    changes += [f"{key} {before.get(key)} → {after.get(key)}" for key in keys]
+    return ", ".join(changes[:3]) or NEW_SETTING
 
 
-def blocks_of(cells: Iterable[Cell], workers: int = 1) -> list[Block]:
-    """The cells grouped by task, seeds, repeat and threads (a process has one number of them), in the order of their
-    first cells; each id once. Those of a batch are grouped by setting, into as many blocks as there are workers or
-    more."""
-    groups: dict[tuple[object, ...], list[Cell]] = {}
-    for cell in unique_cells(cells):
-        key: tuple[object, ...] = cell.task, cell.seeds, cell.repeat, cell.settings["runtime"]["threads"]
-        if batch_of(cell.settings) > 1:
-            key = (json.dumps([without(cell.settings, {"task"}), cell.identity], sort_keys=True), cell.repeat)
-        groups.setdefault(key, []).append(cell)
-    return [Block(tuple(part)) for group in groups.values() for part in _parts(group, workers)]
+def explain(plan: Split, earlier: Mapping[str, tuple[Setting, str]]) -> Split:
+    """Return the plan with `new setting` replaced by what changed since a setting of the same label and target ran.
+
+    earlier: Label -> the stored setting, and the `work` that it had.
+    """
+    texts = {
+        setting.label: differences(*earlier[setting.label], setting)
+        for setting in plan.study.settings
+        if setting.label in earlier
+        and earlier[setting.label][0].settings["policy"]["target"] == setting.settings["policy"]["target"]
+    }
+    reasons = {
+        one: texts.get(one.setting.label, why) if why == NEW_SETTING else why for one, why in plan.reasons.items()
+    }
+    return replace(plan, reasons=reasons)
 
 
-def _parts(group: Sequence[Cell], workers: int) -> Iterator[list[Cell]]:
-    """The cells of one block; those of a batch in parts of as many episodes as keep every worker's batch full."""
-    batch = batch_of(group[0].settings)
-    if batch == 1:
-        yield list(group)
-        return
-    most = min(FULL_BATCHES * batch, -(-_episodes(group) // workers))
-    part: list[Cell] = []
-    for cell in group:
-        if part and _episodes(part) + len(cell.seeds) > most:
-            yield part
-            part = []
-        part.append(cell)
-    yield part
-
-
-def _episodes(cells: Iterable[Cell]) -> int:
-    return sum(len(cell.seeds) for cell in cells)
-
-
-def unique_cells(cells: Iterable[Cell]) -> list[Cell]:
-    """The first cell of every id, in order."""
-    first: dict[str, Cell] = {}
-    for cell in cells:
-        first.setdefault(cell.id, cell)
-    return list(first.values())
+def plain_settings(settings: Plain) -> dict[str, Any]:
+    """Return plain RolloutSettings without the task, as a Setting holds them."""
+    return without(settings, {"task"})
 
 
 def seeds_text(seeds: Iterable[int]) -> str:
-    """Seeds as ranges: (5, 6, 7, 9) -> "5-7;9"."""
+    """Return seeds as ranges: (5, 6, 7, 9) -> "5-7;9"."""
     runs: list[list[int]] = []
     for seed in sorted(set(seeds)):
         if runs and seed == runs[-1][1] + 1:
@@ -219,117 +419,6 @@ def seeds_text(seeds: Iterable[int]) -> str:
     return ";".join(str(a) if a == b else f"{a}-{b}" for a, b in runs)
 
 
-def parse_seeds(text: str) -> tuple[int, ...]:
-    """The inverse of `seeds_text`.
-
-    Raises:
-        ValueError: not a list of ranges.
-    """
-    seeds: list[int] = []
-    for part in text.split(";"):
-        first, _, last = part.partition("-")
-        span = range(int(first), int(last or first) + 1)
-        if not 0 < len(span) <= MOST_SEEDS:
-            raise ValueError(f"'{part}' is no range of seeds")
-        seeds.extend(span)
-    return tuple(seeds)
-
-
-@dataclass(frozen=True)
-class StudyPlan:
-    """A study and its cells, in the order in which they run."""
-
-    name: str
-    title: str
-    baseline: str  # label that the others are compared with
-    axis: str  # config key of the plots' x axis; empty where there is none
-    cells: tuple[Cell, ...]
-    note: str = ""  # what to see
-
-    @property
-    def labels(self) -> list[str]:
-        """Labels in the order of the plan."""
-        return list(dict.fromkeys(cell.label for cell in self.cells))
-
-
-@dataclass(frozen=True)
-class _Label:
-    overrides: str
-    identity: dict[str, str]
-    settings: dict[str, Any]  # without the task
-
-
-@dataclass(frozen=True)
-class _Line:
-    """A cell in the file. seeds: as `seeds_text`."""
-
-    id: str
-    label: str
-    task: str
-    seeds: str
-    repeat: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class _File:
-    """plan.yaml: every label's settings once, then one line per cell."""
-
-    study: str
-    title: str
-    baseline: str
-    axis: str
-    note: str = ""
-    labels: dict[str, _Label]
-    cells: tuple[_Line, ...]
-
-
-def plan_text(plan: StudyPlan) -> str:
-    """The plan as YAML."""
-    labels = {c.label: _Label(c.overrides, c.identity, without(c.settings, {"task"})) for c in reversed(plan.cells)}
-    labels = {label: labels[label] for label in plan.labels}
-    lines = tuple(_Line(c.id, c.label, c.task, seeds_text(c.seeds), c.repeat) for c in plan.cells)
-    head = {name: getattr(plan, name) for name in ("title", "baseline", "axis", "note")}
-    file = asdict(_File(study=plan.name, labels=labels, cells=lines, **head))
-    cells = list(file.pop("cells"))
-    return to_yaml(file) + to_yaml({"cells": cells}, default_flow_style=None, width=1000)
-
-
-def plan_from_text(text: str) -> StudyPlan:
-    """The inverse of `plan_text`.
-
-    Raises:
-        CheckpointError, ValueError: not a plan, or one that contradicts itself.
-    """
-    file = read(_File, read_yaml(text), "the plan")
-    unknown = {line.label for line in file.cells} - set(file.labels)
-    if unknown or file.baseline not in file.labels:
-        raise ValueError(f"it has no label {', '.join(sorted(unknown)) or file.baseline}")
-    return StudyPlan(file.study, file.title, file.baseline, file.axis, tuple(_cells_of(file)), file.note)
-
-
-def _cells_of(file: _File) -> Iterator[Cell]:
-    shared: dict[tuple[str, str], dict[str, Any]] = {}  # of thousands of cells: memory
-    for line in file.cells:
-        label, key = file.labels[line.label], (line.label, line.task)
-        if key not in shared:
-            shared[key] = {**label.settings, "task": [line.task]}
-        seeds = parse_seeds(line.seeds)
-        yield Cell(line.id, line.label, label.overrides, line.task, seeds, shared[key], label.identity, line.repeat)
-
-
-def merge_plans(old: StudyPlan, new: StudyPlan) -> StudyPlan:
-    """`new`, preceded by the cells of `old` with its settings and seeds on tasks that `new` does not name."""
-    if (old.name, old.baseline) != (new.name, new.baseline):
-        return new
-    tasks = {cell.task for cell in new.cells}
-    settings = {(cell.label, cell.repeat): cell.work[0] for cell in new.cells}
-    seeds: dict[tuple[str, int], set[int]] = {}
-    for cell in new.cells:
-        seeds.setdefault((cell.label, cell.repeat), set()).update(cell.seeds)
-    cells = []
-    for cell in old.cells:
-        key = cell.label, cell.repeat
-        shared = [seed for seed in cell.seeds if seed in seeds.get(key, ())]
-        if shared and cell.task not in tasks and cell.work[0] == settings[key]:
-            cells.append(cell.part(shared, cell.id))
-    return replace(new, cells=(*cells, *new.cells))
+def count(number: int, noun: str) -> str:
+    """Return a number with its noun: `1 task`, `2 tasks`."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

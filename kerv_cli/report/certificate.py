@@ -19,10 +19,10 @@ from kerv_cli.base.places import check_not_shipped
 from kerv_cli.base.provenance import provenance
 from kerv_cli.base.registry import METHOD_KINDS, part_of
 from kerv_cli.base.settings import WAITS, RolloutSettings
-from kerv_cli.lab.identity import ENGINE
-from kerv_cli.lab.plan import Cell, seeds_text
-from kerv_cli.lab.policy import artifacts_of
-from kerv_cli.lab.resolve import ResolvedStudy
+from kerv_cli.episodes.identity import ENGINE
+from kerv_cli.episodes.policy import artifacts_of
+from kerv_cli.episodes.resolve import ResolvedStudy
+from kerv_cli.lab.plan import Wanted, seeds_text
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.methods.certified.betting import more_to_decide, p_value
 from kerv_cli.methods.certified.certificate import Candidate, Certificate, CertificateArtifact
@@ -102,12 +102,12 @@ def _difference(kind: str, part: Any, other: Any) -> list[str]:
 
 
 def certify(
-    resolved: ResolvedStudy, store: StudyStore, cells: Sequence[Cell], margin: float, delta: float
+    resolved: ResolvedStudy, store: StudyStore, wanted: Sequence[Wanted], margin: float, delta: float
 ) -> Certificate:
     """Tests the study's settings in their order, each at delta, up to the first that is not shown to lose at most
     `margin` points (fixed-sequence testing: the probability that any certified one loses more is delta at most)."""
     baseline, first = _settings(resolved)[:2]
-    episodes = load_study(store, cells).episodes
+    episodes = load_study(store, wanted).episodes
     episodes = episodes[episodes["repeat"] == 0]  # a repeat is another time, not another pair
     ar = episodes[episodes["label"] == resolved.study.baseline]
     candidates: list[Candidate] = []
@@ -149,7 +149,7 @@ def certify(
         dtype=first.runtime.dtype,
         margin=margin,
         delta=delta,
-        seeds=seeds_text(seed for cell in cells for seed in cell.seeds),
+        seeds=seeds_text(one.seed for one in wanted),
         candidates=candidates,
         chosen=chosen,
         provenance={"command": "kerv calibrate success", "engine": ENGINE, **provenance(first.runtime.device)},

@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 import pandas as pd
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.files import read_table
-from kerv_cli.lab.catalogue import RunEntry, description_of, find_run, store_of
-from kerv_cli.lab.identity import NOT_DETERMINING, OBSERVATION, without
-from kerv_cli.lab.plan import Cell, seeds_text
+from kerv_cli.catalogue.entries import RunEntry, description_of, find_run, store_of
+from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, without
+from kerv_cli.lab.plan import seeds_text
 from kerv_cli.report.measures import MICRO, Row, measure
 from kerv_cli.report.summary import SPEEDS
 from kerv_cli.report.tables import StudyData, flatten, is_number, load_study
@@ -63,7 +62,7 @@ def sides(results: str, name: str) -> list[Side]:
         if label:
             raise UsageError(f"{run.id} is a {run.kind}: it has no setting '{label}'")
         return [Side(run.id, run)]
-    labels = store_of(run).read_plan().labels
+    labels = store_of(run).load().labels
     if label and label not in labels:
         raise UsageError(f"run {run.id} has no setting '{label}': it has {', '.join(labels)}")
     many = len(labels) > 1
@@ -77,7 +76,7 @@ def pairs_to_compare(results: str, first: str, second: str) -> list[tuple[Side, 
 
     Raises:
         UsageError, UnknownName: no such run or setting. UsageError: a training beside a run with episodes, or a run
-            without complete cells. CheckpointError: a damaged one.
+            without episodes. CheckpointError: a damaged one.
     """
     ours, theirs = sides(results, first), sides(results, second)
     if ours[0].run.has_episodes != theirs[0].run.has_episodes:
@@ -91,7 +90,7 @@ def pairs_to_compare(results: str, first: str, second: str) -> list[tuple[Side, 
 
 
 def compare(first: Side, second: Side) -> Comparison:
-    """The differences between two sides. Raises UsageError: a setting without complete cells."""
+    """The differences between two sides. Raises UsageError: a setting without episodes."""
     if first.data is None or second.data is None:
         rows = _training_results(first.run, second.run)
     else:
@@ -112,25 +111,27 @@ def _settings_of(side: Side) -> Row:
         settings: Row = dict(description.get("settings", {}))
         settings.update((key, description[key]) for key in ("git_commit", "versions", "demos") if key in description)
         return flatten(settings)
-    cells = [cell for cell in side.data.plan.cells if cell.label == side.label]
-    settings = flatten(without(cells[0].settings, NOT_DETERMINING - {"policy", "method"}))
-    weights = {name: value[:12] for name, value in cells[0].identity.items() if name != OBSERVATION}
-    statuses = [side.data.cells[cell.id].status for cell in side.data.complete.get(side.label, ())]
+    setting, episodes = side.data.settings[side.label], _episodes(side.data, side.label)
+    settings = flatten(without(setting.settings, NOT_DETERMINING - {"policy", "method"}))
+    weights = {name: value[:12] for name, value in setting.identity.items() if name != OBSERVATION}
     circumstances = {
-        key: ";".join(sorted({str(status.get(key, "")) for status in statuses})) for key in _STATUS_KEYS if statuses
+        key: ";".join(sorted({str(value) for value in episodes[key].dropna()}))
+        for key in _STATUS_KEYS
+        if key in episodes and len(episodes)
     }
-    return {**settings, **weights, **_tasks_and_seeds(cells), **circumstances}
+    return {**settings, **weights, **_tasks_and_seeds(side.data, side.label), **circumstances}
 
 
-def _tasks_and_seeds(cells: list[Cell]) -> Row:
-    tasks = ";".join(sorted({cell.task for cell in cells}))
-    return {"tasks": tasks, "seeds": seeds_text(seed for cell in cells for seed in cell.seeds)}
+def _tasks_and_seeds(data: StudyData, label: str) -> Row:
+    wanted = [one for one in data.study.wanted if one.setting.label == label]
+    tasks = ";".join(sorted({one.task for one in wanted}))
+    return {"tasks": tasks, "seeds": seeds_text(one.seed for one in wanted)}
 
 
 def _episode_results(first: StudyData, ours: str, second: StudyData, theirs: str) -> list[Row]:
     baseline, episodes = _episodes(first, ours), _episodes(second, theirs)
     if baseline.empty or episodes.empty:
-        raise UsageError("one of the two settings has no complete cell: run it to the end first")
+        raise UsageError("one of the two settings has no episode yet: run it first")
     a, b = measure(baseline, baseline, MICRO), measure(episodes, baseline, MICRO, apart=True)
     rows = [
         _row("success", a["success"], b["success"], b, "difference", "difference"),
@@ -184,7 +185,7 @@ def same_tokens(first: RunEntry, second: RunEntry) -> tuple[int, int]:
     """(episodes with equal tokens, episodes) of the settings, tasks and seeds that both runs have.
 
     Raises:
-        CheckpointError: a cell is damaged. UsageError: no complete cell.
+        UsageError: no episode.
     """
     ours, theirs = _tokens(first), _tokens(second)
     shared = ours.keys() & theirs.keys()
@@ -193,11 +194,12 @@ def same_tokens(first: RunEntry, second: RunEntry) -> tuple[int, int]:
 
 def _tokens(run: RunEntry) -> dict[tuple[str, str, int, int], list[list[int]]]:
     store = store_of(run)
-    cells = store.read_plan().cells
-    complete, _ = store.read_cells(cells)
+    frame = store.frame()
     tokens: dict[tuple[str, str, int, int], list[list[int]]] = {}
-    for cell in (cell for cell in cells if cell.id in complete):
-        decodes = read_table(store.cells / cell.id / "decodes.parquet", ["seed", "tokens"]).to_pandas()
-        for seed, group in decodes.groupby("seed"):
-            tokens[cell.label, cell.task, int(str(seed)), cell.repeat] = [list(row) for row in group["tokens"]]
+    if frame.empty:
+        return tokens
+    decodes = store.decodes(frame["episode"].tolist(), ["tokens"]).to_pandas()
+    keys = list(zip(*(frame[name] for name in ("label", "task", "seed", "repeat")), strict=True))
+    for position, group in decodes.groupby("episode"):
+        tokens[keys[int(str(position))]] = [list(row) for row in group["tokens"]]
     return tokens

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import write_bytes
+from kerv_cli.lab.runs import Curve
 from kerv_cli.report.drawing import COLOURS, MUTED, STYLE, entitle, figure_bytes, new_figure
 
 _COLUMNS = 3  # panels beside one another
@@ -21,7 +22,10 @@ def read_log(folder: Path) -> pd.DataFrame:
     Raises:
         CheckpointError: no log there, or not one that a training wrote.
     """
-    path = folder / "log.csv"
+    rows = Curve.of(folder).read() if folder.parent.parent.name == "artifacts" else []
+    if rows:
+        return pd.DataFrame(rows)
+    path = folder / "log.csv"  # travels with an artifact, also without its database
     try:
         log = pd.read_csv(path)
     except (OSError, ValueError) as error:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import NormalDist
@@ -21,10 +21,12 @@ import pandas as pd
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import read_json, write_json
-from kerv_cli.lab.plan import Cell
+from kerv_cli.lab.plan import Wanted
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.study import Judge
 from kerv_cli.report import statistics as stats
 from kerv_cli.report.measures import MICRO, Row, pair_counts, paired
-from kerv_cli.report.tables import StudyData, is_baseline, is_number, rows_of
+from kerv_cli.report.tables import StudyData, is_baseline, is_number, load_study, rows_of
 from kerv_cli.report.text import interval
 
 POINTS = 100.0
@@ -206,7 +208,7 @@ def verdict_of(label: str, counts: stats.PairedCounts, margin: float, look: int,
 def verdicts(data: StudyData, labels: Sequence[str], margin: float, look: int, looks: int) -> list[Verdict]:
     """Judges the settings of these labels by all their pairs with the baseline."""
     episodes = data.episodes[data.episodes["repeat"] == 0]
-    baseline = episodes[episodes["label"] == data.plan.baseline]
+    baseline = episodes[episodes["label"] == data.study.baseline]
     answers = []
     for label in labels:
         counts = pair_counts(paired(episodes[episodes["label"] == label], baseline))
@@ -214,13 +216,23 @@ def verdicts(data: StudyData, labels: Sequence[str], margin: float, look: int, l
     return answers
 
 
-def looks_of(cells: Sequence[Cell], block: int) -> list[list[Cell]]:
-    """The plan's cells by block of so many seeds: one look each."""
-    first = min(cell.seeds[0] for cell in cells)
-    groups: dict[int, list[Cell]] = {}
-    for cell in cells:
-        groups.setdefault((cell.seeds[0] - first) // block, []).append(cell)
-    return [groups[number] for number in sorted(groups)]
+def judge(loss: float, tell: Callable[[str], None]) -> Judge:
+    """Return the `judge` of `study.run` for a bound on the loss of success.
+
+    Args:
+        loss: The bound, in points.
+        tell: Takes a line of progress.
+    """
+    latest: dict[str, Verdict] = {}
+
+    def ask(store: StudyStore, wanted: Sequence[Wanted], labels: Sequence[str], look: int, looks: int) -> list[str]:
+        answers = verdicts(load_study(store, wanted), labels, loss / POINTS, look, looks)
+        tell(f"look {look} of {looks}: {progress_line(answers)}")
+        latest.update({answer.label: answer for answer in answers})
+        write_verdicts(store.root, latest, loss, looks)
+        return [answer.label for answer in answers if answer.verdict == OPEN]
+
+    return ask
 
 
 def write_verdicts(folder: Path, answers: Mapping[str, Verdict], loss: float, looks: int) -> None:

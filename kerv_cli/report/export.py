@@ -12,12 +12,19 @@ from pathlib import Path
 import pandas as pd
 
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.lab.catalogue import RunEntry, description_of, store_of
+from kerv_cli.base.files import atomic_path
+from kerv_cli.catalogue.entries import RunEntry, description_of, store_of
+from kerv_cli.catalogue.stored import export_database
+from kerv_cli.episodes.rows import DECODE_SCHEMA
+from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.curves import read_log
 from kerv_cli.report.measures import MICRO
 from kerv_cli.report.tables import flatten, load_study, rows_of, write_csv
 
 PROJECT = "kerv"
+FILES = ("csv", "parquet", "db")
+"""What is written without a tracker."""
+_AT_ONCE = 100
 
 
 @dataclass(frozen=True)
@@ -38,12 +45,40 @@ def export(run: RunEntry, to: str, folder: Path) -> list[str]:
     Raises:
         UnknownName: no such tracker. UsageError: its package is not installed; the message says how to install it.
     """
-    if to not in TRACKERS:
-        raise UnknownName("tracker", to, TRACKERS)
-    if to != "csv" and importlib.util.find_spec(to) is None:
+    if to not in (*FILES, *TRACKERS):
+        raise UnknownName("tracker", to, (*FILES, *TRACKERS))
+    if to in ("db", "parquet"):
+        store = store_of(run)
+        return [str(export_database(store, folder / run.id))] if to == "db" else _to_parquet(store, folder / run.id)
+    if to not in FILES and importlib.util.find_spec(to) is None:
         raise UsageError(f"--to {to} needs the package {to}: pip install 'kerv[{to}]'")
     folder.mkdir(parents=True, exist_ok=True)
     return [TRACKERS[to](tracked, folder) for tracked in tracked_runs(run)]
+
+
+def _to_parquet(store: StudyStore, folder: Path) -> list[str]:
+    """Write episodes.parquet and decodes.parquet; the episodes of a hundred are in memory at once."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    frame = store.frame()
+    if frame.empty:
+        raise UsageError(f"study '{store.name}' has no episode yet: {store.how_to_run()}")
+    keys = ["label", "task", "seed", "repeat"]
+    folder.mkdir(parents=True, exist_ok=True)
+    episodes, decodes = folder / "episodes.parquet", folder / "decodes.parquet"
+    with atomic_path(episodes) as path:
+        table = pa.Table.from_pandas(frame.drop(columns=["episode", "decode_seconds"]), preserve_index=False)
+        pq.write_table(table, path, compression="zstd")
+    schema = pa.schema([*(table.schema.field(key) for key in keys), *DECODE_SCHEMA])
+    with atomic_path(decodes) as path, pq.ParquetWriter(path, schema, compression="zstd") as writer:
+        for at in range(0, len(frame), _AT_ONCE):
+            part = frame.iloc[at : at + _AT_ONCE]
+            rows = store.decodes(list(part["episode"]))
+            of = pa.Table.from_pandas(part[keys], preserve_index=False).take(rows["episode"])
+            columns = [*of.columns, *(rows[name] for name in DECODE_SCHEMA.names)]
+            writer.write_table(pa.table(columns, names=schema.names).cast(schema))
+    return [str(episodes), str(decodes)]
 
 
 def tracked_runs(run: RunEntry) -> Iterator[Tracked]:
@@ -59,8 +94,8 @@ def tracked_runs(run: RunEntry) -> Iterator[Tracked]:
             values = {name: float(episode[name]) for name in ("success", "steps", "forwards", "decodes", "seconds")}
             values["ms_per_step"] = 1000 * values["seconds"] / values["steps"]
             history.append((number, values))
-        cell = next(cell for cell in data.plan.cells if cell.label == row["label"])
-        config = {"kind": run.kind, "run": run.id, **flatten(cell.settings), **cell.identity}
+        setting = data.settings[row["label"]]
+        config = {"kind": run.kind, "run": run.id, **flatten(setting.settings), **setting.identity}
         numbers = {name: float(value) for name, value in row.items() if _is_measure(value)}
         yield Tracked(f"{run.id} {row['label']}", run.id, config, history, numbers)
 

@@ -7,7 +7,7 @@ import json
 import pandas as pd
 
 from kerv_cli.base.settings import REAL
-from kerv_cli.lab.identity import Plain
+from kerv_cli.episodes.identity import Plain
 from kerv_cli.report.measures import MICRO, measure
 from kerv_cli.report.tables import StudyData, is_autoregressive, rows_of
 from kerv_cli.report.text import LOST_WON, Column, compared, intervals, lost_won, numbers, p_value, shares, text_frame
@@ -21,9 +21,9 @@ def latency_table(data: StudyData) -> pd.DataFrame | None:
     """One row per setting whose world goes on during a decode, pooled over tasks: its latency, its success, and the
     difference from AR with the same `rollout.*` in the same episodes. `ar_latency_ms`: mean latency of AR's decodes in
     those episodes. None where every world waits, or no setting is AR."""
-    settings = {cell.label: cell.settings for cell in reversed(data.plan.cells)}
+    settings = {label: setting.settings for label, setting in data.settings.items()}
     episodes = {str(label): group for label, group in data.episodes.groupby("label", sort=False)}
-    real = [label for label in data.plan.labels if label in episodes and settings[label]["rollout"]["clock"] == REAL]
+    real = [label for label in data.labels if settings[label]["rollout"]["clock"] == REAL]
     references = {_key(settings[label]): label for label in reversed(real) if is_autoregressive(settings[label])}
     rows = []
     for label in real:
@@ -32,7 +32,7 @@ def latency_table(data: StudyData) -> pd.DataFrame | None:
             continue
         values = measure(episodes[label], episodes[reference], MICRO)
         ar = episodes[reference]
-        head = {"study": data.plan.name, "label": label, "method": settings[label]["method"], "ar": reference}
+        head = {"study": data.study.name, "label": label, "method": settings[label]["method"], "ar": reference}
         timing = {f"rollout.{name}": value for name, value in settings[label]["rollout"].items()}
         latency = {"ar_latency_ms": 1000.0 * float(ar["delay_seconds"].sum() / ar["delay_decodes"].sum())}
         measures = {name: values[name] for name in (*_FELT, *_SUCCESS, *_DIFFERENCE)}

@@ -1,4 +1,4 @@
-"""The measures of docs/methods.md §7, from rows of episodes.parquet."""
+"""The measures of docs/methods.md §7, from rows of the table `episodes`."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ def paired(episodes: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
         agree &= elsewhere | (both[f"{name}_method"] == both[f"{name}_baseline"])
     both = both[agree].sort_values(keys, kind="stable").reset_index(drop=True)
     both["same_run"] = both["run_method"] == both["run_baseline"]
-    both["same_block"] = both["same_run"] & (both["block_method"] == both["block_baseline"])
+    both["same_block"] = both["block_method"] == both["block_baseline"]
     return both.rename(columns={"difficulty_method": "difficulty"})
 
 

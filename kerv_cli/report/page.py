@@ -55,15 +55,16 @@ def render(
     answer, is_shown = verdict(data.table, loss)
     return template.render(
         name=store.name,
-        title=data.plan.title or store.name,
+        title=data.study.title or store.name,
         verdict=answer[:1].upper() + answer[1:],
         is_shown=is_shown,
         caution=caution(data.table),
-        note=data.plan.note,
+        note=data.study.note,
         about=_about(data.table),
-        baseline=data.plan.baseline,
-        absent=[f"{cell.label} on {cell.task}" for cell in data.absent],
-        planned=len({cell.id for cell in data.plan.cells}),
+        baseline=data.study.baseline,
+        absent=list(dict.fromkeys(f"{one.setting.label} on {one.task}" for one in data.absent)),
+        missing=len(data.absent),
+        planned=len(data.study.wanted),
         how_to_run=_how_to_run(store),
         suite=_suite(data.table),
         reasons=differences(rows_of(data.table, MICRO)),
@@ -73,7 +74,7 @@ def render(
         tasks=_by_task(data.per_task),
         recordings=[(path.stem, _href(path, store.root)) for path in store.recordings],
         files=[(path.name, _href(path, store.root)) for path in files if path.suffix == ".csv"],
-        commands=[(cell.label, cell.overrides) for cell in {c.label: c for c in data.plan.cells}.values()],
+        commands=[(setting.label, setting.overrides) for setting in data.study.settings],
     )
 
 
@@ -133,7 +134,7 @@ def _suite(whole: pd.DataFrame) -> pd.DataFrame:
 
 def _how_to_run(store: StudyStore) -> str:
     """The command that completes the study, wherever its results lie."""
-    results = str(store.root.parent.parent)
+    results = str(store.database.results)
     where = "" if results == "results" else f" results={shlex.quote(results)}"
     return f"Run `kerv sweep study={store.name}{where}`"
 

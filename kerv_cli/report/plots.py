@@ -4,7 +4,7 @@ against speed; success task by task."""
 from __future__ import annotations
 
 import math
-import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -127,14 +127,21 @@ def series_of(rows: pd.DataFrame, axis: str) -> dict[str, pd.DataFrame]:
     numbers = axis_numbers(methods, axis)
     series: dict[str, pd.DataFrame] = {}
     keys = [methods[name].map(str) for name in varying] + [methods["label"].where(numbers.isna(), "")]
-    for _, group in methods.groupby(keys, sort=False):
-        stems = {_stem(str(label), axis) for label in group["label"]}
-        name = str(group["label"].iloc[0]) if len(group) == 1 else stems.pop()
-        if len(group) > 1 and (stems or name in series):
-            shared = [f"{key.split('.')[-1]} {group[key].iloc[0]}" for key in varying if "sha256" not in key]
-            name = ", ".join([str(group["method"].iloc[0]), *shared])
+    groups = [group for _, group in methods.groupby(keys, sort=False)]
+    shared = Counter(name for group in groups if len(group) > 1 for name in set(group["name"]))
+    for group in groups:
+        first = group.iloc[0]
+        name = str(first["label"])
         if len(group) > 1:
-            group = pd.concat([group, rows[reference & (rows["label"].map(lambda x: _stem(x, axis)) == name)]])
+            same = group["name"].nunique() == 1
+            name = str(first["name"] if same else first["method"])
+            if not same or shared[name] > 1:
+                values = [f"{key.split('.')[-1]} {first[key]}" for key in varying if "sha256" not in key]
+                name = ", ".join([name, *values])
+            point = reference & (rows["name"] == first["name"])
+            for key in varying:
+                point &= rows[key].map(str) == str(first[key])
+            group = pd.concat([group, rows[point]])
         series[name] = group.assign(x=axis_numbers(group, axis)).sort_values("x")
     return series
 
@@ -150,11 +157,6 @@ def axis_numbers(rows: pd.DataFrame, axis: str) -> pd.Series:
     values = rows[axis] if axis in rows else pd.Series(math.nan, index=rows.index)
     values = values.map(lambda value: math.nan if isinstance(value, bool | np.bool_) else value)
     return pd.to_numeric(values, errors="coerce")
-
-
-def _stem(label: str, axis: str) -> str:
-    """A grid's label without the axis: `fused f_star=0.3` -> `fused`."""
-    return re.sub(rf"\s+{re.escape(axis.rsplit('.', 1)[-1])}=\S+", "", label)
 
 
 def _against_axis(rows: pd.DataFrame, axis: str, title: str, about: str) -> Figure:

@@ -20,13 +20,13 @@ def refusals(table: pd.DataFrame) -> list[str]:
     clauses = []
     commits = values_of(table, "git_commit")
     if any(commit.endswith("+changes") or commit in ("none", "nan", "") for commit in commits):
-        clauses.append("some cells were computed by code that is not committed")
+        clauses.append("some episodes were computed by code that is not committed")
     if len(commits) > 1:
-        clauses.append(f"its cells are of {len(commits)} commits")
+        clauses.append(f"its episodes are of {len(commits)} commits")
     for column, what in (("host", "machines"), ("device_name", "devices"), ("engine", "engines")):
         names = values_of(table, column)
         if len(names) > 1:
-            clauses.append(f"its cells are of {len(names)} {what}")
+            clauses.append(f"its episodes are of {len(names)} {what}")
     compared = table[(table["label"] != table["baseline"]) & (table["pairs"] > 0)]
     for column, value, what in (("same_run", True, "in one run with"), ("same_block", 1.0, "in turn with")):
         apart = list(dict.fromkeys(compared.loc[compared[column] != value, "label"]))
@@ -36,11 +36,11 @@ def refusals(table: pd.DataFrame) -> list[str]:
 
 
 def check_publishable(data: StudyData) -> None:
-    """Raises Unpublishable: cells are missing, or there are `refusals`; its line lists them all."""
-    clauses = [f"{len(data.absent)} of its cells are missing"] if data.absent else []
+    """Raises Unpublishable: episodes are missing, or there are `refusals`; its line lists them all."""
+    clauses = [f"{len(data.absent)} of its episodes are missing"] if data.absent else []
     clauses += refusals(data.table)
     if clauses:
         raise Unpublishable(
-            f"study {data.plan.name} may not be published: {'; '.join(clauses)}. Commit, then run 'kerv sweep "
-            f"study={data.plan.name}' into a fresh results folder on one machine"
+            f"study {data.study.name} may not be published: {'; '.join(clauses)}. Commit, then run 'kerv sweep "
+            f"study={data.study.name}' into a fresh results folder on one machine"
         )

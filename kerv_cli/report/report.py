@@ -1,17 +1,19 @@
-"""Writes the tables, plots and self-contained page of each study from its stored cells."""
+"""Writes the tables, plots and self-contained page of each study from its stored episodes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 from matplotlib.figure import Figure
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.files import write_text
-from kerv_cli.lab.store import StudyStore, begun_studies
+from kerv_cli.base.files import write_json, write_text
+from kerv_cli.lab.database import Database
+from kerv_cli.lab.store import ROLLOUT, StudyStore, studies
 from kerv_cli.report.drawing import save_plot
 from kerv_cli.report.latency import latency_summary, latency_table
 from kerv_cli.report.measures import MICRO
@@ -20,14 +22,15 @@ from kerv_cli.report.plots import about, has_task_map, latency_figure, study_fig
 from kerv_cli.report.publish import check_publishable
 from kerv_cli.report.reprice import ASSUMES, open_profiles, repriced_summary, repriced_table
 from kerv_cli.report.stressed import is_stressed, summed_table
-from kerv_cli.report.tables import StudyData, load_study, write_csv
+from kerv_cli.report.tables import CSV_COLUMNS, StudyData, further_of, load_study, write_csv
 
 
 def names_to_report(results: Path | str, study: str | None) -> list[str]:
-    """The study of that name; None: every study that has a complete cell. Raises UsageError: there is none."""
-    names = [study] if study else begun_studies(results)
+    """The study of that name; None: every study that has an episode. Raises UsageError: there is none."""
+    there = [] if study else [one for one in studies(Database(results)) if one.kind != ROLLOUT and one.counts()[0]]
+    names = [study] if study else sorted(store.name for store in there)
     if not names:
-        raise UsageError(f"no study in {Path(results) / 'studies'} has a complete cell: run `kerv sweep study=demo`")
+        raise UsageError(f"no study in {results} has an episode: run `kerv sweep study=demo`")
     return names
 
 
@@ -48,16 +51,16 @@ def report(
     on: Sequence[str] = (),
     loss: float = LOSS,
 ) -> Report:
-    """Writes a study's files, or those of every study that has a complete cell.
+    """Writes a study's files, or those of every study that has an episode.
 
-    In report/, or to publish in the results folder itself: tables/<study>.csv and <study>_per_task.csv,
+    In report/, or to publish in the results folder itself: tables/<study>.csv, <study>_per_task.csv and <study>.json,
     plots/<study>*.png; with `on`, names of profiles, tables/<study>_on.csv. Always
-    studies/<study>/report.html, whose verdict allows `loss` points of success. The same cells give the same bytes.
+    studies/<study>/report.html, whose verdict allows `loss` points of success. The same episodes give the same bytes.
 
     Raises:
         UsageError: no such study, or nothing to report; the message names what to run.
         Unpublishable: a study that may not be published; nothing of it is written.
-        CheckpointError: a cell is damaged.
+        CheckpointError: the database is damaged.
         StorageError: the disk refused.
     """
     if on and not study:
@@ -67,7 +70,7 @@ def report(
     for name in names:
         store = StudyStore(results, name)
         data = load_study(store)
-        output.priced = repriced_table(data, profiles) if profiles else None
+        output.priced = repriced_table(data, store, profiles) if profiles else None
         output.files += write_study(store, data, loss, publish, output.priced)
         output.tables[name] = data.table
     return output
@@ -82,14 +85,15 @@ def write_study(
         data: of the whole study.
         priced: its decodes at the costs of other machines, `repriced_table`.
     """
-    results = store.root.parent.parent
+    results = store.database.results
     if publish:
         check_publishable(data)
     files = _Files(results if publish else results / "report")
-    files.add_table(data.table, store.name)
-    files.add_table(data.per_task, f"{store.name}_per_task")
-    title = data.plan.title or store.name
-    figures = study_figures(data.table, data.plan.axis, title)
+    files.add_table(data.table[list(CSV_COLUMNS)], store.name)
+    files.add_table(data.per_task[list(CSV_COLUMNS)], f"{store.name}_per_task")
+    files.add_json(further_of(data), store.name)
+    title = data.study.title or store.name
+    figures = study_figures(data.table, data.study.axis, title)
     if has_task_map(data.per_task):
         figures["_tasks"] = task_map(
             data.per_task, f"{title}: task by task", about(data.table, "successes of each task")
@@ -113,6 +117,11 @@ class _Files:
         """Writes tables/<name>.csv."""
         self.paths.append(write_csv(table, self.folder / "tables" / f"{name}.csv"))
 
+    def add_json(self, value: Mapping[str, Any], name: str) -> None:
+        """Writes tables/<name>.json."""
+        self.paths.append(self.folder / "tables" / f"{name}.json")
+        write_json(self.paths[-1], value)
+
     def add_plot(self, figure: Figure, name: str) -> str:
         """Writes plots/<name>.png -> the figure's HTML element."""
         self.paths.append(self.folder / "plots" / f"{name}.png")
@@ -133,7 +142,7 @@ def _latency_section(data: StudyData, files: _Files) -> Section | None:
     table = latency_table(data)
     if table is None:
         return None
-    name, title = f"{data.plan.name}_latency", "Success against the time that AR takes"
+    name, title = f"{data.study.name}_latency", "Success against the time that AR takes"
     files.add_table(table, name)
     subtitle = f"{table['episodes'].max()} episodes per setting, {MICRO}"
     return Section(
@@ -149,7 +158,7 @@ def _stress_section(data: StudyData, files: _Files) -> Section | None:
     if not is_stressed(data.table):
         return None
     table = summed_table(data.table)
-    name, title = f"{data.plan.name}_summed", "Summed over levels, and over kinds"
+    name, title = f"{data.study.name}_summed", "Summed over levels, and over kinds"
     files.add_table(table, name)
     fields = table.drop(columns="label").rename(columns={"sum": "task", "method": "label"})
     figure = task_map(fields, title, about(data.table, "successes over all tasks"))

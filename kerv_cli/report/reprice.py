@@ -13,10 +13,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.files import read_table
 from kerv_cli.base.places import as_path, shipped_dir
 from kerv_cli.engine.cost import READ_PHASES, Profile, Work, missing, prices, read_profile, work_of
-from kerv_cli.lab.identity import batch_of
+from kerv_cli.episodes.identity import batch_of
+from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MICRO, Row, decodes, measure
 from kerv_cli.report.summary import SPEEDS
 from kerv_cli.report.tables import StudyData, rows_of
@@ -26,7 +26,7 @@ ASSUMES = (
     "Speed against the baseline by the cost model: the recorded decodes at a profile's costs, as if the other machine "
     "and target decoded the same tokens in the same control steps; success is the recorded policy's"
 )
-_COLUMNS = ("seed", "index", "rounds", "similarity", *(f"seconds.{phase}" for phase in READ_PHASES))
+_COLUMNS = ("index", "rounds", "similarity", *(f"seconds.{phase}" for phase in READ_PHASES))
 _SHIPPED = "-profile.json"
 _ROUND = ("mode", "proposer", "start", "tree_size", "accepted")
 _TIMES = ("time_per_episode_ms", "time_per_step_ms", "latency_p95_ms")
@@ -71,7 +71,7 @@ def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfil
     return profiles
 
 
-def repriced_table(data: StudyData, profiles: Sequence[NamedProfile]) -> pd.DataFrame:
+def repriced_table(data: StudyData, store: StudyStore, profiles: Sequence[NamedProfile]) -> pd.DataFrame:
     """One row per machine and label, pooled over tasks: speeds against the baseline there, per episode and per control
     step, with their intervals; times; and the speeds as they were measured.
 
@@ -80,8 +80,8 @@ def repriced_table(data: StudyData, profiles: Sequence[NamedProfile]) -> pd.Data
             times of its own.
     """
     episodes = {str(label): group for label, group in data.episodes.groupby("label", sort=False)}
-    labels = [label for label in data.plan.labels if label in episodes and decodes(episodes[label])]
-    works = {label: _label_work(data, label) for label in labels}
+    labels = [label for label in data.labels if decodes(episodes[label])]
+    works = {label: _label_work(data, label, store) for label in labels}
     rows = []
     for named in profiles:
         _check(named, works)
@@ -93,7 +93,7 @@ def repriced_table(data: StudyData, profiles: Sequence[NamedProfile]) -> pd.Data
             measured = measure(episodes[label], episodes.get(reference, episodes[label].iloc[:0]), MICRO)
             rows.append(
                 {
-                    "study": data.plan.name,
+                    "study": data.study.name,
                     "label": label,
                     "baseline": reference,
                     "on": named.name,
@@ -123,29 +123,19 @@ class LabelWork:
     size: int
 
 
-def _label_work(data: StudyData, label: str) -> LabelWork:
-    """The decodes of a label's cells, in the order of its episodes."""
-    cells = data.complete[label]
-    if (batch := batch_of(cells[0].settings)) > 1:
+def _label_work(data: StudyData, label: str, store: StudyStore) -> LabelWork:
+    """Return the decodes of a label, in the order of its episodes."""
+    setting = data.settings[label]
+    if (batch := batch_of(setting.settings)) > 1:
         raise UsageError(
             f"setting '{label}' ran {batch} episodes at a time, without times: run it with rollout.batch=1"
         )
-    tables, owners, first = [], [], 0
-    for cell in cells:
-        stored = data.cells[cell.id]
-        seeds = stored.of(cell)["seed"].tolist()
-        table = read_table(stored.folder / "decodes.parquet", _COLUMNS)
-        row_of = {seed: first + number for number, seed in enumerate(seeds)}
-        keep = pc.is_in(table["seed"], pa.array(seeds, pa.int64()))
-        table = table.filter(keep)
-        owners.append(np.array([row_of[seed] for seed in table["seed"].to_pylist()]))
-        tables.append(table)
-        first += len(seeds)
-    whole = pa.concat_tables(tables, promote_options="default").combine_chunks()
-    proposer = cells[0].settings.get("proposer", {})
+    episodes = data.episodes.loc[data.episodes["label"] == label, "episode"]
+    whole = store.decodes(episodes.tolist(), _COLUMNS).combine_chunks()
+    proposer = setting.settings.get("proposer", {})
     drafter = (int(proposer["depth"]), int(proposer["top_k"])) if "top_k" in proposer else None
     work, size = _work(whole, drafter)
-    return LabelWork(work, np.concatenate(owners), size)
+    return LabelWork(work, whole["episode"].to_numpy(), size)
 
 
 def _work(table: pa.Table, drafter: tuple[int, int] | None) -> tuple[Work, int]:

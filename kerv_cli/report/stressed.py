@@ -3,7 +3,6 @@ autoregressive decoding under the same stress."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 
 import pandas as pd
@@ -22,19 +21,14 @@ def is_stressed(table: pd.DataFrame) -> bool:
     return table["stress"].nunique() > 1 or table["stress_level"].nunique() > 1
 
 
-def stem(label: str) -> str:
-    """A setting's label without its stress: `one_pass, kind=push level=2` -> `one_pass`."""
-    return re.sub(r",?\s+(kind|level)=\S+", "", label)
-
-
 def by_kind(table: pd.DataFrame) -> dict[str, dict[str, list[Row]]]:
     """Kind -> method -> rows of the table along the level, beginning with the method's unstressed row."""
     rows = rows_of(table, MICRO)
-    plain = {stem(str(row["label"])): row for row in rows if row["stress"] == NONE}
+    plain = {str(row["unstressed"]): row for row in rows if row["stress"] == NONE}
     kinds: dict[str, dict[str, list[Row]]] = {}
     for row in rows:
         if row["stress"] != NONE:
-            kinds.setdefault(str(row["stress"]), {}).setdefault(stem(str(row["label"])), []).append(row)
+            kinds.setdefault(str(row["stress"]), {}).setdefault(str(row["unstressed"]), []).append(row)
     return {
         kind: {
             name: sorted([*([plain[name]] if name in plain else []), *group], key=lambda row: int(row["stress_level"]))
@@ -57,16 +51,16 @@ def summed_table(table: pd.DataFrame) -> pd.DataFrame:
         with the endings _low and _high.
     """
     rows = [row for row in rows_of(table, MICRO) if row["stress"] != NONE]
-    reference = stem(str(table["baseline"].iloc[0]))
+    reference = _reference(table)
     kinds = sorted({str(row["stress"]) for row in rows})
     levels = sorted({int(row["stress_level"]) for row in rows})
     groups = {kind: [row for row in rows if row["stress"] == kind] for kind in kinds}
     groups |= {f"level {level}": [row for row in rows if int(row["stress_level"]) == level] for level in levels}
     groups["all"] = rows
     return pd.DataFrame(
-        _sum([row for row in group if stem(str(row["label"])) == method], method, name, reference)
+        _sum([row for row in group if row["unstressed"] == method], method, name, reference)
         for name, group in groups.items()
-        for method in _stems(group)
+        for method in _names(group)
     )
 
 
@@ -90,17 +84,24 @@ def verdict(table: pd.DataFrame) -> str:
     """In which levels of which kinds each method falls behind the baseline, in one sentence."""
     behind = [row for row in rows_of(table, MICRO) if row["pairs"] and row["difference"] <= -BEHIND]
     behind = [row for row in behind if row["label"] != row["baseline"]]
-    reference = stem(str(table["baseline"].iloc[0]))
+    reference = _reference(table)
     bound = f"{100 * BEHIND:.0f} points of success or more behind {reference} under the same stress"
     if not behind:
         return f"No method falls {bound}."
-    methods = {name: [row for row in behind if stem(str(row["label"])) == name] for name in _stems(behind)}
+    methods = {name: [row for row in behind if row["unstressed"] == name] for name in _names(behind)}
     clauses = [f"{name}: {_levels_text(rows)}" for name, rows in methods.items()]
     return f"{bound} (* with 95 % confidence behind it): {'; '.join(clauses)}."
 
 
-def _stems(rows: Iterable[Row]) -> list[str]:
-    return list(dict.fromkeys(stem(str(row["label"])) for row in rows))
+def _names(rows: Iterable[Row]) -> list[str]:
+    return list(dict.fromkeys(str(row["unstressed"]) for row in rows))
+
+
+def _reference(table: pd.DataFrame) -> str:
+    """Return what the baseline is called, whatever its stress."""
+    baseline = table["baseline"].iloc[0]
+    same = table.loc[table["label"] == baseline, "unstressed"]
+    return str(same.iloc[0] if len(same) else baseline)
 
 
 def _levels_text(rows: Iterable[Row]) -> str:

@@ -1,21 +1,22 @@
-"""Tables of a study from its stored cells: per task and aggregated, as data frames and CSV files."""
+"""Tables of a study from its stored episodes: per task and aggregated, as data frames and CSV files."""
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_text
 from kerv_cli.base.provenance import PACKAGES
 from kerv_cli.base.settings import MODEL
-from kerv_cli.lab.identity import (
+from kerv_cli.episodes.identity import (
     NOT_DETERMINING,
     NOT_DETERMINING_RUNTIME,
     OBSERVATION,
@@ -25,45 +26,88 @@ from kerv_cli.lab.identity import (
     without,
     work_of,
 )
-from kerv_cli.lab.plan import Cell, StudyPlan, seeds_text
-from kerv_cli.lab.store import StoredCell, StudyStore
+from kerv_cli.lab.plan import Setting, Study, Wanted, seeds_text
+from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MACRO, MICRO, Row, measure
 from kerv_cli.worlds import specs
 
+_RUNTIME = ("device", "dtype", "threads")
 _MACHINE = ("executor", "workers", "device_name", "host")
 _CODE = ("git_commit", "engine", "code", "run")
+CSV_COLUMNS = (
+    "study", "averaging", "label", "method", "stress", "stress_level", "task", "seeds", "episodes", "baseline",
+    "successes", "success", "success_low", "success_high", "speedup", "speedup_low", "speedup_high",
+    "episode_speedup", "episode_speedup_low", "episode_speedup_high", "time_per_step_ms",
+    "time_per_episode_ms", "latency_p50_ms", "latency_p95_ms", "latency_worst_ms", "AL", "forwards_per_step",
+    "skip_rate", "unverified_share", "compensation_rate", "retrieval_share", "deviation", "pairs", "only_baseline",
+    "only_method", "mcnemar_p", "difference", "difference_low", "difference_high", "non_inferior", "pairs_to_settle",
+    "steps", "decodes", "steps_to_success",
+)  # fmt: skip
+"""Columns of a study's CSV files. The other measures and the settings are in `further_of`, tables/<study>.json."""
 _STATUS_COLUMNS = (*_MACHINE, *(f"{name}_version" for name in PACKAGES), "python_version", *_CODE)
 
 
 @dataclass(frozen=True)
 class StudyData:
-    """A study's plan and the episodes of its complete cells; its tables are computed once."""
+    """A study and those of its episodes that are there; its tables are computed once.
 
-    plan: StudyPlan
-    cells: dict[str, StoredCell]  # by id
-    episodes: pd.DataFrame  # one row per label and episode
-    absent: list[Cell]  # planned, not complete
+    Attributes:
+        study: Its settings and what it wants.
+        episodes: A row per label, task, seed and repeat; columns of `StudyStore.frame` and those of `_labelled`.
+    """
+
+    study: Study
+    episodes: pd.DataFrame
+
+    @functools.cached_property
+    def settings(self) -> dict[str, Setting]:
+        """Label -> its setting."""
+        return {setting.label: setting for setting in self.study.settings}
+
+    @functools.cached_property
+    def labels(self) -> list[str]:
+        """Labels that have episodes, in the study's order."""
+        there = set(self.episodes["label"])
+        return [label for label in self.study.labels if label in there]
+
+    @property
+    def absent(self) -> list[Wanted]:
+        """Episodes that are wanted and not there."""
+        names = ("label", "task", "seed", "repeat")
+        there = set(zip(*(self.episodes[name] for name in names), strict=True))
+        return [one for one in self.study.wanted if (one.setting.label, *one.key[1:]) not in there]
 
     @functools.cached_property
     def references(self) -> dict[str, str]:
-        """Label -> the label that it is compared with: the baseline's setting under its own stress where the study has
-        it, else the baseline."""
-        first = {cell.label: cell for cell in reversed(self.plan.cells)}
-        baseline = first.get(self.plan.baseline)
+        """Label -> the label that it is compared with.
+
+        It is the baseline's setting under its own stress if the study has it, else the baseline.
+        """
+        baseline = self.settings.get(self.study.baseline)
         if baseline is None:
-            return dict.fromkeys(first, self.plan.baseline)
-        same = {_stress(cell): label for label, cell in first.items() if _unstressed(cell) == _unstressed(baseline)}
-        same[_stress(baseline)] = self.plan.baseline
-        return {label: same.get(_stress(cell), self.plan.baseline) for label, cell in first.items()}
+            return dict.fromkeys(self.settings, self.study.baseline)
+        plain = _unstressed(baseline)
+        same = {_stress(one): label for label, one in self.settings.items() if _unstressed(one) == plain}
+        same[_stress(baseline)] = self.study.baseline
+        return {label: same.get(_stress(one), self.study.baseline) for label, one in self.settings.items()}
 
     @functools.cached_property
-    def complete(self) -> dict[str, list[Cell]]:
-        """Label -> its complete cells, in the plan's order."""
-        cells: dict[str, list[Cell]] = {}
-        for cell in self.plan.cells:
-            if cell.id in self.cells:
-                cells.setdefault(cell.label, []).append(cell)
-        return cells
+    def unstressed(self) -> dict[str, str]:
+        """Label -> what the setting is called in a study of stress, whatever its stress.
+
+        It is the label of the same setting without stress. Without one it is the method, or if several such settings
+        share a method the first label.
+        """
+        groups: dict[str, list[Setting]] = {}
+        for setting in self.study.settings:
+            groups.setdefault(_unstressed(setting), []).append(setting)
+        methods = Counter(str(group[0].settings["method"]) for group in groups.values())
+        names: dict[str, str] = {}
+        for group in groups.values():
+            plain, method = [one for one in group if not _stress(one)[1]], str(group[0].settings["method"])
+            name = plain[0].label if plain else method if methods[method] == 1 else group[0].label
+            names |= {one.label: one.label if one in plain else name for one in group}
+        return names
 
     @functools.cached_property
     def table(self) -> pd.DataFrame:
@@ -72,62 +116,51 @@ class StudyData:
 
     @functools.cached_property
     def per_task(self) -> pd.DataFrame:
-        """One row per task and label: tasks by name, labels in the plan's order."""
+        """One row per task and label: tasks by name, labels in the study's order."""
         by_task = [episodes for _, episodes in self.episodes.groupby("task", sort=True)]
         return _frame([row for episodes in by_task for row in _rows(self, episodes, "one task")])
 
 
-def _stress(cell: Cell) -> tuple[str, int]:
-    stress = stress_of(cell.settings)
+def _stress(setting: Setting) -> tuple[str, int]:
+    stress = stress_of(setting.settings)
     return stress["kind"], stress["level"]
 
 
-def _unstressed(cell: Cell) -> str:
-    """Hash of what determines a setting, apart from its stress."""
-    plain = {**cell.settings, "world": without(cell.settings["world"], {"stress"})}
-    return work_of(plain, cell.identity)
+def _unstressed(setting: Setting) -> str:
+    """Return the hash of what determines a setting, apart from its stress."""
+    plain = {**setting.settings, "world": without(setting.settings["world"], {"stress"})}
+    return work_of(plain, setting.identity)
 
 
-def load_study(store: StudyStore, cells: Sequence[Cell] | None = None) -> StudyData:
-    """The study's plan and complete cells; with `cells`, a plan of only those cells.
+def load_study(store: StudyStore, wanted: Sequence[Wanted] | None = None) -> StudyData:
+    """Return a study and its episodes; with `wanted`, a study of only those.
 
     Raises:
-        UsageError: no such study, or no complete cell.
-        CheckpointError: a cell is damaged.
+        UsageError: No such study, or none of its episodes is there.
     """
-    plan = store.read_plan()
-    if cells is not None:
-        plan = replace(plan, cells=tuple(cells))
-    complete, absent = store.read_cells(plan.cells)
-    episodes = _labelled_episodes([cell for cell in plan.cells if cell.id in complete], complete)
-    return StudyData(plan, complete, episodes, absent)
+    study = store.load()
+    if wanted is not None:
+        labels = {one.setting.label for one in wanted}
+        settings = tuple(setting for setting in study.settings if setting.label in labels)
+        study = replace(study, settings=settings, wanted=tuple(wanted))
+    frame = store.frame(wanted)
+    if frame.empty:
+        raise UsageError(f"study '{store.name}' has no episode yet: {store.how_to_run()}")
+    return StudyData(study, _labelled(study, frame))
 
 
-def _labelled_episodes(cells: Sequence[Cell], complete: Mapping[str, StoredCell]) -> pd.DataFrame:
-    """The episodes of the cells in order, with the columns of their cells that the tables need. complete: by id."""
-    stored = [complete[cell.id] for cell in cells]
-    frames = [one.of(cell) for one, cell in zip(stored, cells, strict=True)]
-    episodes = pd.concat(frames, ignore_index=True)
-    groups = {task: difficulty_of(task) for task in {cell.task for cell in cells}}
-    columns: dict[str, list[Any]] = {
-        "label": [cell.label for cell in cells],
-        "cell": [cell.id for cell in cells],
-        "difficulty": [groups[cell.task] for cell in cells],
-        "run": [one.status["run"] for one in stored],
-        "device": [cell.settings["runtime"]["device"] for cell in cells],
-        "device_name": [one.status["device_name"] for one in stored],
-        "dtype": [cell.settings["runtime"]["dtype"] for cell in cells],
-        "threads": [cell.settings["runtime"]["threads"] for cell in cells],
-    }
-    lengths = [len(part) for part in frames]
-    spread = {
-        name: np.repeat(np.array(values, dtype=object if isinstance(values[0], str) else None), lengths)
-        for name, values in columns.items()
+def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
+    """Return the episodes with the columns of their settings that the tables need."""
+    groups = {task: difficulty_of(task) for task in set(episodes["task"])}
+    runtime = {setting.label: setting.settings["runtime"] for setting in study.settings}
+    columns = {name: episodes["label"].map({k: v[name] for k, v in runtime.items()}) for name in _RUNTIME}
+    # strings as Python objects: these frames are cut into hundreds of small ones, which arrow's arrays are slow at
+    texts = {
+        name: episodes[name].astype(object) for name in ("label", "task", "block", "started", "device_name", "run")
     }
     states = episodes["initial_state"].map(tuple)  # comparable
-    # strings as Python objects: these frames are cut into hundreds of small ones, which arrow's arrays are slow at
-    texts = {name: episodes[name].astype(object) for name in ("task", "block", "started")}
-    return episodes.assign(initial_state=states, **texts, **spread)
+    episodes = episodes.assign(difficulty=episodes["task"].map(groups), initial_state=states, **columns, **texts)
+    return episodes.astype(dict.fromkeys(("difficulty", "device", "dtype"), object))
 
 
 def difficulty_of(task: str) -> str:
@@ -148,7 +181,7 @@ def _frame(rows: Sequence[Sections]) -> pd.DataFrame:
 
 def _rows(data: StudyData, episodes: pd.DataFrame, averaging: str) -> Iterator[Sections]:
     """One row per label that has episodes here."""
-    for label in data.plan.labels:
+    for label in data.study.labels:
         group = episodes[episodes["label"] == label]
         if len(group):
             baseline = episodes[episodes["label"] == data.references[label]]
@@ -157,12 +190,14 @@ def _rows(data: StudyData, episodes: pd.DataFrame, averaging: str) -> Iterator[S
 
 def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> Sections:
     tasks = sorted(set(episodes["task"]))
-    cells = [cell for cell in data.complete[label] if cell.task in tasks]
+    setting = data.settings[label]
     head = {
-        "study": data.plan.name,
+        "study": data.study.name,
         "averaging": averaging,
         "label": label,
-        "method": cells[0].settings["method"],
+        "name": setting.name,
+        "unstressed": data.unstressed[label],
+        "method": setting.settings["method"],
         "task": ";".join(tasks),
         "tasks": len(tasks),
         "difficulty": _joined(sorted(set(episodes["difficulty"]))),
@@ -172,22 +207,21 @@ def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataF
         "baseline": data.references[label],
     }
     measures = measure(episodes, baseline, averaging)
-    return [head, measures, *_origin(data, cells)]
+    return [head, measures, *_origin(setting, episodes)]
 
 
-def _origin(data: StudyData, cells: Sequence[Cell]) -> Sections:
-    """Settings, weights and provenance of a row; where its cells differ, the values are joined by semicolons."""
-    settings, policy = cells[0].settings, cells[0].settings["policy"]
+def _origin(setting: Setting, episodes: pd.DataFrame) -> Sections:
+    """Return settings, weights and provenance of a row; values that differ are joined by semicolons."""
+    settings, policy = setting.settings, setting.settings["policy"]
     world, runtime, stress = settings["world"], settings["runtime"], stress_of(settings)
-    statuses = [data.cells[cell.id].status for cell in cells]
     parts = without(settings, {*NOT_DETERMINING, "world", "runtime"})
     weights = {
         "policy.kind": policy.get("kind", MODEL),
         "target": policy["target"],
         "drafter": policy.get("drafter"),
         "early": policy.get("early"),
-        OBSERVATION: cells[0].identity.get(OBSERVATION, ""),
-        **{f"{name}_sha256": value for name, value in sorted(cells[0].identity.items()) if name != OBSERVATION},
+        OBSERVATION: setting.identity.get(OBSERVATION, ""),
+        **{f"{name}_sha256": value for name, value in sorted(setting.identity.items()) if name != OBSERVATION},
     }
     surroundings = {
         "horizon": world["horizon"],
@@ -196,10 +230,9 @@ def _origin(data: StudyData, cells: Sequence[Cell]) -> Sections:
         "stress": stress["kind"],
         "stress_level": stress["level"],
         **without(runtime, NOT_DETERMINING_RUNTIME),
-        **{key: _joined(status.get(key, "") for status in statuses) for key in _STATUS_COLUMNS},
-        "cell": ";".join(cell.id for cell in cells),
+        **{key: _joined(episodes[key].dropna()) if key in episodes else "" for key in _STATUS_COLUMNS},
     }
-    return [{"overrides": cells[0].overrides}, flatten(parts), weights, surroundings]
+    return [{"overrides": setting.overrides}, flatten(parts), weights, surroundings]
 
 
 def is_autoregressive(settings: Plain) -> bool:
@@ -220,6 +253,37 @@ def _joined(values: Iterable[object]) -> str:
 def values_of(table: pd.DataFrame, column: str) -> set[str]:
     """The values of a column whose rows join several by semicolons."""
     return {value for text in table[column].astype(str) for value in text.split(";")}
+
+
+def further_of(data: StudyData) -> dict[str, Any]:
+    """Return what a study's CSV files leave out, as JSON values, by label.
+
+    A label has `name` and `varies` (of a grid), `overrides`, `settings`, `identity` (hashes of weights and data),
+    `provenance` of its episodes, and `measures`: averaging, or task, -> the measures that are no column.
+    """
+    columns = list(data.table.columns)
+    left_out = {*CSV_COLUMNS, "name", "unstressed"}
+    measures = [name for name in columns[: columns.index("overrides")] if name not in left_out]
+    labels: dict[str, Any] = {}
+    for rows, key in ((rows_of(data.table), "averaging"), (rows_of(data.per_task), "task")):
+        for row in rows:
+            setting = data.settings[row["label"]]
+            about = {
+                "name": setting.name,
+                "varies": dict(setting.varies),
+                "overrides": setting.overrides,
+                "settings": without(setting.settings, {"results", "task"}),
+                "identity": dict(setting.identity),
+                "provenance": {name: _json(row[name]) for name in (*_RUNTIME, *_STATUS_COLUMNS)},
+                "measures": {},
+            }
+            values = {name: _json(row[name]) for name in measures}
+            labels.setdefault(row["label"], about)["measures"][row[key]] = values
+    return {"study": data.study.name, "axis": data.study.axis, "labels": labels}
+
+
+def _json(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def csv_text(table: pd.DataFrame) -> str:

@@ -19,8 +19,8 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.batched import BatchDecoder, Lane
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.engine.record import DecodeRecord
-from kerv_cli.lab.episode import Follower
-from kerv_cli.lab.policy import artifacts_of, warm_up
+from kerv_cli.episodes.episode import Follower
+from kerv_cli.episodes.policy import artifacts_of, warm_up
 from kerv_cli.methods.compose import Method
 from kerv_cli.serve.guard import HOLD, Finite, StateRange
 from kerv_cli.serve.session import Interface, Session

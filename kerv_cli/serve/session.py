@@ -12,7 +12,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
 from kerv_cli.base.views import frame_shape
 from kerv_cli.engine.record import DecodeRecord
-from kerv_cli.lab.episode import Follower
+from kerv_cli.episodes.episode import Follower
 from kerv_cli.serve.guard import StateRange
 from kerv_cli.serve.wire import Message
 

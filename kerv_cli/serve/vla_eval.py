@@ -22,9 +22,8 @@ import numpy as np
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.places import results_dir
 from kerv_cli.base.spaces import Observation
+from kerv_cli.catalogue.served import path_of, write_served
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
-from kerv_cli.lab.rows import Circumstances
-from kerv_cli.lab.served import path_of, write_served
 from kerv_cli.serve.policy import Policy
 from kerv_cli.serve.server import Conversation, Reply
 from kerv_cli.serve.session import LARGEST, Interface, Session, hand_of, keys_of, text_of
@@ -210,7 +209,7 @@ class VlaEval(Conversation):
         if isinstance(last, list) and len(last) == 3 and all(isinstance(x, float) for x in last):
             episode.path.append(np.array(last))
         record = self._record(episode, success, float(elapsed) if isinstance(elapsed, int | float) else 0.0)
-        write_served(path, record, Circumstances(started=episode.started), self.policy.facts())
+        write_served(path, record, episode.started, self.policy.facts())
 
     def _record(self, episode: _Episode, success: bool, elapsed: float) -> EpisodeRecord:
         interface, steps = self.policy.interface, len(episode.sent)

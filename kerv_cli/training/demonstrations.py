@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from kerv_cli.base.places import artifact, find_target, results_dir
 from kerv_cli.base.settings import DEFAULT_TASKS, DemonstrationSettings
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.base.views import views_of
+from kerv_cli.lab.runs import command_to_go_on
 from kerv_cli.targets.checkpoint import TargetDescription, described
 from kerv_cli.worlds import resolve_tasks, specs, stands_for_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset
@@ -39,6 +41,10 @@ def open_demos(results: str, names: str, tasks: Sequence[str] = (), episodes: in
         try:
             datasets.append(DemoDataset.open(folder))
         except CheckpointError as error:
+            words = command_to_go_on(results, "demos", folder)
+            if words and not (folder / "manifest.json").exists():
+                line = shlex.join(["kerv", *words])
+                raise CheckpointError(f"the demonstrations in {folder} are unfinished: go on with '{line}'") from error
             if folder.is_dir():
                 raise
             remedy = _remedy(results, folder, tasks, episodes)

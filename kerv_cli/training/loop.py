@@ -70,7 +70,7 @@ class RunProgress:
 class Loop:
     """Optimises a lesson's module. save: writes the best weights, which have these metrics. folder: holds
     `resume.safetensors` and `log.csv`. identity: hash of everything that determines the run; another run is never
-    resumed. borders: of `draw_samples`."""
+    resumed. borders: of `draw_samples`. keep: told every validation so far, after each one and when the run goes on."""
 
     def __init__(
         self,
@@ -80,7 +80,9 @@ class Loop:
         folder: Path,
         identity: str,
         borders: Tensor | None = None,
+        keep: Callable[[list[Metrics]], None] = lambda history: None,
     ) -> None:
+        self.keep = keep
         self.lesson, self.module, self.save, self.settings = lesson, lesson.module, save, settings
         self.folder, self.identity, self.borders = folder, identity, borders
         self.step, self.best = 0, -math.inf
@@ -180,11 +182,13 @@ class Loop:
         self.log()
 
     def log(self) -> None:
-        """Writes `log.csv`, a row per validation; nothing before the first."""
+        """Keep the curve, and write `log.csv`, a row per validation; no file before the first."""
         import pandas as pd
 
-        if self.history:
-            write_text(self.folder / "log.csv", pd.DataFrame(self.history).to_csv(index=False, float_format="%.6g"))
+        self.keep(self.history)
+        if not self.history:
+            return
+        write_text(self.folder / "log.csv", pd.DataFrame(self.history).to_csv(index=False, float_format="%.6g"))
 
     def restore(self) -> None:
         """Continues from the folder's resume file, if there is one.
@@ -194,6 +198,7 @@ class Loop:
         """
         path = self.folder / RESUME
         if not path.is_file():
+            self.keep([])  # of a run that was here before
             return
         tensors, progress = read_state(path)
         check_same_run(self.folder, progress.identity, self.identity, "move it aside")

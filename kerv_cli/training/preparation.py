@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.base.places import RESUME
 from kerv_cli.base.registry import parts
 from kerv_cli.base.settings import CalibrateSuccessSettings, PrepareSettings, RolloutSettings, TrainDrafterSettings
-from kerv_cli.lab.catalogue import state_of
-from kerv_cli.lab.resolve import resolve
+from kerv_cli.catalogue.entries import state_of
+from kerv_cli.episodes.resolve import resolve
 from kerv_cli.methods.artifacts import Artifacts, Weights, kind_of, removal
 from kerv_cli.methods.compose import Method
 from kerv_cli.training.demonstrations import demos_for
@@ -114,4 +115,6 @@ def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
         lacks = [name for name, part in (("variability", "drafter"), ("skip", "datastore")) if part in kinds]
         return MISSING if any(not getattr(described, name) for name in lacks) else THERE
     state = state_of(path, kind) if isinstance(files, Weights) else THERE
+    if state == "complete" and (path / RESUME).is_file() and not (path / "curves.png").is_file():
+        return "without curves"  # the disk was full at the training's end
     return THERE if state == "complete" else state

@@ -23,7 +23,8 @@ from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import TrainDrafterSettings, TrainSettings, TrainTargetSettings
 from kerv_cli.base.views import views_of
 from kerv_cli.engine.protocol import ReadableTarget
-from kerv_cli.lab.run import success_of
+from kerv_cli.episodes.runner import success_of
+from kerv_cli.lab.runs import Curve
 from kerv_cli.methods.artifacts import MadeFor, Weights, removal
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.folder import save_target
@@ -83,6 +84,11 @@ class Run(ABC):
     learnt: Lesson
     borders: Tensor | None = None
 
+    @property
+    def folder_kind(self) -> str:
+        """Kind of the artifact that is made."""
+        return self.kind
+
     @abstractmethod
     def identity(self) -> dict[str, Any]:
         """What determines the run besides the optimisation settings and the demonstrations."""
@@ -98,7 +104,8 @@ class Run(ABC):
             CheckpointError: the folder holds another run. KervError: training diverged. StorageError: writing failed.
         """
         self.learnt.module.train()
-        loop = Loop(self.learnt, self.save, self.settings.train, self.folder, self.hash, self.borders)
+        keep = Curve.of(self.folder, self.settings.results).write
+        loop = Loop(self.learnt, self.save, self.settings.train, self.folder, self.hash, self.borders, keep)
         return loop.run(on_step)
 
     @property
@@ -305,6 +312,11 @@ class DrafterRun(Run):
             f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
         )
         self.check_folder(self.artifact.kind, f"policy.{self.artifact.kind}")
+
+    @property
+    def folder_kind(self) -> str:
+        """Kind of the artifact that is made."""
+        return self.artifact.kind
 
     @abstractmethod
     def lesson(self, progress: OnProgress) -> Lesson:

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def longest(episodes: pd.DataFrame) -> float:
-    """episodes: a setting's, with the columns of `EPISODE_SCHEMA` (`kerv_cli/lab/rows.py`)."""
+    """episodes: a setting's, with the columns of `EPISODE_SCHEMA` (`kerv_cli/episodes/rows.py`)."""
     return float(episodes["steps"].max())
 
 

@@ -8,9 +8,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from kerv_cli.lab.identity import ENGINE
-from kerv_cli.lab.resolve import resolve
-from kerv_cli.lab.run import Runner, close_worlds
+from kerv_cli.episodes.identity import ENGINE
+from kerv_cli.episodes.resolve import resolve
+from kerv_cli.episodes.runner import Runner, close_worlds
 
 FILE = Path(__file__).with_name("main.json")
 ENGINES = Path(__file__).with_name("engines.json")

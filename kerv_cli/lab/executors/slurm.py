@@ -5,6 +5,7 @@ The nodes must share the results folder. A job that the cluster ends is a lost w
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.processes import guard
 from kerv_cli.lab.executors import THREAD_VARIABLES, Executor, SlurmOptions, WorkerLost
 
 T = TypeVar("T")
@@ -35,7 +37,10 @@ def build(options: SlurmOptions, slots: int, threads: int, folder: Path) -> Exec
         jobs.update_parameters(**_parameters(options, threads))
     except (RuntimeError, ValueError, TypeError) as error:
         raise UsageError(f"Slurm cannot be used from here: {' '.join(str(error).split())}") from None
-    return Jobs(jobs, slots, _POLL_SECONDS[options.cluster])
+    stack = contextlib.ExitStack()
+    if options.cluster == "local":  # submitit's processes would outlive this one
+        stack.enter_context(guard())
+    return Jobs(jobs, slots, _POLL_SECONDS[options.cluster], stack)
 
 
 def _parameters(options: SlurmOptions, threads: int) -> dict[str, Any]:
@@ -48,8 +53,8 @@ def _parameters(options: SlurmOptions, threads: int) -> dict[str, Any]:
 class Jobs:
     """Submitted jobs; one thread polls them all."""
 
-    def __init__(self, jobs: Any, slots: int, poll_seconds: float) -> None:
-        self.slots = slots
+    def __init__(self, jobs: Any, slots: int, poll_seconds: float, stack: contextlib.ExitStack) -> None:
+        self.slots, self._stack = slots, stack
         self._jobs, self._poll_seconds = jobs, poll_seconds
         self._open: dict[Future[Any], Any] = {}
         self._changed = threading.Lock()
@@ -82,6 +87,7 @@ class Jobs:
         deadline = time.monotonic() + 10
         while abandon and any(not job.done() for job in jobs) and time.monotonic() < deadline:
             time.sleep(0.1)
+        self._stack.close()
 
 
 def _settle(future: Future[Any], job: Any) -> None:

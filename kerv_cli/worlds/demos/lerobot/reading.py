@@ -11,11 +11,11 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from PIL import Image, UnidentifiedImageError
 
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
 from kerv_cli.base.files import read_mapping, regular, write_folder, write_json
+from kerv_cli.base.foreign import foreign_table
 from kerv_cli.base.places import as_path
 from kerv_cli.base.settings import DemosImportSettings
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, action_limits
@@ -93,7 +93,7 @@ class Source:
     def table(self, episode: Row) -> pa.Table:
         """The rows of one episode, in order."""
         path = self.path(episode, "data", self.info.get("data_path") or layout.DATA)
-        table = _table(path, filters=[("episode_index", "==", int(episode["episode_index"]))])
+        table = _table(path, ("episode_index", int(episode["episode_index"])))
         if len(table) != int(episode["length"]):
             raise CheckpointError(f"{path} has {len(table)} rows of episode {episode['episode_index']}, not its length")
         return table
@@ -244,9 +244,14 @@ def _task_names(tasks: Mapping[int, str]) -> dict[int, str]:
     return names
 
 
-def _table(path: Path, **options: Any) -> pa.Table:
+def _identifier(name: str) -> str:
+    """A registered environment's name: letters, digits and underscores."""
+    return re.sub(r"\W+", "_", name).strip("_").lower() or "recorded"
+
+
+def _table(path: Path, where: tuple[str, Any] | None = None) -> pa.Table:
     try:
-        return pq.read_table(regular(path), **options)
+        return foreign_table(path, where=where)
     except (OSError, ValueError) as error:
         raise CheckpointError(f"{path} is missing or damaged: {str(error)[:120]}") from error
 

@@ -15,7 +15,7 @@ from typing import Generic, TypeVar
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.batched import BatchDecoder, Lane
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
-from kerv_cli.lab.episode import episode
+from kerv_cli.episodes.episode import episode
 from kerv_cli.worlds.spec import World
 
 K = TypeVar("K")

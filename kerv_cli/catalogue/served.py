@@ -1,6 +1,6 @@
 """What a server keeps of an episode whose world ran elsewhere: its decodes and a row like that of an episode here.
 
-results/served/<evaluation>/<episode>.arrow: rows of decodes.parquet; the row of episodes.parquet and what served it are
+results/served/<evaluation>/<episode>.arrow: the decodes; the columns of the episode and what served it are
 JSON in the file's metadata. Both names are the harness's. Arrow's files are read several times as fast as parquet's,
 and an import reads thousands.
 """
@@ -8,7 +8,6 @@ and an import reads thousands.
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ import pyarrow as pa
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import atomic_path
 from kerv_cli.engine.record import EpisodeRecord
-from kerv_cli.lab.rows import DECODE_SCHEMA, Circumstances, decode_rows, episode_row
+from kerv_cli.episodes.rows import DECODE_SCHEMA, decodes_table, episode_row
 
 SERVED = "served"
 _KEY = b"kerv"
@@ -29,8 +28,8 @@ _NAME = re.compile(r"\w[\w.-]{0,199}")
 
 @dataclass(frozen=True)
 class Served:
-    """An episode as its server saw it. episode: a row of episodes.parquet. by: `Policy.facts` of the server. decodes:
-    rows of decodes.parquet."""
+    """An episode as its server saw it. episode: columns of the table `episodes`. by: `Policy.facts` of the server.
+    decodes: with the columns of rows.DECODE_SCHEMA."""
 
     episode: dict[str, Any]
     by: dict[str, Any]
@@ -44,17 +43,17 @@ def path_of(results: Path, evaluation: str, episode: str) -> Path | None:
     return results / SERVED / evaluation / f"{episode}.arrow"
 
 
-def write_served(path: Path, record: EpisodeRecord, at: Circumstances, by: Mapping[str, Any]) -> None:
+def write_served(path: Path, record: EpisodeRecord, started: str, by: Mapping[str, Any]) -> None:
     """Writes an episode. A record whose path is not known has none (n, 3) of length 0.
 
     Raises:
         StorageError: the disk refused.
     """
-    row = episode_row(record, at)
+    row = episode_row(record) | {"task": record.task, "seed": record.seed, "started": started}
     if not len(record.path):
-        row |= {"path_length": math.nan}
+        row |= {"path_length": None, "jerk": None}
     facts = json.dumps({"episode": row, "by": by})
-    table = pa.Table.from_pylist(decode_rows(record), schema=DECODE_SCHEMA).replace_schema_metadata({_KEY: facts})
+    table = decodes_table(record).replace_schema_metadata({_KEY: facts})
     options = pa.ipc.IpcWriteOptions(compression="zstd")
     with atomic_path(path) as temporary, pa.ipc.new_file(str(temporary), table.schema, options=options) as file:
         file.write_table(table)

@@ -1,4 +1,4 @@
-"""Which code computes a cell: a hash of what its source means, so that what other code computed is not reused."""
+"""Which code computes an episode: a hash of what its source means, so that what other code computed is not reused."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 import kerv_cli
 from kerv_cli.base.registry import kinds, parts
 
-_COMPUTING = ("base", "engine", "methods", "targets", "worlds", "lab")
+_COMPUTING = ("base", "engine", "methods", "targets", "worlds", "episodes")
 """Rooms whose code an episode runs; not how it is shown or reported."""
 
 

@@ -1,5 +1,5 @@
-"""The runs of a results folder: sweeps, rollouts, trainings and whatever else was recorded, built or calibrated, each
-by its folder and what lies in it."""
+"""The runs of a results folder: the studies of its database, and its folders of what was trained, recorded, built or
+calibrated, with the rows of the commands that were begun."""
 
 from __future__ import annotations
 
@@ -16,22 +16,27 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import sqlalchemy as sa
+
 from kerv_cli.base.config import as_words, compose, groups
-from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
+from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.files import read_mapping, read_text, sha256_of, storage_errors, sync, visible
 from kerv_cli.base.leftovers import clean, temporary_beside
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.places import shipped_dir
 from kerv_cli.base.registry import parts
 from kerv_cli.base.settings import choices_of
-from kerv_cli.lab.claims import is_claimed
-from kerv_cli.lab.identity import OBSERVATION
-from kerv_cli.lab.plan import Cell, unique_cells
-from kerv_cli.lab.store import ROLLOUTS, STUDIES, StudyStore, stores
+from kerv_cli.episodes.identity import OBSERVATION
+from kerv_cli.lab.database import COMPLETE, EPISODES, RUNNING, SETTINGS, STUDIES, WANTED, Database
+from kerv_cli.lab.runs import RunRow, forget, run_rows
+from kerv_cli.lab.store import IMPORT, ROLLOUT, SWEEP, StudyStore
 
-SWEEP, ROLLOUT = "sweep", "rollout"
+OLDER = ("risk", "score")
+"""Kinds of artifacts that an older kerv made."""
 LOG, WEIGHTS = "log.csv", "model.safetensors"
 """Files of a training."""
+POLICY = "policy"
+"""What `kerv build policy` installs; it is listed while it is unfinished."""
 LAST = "last"
 """Stands for the newest run where one is named."""
 
@@ -43,7 +48,7 @@ def artifact_kinds() -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class RunEntry:
-    """One run. id: how commands name it. state: `complete`, `2 of 6 cells`, `step 300 of 600`, `begun`, `damaged`.
+    """One run. id: how commands name it. state: `complete`, `2 of 6 episodes`, `step 300 of 600`, `begun`, `damaged`.
     figures: its headline, by name. command: words behind `kerv`; empty where no record has them. sha256: by which
     others name it. made_from: kind -> that hash of each artifact that it was made from."""
 
@@ -62,8 +67,8 @@ class RunEntry:
 
     @property
     def has_episodes(self) -> bool:
-        """Whether the run is a sweep or a rollout."""
-        return self.kind in (SWEEP, ROLLOUT)
+        """Whether the run is a sweep, a rollout or an import."""
+        return self.kind in (SWEEP, ROLLOUT, IMPORT)
 
     @property
     def is_training(self) -> bool:
@@ -72,11 +77,28 @@ class RunEntry:
 
 
 def find_runs(results: str | Path) -> list[RunEntry]:
-    """Every run of the results folder, the newest first."""
-    root = Path(results).expanduser()
-    runs = [_study(store) for family in (STUDIES, ROLLOUTS) for store in stores(root, family)]
-    runs += [run for kind in artifact_kinds() for run in _artifacts(root / "artifacts" / kind, kind)]
-    return sorted(runs, key=lambda run: (run.started, run.id), reverse=True)
+    """Return every run of the results folder, the newest first."""
+    database = Database(results)
+    rows: dict[tuple[str, str], RunRow] = {}
+    for row in run_rows(database):
+        rows.setdefault((row.kind, row.name), row)
+    runs = _studies(database, rows)
+    kinds = artifact_kinds()
+    made = {run.id: run for kind in kinds for run in _artifacts(database.results / "artifacts" / kind, kind)}
+    for (kind, name), row in rows.items():
+        entry = made.get(f"{kind}/{name}")
+        if kind not in (SWEEP, ROLLOUT, IMPORT) and row.status != COMPLETE:
+            folder = database.results / ("pretrained" if kind == POLICY else f"artifacts/{kind}") / name
+            entry = entry or RunEntry(f"{kind}/{name}", kind, folder, "", "begun", (kind,))
+            made[entry.id] = replace(entry, started=row.started[:19], state=state_text(row), command=row.command)
+        elif entry is not None and not entry.command:  # demonstrations do not say how they were recorded
+            made[entry.id] = replace(entry, command=row.command)
+    return sorted([*runs, *made.values()], key=lambda run: (run.started, run.id), reverse=True)
+
+
+def state_text(row: RunRow) -> str:
+    """Return a begun command's state in words: `running, 300 of 600`."""
+    return f"{row.status}, {row.done} of {row.total}" if row.total else row.status
 
 
 def find_run(results: str | Path, name: str, exact: bool = False) -> RunEntry:
@@ -99,7 +121,7 @@ def find_run(results: str | Path, name: str, exact: bool = False) -> RunEntry:
     return near[0]
 
 
-_STATES = ("complete", "begun", "damaged", "step ")
+_STATES = ("complete", "begun", "damaged", "step ", "running", "interrupted", "failed")
 """How states begin that do not begin with a number."""
 
 
@@ -114,7 +136,7 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
     for key in filters:
         if key not in filter_names:
             raise UnknownName("filter", key, filter_names)
-    kinds = (SWEEP, ROLLOUT, *artifact_kinds())
+    kinds = (SWEEP, ROLLOUT, IMPORT, POLICY, *artifact_kinds())
     if filters.get("kind", SWEEP) not in kinds:
         raise UnknownName("kind of run", filters["kind"], kinds)
     state = filters.get("state", "")
@@ -137,53 +159,58 @@ def _agrees(run: RunEntry, filters: dict[str, str]) -> bool:
 
 
 def store_of(run: RunEntry) -> StudyStore:
-    """The store of a sweep or rollout.
+    """Return the store of a sweep, a rollout or an import.
 
     Raises:
-        UsageError: it is another kind of run.
+        UsageError: It is another kind of run.
     """
     if not run.has_episodes:
         raise UsageError(f"{run.id} is a {run.kind}: it has no episodes")
-    return StudyStore(run.folder.parent.parent, run.folder.name, run.folder.parent.name)
+    return StudyStore(run.folder.parent.parent, run.folder.name, run.kind)
 
 
-def _study(store: StudyStore) -> RunEntry:
-    kind = SWEEP if store.family == STUDIES else ROLLOUT
-    commands = store.commands()
-    name = store.name
-    try:
-        cells = unique_cells(store.read_plan().cells)
-    except KervError:
-        return RunEntry(name, kind, store.root, _changed(store.root / "plan.yaml"), "damaged")
-    status = [entries for cell in cells if (entries := _status(store, cell)) is not None]
-    started = [s["started"] for s in status if s.get("started")] or [command.started for command in commands]
-    episodes, successes = (sum(int(s[key]) for s in status) for key in ("episodes", "successes"))
-    return RunEntry(
-        id=name,
-        kind=kind,
-        folder=store.root,
-        started=min(started)[:19] if started else _changed(store.root / "plan.yaml"),
-        state="complete" if len(status) == len(cells) else f"{len(status)} of {len(cells)} cells",
-        methods=tuple(dict.fromkeys(str(cell.settings["method"]) for cell in cells)),
-        tasks=tuple(dict.fromkeys(cell.task for cell in cells)),
-        episodes=episodes,
-        figures={"success": successes / episodes} if episodes else {},
-        command=commands[-1].arguments if commands else (),
-        made_from=_weights(cells),
-    )
-
-
-def _weights(cells: Sequence[Cell]) -> dict[str, str]:
-    """Kind -> hash of the artifacts that a study reads; of several targets the first one's."""
-    pairs = [pair for cell in cells for pair in cell.identity.items() if pair[0] != OBSERVATION and pair[1]]
-    return dict(reversed(pairs))
-
-
-def _status(store: StudyStore, cell: Cell) -> dict[str, Any] | None:
-    """The sums in a complete cell's status.json, unchecked: a list must be quick."""
-    with contextlib.suppress(CheckpointError):
-        return read_mapping(store.cells / cell.id / "status.json")
-    return None
+def _studies(database: Database, rows: Mapping[tuple[str, str], RunRow]) -> list[RunEntry]:
+    """Return the studies of the database, with what they want and have."""
+    count = sa.func.count
+    every = WANTED.join(SETTINGS).join(STUDIES).outerjoin(EPISODES, EPISODES.c.id == WANTED.c.episode_id)
+    sums = sa.select(
+        STUDIES.c.name, count(), count(WANTED.c.episode_id), sa.func.min(EPISODES.c.started),
+        sa.func.sum(sa.cast(EPISODES.c.success, sa.Integer)),
+    ).select_from(every).group_by(STUDIES.c.name)  # fmt: skip
+    tasks: dict[str, list[str]] = {}
+    with database.reading() as connection:
+        found = {row[0]: row[1:] for row in connection.execute(sums)}
+        query = sa.select(STUDIES.c.name, WANTED.c.task).select_from(WANTED.join(SETTINGS).join(STUDIES))
+        for name, task in connection.execute(query.group_by(STUDIES.c.name, WANTED.c.task).order_by(WANTED.c.task)):
+            tasks.setdefault(name, []).append(task)
+        studies = connection.execute(sa.select(STUDIES)).all()
+        settings = connection.execute(
+            sa.select(SETTINGS.c.study_id, SETTINGS.c.method, SETTINGS.c.identity).order_by(SETTINGS.c.position)
+        ).all()
+    entries = []
+    for study in studies:
+        store, row = StudyStore(database, study.name, study.kind), rows.get((study.kind, study.name))
+        wanted, there, started, successes = found.get(study.name, (0, 0, None, None))
+        state = "complete" if there == wanted else f"{there} of {wanted} episodes"
+        state = f"running, {there} of {wanted} episodes" if row is not None and row.status == RUNNING else state
+        mine = [one for one in settings if one.study_id == study.id]
+        pairs = [pair for one in mine for pair in one.identity.items() if pair[0] != OBSERVATION and pair[1]]
+        entries.append(
+            RunEntry(
+                id=study.name,
+                kind=study.kind,
+                folder=store.root,
+                started=(started or (row.started if row else study.created))[:19],
+                state=state,
+                methods=tuple(dict.fromkeys(one.method for one in mine)),
+                tasks=tuple(tasks.get(study.name, ())),
+                episodes=int(there),
+                figures={"success": int(successes or 0) / there} if there else {},
+                command=row.command if row else (),
+                made_from=dict(reversed(pairs)),
+            )
+        )
+    return entries
 
 
 def description_of(run: RunEntry) -> dict[str, Any]:
@@ -317,25 +344,33 @@ def disk_bytes(folder: Path) -> int:
 
 
 def check_removable(run: RunEntry) -> None:
-    """Raises UsageError: the folder is a link, or a process computes cells of the run at the moment."""
+    """Raise UsageError if the folder is a link, or a process makes the run at the moment."""
     if run.folder.is_symlink():
         raise UsageError(f"{run.folder} is a link to {os.readlink(run.folder)}: remove the link, or what it points to")
-    if not run.has_episodes or run.state == "damaged":
-        return
-    store = store_of(run)
-    if any(is_claimed(store.claims, cell) for cell in store.read_plan().cells):
+    if run.state.startswith(RUNNING):
         raise UsageError(f"{run.id} is running: stop it first")
 
 
-def remove(run: RunEntry) -> None:
-    """Removes the run's folder: first it gets a temporary's name, which no command reads and which the next one that
-    looks there cleans away if this process is killed before it is done.
+def remove(run: RunEntry, results: str | Path = "") -> None:
+    """Remove the run's folder and its rows.
+
+    The folder first gets the name of a temporary, which no command reads and which a later one cleans away. If this
+    process is killed before the rows are gone, the run is still listed and can be removed again.
+
+    Args:
+        run: What to remove.
+        results: Its results folder; by default the one that its own folder lies in.
 
     Raises:
-        StorageError: the disk refused; the run is as it was.
+        StorageError: The disk refused.
     """
     gone = temporary_beside(run.folder)
-    with storage_errors(run.folder):
-        run.folder.rename(gone)
-        sync(run.folder.parent)
+    if run.folder.exists():
+        with storage_errors(run.folder):
+            run.folder.rename(gone)
+            sync(run.folder.parent)
+    if run.has_episodes:
+        store_of(run).remove()
+    database = Database(results or run.folder.parents[1 if run.has_episodes else 2])
+    forget(database, run.kind, run.id if run.has_episodes else run.id.removeprefix(f"{run.kind}/"))
     shutil.rmtree(gone, ignore_errors=True)

@@ -4,26 +4,35 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Iterable
 
 import numpy as np
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.places import find_target
 from kerv_cli.base.runtime import set_up
-from kerv_cli.base.settings import EXPERT, WAITS, PolicySettings, RolloutSettings, RuntimeSettings, ServeSettings
+from kerv_cli.base.settings import (
+    DEFAULT_TASKS,
+    EXPERT,
+    WAITS,
+    PolicySettings,
+    RolloutSettings,
+    RuntimeSettings,
+    ServeSettings,
+)
 from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.base.views import frame_shape
 from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.decoder import Decoder
-from kerv_cli.lab import clock
-from kerv_cli.lab.clock import RealClock
-from kerv_cli.lab.episode import ActionDecoder
-from kerv_cli.lab.expert import ExpertDecoder
-from kerv_cli.lab.identity import OBSERVATION
-from kerv_cli.lab.plan import Cell, plan
-from kerv_cli.lab.resolve import ResolvedStudy, tasks_of
+from kerv_cli.episodes import clock
+from kerv_cli.episodes.clock import RealClock
+from kerv_cli.episodes.episode import ActionDecoder
+from kerv_cli.episodes.expert import ExpertDecoder
+from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.compose import Method
-from kerv_cli.worlds import spec_of
+from kerv_cli.targets.checkpoint import TargetDescription, described
+from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.stress import check as check_stress
 
@@ -77,25 +86,36 @@ def check(settings: RolloutSettings) -> dict[str, str]:
     return {**hashes, **clock.profile_identity(settings), OBSERVATION: observation}
 
 
-def cells_of(resolved: ResolvedStudy) -> list[Cell]:
-    """The cells of a study, on the devices of this machine.
+def tasks_of(settings: RolloutSettings) -> tuple[str, ...]:
+    """Full names of a rollout's tasks; of tasks that are not named those that the target was trained on.
 
     Raises:
-        UsageError, CheckpointError: as `check` of each setting. UsageError: more cells than a study can have.
+        UnknownName: no such task. CheckpointError: the target's description is damaged.
     """
-    study, settings = resolved.study, resolved.settings
-    identities = {label: check(one) for label, one in settings.items()}
-    for one in settings.values():
-        one.runtime.device, _ = set_up(one.runtime)
-    return plan(
-        settings,
-        resolved.tasks,
-        identities.__getitem__,
-        baseline=study.baseline,
-        overrides=resolved.overrides,
-        block=study.block,
-        repeats=study.repeats,
-    )
+    return resolve_tasks(settings.task or list(trained_tasks(settings)) or DEFAULT_TASKS)
+
+
+def trained_tasks(settings: RolloutSettings) -> tuple[str, ...]:
+    """Full names of the tasks that a rollout's target was trained on; none of the expert, and where it does not say or
+    is not there, which `policy.check` refuses.
+
+    Raises:
+        CheckpointError: its description is damaged.
+    """
+    if settings.policy.kind == EXPERT:
+        return ()
+    try:
+        folder = find_target(settings.results, settings.policy.target)
+    except UsageError:
+        return ()
+    names = described(folder, "target", TargetDescription).tasks
+    return resolve_tasks(names) if names else ()
+
+
+def unseen_tasks(settings: RolloutSettings, tasks: Iterable[str]) -> list[str]:
+    """Those of the tasks that the policy's target was not trained on; none where its description names no tasks."""
+    trained = trained_tasks(settings)
+    return [task for task in tasks if trained and task not in trained]
 
 
 def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:

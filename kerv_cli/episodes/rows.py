@@ -1,22 +1,18 @@
-"""A cell's parquet tables: records of episodes and decodes as rows, and the rows as data frames."""
+"""Episodes and decodes as rows: what the database stores of a record."""
 
 from __future__ import annotations
 
 import io
-import os
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, fields
 from operator import attrgetter
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import read_table
 from kerv_cli.engine.record import PHASES, DecodeRecord, Delay, EpisodeRecord, Round
 
 INT, FLOAT, TEXT, FLAG = pa.int64(), pa.float64(), pa.string(), pa.bool_()
@@ -49,8 +45,6 @@ def _attributes(*names: str, kind: pa.DataType = INT) -> Fields:
 
 
 _EPISODE: Fields = {
-    **_attributes("task", kind=TEXT),
-    **_attributes("seed"),
     **_attributes("success", kind=FLAG),
     **_attributes("steps"),  # control steps executed
     "decodes": (INT, lambda episode: len(episode.decodes)),
@@ -77,18 +71,12 @@ _EPISODE: Fields = {
     "carried_steps": (INT, _delays(lambda delay: delay.carried)),  # of those: on the chunk before
     "held_steps": (INT, _delays(lambda delay: delay.held)),  # … on the last action
     "dropped_steps": (INT, _delays(lambda delay: delay.dropped)),  # actions of new chunks left out as stale
-    **_attributes("path_length", kind=FLOAT),  # of the end effector, metres
+    **_attributes("path_length", "jerk", kind=FLOAT),  # of the end effector: metres; m/s³
     **_attributes("wall_seconds", kind=FLOAT),
     "initial_state": (pa.list_(FLOAT), lambda episode: np.asarray(episode.initial_state, np.float64).ravel().tolist()),
 }
-_CIRCUMSTANCES = {
-    "repeat": INT,
-    "block": TEXT,  # which run of which block; empty where it is not known
-    "order": INT,  # episodes that the block ran before it
-    "started": TEXT,  # ISO 8601
-    "worker_pid": INT,
-}
-EPISODE_SCHEMA = pa.schema({**{name: kind for name, (kind, _) in _EPISODE.items()}, **_CIRCUMSTANCES}.items())
+EPISODE_SCHEMA = pa.schema((name, kind) for name, (kind, _) in _EPISODE.items())
+"""Columns of an episode that come from its record. The database adds what it means and when it ran."""
 
 _TOKENS = pa.list_(pa.int32())
 _COUNTS = ("start", "accepted", "committed", "tree_size")
@@ -120,106 +108,54 @@ _DECODE: Fields = {
     "delay_steps": (INT, _delay("steps")),
     **{name: (INT, _delay(name)) for name in ("observed", "carried", "held", "dropped")},
 }
-# index: of the decode in its episode; step: control step at which its actions begin
-_POSITION = {"task": TEXT, "seed": INT, "index": INT, "step": INT}
+# index: position of the decode in its episode; step: control step at which its actions begin
+_POSITION = {"index": INT, "step": INT}
 DECODE_SCHEMA = pa.schema({**_POSITION, **{name: kind for name, (kind, _) in _DECODE.items()}}.items())
 
 
-@dataclass(frozen=True)
-class Circumstances:
-    """When and in which block an episode ran: columns of episodes.parquet."""
-
-    block: str = ""
-    order: int = 0
-    started: str = ""
-
-
-def episode_row(record: EpisodeRecord, at: Circumstances, repeat: int = 0) -> dict[str, Any]:
-    """One row of episodes.parquet.
+def episode_row(record: EpisodeRecord) -> dict[str, Any]:
+    """Return the columns of one episode, as JSON values. NaN becomes None.
 
     Raises:
-        ValueError: a decode names a phase that is not in PHASES.
+        ValueError: A decode names a phase that is not in PHASES.
     """
     unknown = {phase for decode in record.decodes for phase in decode.phases} - set(PHASES)
     if unknown:
         raise ValueError(f"phases {sorted(unknown)} are not in PHASES")
-    values = {name: value(record) for name, (_, value) in _EPISODE.items()}
-    return {**values, "repeat": repeat, **asdict(at), "worker_pid": os.getpid()}
+    return {name: _plain(value(record)) for name, (_, value) in _EPISODE.items()}
 
 
-def decode_rows(record: EpisodeRecord) -> list[dict[str, Any]]:
-    """The rows of decodes.parquet of one episode, in order."""
-    return [
-        {"task": record.task, "seed": record.seed, "index": index, "step": step}
-        | {name: value(decode) for name, (_, value) in _DECODE.items()}
+def _plain(value: Any) -> Any:
+    value = value.item() if isinstance(value, np.generic) else value
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def decodes_blob(record: EpisodeRecord) -> bytes:
+    """Return the decodes of one episode as a compressed Parquet file with the columns of DECODE_SCHEMA."""
+    return table_blob(decodes_table(record))
+
+
+def decodes_table(record: EpisodeRecord) -> pa.Table:
+    """Return the decodes of one episode, with the columns of DECODE_SCHEMA."""
+    rows = [
+        {"index": index, "step": step, **{name: value(decode) for name, (_, value) in _DECODE.items()}}
         for index, (decode, step) in enumerate(zip(record.decodes, record.decode_steps, strict=True))
     ]
+    return pa.Table.from_pylist(rows, schema=DECODE_SCHEMA)
 
 
-def table_bytes(table: pa.Table) -> bytes:
-    """A table as the bytes of a parquet file."""
+def table_blob(table: pa.Table) -> bytes:
+    """Return a table as a compressed Parquet file."""
     buffer = io.BytesIO()
     pq.write_table(table, buffer, compression="zstd")
     return buffer.getvalue()
 
 
-def tables_of(records: Sequence[EpisodeRecord], at: Sequence[Circumstances], repeat: int) -> dict[str, pa.Table]:
-    """A cell's tables by the names of their files. at: circumstances of each record."""
-    episodes = [episode_row(record, one, repeat) for record, one in zip(records, at, strict=True)]
-    decodes = [row for record in records for row in decode_rows(record)]
-    return {
-        "episodes.parquet": pa.Table.from_pylist(episodes, schema=EPISODE_SCHEMA),
-        "decodes.parquet": pa.Table.from_pylist(decodes, schema=DECODE_SCHEMA),
-    }
+def read_decodes(blob: bytes, columns: Sequence[str] | None = None) -> pa.Table:
+    """Return the decodes in a blob of `decodes_blob`, or only `columns`."""
+    return pq.read_table(io.BytesIO(blob), columns=columns, use_threads=False)
 
 
-class CellTables(NamedTuple):
-    """What a report needs of a cell's tables. seconds: seed -> (decodes,) seconds."""
-
-    folder: Path
-    episodes: pa.Table
-    seconds: dict[int, np.ndarray]
-
-
-def read_tables(folder: Path) -> CellTables:
-    """The tables in a cell's folder.
-
-    Raises:
-        OSError, ValueError, ArrowException: they are not what a kerv wrote.
-    """
-    episodes = _with_columns(read_table(folder / "episodes.parquet"))
-    return CellTables(folder, episodes, _split_by_seed(read_table(folder / "decodes.parquet", ["seed", "seconds"])))
-
-
-def frames_of(cells: Sequence[CellTables]) -> list[pd.DataFrame]:
-    """The episodes of each cell, one row each, with the column decode_seconds; converted all at once.
-
-    Raises:
-        CheckpointError: an episode has no decodes.
-    """
-    whole = pa.concat_tables([cell.episodes for cell in cells], promote_options="default").to_pandas()
-    try:
-        whole["decode_seconds"] = [cell.seconds[s] for cell in cells for s in cell.episodes["seed"].to_pylist()]
-    except KeyError as error:
-        raise CheckpointError(f"a cell in {cells[0].folder.parent} has no decodes of seed {error}") from error
-    stops = np.cumsum([cell.episodes.num_rows for cell in cells]).tolist()
-    return [whole.iloc[stop - cell.episodes.num_rows : stop] for cell, stop in zip(cells, stops, strict=True)]
-
-
-def _with_columns(table: pa.Table) -> pa.Table:
-    """The columns of EPISODE_SCHEMA. One that the table lacks is empty: cells of version 0.1.0 lack some.
-
-    Raises:
-        ValueError: a column of another type.
-    """
-    for field in EPISODE_SCHEMA:
-        if field.name not in table.column_names:
-            table = table.append_column(field, pa.nulls(table.num_rows, field.type))
-    return table.select(EPISODE_SCHEMA.names).cast(EPISODE_SCHEMA)
-
-
-def _split_by_seed(decodes: pa.Table) -> dict[int, np.ndarray]:
-    """Seed -> seconds of its decodes, in order; the decodes of an episode stand together."""
-    seeds, seconds = (decodes[name].to_numpy() for name in ("seed", "seconds"))
-    starts = np.flatnonzero(np.diff(seeds, prepend=-1))
-    return dict(zip(seeds[starts].tolist(), np.split(seconds, starts[1:]), strict=True))
+def seconds_blob(seconds: Iterable[float]) -> bytes:
+    """Return the seconds of each decode as little-endian float64."""
+    return np.asarray(list(seconds), dtype="<f8").tobytes()

@@ -1,4 +1,4 @@
-"""Runs episodes in the worlds of this process: of one setting on one task, of a study's cell, or several at once.
+"""Runs episodes in the worlds of this process: one after the other, or several at once.
 
 Weights, datastores and worlds are shared by all settings of a process. Frames and decoders are not: a setting that got
 its frames from another would decode with warm caches, and a skip's level may follow the episodes of its own block.
@@ -7,24 +7,19 @@ its frames from another would decode with warm caches, and a skip's level may fo
 from __future__ import annotations
 
 import dataclasses
-import functools
-import json
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeVar
 
 import numpy as np
 
-from kerv_cli.base.settings import CameraSettings, RolloutSettings, WorldSettings, settings_from
+from kerv_cli.base.settings import CameraSettings, RolloutSettings, WorldSettings
 from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.record import EpisodeRecord
-from kerv_cli.lab.episode import OnStep, run_episode
-from kerv_cli.lab.plan import Cell
-from kerv_cli.lab.policy import batch_decoder_for, clock_for, decoder_for
-from kerv_cli.lab.together import EpisodeEnd, Request, run_together
+from kerv_cli.episodes.episode import OnStep, run_episode
+from kerv_cli.episodes.policy import batch_decoder_for, clock_for, decoder_for
+from kerv_cli.episodes.together import EpisodeEnd, Request, run_together
 from kerv_cli.methods.compose import native_decoder
 from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.spec import World
@@ -123,58 +118,3 @@ def success_of(target: Target, tasks: Iterable[str], seeds: Sequence[int], setti
             raise result
         outcomes.append(result.success)
     return float(np.mean(outcomes))
-
-
-OnCellStep = Callable[[Cell, int, int], None]
-"""Told the cell, the seed and the number of control steps executed, after each of them."""
-
-Save = Callable[[EpisodeRecord, Path, str], object]
-"""Writes a recording: the record of the episode, the .rrd file and the label of the setting."""
-
-
-@dataclass(frozen=True)
-class CellRunner:
-    """Prepares cells for their episodes; picklable without `on_step`.
-
-    rollouts: folder of the .rrd files, one per recorded episode, written by `save`. keep: cells of one setting and task
-    share a decoder, so that what it learns and its warm-up carry over from cell to cell. on_step: shows progress within
-    an episode.
-    """
-
-    rollouts: Path
-    save: Save
-    keep: bool = False
-    on_step: OnCellStep | None = None
-
-    def __call__(self, cell: Cell) -> Callable[[int], EpisodeRecord]:
-        """Builds the cell's decoder -> the function that runs the episode of a seed. Only repeat 0 is recorded."""
-        if self.keep:
-            runner = _runner(json.dumps(cell.settings, sort_keys=True), cell.task)
-        else:
-            runner = Runner(settings_from(cell.settings), cell.task)
-
-        def episode(seed: int) -> EpisodeRecord:
-            on_step = functools.partial(self.on_step, cell, seed) if self.on_step is not None else None
-            record = runner.episode(seed, cell.repeat == 0 and is_recorded(runner.settings, seed), on_step)
-            if record.frames:
-                name = f"{cell.label.replace(' ', '_').replace('=', '')}-{record.task}-{seed}-{cell.id[:6]}.rrd"
-                self.save(record, self.rollouts / name, cell.label)
-            return dataclasses.replace(record, frames={}, places={})
-
-        return episode
-
-    def together(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, int, EpisodeRecord | Exception]]:
-        """Runs the episodes of cells whose settings differ in the task alone, `rollout.batch` at a time; yields each as
-        it ends: its cell, its seed, and its record or the error that its world raised."""
-        settings = settings_from(cells[0].settings)
-        requests = [Request(cell, cell.task, seed) for cell in cells for seed in cell.seeds]
-        for request, result in run_batch(settings, requests):
-            if self.on_step is not None:
-                self.on_step(request.key, request.seed, settings.world.horizon)
-            yield request.key, request.seed, result
-
-
-@functools.lru_cache(maxsize=64)
-def _runner(settings: str, task: str) -> Runner:
-    """The process's runner of these settings (JSON) on a task."""
-    return Runner(settings_from(json.loads(settings)), task)

@@ -1,4 +1,4 @@
-"""Evaluations that vla-eval ran, as a study: a setting per server and a cell per task, whose episodes reports pair.
+"""Evaluations that vla-eval ran, as a study: a setting per server, whose episodes reports pair.
 
 A recording is a SQLite file or the aggregate JSON beside it. What kerv served has kerv's decodes too (served.py); of
 other servers success and steps are known, and nothing of their time.
@@ -19,22 +19,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import read_json, visible
-from kerv_cli.base.settings import RolloutSettings, StudySettings, settings_from
+from kerv_cli.base.foreign import foreign_sqlite
+from kerv_cli.base.settings import RolloutSettings, settings_from
 from kerv_cli.base.spaces import ActionSpace, Group
+from kerv_cli.catalogue.served import Served, path_of, read_served
 from kerv_cli.engine.record import UNTIMED, DecodeRecord, EpisodeRecord
-from kerv_cli.lab.identity import ENGINE, OBSERVATION
-from kerv_cli.lab.plan import Cell, make_cell
-from kerv_cli.lab.rows import DECODE_SCHEMA, EPISODE_SCHEMA, Circumstances, decode_rows, episode_row
-from kerv_cli.lab.served import Served, path_of, read_served
-from kerv_cli.lab.store import StudyStore, new_run_id
+from kerv_cli.episodes.identity import ENGINE, OBSERVATION
+from kerv_cli.episodes.rows import EPISODE_SCHEMA, decodes_table, episode_row
+from kerv_cli.lab.plan import Setting, Study, Wanted
+from kerv_cli.lab.store import IMPORT, Foreign, StudyStore
 
 _ELSEWHERE = "elsewhere"
 """Mode of the one decode that stands for those of a server which is not kerv."""
-_UNKNOWN = ("path_length", "worker_pid")
+_UNKNOWN = ("path_length", "jerk")
 """Columns of an episode of another server."""
 _ONE = ActionSpace(("x",), (Group("x", 1),), (), 1.0, (-1.0,), (1.0,))
 _WORLD = {"horizon": "horizon", "stress": "stress.kind", "stress_level": "stress.level", "camera": "camera.name"}
@@ -50,7 +50,7 @@ class Episode:
     index: int
     seed: int
     success: bool
-    steps: int
+    steps: int | None
     seconds: float
     id: str
     start: tuple[float, ...] = ()
@@ -60,7 +60,7 @@ class Episode:
 @dataclass(frozen=True)
 class Evaluation:
     """One benchmark of a recording. id: the harness's name of it. config: of the benchmark. server: what the model
-    server said of itself. planned: episodes, as far as the recording tells."""
+    server said of itself. planned: episodes, as far as the recording tells. harness: the program that ran it."""
 
     source: Path
     id: str
@@ -69,6 +69,7 @@ class Evaluation:
     server: dict[str, Any]
     episodes: tuple[Episode, ...]
     planned: int
+    harness: str = "vla-eval"
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -83,7 +84,7 @@ class Evaluation:
 
 
 def read_evaluations(path: Path) -> list[Evaluation]:
-    """The evaluations in a recording, or in all recordings of a folder.
+    """The evaluations in a recording of vla-eval or a file of lerobot-eval, or in all of a folder.
 
     Raises:
         UsageError: nothing is there. CheckpointError: a recording is damaged or cut short.
@@ -102,10 +103,7 @@ def read_evaluations(path: Path) -> list[Evaluation]:
 
 
 def _from_sqlite(path: Path) -> list[Evaluation]:
-    with _damage(path), contextlib.closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=rw", uri=True)) as file:
-        pages = file.execute("PRAGMA page_count").fetchone()[0] * file.execute("PRAGMA page_size").fetchone()[0]
-        if path.stat().st_size < pages:
-            raise ValueError(f"{path.stat().st_size} of {pages} bytes are there")
+    with _damage(path), foreign_sqlite(path) as file:
         return [_of_row(file, path, *row) for row in file.execute("SELECT eval_id, metadata FROM eval_metadata")]
 
 
@@ -193,8 +191,9 @@ def sides_of(recordings: Sequence[Sequence[Evaluation]], labels: Sequence[str] =
             name = labels[number] if labels else one.name
             side = next((s for s in sides if (s.label == name if labels else s.takes(one))), None)
             if side is None:
-                same = sum(s.label == name or s.label.startswith(f"{name}-") for s in sides)
-                sides.append(side := Side(f"{name}-{same + 1}" if same else name))
+                taken = {other.label for other in sides}
+                free = (label for label in (name, *(f"{name}-{n}" for n in range(2, 10_000))) if label not in taken)
+                sides.append(side := Side(next(free)))
             side.evaluations.append(one)
     for side in sides[1:]:
         _check_same_episodes(sides[0], side)
@@ -227,60 +226,59 @@ def _conditions(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_study(results: Path, name: str, sides: Sequence[Side], baseline: str, words: Sequence[str]) -> list[str]:
-    """Writes the study of these sides -> lines about what is missing. baseline: label; empty: ar, else the first.
-    words: the command, for run.json.
+    """Write the study of these sides -> lines about what is missing.
+
+    Args:
+        results: The results folder.
+        name: Of the study.
+        sides: A setting each.
+        baseline: Its label; empty: ar, else the first.
+        words: The command, after `kerv`.
 
     Raises:
-        UsageError: a study of that name is there that was not imported, or no such label. StorageError: the disk
-            refused. CheckpointError: a served episode is damaged.
+        UsageError: A study of that name is there that was not imported, or no such label. StorageError: The disk
+            refused. CheckpointError: A served episode is damaged.
     """
     store = StudyStore(results, name)
-    if store.plan_path.is_file() and not store.is_imported:
+    if store.is_there and store.kind != IMPORT:
         raise UsageError(f"study '{name}' is there and was not imported: choose another with name=")
     labels = [side.label for side in sides]
     baseline = baseline or ("ar" if "ar" in labels else labels[0])
     if baseline not in labels:
         raise UsageError(f"baseline={baseline}: the recordings are of {', '.join(labels)}")
     benchmarks = list(dict.fromkeys(one.benchmark for side in sides for one in side.evaluations))
-    run = new_run_id()
-    planned = [cell for side in sides for cell in _planned(side, len(benchmarks) > 1)]
+    settings = {side.label: Setting(side.label, "", _settings(side), _identity(side)) for side in sides}
+    planned = [one for side in sides for one in _planned(side, settings[side.label], len(benchmarks) > 1)]
     notes = [line for side in sides for one in side.evaluations for line in _notes(side.label, one)]
-    study = StudySettings(
-        name=name, title=f"vla-eval: {', '.join(benchmarks)}", baseline=baseline, note="; ".join(notes)
+    harnesses = dict.fromkeys(one.harness for side in sides for one in side.evaluations)
+    title = f"{', '.join(harnesses)}: {', '.join(benchmarks)}"
+    wanted = tuple(one for one, _, _ in planned)
+    study = Study(name, tuple(settings.values()), wanted, IMPORT, title, baseline, note="; ".join(notes))
+    foreign = (
+        _foreign(want, one, episode, _served(results, one, episode))
+        for want, one, episode in planned
+        if episode is not None
     )
-    store.note_command(words)
-    store.write_plan(study, [cell for cell, _, _ in planned])
-    for cell, one, episodes in planned:
-        if episodes:
-            pairs = [(episode, _served(results, one, episode)) for episode in episodes]
-            rows = [_row(cell, one, *pair) for pair in pairs]
-            tables = {
-                "episodes.parquet": pa.Table.from_pylist(rows, schema=EPISODE_SCHEMA),
-                "decodes.parquet": _decodes(cell, pairs),
-            }
-            store.write_tables(cell, tables, _status(one, episodes, sum(row["seconds"] for row in rows), run))
-    store.note_finished()
+    StudyStore(results, name, IMPORT).add(study, foreign, words)
     return notes
 
 
-def _planned(side: Side, several: bool) -> Iterator[tuple[Cell, Evaluation, list[Episode]]]:
-    """The side's cells, each with its episodes; one without any is of those that are missing. several: the study is of
-    several benchmarks."""
-    settings, identity = _settings(side), _identity(side)
+def _planned(side: Side, setting: Setting, several: bool) -> Iterator[tuple[Wanted, Evaluation, Episode | None]]:
+    """Yield what the side wants, each with its episode; without one, it is missing.
+
+    several: the study is of several benchmarks.
+    """
     for one in side.evaluations:
         tasks: dict[str, list[Episode]] = {}
         for episode in one.episodes:
             tasks.setdefault(episode.task, []).append(episode)
         each = int(one.config.get("episodes_per_task") or 0)
         for task, episodes in tasks.items():
-            good = sorted((e for e in episodes if not e.reason), key=lambda e: e.seed)
+            good = {e.seed: e for e in sorted(episodes, key=lambda e: e.seed) if not e.reason}
             offset = episodes[0].seed - episodes[0].index if not episodes[0].reason else 0
-            missing = [i + offset for i in range(each) if i + offset not in {e.seed for e in good}]
             name = f"{one.benchmark}: {task}" if several else task
-            if good:
-                yield make_cell(side.label, "", settings, identity, name, [e.seed for e in good]), one, good
-            if missing:
-                yield make_cell(side.label, "", settings, identity, name, missing), one, []
+            for seed in dict.fromkeys([*good, *(i + offset for i in range(each))]):
+                yield Wanted(setting, name, seed), one, good.get(seed)
 
 
 def _notes(label: str, one: Evaluation) -> Iterator[str]:
@@ -299,19 +297,13 @@ def _served(results: Path, one: Evaluation, episode: Episode) -> Served | None:
     return read_served(path) if path is not None else None
 
 
-def _status(one: Evaluation, episodes: Sequence[Episode], seconds: float, run: str) -> dict[str, Any]:
+def _about(one: Evaluation) -> dict[str, Any]:
+    """Return the provenance of an evaluation's episodes."""
     return {
-        "episodes": len(episodes),
-        "successes": sum(episode.success for episode in episodes),
-        "wall_seconds": sum(episode.seconds for episode in episodes),
-        "timed": not math.isnan(seconds),
-        "started": "",
         "device_name": "",
         **dict(one.facts.get("machine") or {}),
-        "seconds": 0.0 if math.isnan(seconds) else seconds,
-        "run": run,
         "workers": 1,
-        "executor": "vla-eval",
+        "executor": one.harness,
         "engine": ENGINE,
         "server": one.server.get("model_server", ""),
         "harness_version": one.server.get("harness_version", ""),
@@ -347,39 +339,28 @@ def _identity(side: Side) -> dict[str, str]:
     return {"target": "", **hashes, "evaluation": digest, OBSERVATION: "of the benchmark"}
 
 
-def _row(cell: Cell, one: Evaluation, episode: Episode, served: Served | None) -> dict[str, Any]:
-    """The row of episodes.parquet. Success and steps are the harness's; its evaluations did not take turns, so that
-    each is a block of its own."""
+def _foreign(wanted: Wanted, one: Evaluation, episode: Episode, served: Served | None) -> Foreign:
+    """Return an episode for the database.
+
+    Success and steps are the harness's. Its evaluations did not take turns, so each is a block of its own.
+    """
     if served is None:
-        row = episode_row(_bare(cell, episode), Circumstances()) | dict.fromkeys(_UNKNOWN)
+        record = _bare(wanted, episode)
+        row, decodes = episode_row(record) | dict.fromkeys(_UNKNOWN), decodes_table(record)
     else:
-        row = {name: served.episode.get(name) for name in EPISODE_SCHEMA.names}
-    shared = {"task": cell.task, "seed": episode.seed, "success": episode.success, "steps": episode.steps}
-    here = {"initial_state": list(episode.start), "wall_seconds": episode.seconds, "repeat": 0, "block": one.id}
-    return row | shared | here
+        names = (*EPISODE_SCHEMA.names, "started")
+        row, decodes = {name: served.episode.get(name) for name in names}, served.decodes
+    here: dict[str, Any] = {"success": episode.success, "steps": episode.steps}
+    here |= {"initial_state": list(episode.start), "wall_seconds": episode.seconds}
+    return Foreign(wanted, row | here, decodes, f"{one.id} {wanted.setting.label}", _about(one))
 
 
-def _decodes(cell: Cell, pairs: Sequence[tuple[Episode, Served | None]]) -> pa.Table:
-    """The rows of decodes.parquet of a cell's episodes."""
-    bare = [row for episode, served in pairs if served is None for row in decode_rows(_bare(cell, episode))]
-    tables = [(episode, served.decodes) for episode, served in pairs if served is not None]
-    whole = pa.concat_tables([pa.Table.from_pylist(bare, schema=DECODE_SCHEMA), *(table for _, table in tables)])
-    seeds = np.repeat([episode.seed for episode, _ in tables], [len(table) for _, table in tables]).astype(np.int64)
-    columns = {
-        "task": pa.array([cell.task] * len(whole), pa.string()),
-        "seed": pa.array([*(row["seed"] for row in bare), *seeds.tolist()], pa.int64()),
-    }
-    for name, values in columns.items():
-        whole = whole.set_column(whole.column_names.index(name), DECODE_SCHEMA.field(name), values)
-    return whole
-
-
-def _bare(cell: Cell, episode: Episode) -> EpisodeRecord:
+def _bare(wanted: Wanted, episode: Episode) -> EpisodeRecord:
     """An episode of which no decode is known."""
     decode = DecodeRecord((), np.zeros((0, 1), np.float32), 0, (), _ELSEWHERE, math.nan, dict(UNTIMED))
     nothing = np.zeros((0, 1), np.float32)
     return EpisodeRecord(
-        *("none", _ONE, cell.task, "", episode.seed, episode.success, episode.steps, (decode,), (0,)),
+        *("none", _ONE, wanted.task, "", episode.seed, episode.success, episode.steps or 0, (decode,), (0,)),
         *(nothing, np.zeros((1, 3), np.float32), np.ones(1, np.float32), np.zeros(0)),
     )
 

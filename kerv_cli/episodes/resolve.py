@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +13,14 @@ from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.files import read_yaml_file
 from kerv_cli.base.limits import check_label
 from kerv_cli.base.manifests import read
-from kerv_cli.base.places import find_target
 from kerv_cli.base.registry import METHOD_KINDS
-from kerv_cli.base.settings import DEFAULT_TASKS, EXPERT, RolloutSettings, StudySettings, SweepSettings
-from kerv_cli.lab.identity import without_effect
-from kerv_cli.targets.checkpoint import TargetDescription, described
+from kerv_cli.base.settings import RolloutSettings, StudySettings, SweepSettings
+from kerv_cli.episodes.identity import without_effect
+from kerv_cli.episodes.policy import tasks_of, trained_tasks
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
 
-EPISODES_PER_CELL = 1
-"""Of a rollout: Ctrl-C loses at most the episode that runs."""
+MOST_SEEDS = 10_000
+"""Seeds of a block. The settings of a rollout take turns in a single one."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +31,8 @@ class ResolvedStudy:
     settings: Mapping[str, RolloutSettings]  # by label, the study's order
     overrides: Mapping[str, str]  # by label, as written
     common: tuple[str, ...] = ()  # of the command line, for every setting
+    varies: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # label -> the grid's keys and values
+    names: Mapping[str, str] = field(default_factory=dict)  # label -> what the settings of its grid share
 
     @property
     def study(self) -> StudySettings:
@@ -67,7 +68,7 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     study.name = study.name or next(o.split("=", 1)[1] for o in of_sweep if o.startswith("study="))
     keys = {_key(o) for o in of_settings}
     common = [o for o in split_words(study.common) if _key(o) not in keys] + of_settings
-    points = _points(study)
+    points, varies, shared = _points(study)
     for words in points.values():
         varied = keys & {_key(word) for word in words}
         if varied:
@@ -84,7 +85,7 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     narrows = any(key.startswith("policy") for key in keys) and "task" not in keys  # to the policy named
     _settle(settings.values(), settings[study.baseline], narrows)
     texts = {label: " ".join(words) for label, words in points.items()}
-    return ResolvedStudy(sweep, settings, texts, tuple(of_settings))
+    return ResolvedStudy(sweep, settings, texts, tuple(of_settings), varies, shared)
 
 
 def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
@@ -102,48 +103,20 @@ def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
         raise UsageError("results= names one folder: a run lies in one place")
     settings: dict[str, RolloutSettings] = {}
     texts: dict[str, str] = {}
+    varies: dict[str, dict[str, str]] = {}
+    names: dict[str, str] = {}
     for point in expand(words) if multirun else [words]:
         composed = compose("rollout", [*shared, *point], RolloutSettings)
-        values = _varied_values(point, varied)
+        values = _shown(_varied_values(point, varied))
         parts = [word for word in point if _key(word) in METHOD_KINDS and _key(word) not in varied]
-        label = check_label(" ".join([composed.method, *parts, *values]))
-        settings[label], texts[label] = composed, " ".join(point)
+        name = " ".join([composed.method, *parts])
+        label = check_label(" ".join([name, *values]))
+        names[label] = name
+        settings[label], texts[label], varies[label] = composed, " ".join(point), _varied_values(point, varied)
     baseline = next((label for label, s in settings.items() if _is_ar(s)), next(iter(settings)))
     _settle(settings.values(), settings[baseline])
-    study = StudySettings(name="rollout", title="", baseline=baseline, block=EPISODES_PER_CELL)
-    return ResolvedStudy(SweepSettings(study=study), settings, texts)
-
-
-def tasks_of(settings: RolloutSettings) -> tuple[str, ...]:
-    """Full names of a rollout's tasks; of tasks that are not named those that the target was trained on.
-
-    Raises:
-        UnknownName: no such task. CheckpointError: the target's description is damaged.
-    """
-    return resolve_tasks(settings.task or list(trained_tasks(settings)) or DEFAULT_TASKS)
-
-
-def trained_tasks(settings: RolloutSettings) -> tuple[str, ...]:
-    """Full names of the tasks that a rollout's target was trained on; none of the expert, and where it does not say or
-    is not there, which `policy.check` refuses.
-
-    Raises:
-        CheckpointError: its description is damaged.
-    """
-    if settings.policy.kind == EXPERT:
-        return ()
-    try:
-        folder = find_target(settings.results, settings.policy.target)
-    except UsageError:
-        return ()
-    names = described(folder, "target", TargetDescription).tasks
-    return resolve_tasks(names) if names else ()
-
-
-def unseen_tasks(settings: RolloutSettings, tasks: Iterable[str]) -> list[str]:
-    """Those of the tasks that the policy's target was not trained on; none where its description names no tasks."""
-    trained = trained_tasks(settings)
-    return [task for task in tasks if trained and task not in trained]
+    study = StudySettings(name="rollout", title="", baseline=baseline, block=MOST_SEEDS)
+    return ResolvedStudy(SweepSettings(study=study), settings, texts, varies=varies, names=names)
 
 
 def _settle(settings: Iterable[RolloutSettings], first: RolloutSettings, narrows: bool = False) -> None:
@@ -212,18 +185,28 @@ def _key(override: str) -> str:
     return override.split("=", 1)[0]
 
 
-def _varied_values(words: Sequence[str], varied: Collection[str]) -> list[str]:
-    """The words of a grid's keys, for a label: `threshold.r=3` -> `r=3`."""
-    return [word[_key(word).rfind(".") + 1 :] for word in words if _key(word) in varied]
+def _varied_values(words: Sequence[str], varied: Collection[str]) -> dict[str, str]:
+    """Return the words of a grid's keys: key -> value."""
+    pairs = (word.lstrip("+").split("=", 1) for word in words)
+    return {key: value for key, value in pairs if key in varied}
 
 
-def _points(study: StudySettings) -> dict[str, list[str]]:
-    """Label -> override words; a grid's labels carry its values: `spec_vla r=3`."""
+def _shown(values: Mapping[str, str]) -> list[str]:
+    """Return a grid's values for a label: `threshold.r` 3 -> `r=3`."""
+    return [f"{key.rpartition('.')[2]}={value}" for key, value in values.items()]
+
+
+def _points(study: StudySettings) -> tuple[dict[str, list[str]], dict[str, dict[str, str]], dict[str, str]]:
+    """Return label -> override words, label -> what varies, label -> name. A label has both: `spec_vla r=3`."""
     points: dict[str, list[str]] = {}
-    for label, text in study.settings.items():
+    varies: dict[str, dict[str, str]] = {}
+    names: dict[str, str] = {}
+    for name, text in study.settings.items():
         varied = swept_keys(text)
         for words in expand(text):
-            points[check_label(" ".join([label, *_varied_values(words, varied)]))] = words
+            values = _varied_values(words, varied)
+            label = check_label(" ".join([name, *_shown(values)]))
+            points[label], varies[label], names[label] = words, values, name
         if len(points) > MOST_POINTS:
             raise UsageError(f"study '{study.name}' has more than {MOST_POINTS} settings: leave some out")
-    return points
+    return points, varies, names

@@ -1,4 +1,4 @@
-"""The meaning of a cell: the settings that have an effect, the weights and data, the task, the seeds and `ENGINE`.
+"""The meaning of an episode: the settings that have an effect, the weights and data, the task, the seeds and `ENGINE`.
 
 Not the code, versions, machine, workers or layout of files: those are provenance, written beside. So what was measured
 stays, whatever is renamed or added, and what would give the same tokens is the same work in any study.
@@ -30,7 +30,7 @@ ENGINE = 1
 tests/test_golden.py holds both."""
 
 Plain = Mapping[str, Any]
-"""RolloutSettings as nested plain values: those of a cell, as they are stored."""
+"""RolloutSettings as nested plain values: those of a Setting, as they are stored."""
 
 Identity = Mapping[str, str]
 """Hashes of the weights and data behind a setting, e.g. {"target": sha256, "drafter": sha256}."""
@@ -39,9 +39,11 @@ OBSERVATION = "observation"
 """Key of the identity's only entry that is not a hash: what the target observes. The target's hash determines it."""
 
 # Fields of RolloutSettings that do not change an episode's result (where it is written, how much of it is recorded,
-# names), or that count otherwise (task and seeds as the cell's own, the policy by its hashes). All other fields count,
-# so that a new setting makes new cells instead of being overlooked.
-NOT_DETERMINING = frozenset({"task", "episodes", "seed", "policy", "method", "results", "record", "record_size"})
+# names), or that count otherwise (task and seed on their own, the policy by its hashes). All other fields count,
+# so that a new setting makes new episodes instead of being overlooked.
+NOT_DETERMINING = frozenset(
+    {"task", "episodes", "seed", "policy", "method", "results", "store", "record", "record_size"}
+)
 NOT_DETERMINING_RUNTIME = frozenset({"workers", "executor", "executor_options"})
 
 _JUDGED = ("acceptance", "threshold", "rectifier")
@@ -102,7 +104,7 @@ def _drop(settings: dict[str, Any], path: Sequence[str]) -> None:
 
 
 def depends_on_order(settings: Plain) -> bool:
-    """Whether an episode's result depends on the episodes before it in its cell: feedback moves a skip level."""
+    """Whether an episode's result depends on the episodes before it in its block: feedback moves a skip level."""
     skip = settings["skip"]
     return any(skip.get(name) for name in ("up", "down"))
 

@@ -1,0 +1,142 @@
+"""What the commands that run episodes share: notes before, progress while, an estimate instead."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import typer
+
+from kerv_cli.base.config import to_yaml
+from kerv_cli.base.durations import about
+from kerv_cli.cli.common import at_work, console, print_json, print_notes, print_table
+
+if TYPE_CHECKING:
+    from kerv_cli.episodes.resolve import ResolvedStudy
+    from kerv_cli.lab.events import Outcome
+    from kerv_cli.lab.plan import Wanted
+    from kerv_cli.lab.study import Judge, Plan
+
+SECONDS_PER_EPISODE = 1.0
+"""Before anything was measured; MT10 on one core takes 0.5 to 1.5."""
+
+
+def count(number: int, noun: str) -> str:
+    """Return a number with its noun: `1 task`, `2 tasks`."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def planned_study(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
+    """Plan a study; print what runs, and which overrides have no effect, to standard error.
+
+    Raises:
+        UsageError, CheckpointError: As `study.plan`.
+    """
+    from kerv_cli.episodes.resolve import idle_overrides
+
+    print_notes(idle_overrides(resolved))
+    _announce(resolved)
+    with at_work("loading the policy"):
+        from kerv_cli.lab.study import plan
+
+        planned = plan(resolved, command)
+    _warn_of_unseen(resolved)
+    return planned
+
+
+def planned_rollout(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
+    """Plan a rollout, as `planned_study`; say where it goes on with an interrupted one."""
+    _announce(resolved)
+    with at_work("loading the policy"):
+        from kerv_cli.lab.study import plan_rollout
+
+        planned = plan_rollout(resolved, command)
+    _warn_of_unseen(resolved)
+    if planned.there:
+        there, wanted = len(planned.there), len(planned.study.wanted)
+        typer.echo(f"resuming {planned.store.name}: {there} of {wanted} episodes are there", err=True)
+    return planned
+
+
+def _announce(resolved: ResolvedStudy) -> None:
+    """Print the number of episodes, before anything heavy loads."""
+    settings, tasks = resolved.settings, resolved.tasks
+    what = next(iter(settings)) if len(settings) == 1 else f"{len(settings)} settings"
+    whose = _few(list(dict.fromkeys(setting.policy.target for setting in settings.values())), "targets")
+    number = len(settings) * len(tasks) * resolved.first.episodes * resolved.study.repeats
+    typer.echo(f"{what} of {whose} on {_few(tasks, 'tasks')}: {count(number, 'episode')}", err=True)
+
+
+def _warn_of_unseen(resolved: ResolvedStudy) -> None:
+    """Print the tasks that a policy was not trained on."""
+    from kerv_cli.episodes.policy import unseen_tasks
+
+    settings = resolved.settings.values()
+    for target, names in dict.fromkeys((s.policy.target, tuple(unseen_tasks(s, resolved.tasks))) for s in settings):
+        if names:
+            typer.echo(f"kerv: warning: policy {target} was never trained on {', '.join(names)}", err=True)
+
+
+def _few(names: Sequence[str], what: str) -> str:
+    """Return the names; from four on, how many they are."""
+    return ", ".join(names) if len(names) < 4 else f"{len(names)} {what}"
+
+
+def print_settings(resolved: ResolvedStudy) -> None:
+    """Print the study and each of its settings as YAML, for --cfg."""
+    typer.echo(to_yaml(resolved.study), nl=False)
+    for label, settings in resolved.settings.items():
+        typer.echo(f"--- # {label}\n{to_yaml(settings)}", nl=False)
+
+
+def print_study_plan(planned: Plan, as_json: bool) -> None:
+    """Print which episodes would be run, why, and how long that takes."""
+    from kerv_cli.lab.plan import seeds_text
+    from kerv_cli.lab.study import estimate
+
+    by_label: dict[str, list[Wanted]] = {label: [] for label in planned.study.labels}
+    for one in planned.study.wanted:
+        by_label[one.setting.label].append(one)
+    columns = ("setting", "to run", "reused", "tasks", "seeds", "repeats", "why")
+    rows = []
+    for label, wanted in by_label.items():
+        to_run = [one for one in wanted if one in planned.reasons]
+        tasks, repeats = len({one.task for one in wanted}), len({one.repeat for one in wanted})
+        why = "; ".join(dict.fromkeys(planned.reasons[one] for one in to_run))
+        seeds = seeds_text(one.seed for one in wanted)
+        rows.append((label, len(to_run), len(wanted) - len(to_run), tasks, seeds, repeats, why))
+    store, time, to_run, reused = planned.store, estimate(planned, SECONDS_PER_EPISODE), planned.to_run, planned.there
+    if as_json:
+        settings = [dict(zip(columns, row, strict=True)) for row in rows]
+        print_json({"study": store.name, "folder": store.root, "settings": settings, "to run": len(to_run),
+                    "reused": len(reused), "seconds": time.seconds, "source": time.source})  # fmt: skip
+        return
+    print_table(columns, rows, f"study {store.name}, episodes")
+    typer.echo(f"{count(len(to_run), 'episode')} to run, {len(reused)} reused, {about(time.seconds, time.source)}")
+
+
+def run_study(resolved: ResolvedStudy, planned: Plan) -> Outcome:
+    """Run what a plan lacks, with progress.
+
+    Raises:
+        Interrupted: Ctrl-C. KervError: As `study.run`.
+    """
+    from kerv_cli.lab.study import looks_of
+    from kerv_cli.report import decide
+
+    judge = None
+    if resolved.sweep.until == "decided":
+        loss = resolved.sweep.loss
+        typer.echo(decide.stopping_rule(loss, len(looks_of(planned.study))), err=True)
+        judge = decide.judge(loss, lambda line: typer.echo(line, err=True))
+    return run_planned(planned, judge)
+
+
+def run_planned(planned: Plan, judge: Judge | None = None) -> Outcome:
+    """Run what a plan lacks, with progress; see `study.run`."""
+    from kerv_cli.cli.progress import ProgressDisplay
+    from kerv_cli.lab.study import run
+    from kerv_cli.report.viewing import save_recording
+
+    with ProgressDisplay(console(stderr=True)) as display:
+        return run(planned, display, save=save_recording, on_step=display.on_step, judge=judge)

@@ -1,0 +1,129 @@
+"""Runs a training for a command: progress, a tracker, curves and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.cli.common import print_figures, print_json, print_plan, progress_bar
+
+if TYPE_CHECKING:
+    from kerv_cli.lab.runs import Run
+    from kerv_cli.training.runs import DrafterRun, TargetRun
+
+MOST_POINTS = 1000
+"""Of a curve, so that a long run does not wait for its tracker; validations are all logged."""
+_MODULES = {"trackio": "trackio", "wandb": "wandb", "tensorboard": "torch.utils.tensorboard"}
+
+
+def run_training(
+    run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading: str, training: str, command: Sequence[str] = ()
+) -> None:
+    """Train with progress, or print the plan.
+
+    Args:
+        run: The training.
+        plan: Print what would be trained, and end the command.
+        as_json: Print the result as JSON.
+        loading: Title of the progress while data are read.
+        training: Title of the progress while it trains.
+        command: Words after `kerv` that go on with it; by default those that were typed.
+
+    Raises:
+        UsageError: Another process trains this.
+    """
+    if plan:
+        print_plan(run.plan(), as_json)
+    from kerv_cli.lab.runs import making
+
+    with making(run.settings.results, run.folder_kind, run.folder, command) as record:
+        _train(run, record, as_json, loading, training)
+
+
+def _train(run: TargetRun | DrafterRun, record: Run, as_json: bool, loading: str, training: str) -> None:
+    from kerv_cli.training.loop import without_subnormals
+
+    with without_subnormals(), progress_bar(loading, record) as advance:
+        run.load(advance)
+    started = False
+    settings = run.settings
+
+    def on_step(step: int, now: dict[str, float]) -> None:
+        nonlocal started
+        if not started and step > 1:
+            typer.echo(f"resuming at step {step - 1}", err=True)
+        started = True
+        log(step, now)
+        advance(step, settings.train.steps, _line(now))
+
+    name = f"{run.kind}/{run.folder.name}"
+    with (
+        without_subnormals(),
+        _live(settings.log, name, run.folder, settings.train.steps, asdict(settings)) as log,
+        progress_bar(training, record) as advance,
+    ):
+        metrics = run.train(on_step)
+    from kerv_cli.report.curves import save_curves
+
+    plot = save_curves(run.folder)
+    if as_json:
+        print_json({"folder": run.folder, "best": metrics, "curves": plot})
+        return
+    print_figures("best checkpoint", metrics, run.folder)
+    typer.echo(f"curves in {run.folder / 'log.csv'} and {plot}")
+
+
+def _line(metrics: dict[str, float]) -> str:
+    return " ".join(f"{k} {v:.4g}" for k, v in list(metrics.items())[:6] if k != "step")
+
+
+@contextmanager
+def _live(
+    tracker: str, name: str, folder: Path, steps: int, config: Mapping[str, object]
+) -> Iterator[Callable[[int, Mapping[str, float]], None]]:
+    """Yields the function that logs the numbers of a step: of an update, or of a validation, which has a `step` among
+    them.
+
+    Args:
+        tracker: trackio, wandb, tensorboard; none: nothing is logged.
+        folder: of the training; TensorBoard's files go there.
+        steps: of the whole run.
+
+    Raises:
+        UsageError: the tracker is not installed.
+    """
+    if tracker == "none":
+        yield lambda step, numbers: None
+        return
+    try:
+        module = import_module(_MODULES[tracker])
+    except ImportError as error:
+        raise UsageError(f"log={tracker}: pip install 'kerv[{tracker}]'") from error
+    if tracker == "tensorboard":
+        run = module.SummaryWriter(str(folder / "tensorboard"))
+    else:
+        run = module.init(project="kerv", name=name, config=dict(config))
+
+    def log(step: int, numbers: Mapping[str, float]) -> None:
+        validation = "step" in numbers
+        if not validation and step % max(1, steps // MOST_POINTS):
+            return
+        kind = "validation" if validation else "training"
+        named = {f"{kind}/{key}": value for key, value in numbers.items() if key != "step"}
+        if tracker == "tensorboard":
+            for key, value in named.items():
+                run.add_scalar(key, value, step)
+        else:
+            run.log(named, step=step)
+
+    try:
+        yield log
+    finally:
+        (run.close if tracker == "tensorboard" else run.finish)()

@@ -1,0 +1,316 @@
+"""The tables of a results folder: whole or unchanged, whoever dies, whoever else writes, whatever the file holds."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import resource
+import signal
+import sqlite3
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+from conftest import python
+from studies_synthetic import episode, settings_of, still_episode, study_of, swept, threshold_study
+from typer.testing import CliRunner
+
+from kerv_cli.base.errors import CheckpointError, KervError, StorageError, UsageError
+from kerv_cli.cli.app import app
+from kerv_cli.engine.record import PHASES, EpisodeRecord
+from kerv_cli.episodes.rows import decodes_table, episode_row
+from kerv_cli.lab import database as module
+from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, FILE, RUNS, STUDIES, Database, insert_or_ignore
+from kerv_cli.lab.execute import RunEpisode
+from kerv_cli.lab.plan import Setting
+from kerv_cli.lab.runs import Run, run_rows
+from kerv_cli.lab.store import StudyStore, studies
+
+STUDY = threshold_study(["reach-v3"])
+
+
+def count(database: Database, table: sa.Table) -> int:
+    with database.reading() as connection:
+        return int(connection.scalar(sa.select(sa.func.count()).select_from(table)) or 0)
+
+
+BEGUN = """
+import os, signal, sys, time
+from kerv_cli.lab.database import STUDIES, Database, insert_or_ignore
+
+def begun(database, name):
+    with database.writing() as connection:
+        values = {"name": name, "kind": "sweep", "created": "", "about": {}}
+        connection.execute(insert_or_ignore(connection, STUDIES).values(values))
+
+database = Database(sys.argv[1])
+"""
+
+
+def begun(database: Database, name: str) -> None:
+    """Write the row of a study."""
+    with database.writing() as connection:
+        values = {"name": name, "kind": "sweep", "created": "", "about": {}}
+        connection.execute(insert_or_ignore(connection, STUDIES).values(values))
+
+
+def told(error: pytest.ExceptionInfo[KervError]) -> str:
+    message = str(error.value)
+    assert "\n" not in message
+    return message
+
+
+def test_reading_creates_nothing(database: Database, tmp_path: Path) -> None:
+    assert studies(database) == run_rows(database) == []
+    assert StudyStore(tmp_path, "threshold").counts() == (0, 0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_episode_comes_back_as_it_was(database: Database) -> None:
+    setting = STUDY.settings[-1]
+    records = {seed: episode(setting, "reach-v3", seed) for seed in range(100_000, 100_004)}
+    decodes = records[100_000].decodes
+    odd = dataclasses.replace(decodes[0], deviation=0.125, similarity=0.5, compensated=3, skipped=True)
+    records[100_000] = dataclasses.replace(records[100_000], decodes=(odd, *decodes[1:]))
+    store, _ = swept(database.results, study_of({"ar": settings_of("ar")}, ["reach-v3"]), lambda *_: records.get)
+    frame = store.frame()
+    assert list(frame["seed"]) == list(records)
+    for row, record in zip(frame.to_dict("records"), records.values(), strict=True):
+        assert {name: row[name] for name in episode_row(record)} == episode_row(record)
+        assert list(row["decode_seconds"]) == [decode.seconds for decode in record.decodes]
+        assert row["device_name"]
+        stored = store.decodes([row["episode"]]).drop_columns("episode")
+        assert stored.equals(decodes_table(record))
+    assert store.load().settings[0].settings == study_of({"ar": settings_of("ar")}, ["reach-v3"]).settings[0].settings
+
+
+def test_episode_rows_sum_their_decodes() -> None:
+    record = episode(STUDY.settings[-1], "reach-v3", 100_000)
+    row = episode_row(record)
+    assert sum(row[f"seconds.{phase}"] for phase in PHASES) == pytest.approx(row["seconds"])
+    assert row["seconds.verify"] == pytest.approx(sum(d.phases["verify"] for d in record.decodes))
+    assert row["committed"] + row["decodes"] == row["tokens"]  # the prefill gives one token of each chunk
+    assert row["committed"] > row["accepted"]
+    odd = dataclasses.replace(record.decodes[0], phases={"thinking": 1.0})
+    with pytest.raises(ValueError, match="thinking"):
+        episode_row(dataclasses.replace(record, decodes=(odd,)))
+
+
+def test_what_is_no_number_is_stored_as_unknown(database: Database) -> None:
+    def run(seed: int) -> EpisodeRecord:
+        deviates = dataclasses.replace(episode(STUDY.settings[0], "reach-v3", seed).decodes[0], deviation=float("nan"))
+        return still_episode("reach-v3", seed, False, [deviates])
+
+    store, outcome = swept(database.results, study_of({"ar": settings_of("ar")}, ["reach-v3"]), lambda *_: run)
+    assert len(outcome.done) == 4
+    assert store.frame()["deviation_sum"].isna().all()
+
+
+def test_a_failed_transaction_leaves_nothing(database: Database) -> None:
+    begun(database, "a")
+    with pytest.raises(RuntimeError), database.writing() as connection:  # noqa: PT012
+        connection.execute(sa.delete(STUDIES))
+        raise RuntimeError
+    with pytest.raises(StorageError) as error, database.writing() as connection:  # noqa: PT012
+        connection.execute(sa.delete(STUDIES))
+        connection.execute(sa.text("SELECT * FROM nowhere"))
+    assert "nowhere" in told(error)
+    assert count(database, STUDIES) == 1
+
+
+WRITERS = """
+others = []
+while len(others) < 2 and (not others or others[-1]):
+    others.append(os.fork())
+for number in range(25):
+    begun(database, f"{len(others)} {others[-1] == 0} {number}")
+    begun(database, f"both{number}")
+if all(others):
+    assert [os.waitpid(other, 0)[1] for other in others] == [0, 0]
+"""
+
+
+def test_first_commands_at_once_create_one_set_of_tables(database: Database, tmp_path: Path) -> None:
+    with python(BEGUN + WRITERS, tmp_path) as process:
+        assert process.wait(60) == 0
+    assert count(database, STUDIES) == 100
+
+
+KILLED = """
+with database.writing() as connection:
+    connection.execute(STUDIES.delete())
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_kill_in_a_transaction_leaves_nothing(database: Database, tmp_path: Path) -> None:
+    begun(database, "a")
+    with python(BEGUN + KILLED, tmp_path) as process:
+        assert process.wait(60) == -signal.SIGKILL
+    begun(database, "b")
+    assert count(database, STUDIES) == 2
+
+
+def as_version(monkeypatch: pytest.MonkeyPatch, version: int, *statements: str) -> None:
+    monkeypatch.setattr(module, "SCHEMA", version)
+    monkeypatch.setattr(module, "MIGRATIONS", {version - 1: statements})
+
+
+def test_older_tables_are_migrated_in_one_transaction(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun(database, "a")
+    rename = "UPDATE studies SET name = 'b'"
+    as_version(monkeypatch, 2, "ALTER TABLE studies ADD COLUMN colour TEXT", rename, "SELECT * FROM nowhere")
+    with pytest.raises(StorageError) as error:
+        studies(Database(database.results))
+    assert "nowhere" in told(error)
+    assert [store.name for store in studies(database)] == ["a"]
+    as_version(monkeypatch, 2, "ALTER TABLE studies ADD COLUMN colour TEXT", rename)
+    for _ in range(2):
+        assert [store.name for store in studies(Database(database.results))] == ["b"]
+    with database.reading() as connection:
+        assert connection.exec_driver_sql("SELECT colour FROM studies").all() == [(None,)]
+
+
+def test_newer_tables_are_refused(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun(database, "a")
+    as_version(monkeypatch, 0)
+    with pytest.raises(CheckpointError, match=r"newer kerv \(schema 1, this one reads 0\): update kerv") as error:
+        studies(Database(database.results))
+    assert told(error)
+    with pytest.raises(CheckpointError):
+        begun(Database(database.results), "b")
+
+
+@pytest.mark.parametrize(
+    ("url", "message"),
+    [
+        ("results/kerv.db", "is no URL: write postgresql://USER@HOST/DB"),
+        ("postgresql://kerv@host:port/kerv", "is no URL"),
+        ("mysql://root@host/kerv", "mysql:// is not supported: use postgresql://"),
+        ("oracle://host", "is not supported"),
+    ],
+)
+def test_a_wrong_url_is_one_line(tmp_path: Path, url: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message) as error:
+        studies(Database(tmp_path, url))
+    assert told(error)
+
+
+def test_a_server_that_does_not_answer_is_one_line_without_the_password(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match=r"does not answer .*start the server") as error:
+        begun(Database(tmp_path, "postgresql://kerv:secret@127.0.0.1:1/kerv"), "a")
+    assert "secret" not in told(error)
+
+
+@pytest.mark.parametrize("harm", ["no database", "cut", "changed", "empty", "a folder"])
+def test_a_damaged_file_is_one_line(tmp_path: Path, harm: str) -> None:
+    swept(tmp_path, STUDY)
+    path = tmp_path / FILE
+    content = path.read_bytes()
+    if harm == "a folder":
+        path.unlink()
+        path.mkdir()
+    else:
+        path.write_bytes({
+            "no database": b"kerv" * 5000, "cut": content[:6000], "empty": b"",
+            "changed": content[:4096] + bytes(len(content) - 4096),
+        }[harm])  # fmt: skip
+    if harm == "empty":  # as a process leaves it that is killed before its first commit
+        assert studies(Database(tmp_path)) == []
+        return
+    with pytest.raises(KervError) as error:
+        StudyStore(tmp_path, "threshold").frame()
+    assert str(path) in told(error)
+    if harm != "a folder":
+        assert "is damaged" in told(error)
+        assert "restore a copy of it, or move it aside" in told(error)
+    result = CliRunner().invoke(app, ["runs", "list", f"results={tmp_path}"])
+    assert result.exit_code in (0, 1)
+    assert "Traceback" not in result.output
+
+
+def test_a_folder_that_cannot_be_written_to_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    swept(tmp_path, STUDY)
+    before = set(tmp_path.iterdir())
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)
+    assert len(StudyStore(tmp_path, "threshold").frame()) == 16
+    assert set(tmp_path.iterdir()) == before
+    with pytest.raises(StorageError, match=r"cannot use .*readonly") as error:
+        begun(Database(tmp_path), "b")
+    assert told(error)
+
+
+def test_a_locked_file_says_what_else_to_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun(Database(tmp_path), "a")
+    monkeypatch.setattr(module, "LOCK_SECONDS", 0)
+    other = sqlite3.connect(tmp_path / FILE)
+    other.execute("BEGIN IMMEDIATE")
+    with pytest.raises(StorageError, match=r"stays locked .*local disk.*store=postgresql") as error:
+        begun(Database(tmp_path), "b")
+    assert told(error)
+    assert len(studies(Database(tmp_path))) == 1  # readers go on
+    other.close()
+
+
+def test_a_full_disk_keeps_what_was_committed(tmp_path: Path) -> None:
+    """A limit on the size of files stands for the disk."""
+    study = threshold_study(["reach-v3", "push-v3"], episodes=5)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def filling(setting: Setting, task: str) -> RunEpisode:
+        def run(seed: int) -> EpisodeRecord:
+            if seed == 100_002:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+            return episode(setting, task, seed)
+
+        return run
+
+    try:
+        with pytest.raises(StorageError) as error:
+            swept(tmp_path, study, filling)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert str(tmp_path / FILE) in told(error)
+    store = StudyStore(tmp_path, "threshold")
+    assert store.counts() == (8, 40)
+    assert len(store.frame()) == 8
+    swept(tmp_path, study)  # in this process, whose claim could not be released
+    assert store.counts() == (40, 40)
+
+
+def test_a_study_that_is_not_there_names_what_to_run(database: Database, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"no study 'threshold'.*run `kerv sweep study=threshold`") as error:
+        StudyStore(tmp_path, "threshold").load()
+    assert told(error)
+    for name in ("../up", "a/b", "", ".hidden"):
+        with pytest.raises(UsageError, match="study name"):
+            StudyStore(tmp_path, name)
+
+
+def test_a_removed_study_leaves_nothing_but_what_others_want(database: Database) -> None:
+    store, _ = swept(database.results, STUDY)
+    other, _ = swept(database.results, threshold_study(["reach-v3"], radii=(3,), name="other"))
+    store.remove()
+    assert [one.name for one in studies(database)] == ["other"]
+    assert (count(database, EPISODES), count(database, DECODES)) == (12, 12)
+    assert other.counts() == (12, 12)
+    other.remove()
+    assert [count(database, table) for table in (EPISODES, DECODES, BLOCKS, STUDIES)] == [0] * 4
+
+
+def test_a_run_has_a_row_from_its_first_second_to_its_end(database: Database) -> None:
+    def row() -> tuple[str, int, int, str]:
+        (row,) = run_rows(database, "target", "mine")
+        assert row.command == ("train", "target")
+        return row.status, row.done, row.total, row.message
+
+    with Run(database, "target", "mine", ["train", "target"], total=9) as record:
+        assert row() == ("running", 0, 9, "")
+        record.beat(4, at_once=True)
+        assert row() == ("running", 4, 9, "")
+    assert row() == ("complete", 9, 9, "")
+    with database.writing() as connection:
+        connection.execute(sa.delete(RUNS))
+    with pytest.raises(ValueError, match="two"), Run(database, "target", "mine", ["train", "target"]):
+        raise ValueError("two\nlines")
+    assert row() == ("failed", 0, 0, "two lines")

@@ -1,0 +1,442 @@
+"""Running a study: resume, isolation of failures, processes that are killed, sweeps at once, executors."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import importlib
+import io
+import os
+import re
+import signal
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+import sqlalchemy as sa
+from conftest import python, raising
+from rich.console import Console
+from studies_synthetic import (
+    count_calls,
+    episode,
+    episodes_of,
+    misbehave,
+    part,
+    settings_of,
+    slow_elsewhere,
+    study_of,
+    swept,
+    threshold_study,
+    unhurried,
+)
+
+from kerv_cli.base.config import compose
+from kerv_cli.base.errors import KervError, StorageError, UsageError
+from kerv_cli.base.settings import RolloutSettings, RuntimeSettings
+from kerv_cli.cli.progress import ProgressDisplay
+from kerv_cli.engine.record import EpisodeRecord
+from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, WANTED, Database
+from kerv_cli.lab.events import BlockStarted, BlockWaits, EpisodeEnd, Event, SettingFailed, Started
+from kerv_cli.lab.execute import RunEpisode
+from kerv_cli.lab.executors import check_executor
+from kerv_cli.lab.plan import Setting, Study, blocks_of
+from kerv_cli.lab.store import StudyStore, split_of
+from kerv_cli.lab.study import estimate, plan_study
+
+STUDY = threshold_study(["reach-v3"])
+TWO = threshold_study(["reach-v3", "push-v3"])
+PACKAGES = {"slurm": "submitit", "ray": "ray"}
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("kerv_cli.lab.execute._POLL_SECONDS", 0.02)
+
+
+def claims(database: Database) -> int:
+    with database.reading() as connection:
+        return len(connection.execute(sa.select(BLOCKS).where(BLOCKS.c.claim.is_not(None))).all())
+
+
+def episodes(database: Database) -> int:
+    with database.reading() as connection:
+        return int(connection.scalar(sa.select(sa.func.count()).select_from(EPISODES)) or 0)
+
+
+def errors(database: Database) -> list[str]:
+    with database.reading() as connection:
+        return list(connection.scalars(sa.select(WANTED.c.error).where(WANTED.c.error.is_not(None))))
+
+
+def until(condition: Any, seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_the_settings_of_a_block_take_turns_in_a_recorded_order(database: Database) -> None:
+    study, ran = threshold_study(["reach-v3"], episodes=7), []  # two blocks: five seeds and two
+
+    def noting(setting: Setting, task: str) -> RunEpisode:
+        def run(seed: int) -> EpisodeRecord:
+            ran.append((setting.label, seed))
+            return episode(setting, task, seed)
+
+        return run
+
+    store, _ = swept(database.results, study, noting)
+    turns = [one for block in blocks_of(study.wanted, study.block) for one in block.turns()]
+    assert ran == [(one.setting.label, one.seed) for one in turns]
+    table = store.frame().sort_values(["started", "order"])
+    assert list(zip(table["label"], table["seed"], strict=True)) == ran
+    assert list(table["order"]) == [*range(20), *range(8)]
+    assert table["block"].nunique() == 2
+    run, calls = count_calls()
+    _, outcome = swept(database.results, study, run)
+    assert calls == outcome.done == []
+    assert len(outcome.reused) == 28
+
+
+def test_each_episode_is_committed_when_it_ends(database: Database) -> None:
+    told: list[tuple[int, int]] = []
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, EpisodeEnd):
+            told.append(StudyStore(Database(database.results), "threshold").counts())
+
+    store, _ = swept(database.results, STUDY, on_event=on_event)
+    assert told == [(number, 16) for number in range(1, 17)]
+    with pytest.raises(KeyboardInterrupt):
+        swept(database.results, TWO, raising(KeyboardInterrupt(), "ar", [100_002]))
+    assert store.counts()[0] in range(24, 28)  # two seeds of four settings, and some of the third
+    assert claims(database) == 0
+    there = store.counts()[0]
+    _, outcome = swept(database.results, TWO)
+    assert (len(outcome.reused), len(outcome.done)) == (there, 32 - there)
+
+
+def test_a_setting_that_raises_is_dropped_from_its_block_alone(database: Database) -> None:
+    events: list[Event] = []
+    bad = raising(RuntimeError("the gripper\nfell off"), "naive_sd", [100_002])
+    store, outcome = swept(database.results, STUDY, bad, on_event=events.append)
+    assert len(outcome.done) == 14
+    (failure,) = outcome.failed
+    assert [(one.setting.label, one.seed) for one in failure.wanted] == [("naive_sd", 100_002), ("naive_sd", 100_003)]
+    assert re.fullmatch(r"RuntimeError: the gripper fell off \(conftest\.py:\d+\)", failure.reason)
+    assert ["fell off" in text for text in errors(database)] == [True, True]
+    assert [type(event) for event in events[:2]] == [Started, BlockStarted]
+    assert sum(isinstance(event, EpisodeEnd) for event in events) == 14
+    assert [event for event in events if isinstance(event, SettingFailed)] == [failure]
+    _, outcome = swept(database.results, STUDY)
+    assert (len(outcome.done), outcome.failed, errors(database)) == (2, [], [])
+    assert store.counts() == (16, 16)
+
+
+def test_an_error_of_kerv_is_told_in_its_own_words(database: Database) -> None:
+    def unprepared(setting: Setting, task: str) -> RunEpisode:
+        raise UsageError("no drafter fits this target: run `kerv train drafter`")
+
+    _, outcome = swept(database.results, STUDY, unprepared)
+    assert {failure.reason for failure in outcome.failed} == {"no drafter fits this target: run `kerv train drafter`"}
+    with pytest.raises(StorageError, match="disk is full"):
+        swept(database.results, STUDY, raising(StorageError("cannot write x.rrd: the disk is full")))
+    assert claims(database) == 0
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_study_that_is_deleted_while_it_runs_says_so(tmp_path: Path, workers: int) -> None:
+    def remove(event: Event) -> None:
+        if isinstance(event, EpisodeEnd):
+            StudyStore(tmp_path, "threshold").remove()
+
+    with pytest.raises(KervError, match="study threshold was deleted while it ran: the same command begins it anew"):
+        swept(tmp_path, STUDY, unhurried, runtime=RuntimeSettings(workers=workers), on_event=remove)
+    store, outcome = swept(tmp_path, STUDY)
+    assert (outcome.failed, store.counts(), claims(store.database)) == ([], (16, 16), 0)
+
+
+def test_over_processes_only_the_guilty_settings_fail(tmp_path: Path) -> None:
+    """One setting kills its process, one raises what cannot be pickled; the rest of their blocks still takes turns."""
+    study = threshold_study(["reach-v3", "push-v3"], episodes=2, radii=(1, 3, 5))
+    for setting in study.settings:
+        setting.settings["runtime"]["threads"] = 3  # type: ignore[index]
+    store, outcome = swept(tmp_path, study, misbehave, runtime=RuntimeSettings(workers=2))
+    reasons = {failure.wanted[0].setting.label: failure.reason for failure in outcome.failed}
+    assert len(outcome.failed) == 4
+    assert reasons["spec_vla r=1"] == "its worker process was killed by SIGKILL"
+    assert reasons["spec_vla r=5"].startswith("Odd: 1 and 2")
+    assert len(outcome.done) == 2 * (3 * 2 + 1)
+    table = store.frame()
+    assert set(table["workers"]) == {2}
+    assert table["run"].nunique() == 1
+    assert set(table["wall_seconds"]) == {3.0}  # OMP_NUM_THREADS
+    assert claims(store.database) == 0
+    assert not (tmp_path / "spool").exists()
+    _, again = swept(tmp_path, study)
+    assert len(again.done) == 20 - 14
+
+
+SWEEP = """
+import os
+import sys
+import studies_synthetic as s
+from kerv_cli.lab import execute
+execute._POLL_SECONDS = 0.02
+study = s.threshold_study(["reach-v3", "push-v3"], episodes=2, radii=(3,))
+workers, processes = int(sys.argv[3]), int(sys.argv[4])
+children = []
+while len(children) < processes - 1 and (not children or children[-1]):
+    children.append(os.fork())
+s.swept(sys.argv[1], study, getattr(s, sys.argv[2]), runtime=s.RuntimeSettings(workers=workers))
+if all(children):
+    assert [os.waitpid(child, 0)[1] for child in children] == [0] * len(children)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_workers_of_a_killed_sweep_end_and_its_claims_are_taken_over(tmp_path: Path) -> None:
+    store = StudyStore(tmp_path, "threshold")
+    with python(SWEEP, tmp_path, "slow_elsewhere", 2, 1) as process:  # the first task at once, the other in a minute
+        until(lambda: store.counts()[0] == 6)
+        until(lambda: claims(store.database) == 1)
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        assert children
+        process.kill()
+        process.wait()
+    until(lambda: not any(Path(f"/proc/{child}").exists() for child in children), 10.0)
+    assert (store.counts(), claims(store.database)) == ((6, 12), 1)
+    _, outcome = swept(tmp_path, threshold_study(["reach-v3", "push-v3"], episodes=2, radii=(3,)))
+    assert (len(outcome.reused), len(outcome.done), claims(store.database)) == (6, 6, 0)
+
+
+FAR, SILENT = {"host": "far"}, {"heartbeat": 0.0}
+CHANGES = [(SILENT, True), (FAR, True), (FAR | SILENT, False), ({"status": "failed"}, False)]
+
+
+@pytest.mark.parametrize(("change", "held"), CHANGES)
+def test_a_claim_lasts_as_long_as_its_run(database: Database, change: dict[str, Any], held: bool) -> None:
+    """On another machine as long as it was heard of. What it runs meanwhile is not run again."""
+    seen: list[bool] = []
+
+    def claimed(event: Event) -> None:
+        if isinstance(event, BlockStarted):
+            with database.writing() as connection:
+                connection.execute(sa.update(RUNS).values(**change))
+            with contextlib.suppress(InterruptedError):
+                swept(database.results, STUDY, on_event=noted)
+
+    def noted(event: Event) -> None:
+        if isinstance(event, BlockWaits | BlockStarted):
+            seen.append(isinstance(event, BlockWaits))
+            raise InterruptedError
+
+    swept(database.results, STUDY, on_event=claimed)
+    assert seen == [held]
+
+
+def test_sweeps_at_once_run_each_episode_once(database: Database) -> None:
+    with python(SWEEP, database.results, "unhurried", 1, 4) as process:
+        assert process.wait(60) == 0
+    assert episodes(database) == 12
+    assert StudyStore(database, "threshold").counts() == (12, 12)
+    assert claims(database) == 0
+
+
+def test_a_sweep_that_begins_in_the_middle_of_another_runs_nothing_twice(database: Database) -> None:
+    """Its blocks are smaller: some of their episodes were there when it was planned."""
+    outcomes = []
+    with ThreadPoolExecutor(1) as pool:
+
+        def on_event(event: Event) -> None:
+            if isinstance(event, EpisodeEnd) and not outcomes and StudyStore(database, "threshold").counts()[0] == 5:
+                outcomes.append(pool.submit(swept, database.results, STUDY))
+                until(lambda: split_of(database, STUDY).there)
+                time.sleep(0.3)
+
+        swept(database.results, STUDY, on_event=on_event)
+        _, outcome = outcomes[0].result()
+    assert episodes(database) == 16
+    assert (len(outcome.done), len(outcome.reused)) == (0, 16)
+
+
+def in_order() -> Study:
+    """A setting whose result depends on the order of its episodes, beside one that is not so."""
+    settings = settings_of("retrieval")
+    settings.skip = part("skip", "similarity", up=0.25)
+    return study_of({"ar": settings_of("ar"), "heisd": settings}, ["reach-v3"])
+
+
+def killed_at_the_third(setting: Setting, task: str) -> RunEpisode:
+    def run(seed: int) -> EpisodeRecord:
+        if (setting.label, seed) == ("ar", 100_002):
+            os.kill(os.getpid(), signal.SIGKILL)
+        return episode(setting, task, seed)
+
+    return run
+
+
+def test_episodes_whose_order_counts_run_in_one_process(database: Database) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        swept(database.results, in_order(), raising(KeyboardInterrupt(), "ar", [100_002]))
+    store, _ = swept(database.results, in_order())
+    assert store.frame().query("label == 'heisd'")["block"].nunique() == 1
+    assert not split_of(database, in_order()).reasons
+
+
+def test_episodes_whose_order_counts_run_whole_again_when_their_process_dies(tmp_path: Path) -> None:
+    store, outcome = swept(tmp_path, in_order(), killed_at_the_third, runtime=RuntimeSettings(workers=2))
+    assert [one.setting.label for failure in outcome.failed for one in failure.wanted] == ["ar", "ar"]
+    assert len(outcome.done) == 2 + 4
+    frame = store.frame().query("label == 'heisd'")
+    assert (len(frame), frame["block"].nunique()) == (4, 1)
+    assert {one.setting.label for one in split_of(store.database, in_order()).reasons} == {"ar"}
+
+
+def test_estimates_say_what_they_rest_on(database: Database) -> None:
+    def planned(workers: int) -> Any:
+        return plan_study(database, TWO, RuntimeSettings(workers=workers), ["sweep"])
+
+    guess = estimate(planned(1), 10.0)
+    assert guess.seconds == 32 * 10.0
+    assert "guess" in guess.source
+    store, _ = swept(database.results, threshold_study(["reach-v3"], radii=()))
+    wall = store.frame().groupby("label")["wall_seconds"].mean()
+    found = estimate(planned(2), 10.0)
+    assert found.seconds == pytest.approx((4 * wall.sum() + 16 * wall.mean()) / 2)
+    assert "measured on 8 stored episodes" in found.source
+
+
+def test_progress_without_a_terminal_is_plain_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    swept(tmp_path, threshold_study(["reach-v3"], episodes=1))
+    written = io.StringIO()
+    with ProgressDisplay(Console(file=written, width=60)) as display:
+        bad = raising(ValueError("[bold] is not markup"), "naive_sd")
+        swept(tmp_path, STUDY, bad, on_event=display)
+    lines = written.getvalue().splitlines()
+    assert lines[0] == "4 episodes there already"
+    assert any(line.startswith("naive_sd on reach-v3: failed: ValueError: [bold] is not markup") for line in lines)
+    assert re.fullmatch(r"12/12 .* on reach-v3, seed 100003: (success|failure), \d\.\d s", lines[-1])
+    assert "\x1b" not in written.getvalue()
+    monkeypatch.setattr("kerv_cli.cli.progress.LOG_SECONDS", -1.0)
+    with ProgressDisplay(Console(file=written, width=60)) as display:
+        swept(tmp_path, TWO, on_event=display)
+    assert re.search(r"^\d+/19 episodes, about \d+ s left; push-v3 100000-100003: 4 settings in turn$",
+                     written.getvalue(), re.M)  # fmt: skip
+
+
+def test_progress_on_a_terminal_is_a_bar_that_goes_away(tmp_path: Path) -> None:
+    written = io.StringIO()
+    with ProgressDisplay(Console(file=written, width=100, force_terminal=True)) as display:
+        swept(tmp_path, STUDY, on_event=display)
+    assert "16/16 episodes" in written.getvalue()
+    assert written.getvalue().count("\x1b[?25h") == 1  # the cursor is shown again
+
+
+def runtime(executor: str, **options: Any) -> RuntimeSettings:
+    return RuntimeSettings(workers=2, executor=executor, executor_options=options)
+
+
+@pytest.fixture(params=["slurm", "ray"])
+def cluster(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[RuntimeSettings]:
+    """Both kinds of cluster, on this machine."""
+    pytest.importorskip(PACKAGES[request.param])
+    if request.param == "slurm":  # seconds that it waits for the result of a job that was killed
+        monkeypatch.setattr("submitit.core.core.Job._results_timeout_s", 1)
+    # workers of both import this folder's modules
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path for path in sys.path if path))
+    monkeypatch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # theirs: sockets and files left to the collector
+        yield runtime(request.param, **({"cluster": "local"} if request.param == "slurm" else {}))
+        gc.collect()
+
+
+def test_a_cluster_loses_only_the_guilty_settings_and_resumes(cluster: RuntimeSettings, tmp_path: Path) -> None:
+    study = threshold_study(["reach-v3"], episodes=2, radii=(1, 5))
+    store, outcome = swept(tmp_path, study, misbehave, runtime=cluster)
+    reasons = {failure.wanted[0].setting.label: failure.reason for failure in outcome.failed}
+    assert set(reasons) == {"spec_vla r=1", "spec_vla r=5"}
+    assert "its worker process was lost" in reasons["spec_vla r=1"] or "its job" in reasons["spec_vla r=1"]
+    assert reasons["spec_vla r=5"].startswith("Odd: 1 and 2")
+    assert len(outcome.done) == 2 * 2 + 1
+    table = store.frame()
+    assert set(table["executor"]) == {cluster.executor}
+    assert set(table["wall_seconds"]) == {1.0}  # OMP_NUM_THREADS
+    assert claims(store.database) == 0
+    _, again = swept(tmp_path, study)
+    assert (len(again.reused), len(again.done)) == (5, 3)
+
+
+def test_an_interrupt_ends_a_clusters_work(cluster: RuntimeSettings, tmp_path: Path) -> None:
+    ended: list[Event] = []
+
+    def interrupt(event: Event) -> None:
+        ended.extend([event] if isinstance(event, EpisodeEnd) else [])
+        if len(ended) == 16:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        swept(tmp_path, TWO, slow_elsewhere, runtime=cluster, on_event=interrupt)
+    store = StudyStore(tmp_path, "threshold")
+    assert (store.counts(), claims(store.database)) == ((16, 32), 0)
+
+
+def test_an_executor_from_outside(tmp_path: Path) -> None:
+    """One file, `examples/thread_executor.py`, named in KERV_PLUGINS."""
+    importlib.import_module("examples.thread_executor")
+    threads = set()
+
+    def noting(setting: Setting, task: str) -> RunEpisode:
+        def run(seed: int) -> EpisodeRecord:
+            threads.add(threading.current_thread().name)
+            return episodes_of(setting, task)(seed)
+
+        return run
+
+    _, outcome = swept(tmp_path, TWO, noting, runtime=runtime("threads", name="mine"))
+    assert len(outcome.done) == 32
+    assert threads <= {"mine_0", "mine_1"}
+    with pytest.raises(UsageError, match=r"runtime\.executor_options: nam: unexpected"):
+        check_executor(runtime("threads", nam="x"))
+
+
+def test_options_come_from_the_command_line() -> None:
+    for executor, option, value in (("slurm", "partition", "short"), ("ray", "gpus", 0.5)):
+        words = [f"runtime={executor}", f"runtime.executor_options.{option}={value}"]
+        composed = compose("rollout", words, RolloutSettings).runtime
+        assert (composed.executor, composed.executor_options) == (executor, {option: value})
+
+
+@pytest.mark.parametrize("name", ["slurm", "ray"])
+def test_a_package_that_is_not_installed_is_named_with_its_command(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda package: None)
+    with pytest.raises(UsageError, match=rf"needs the package {PACKAGES[name]}: pip install 'kerv\[{name}\]'"):
+        check_executor(runtime(name))
+
+
+WRONG = {
+    "unknown executor 'slrum': did you mean slurm": RuntimeSettings(executor="slrum"),
+    r"runtime\.workers=0: from 1 to": RuntimeSettings(workers=0),
+    r"options: minutes: input should be a valid integer": runtime("slurm", minutes="long"),
+    r"runtime\.executor_options: partition: unexpected": runtime("local", partition="x"),
+    "Slurm cannot be used from here": runtime("slurm"),
+    r"127\.0\.0\.1:1 cannot be reached": runtime("ray", address="127.0.0.1:1"),
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_a_wrong_executor_is_refused_in_one_line(message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = WRONG[message]
+    if settings.executor in PACKAGES:
+        pytest.importorskip(PACKAGES[settings.executor])
+    monkeypatch.setenv("PATH", "")  # no srun, wherever the test runs
+    with pytest.raises(UsageError, match=message) as caught:
+        swept(tmp_path, STUDY, runtime=settings)
+    assert "\n" not in str(caught.value)

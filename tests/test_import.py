@@ -1,0 +1,200 @@
+"""Runs from elsewhere: a results folder of 0.1.0, another kerv.db, lerobot's results; what is handed on, and limits."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sqlite3
+import tarfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from studies_synthetic import swept, threshold_study
+from typer.testing import CliRunner
+
+from kerv_cli.base import foreign
+from kerv_cli.base.foreign import foreign_sqlite, foreign_table
+from kerv_cli.catalogue.lerobot import read_info
+from kerv_cli.cli.app import app
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.report.measures import MACRO
+from kerv_cli.report.tables import CSV_COLUMNS, load_study
+
+ARCHIVE = Path(__file__).parent / "fixtures" / "results-0.1.0.tar.xz"
+STUDY = """
+name: four-methods
+common: policy.target=few task=[reach-v3,drawer-close-v3] episodes=3 world.horizon=12 record=0
+settings: {ar: method=ar, spec_vla: method=spec_vla, heisd: method=heisd, one_pass_streak: method=one_pass_streak}
+"""
+
+
+def answer(*words: str) -> Any:
+    result = CliRunner().invoke(app, [*words, "--json"])
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+def refusal(*words: str) -> str:
+    result = CliRunner().invoke(app, list(words))
+    assert (result.exit_code in (1, 2), len(result.stderr.splitlines())) == (True, 1), result.output
+    return result.stderr
+
+
+@pytest.fixture(scope="module")
+def older(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("older")
+    with tarfile.open(ARCHIVE) as archive:
+        archive.extractall(folder, filter="data")
+    (folder / "study.yaml").write_text(STUDY)
+    told = answer("runs", "import", f"{folder}/results", f"results={folder}/results")
+    assert (len(told["studies"]), told["notes"]) == (3, [])
+    return folder
+
+
+def test_every_run_of_0_1_0_is_listed_shown_and_compared(older: Path) -> None:
+    results = f"results={older}/results"
+    runs = {run["id"]: run for run in answer("runs", "list", results) if run["state"] == "complete"}
+    kinds = ["calibration", "datastore", "demos", "drafter", "early", "rollout", "rollout", "sweep", "target"]
+    assert sorted(run["kind"] for run in runs.values()) == kinds
+    assert runs["four-methods"]["command"] == ["kerv", "sweep", "study=four.yaml", "results=results"]
+    assert runs["four-methods"]["started"] == "2026-11-23T01:31:05"
+    made = answer("runs", "show", "four-methods", results)["made_from"]
+    assert made == {kind: f"{kind}/few" for kind in ("calibration", "datastore", "drafter", "early", "target")}
+    (found,) = answer("runs", "compare", "four-methods:ar", "four-methods:heisd", results)
+    assert {"proposer.kind", "datastore"} <= {row["key"] for row in found["settings"]}
+
+
+def test_it_is_reported_as_it_was(older: Path) -> None:
+    """Columns have the values of then, but for what is inferred from them: intervals of ratios and averages."""
+    before = pd.read_csv(older / "results/report/tables/four-methods.csv")
+    data = load_study(StudyStore(older / "results", "four-methods"))
+    assert set(data.episodes["git_commit"].str[:7]) == {"1e4a685"}
+    now = data.table.loc[:, lambda table: [name in before for name in table]].convert_dtypes().astype(object)
+    text = pd.read_csv(pd.io.common.StringIO(now.to_csv(index=False, float_format="%.6g")))
+    ratios, macro = ("speedup", "episode_speedup", "AL"), before["averaging"] == MACRO
+    inferred = {"pairs_to_settle", *(f"{name}_{end}" for name in ratios for end in ("low", "high"))}
+    of_macro = {"difference", "difference_low", "difference_high", "non_inferior"}
+    for rows, anew in ((~macro, inferred), (macro, inferred | of_macro)):
+        columns = [name for name in text if name not in anew]
+        assert {*CSV_COLUMNS} - {*columns} <= {*anew, "steps_to_success"}
+        pd.testing.assert_frame_equal(text.loc[rows, columns], before.loc[rows, columns])
+
+
+def test_nothing_of_it_is_run_again_and_more_seeds_are_added(older: Path, tmp_path: Path) -> None:
+    shutil.copytree(older, tmp_path, dirs_exist_ok=True)
+    study, results = f"study={tmp_path}/study.yaml", f"results={tmp_path}/results"
+    plan = answer("sweep", study, "--plan", results)
+    assert (plan["to run"], plan["reused"]) == (0, 24)
+    (tmp_path / "study.yaml").write_text(STUDY.replace("episodes=3", "episodes=4"))
+    plan = answer("sweep", study, "--plan", results)
+    assert (plan["to run"], plan["reused"]) == (8, 24)
+    assert {row["why"] for row in plan["settings"]} == {"new seeds"}
+    told = answer("runs", "import", f"{tmp_path}/results", results)
+    assert (told["studies"], len(told["notes"])) == ([], 3)
+
+
+def test_a_damaged_cell_is_left_out_with_a_line(older: Path, tmp_path: Path) -> None:
+    shutil.copytree(older / "results", tmp_path / "old", ignore=shutil.ignore_patterns("kerv.db*", "artifacts"))
+    (cell, *_) = sorted((tmp_path / "old/studies/four-methods/cells").iterdir())
+    (cell / "decodes.parquet").write_bytes(b"PAR1")
+    told = answer("runs", "import", f"{tmp_path}/old", f"results={tmp_path}/new")
+    assert [str(cell) in line for line in told["notes"]] == [True]
+    (run,) = (run for run in answer("runs", "list", f"results={tmp_path}/new") if run["kind"] == "sweep")
+    assert run["state"] == "21 of 24 episodes"
+
+
+@pytest.mark.bits
+def test_its_tokens_are_those_of_today(older: Path, tmp_path: Path) -> None:
+    shutil.copytree(older, tmp_path, dirs_exist_ok=True)
+    told = answer("runs", "rerun", "four-methods", f"results={tmp_path}/results")
+    assert (told["episodes"], told["same_tokens"]) == (24, 24)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("made")
+    swept(folder, threshold_study(["reach-v3", "push-v3"]))
+    swept(folder, threshold_study(["reach-v3"], name="other"))
+    return folder
+
+
+def test_an_exported_database_is_the_study_elsewhere(made: Path, tmp_path: Path) -> None:
+    answer("runs", "export", "threshold", "--to", "db", "--dir", f"{tmp_path}/out", f"results={made}")
+    (run,) = answer("runs", "list", f"results={tmp_path}/out/threshold")
+    assert (run["id"], run["state"]) == ("threshold", "complete")
+    told = answer("runs", "import", f"{tmp_path}/out/threshold/kerv.db", "name=copy", f"results={tmp_path}/new")
+    assert told == {"studies": ["copy"], "notes": []}
+    before, after = (load_study(StudyStore(*at)) for at in ((made, "threshold"), (tmp_path / "new", "copy")))
+    pd.testing.assert_frame_equal(before.per_task.drop(columns="study"), after.per_task.drop(columns="study"))
+    with sqlite3.connect(tmp_path / "out/threshold/kerv.db") as file:
+        file.execute("UPDATE kerv SET value = '99'")
+    said = refusal("runs", "import", f"{tmp_path}/out/threshold", f"results={tmp_path}/new")
+    assert "newer kerv" in said
+
+
+def test_episodes_and_decodes_as_parquet(made: Path, tmp_path: Path) -> None:
+    answer("runs", "export", "threshold", "--to", "parquet", "--dir", str(tmp_path), f"results={made}")
+    episodes, decodes = (pd.read_parquet(tmp_path / f"threshold/{name}.parquet") for name in ("episodes", "decodes"))
+    assert len(episodes) == len(StudyStore(made, "threshold").frame()) == 32
+    counted = decodes.groupby(["label", "task", "seed", "repeat"]).size()
+    assert counted.to_dict() == episodes.set_index(["label", "task", "seed", "repeat"])["decodes"].to_dict()
+
+
+def info(folder: Path, successes: list[list[bool]]) -> Path:
+    folder.mkdir()
+    metrics = [{"sum_rewards": [1.0] * len(one), "max_rewards": [1.0], "successes": one} for one in successes]
+    tasks = [{"task_group": "libero_10", "task_id": i, "metrics": one} for i, one in enumerate(metrics)]
+    overall = {"pc_success": 50.0, "eval_ep_s": 2.5, "avg_sum_reward": float("nan"), "video_paths": []}
+    (folder / "eval_info.json").write_text(json.dumps({"per_task": tasks, "per_group": {}, "overall": overall}))
+    return folder
+
+
+def test_results_of_lerobot_are_compared_as_pairs(tmp_path: Path) -> None:
+    act = info(tmp_path / "act", [[True, False], [True, True]])
+    pi0 = info(tmp_path / "pi0", [[False, False], [True, True]])
+    told = answer("runs", "import", str(act), str(pi0), "name=libero", "baseline=act", f"results={tmp_path}/new")
+    rows = {row["label"]: row for row in told["settings"] if row["averaging"].startswith("micro")}
+    assert (rows["act"]["successes"], rows["pi0"]["successes"]) == (3, 2)
+    assert (rows["pi0"]["pairs"], rows["pi0"]["only_baseline"], rows["pi0"]["episodes"]) == (4, 1, 4)
+    assert rows["pi0"]["steps_to_success"] is None
+    answer("report", "study=libero", f"results={tmp_path}/new")
+    single = {"per_episode": [{"episode_ix": 0, "success": True, "seed": 7}], "aggregated": {"eval_ep_s": 1.0}}
+    (tmp_path / "act/eval_info.json").write_text(json.dumps(single))
+    assert [one.seed for one in read_info(tmp_path / "act/eval_info.json")[0].episodes] == [7]
+    (tmp_path / "act/eval_info.json").write_text(json.dumps({"per_task": [{"metrics": 3}]}))
+    assert "lerobot-eval" in refusal("runs", "import", str(act), f"results={tmp_path}/new")
+
+
+def test_a_foreign_database_that_never_ends_is_refused(tmp_path: Path) -> None:
+    path, endless = tmp_path / "recording-1.sqlite", "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)"
+    with sqlite3.connect(path) as file:
+        file.execute("CREATE TABLE t (x)")
+    begun = time.monotonic()
+    with foreign_sqlite(path) as file, pytest.raises(sqlite3.OperationalError):
+        file.execute(f"{endless} SELECT MAX(i) FROM n").fetchone()
+    for name in ("eval_metadata", "kerv"):
+        with sqlite3.connect(path) as file:
+            file.execute(f"CREATE VIEW {name} AS {endless} SELECT i AS eval_id, '' AS metadata FROM n")
+        assert str(path) in refusal("runs", "import", str(path), f"results={tmp_path}/new")
+    assert time.monotonic() - begun < 10
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_small_parquet_file_that_expands_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(foreign, "MOST_EXPANDED", 2**24)
+    text = pa.DictionaryArray.from_arrays(pa.array(np.zeros(50_000, np.int32)), pa.array(["x" * 1000]))
+    texts = pa.ListArray.from_arrays(pa.array([0, 50_000], pa.int32()), text).cast(pa.list_(pa.string()))
+    for name, column in enumerate((text, texts, text.cast(pa.string()), np.zeros(2**22))):
+        path = tmp_path / f"{name}.parquet"
+        pq.write_table(pa.table({"a": column}), path, compression="zstd")
+        with pytest.raises(ValueError, match="expands to more than"):
+            foreign_table(path)
+    pq.write_table(pa.table({"a": [1, 2, 3], "b": ["x", "y", "z"]}), path, row_group_size=1)
+    assert foreign_table(path, ["b"]).to_pylist() == [{"b": "x"}, {"b": "y"}, {"b": "z"}]
+    assert foreign_table(path, where=("a", 2)).to_pylist() == [{"a": 2, "b": "y"}]

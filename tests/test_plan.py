@@ -1,0 +1,315 @@
+"""A plan is what a study wants minus what the database has, with a reason for the rest."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+from conftest import raising
+from studies_synthetic import IDENTITY, part, settings_of, study_of, swept, threshold_study
+
+import kerv_cli
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.settings import RolloutSettings
+from kerv_cli.episodes import identity
+from kerv_cli.episodes.code import _meaning, code_hash
+from kerv_cli.episodes.identity import ENGINE, hash_of, work_of
+from kerv_cli.lab.database import Database
+from kerv_cli.lab.plan import Block, Setting, Split, Study, blocks_of, plain_settings, seeds_text, wanted_of
+from kerv_cli.lab.runs import interrupted_since
+from kerv_cli.lab.store import StudyStore, split_of
+from kerv_cli.report.summary import not_in_turn
+from kerv_cli.report.tables import load_study
+
+TASKS = ("reach-v3", "push-v3")
+Found = dict[tuple[str, str], tuple[list[int], str]]
+
+
+def work(settings: RolloutSettings, weights: dict[str, str] = IDENTITY) -> str:
+    return Setting("x", "", plain_settings(asdict(settings)), weights).work
+
+
+def changed(path: str, value: Any) -> RolloutSettings:
+    settings = settings_of("spec_vla", 9)
+    owner: Any = settings
+    *groups, name = path.split(".")
+    for group in groups:
+        owner = getattr(owner, group)
+    assert getattr(owner, name) != value
+    setattr(owner, name, value)
+    return settings
+
+
+def to_run(split: Split) -> Found:
+    """(label, task) -> the seeds to run and why."""
+    found: Found = {}
+    for one, why in split.reasons.items():
+        found.setdefault((one.setting.label, one.task), ([], why))[0].append(one.seed)
+    return found
+
+
+def why(split: Split) -> set[str]:
+    return set(split.reasons.values())
+
+
+def table_of(store: StudyStore) -> pd.DataFrame:
+    return load_study(store).table.query("averaging == 'micro over tasks'").set_index("label")
+
+
+def same_wanted(store: StudyStore, study: Study) -> bool:
+    return {(one.setting.label, one.key) for one in store.load().wanted} == {
+        (one.setting.label, one.key) for one in study.wanted
+    }
+
+
+def test_what_determines_a_result_is_another_episode() -> None:
+    for path, value in {
+        "proposer.kind": "hold", "proposer.depth": 3, "acceptance.strict_dofs": False, "threshold.r": 5,
+        "rectifier.kind": "compensate", "boundary.kind": "fused", "world.horizon": 200, "world.camera.size": 64,
+        "runtime.device": "cuda", "runtime.dtype": "bfloat16", "runtime.threads": 2, "deviation_every": 4,
+    }.items():  # fmt: skip
+        assert work(changed(path, value)) != work(settings_of("spec_vla", 9)), path
+    for path, value in {
+        "seed": 100_001, "episodes": 5, "runtime.workers": 2, "runtime.executor": "slurm",
+        "runtime.executor_options": {"partition": "p"}, "results": "elsewhere", "record": -1, "record_size": 480,
+        "method": "other_name", "policy.target": "same-weights-elsewhere", "task": ["push-v3"],
+        "rollout.latency_ms": 5.0,
+    }.items():  # fmt: skip
+        assert work(changed(path, value)) == work(settings_of("spec_vla", 9)), path
+
+
+def test_weights_and_engine_are_part_of_the_meaning() -> None:
+    settings = settings_of("ar")
+    assert work(settings, {**IDENTITY, "drafter": "c" * 64}) != work(settings)
+    assert work_of(asdict(settings), IDENTITY, engine=ENGINE + 1) != work(settings)
+    expected = hashlib.sha256(b'{"a":1,"b":{"c":[1,2],"d":null}}').hexdigest()[:16]
+    assert hash_of({"b": {"d": None, "c": [1, 2]}, "a": 1}) == expected
+    with pytest.raises(ValueError, match="JSON compliant"):
+        hash_of({"a": float("nan")})
+
+
+def test_the_code_below_the_commands_counts_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(Path(kerv_cli.__file__).parent, tmp_path / "kerv_cli")
+    monkeypatch.setattr(kerv_cli, "__file__", str(tmp_path / "kerv_cli" / "__init__.py"))
+
+    def hash_after(file: str, more: str) -> str:
+        path = tmp_path / "kerv_cli" / file
+        path.write_text(f"{path.read_text()}\n{more}\n")
+        return code_hash.__wrapped__()
+
+    before = code_hash.__wrapped__()
+    assert hash_after("report/tables.py", "x = 1") == hash_after("cli/sweep.py", "x = 1") == before
+    assert hash_after("base/settings.py", '# a comment\n"""and a string that stands alone"""\n') == before
+    computing = [hash_after(file, "x = 1") for file in ("engine/decoder.py", "base/settings.py", "episodes/runner.py")]
+    assert len({before, *computing}) == 4
+    first = b'def f(x):\n    """Doubles."""\n    return 2*x\n'
+    assert _meaning(first) == _meaning(b"# doubles\ndef f( x ):\n\n    return (2 * x)\n")
+    assert _meaning(first) != _meaning(b'def f(x):\n    return "Doubles."\n')
+
+
+@pytest.mark.parametrize(("seeds", "text"), [((5, 6, 7, 9), "5-7;9"), ((3,), "3"), ((2, 1), "1-2")])
+def test_seeds_as_ranges(seeds: tuple[int, ...], text: str) -> None:
+    assert seeds_text(seeds) == text
+
+
+def test_blocks_go_by_repeat_task_and_seeds() -> None:
+    settings = {"ar": settings_of("ar", episodes=7), "b": settings_of("spec_vla", 9, episodes=7)}
+    study = study_of(settings, TASKS, block=3, repeats=2)
+    assert len({one.key for one in study.wanted}) == len(study.wanted) == 2 * 2 * 2 * 7
+    blocks = blocks_of(study.wanted, 3)
+    assert [(b.task, len(b.seeds)) for b in blocks[:4]] == [*(("reach-v3", n) for n in (3, 3, 1)), ("push-v3", 3)]
+    assert [b.seeds[0] for b in blocks[:3]] == [100_000, 100_003, 100_006]
+    assert all([setting.label for setting in block.settings] == ["ar", "b"] for block in blocks)
+    assert blocks[0].name == "reach-v3 100000-100002"
+    assert blocks[-1].name == "push-v3 100006 repeat 1"
+
+
+def test_settings_take_turns_seed_by_seed_in_a_drawn_order() -> None:
+    (block,) = blocks_of(threshold_study(["reach-v3"], episodes=5).wanted, 5)
+    turns = list(block.turns())
+    assert [one.seed for one in turns] == sorted(one.seed for one in turns)
+    orders = [tuple(one.setting.label for one in turns[at : at + 4]) for at in range(0, 20, 4)]
+    assert {frozenset(order) for order in orders} == {frozenset(threshold_study(["reach-v3"]).labels)}
+    assert len(set(orders)) > 1
+    assert list(Block(block.wanted).turns()) == turns
+
+
+def test_what_differs_in_threads_cannot_take_turns_in_one_process() -> None:
+    study = study_of({"a": settings_of("ar"), "b": changed("runtime.threads", 2)}, ["reach-v3"])
+    assert [len(block.settings) for block in blocks_of(study.wanted, 5)] == [1, 1]
+
+
+def test_a_batch_takes_any_tasks_of_one_setting_in_a_block_per_worker() -> None:
+    settings = {"ar": settings_of("ar"), "b": settings_of("spec_vla", 9)}
+    for one in settings.values():
+        one.rollout.batch = 2
+    blocks = blocks_of(study_of(settings, TASKS).wanted, 5, workers=2)
+    assert [(len(block.wanted), [s.label for s in block.settings]) for block in blocks] == [
+        (4, [label]) for label in ("ar", "ar", "b", "b")
+    ]
+    assert [len(block.wanted) for block in blocks_of(study_of(settings, TASKS).wanted, 5)] == [8, 8]
+
+
+def test_a_study_is_counted_before_it_is_planned() -> None:
+    setting = study_of({"ar": settings_of("ar", episodes=1)}, ["reach-v3"]).settings[0]
+    large = dataclasses.replace(setting, settings={**setting.settings, "episodes": 10**7})
+    with pytest.raises(UsageError, match="10000000 episodes: at most 1000000"):
+        wanted_of([large], ["reach-v3"])
+
+
+def test_more_episodes_run_only_the_new_seeds_in_turn(database: Database) -> None:
+    swept(database.results, threshold_study(TASKS, episodes=3, radii=(3,)))
+    study = threshold_study(TASKS, episodes=5, radii=(3,))
+    new = {(label, task): ([100_003, 100_004], "new seeds") for label in study.labels for task in TASKS}
+    assert to_run(split_of(database, study)) == new
+    store, outcome = swept(database.results, study)
+    assert (len(outcome.done), len(outcome.reused)) == (12, 18)
+    row = table_of(store).loc["spec_vla r=3"]
+    assert (row["pairs"], row["same_block"]) == (10, 1.0)
+    assert row["speedup"] > 0
+    store, outcome = swept(database.results, threshold_study(TASKS, episodes=2, radii=(3,)))
+    assert outcome.done == []
+    assert table_of(store)["episodes"].tolist() == [4, 4, 4]
+
+
+def test_sweeps_over_other_tasks_end_in_one_study(database: Database) -> None:
+    swept(database.results, threshold_study(["reach-v3"]))
+    store, _ = swept(database.results, threshold_study(["push-v3"]))
+    assert same_wanted(store, threshold_study(TASKS))
+    assert store.counts() == (32, 32)
+    store, _ = swept(database.results, threshold_study(["push-v3"], episodes=2))  # fewer seeds are fewer on all tasks
+    assert same_wanted(store, threshold_study(TASKS, episodes=2))
+    settings = {label: settings_of("ar", episodes=2) for label in ("ar", "other")}
+    store, _ = swept(database.results, study_of(settings, ["push-v3"]))
+    assert {(one.setting.label, one.task) for one in store.load().wanted} == {
+        ("ar", "reach-v3"), ("ar", "push-v3"), ("other", "push-v3")
+    }  # fmt: skip
+
+
+def test_another_study_runs_only_what_it_does_not_share(database: Database) -> None:
+    store, _ = swept(database.results, threshold_study(["reach-v3"]))
+    settings = {"renamed": settings_of("spec_vla", 3), "ar": settings_of("ar"), "new": settings_of("spec_vla", 15)}
+    study = study_of(settings, ["reach-v3"], "other")
+    assert to_run(split_of(database, study)) == {("new", "reach-v3"): (list(range(100_000, 100_004)), "new setting")}
+    other, outcome = swept(database.results, study)
+    assert len(outcome.reused) == 8
+    store.remove()
+    assert not store.is_there
+    assert other.counts() == (12, 12)
+    assert len(table_of(other)) == 3
+    assert len(to_run(split_of(database, threshold_study(["reach-v3"])))) == 2  # only naive_sd and r=9 are gone
+
+
+def test_two_labels_of_one_result_run_once(database: Database) -> None:
+    study = study_of({"ar": settings_of("ar"), "again": settings_of("ar")}, ["reach-v3"])
+    store, outcome = swept(database.results, study)
+    assert len(outcome.done) == 4
+    assert store.counts() == (8, 8)
+
+
+def test_times_of_other_blocks_are_no_ratio_until_they_are_taken_in_turn(database: Database) -> None:
+    swept(database.results, threshold_study(["reach-v3"], radii=(3,)))
+    study = threshold_study(["reach-v3"], radii=(3, 9))
+    store, _ = swept(database.results, study)
+    assert not_in_turn(table_of(store).reset_index()) == ["spec_vla r=9"]
+    assert table_of(store).loc["spec_vla r=9", "pairs"] == 4  # successes are compared
+    assert why(split_of(database, study, "timed")) == {"times wanted in turn"}
+    swept(database.results, study, rerun="timed")
+    assert not_in_turn(table_of(store).reset_index()) == []
+    assert not split_of(database, study, "timed").reasons
+
+
+def test_other_code_runs_again_on_request_only(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+    study = threshold_study(["reach-v3"])
+    swept(database.results, study)
+    assert not split_of(database, study, "changed").reasons
+    monkeypatch.setattr("kerv_cli.episodes.code.code_hash", lambda: "f" * 64)
+    assert not split_of(database, study).reasons
+    assert why(split_of(database, study, "changed")) == {"other code"}
+
+
+def test_a_rerun_keeps_the_older_measurement(database: Database) -> None:
+    study = threshold_study(["reach-v3"])
+    store, _ = swept(database.results, study)
+    first = set(store.frame()["episode"])
+    assert why(split_of(database, study, "all")) == {"rerun=all"}
+    swept(database.results, study, rerun="all")
+    assert first.isdisjoint(store.frame()["episode"])
+    newest = {row.id for row in split_of(database, study).there.values()}
+    assert newest == set(store.frame()["episode"])
+
+
+def test_an_interrupted_rerun_goes_on(database: Database) -> None:
+    study = threshold_study(["reach-v3"])
+    swept(database.results, study)
+    with database.writing() as connection:  # not in the second in which the next one begins
+        connection.exec_driver_sql("UPDATE runs SET started = '2020'")
+        connection.exec_driver_sql("UPDATE blocks SET started = '2020'")
+    words = ["sweep", f"study={study.name}"]
+    assert interrupted_since(database, "sweep", study.name, words) == ""
+    with pytest.raises(KeyboardInterrupt):
+        swept(database.results, study, raising(KeyboardInterrupt(), seeds=[100_002]), rerun="all")
+    since = interrupted_since(database, "sweep", study.name, words)
+    assert since
+    rest = {(label, "reach-v3"): ([100_002, 100_003], "rerun=all") for label in study.labels}
+    assert to_run(split_of(database, study, "all", since)) == rest
+
+
+def test_reasons_name_what_changed(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+    swept(database.results, threshold_study(["reach-v3"]))
+
+    def reason(settings: RolloutSettings, task: str = "reach-v3", weights: dict[str, str] = IDENTITY) -> str:
+        setting = Setting("spec_vla r=3", "", plain_settings(asdict(settings)), weights)
+        split = split_of(database, Study("threshold", (setting,), wanted_of([setting], [task])))
+        return next(iter(split.reasons.values()), "")
+
+    same = settings_of("spec_vla", 3)
+    assert reason(same) == ""
+    assert reason(same, "push-v3") == "new task"
+    assert reason(settings_of("spec_vla", 4)) == "threshold.r 3 → 4"
+    assert reason(same, weights={**IDENTITY, "target": "c" * 64}) == "weights of mt10-vision changed"
+    another = dataclasses.replace(same, policy=dataclasses.replace(same.policy, target="mine"))
+    assert reason(another, weights={**IDENTITY, "target": "c" * 64}) == "new setting"  # nobody's weights changed
+    repeated = study_of({"ar": settings_of("ar")}, ["reach-v3"], repeats=2)
+    assert why(split_of(database, repeated)) == {"new repeat"}
+    idle = settings_of("spec_vla", 3)
+    idle.policy.datastore = "mine"  # not read
+    assert reason(idle) == ""
+    monkeypatch.setattr(identity.work_of, "__defaults__", (4,))
+    monkeypatch.setattr("kerv_cli.lab.plan.ENGINE", 4)
+    assert reason(same) == "engine 1 → 4"
+
+
+def test_what_depends_on_the_order_of_episodes_is_reused_whole(database: Database) -> None:
+    def study(episodes: int) -> Study:
+        settings = settings_of("retrieval", episodes=episodes)
+        settings.skip = part("skip", "similarity", up=0.25)
+        return study_of({"ar": settings_of("ar", episodes=episodes), "heisd": settings}, ["reach-v3"])
+
+    swept(database.results, study(2))
+    assert not split_of(database, study(2)).reasons
+    split = split_of(database, study(4))
+    assert {key: sorted(seeds) for key, (seeds, _) in to_run(split).items()} == {
+        ("ar", "reach-v3"): [100_002, 100_003],
+        ("heisd", "reach-v3"): [100_000, 100_001, 100_002, 100_003],
+    }
+    assert why(split) == {"new seeds", "order of episodes"}
+    store, outcome = swept(database.results, study(4))
+    assert len(outcome.done) == 6
+    ran = store.frame().query("label == 'heisd'")
+    assert ran["block"].nunique() == 1
+    assert ran.sort_values("order")["seed"].is_monotonic_increasing
+
+
+@pytest.mark.parametrize("missing", [[100_001], [100_000, 100_002]])
+def test_episodes_that_failed_are_planned_again(database: Database, missing: Sequence[int]) -> None:
+    study = study_of({"ar": settings_of("ar")}, ["reach-v3"], block=1)
+    swept(database.results, study, raising(RuntimeError(), seeds=missing))
+    assert to_run(split_of(database, study)) == {("ar", "reach-v3"): (missing, "new seeds")}

@@ -1,0 +1,144 @@
+"""Rows of everything that was begun, curves of trainings, and which database holds them."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_calibration import write_dataset
+from test_training import quadratic
+from typer.testing import CliRunner
+
+from kerv_cli.base.errors import CheckpointError, Interrupted, UsageError
+from kerv_cli.cli.app import app
+from kerv_cli.engine.cost import read_profile
+from kerv_cli.lab.database import VARIABLE, Database
+from kerv_cli.lab.runs import Curve, making, run_rows
+from kerv_cli.report.curves import read_log
+from kerv_cli.training.demonstrations import open_demos
+
+HOLD = """
+import sys
+from pathlib import Path
+from kerv_cli.lab.runs import making, set_command
+results = Path(sys.argv[1])
+set_command(["demos", "name=mine", "episodes=7", f"results={results}"])
+with making(results, "demos", results / "artifacts/demos/mine") as record:
+    record.beat(3, 7)
+    print("begun", flush=True)
+    sys.stdin.read()
+"""
+
+
+def kerv(*words: str, code: int = 0) -> str:
+    """Return the output of a command that ends with this code."""
+    run = CliRunner().invoke(app, list(words))
+    assert run.exit_code == code, run.output
+    return run.output
+
+
+def listed(results: Path) -> list[dict[str, Any]]:
+    return json.loads(kerv("runs", "list", f"results={results}", "--json"))
+
+
+def test_a_name_in_use_is_refused_and_a_killed_command_is_listed_with_how_to_go_on(tmp_path: Path) -> None:
+    again = "kerv demos name=mine episodes=7 results="
+    place = tmp_path / "artifacts/demos/mine"
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "begun\n"
+        line = kerv("demos", "name=mine", "task=reach", f"results={tmp_path}", code=2)
+        assert f"demos mine is being made by process {process.pid}" in line
+        assert listed(tmp_path)[0]["state"] == "running, 3 of 7"
+        assert "is running" in kerv("runs", "rm", "demos/mine", "--yes", f"results={tmp_path}", code=2)
+        process.kill()
+    with pytest.raises(UsageError), making(tmp_path, "demos", place, ["demos", "name=mine", "episodes=8"]):
+        raise UsageError("these are others")
+    (row,) = listed(tmp_path)
+    assert (row["id"], row["state"], row["command"][:2]) == ("demos/mine", "interrupted, 3 of 7", ["kerv", "demos"])
+    assert again in kerv("runs", "show", "demos/mine", f"results={tmp_path}")
+    assert again in kerv("runs", "rerun", "demos/mine", f"results={tmp_path}", code=2)
+    place.mkdir(parents=True)
+    (place / "recording.json").write_text("{}")
+    with pytest.raises(CheckpointError, match=again):
+        open_demos(str(tmp_path), "mine")
+    kerv("runs", "rm", "demos/mine", "--yes", f"results={tmp_path}")
+    assert listed(tmp_path) == []
+
+
+def test_a_command_that_failed_or_was_interrupted_is_listed(policies: Path, tmp_path: Path) -> None:
+    (tmp_path / "artifacts").symlink_to(policies / "artifacts")
+    for error, state in ((Interrupted("stopped"), "interrupted"), (ValueError("broken"), "failed")):
+        with pytest.raises(type(error)), making(tmp_path, "early", tmp_path / "artifacts/early/mine", ["train"]):
+            raise error
+        assert {row["id"]: row["state"] for row in listed(tmp_path)}["early/mine"] == state
+
+
+@pytest.mark.usefixtures("few_validations")
+def test_every_command_that_makes_something_has_a_row(policies: Path, tmp_path: Path) -> None:
+    import shutil
+
+    shutil.copytree(policies / "artifacts", tmp_path / "artifacts")
+    write_dataset(tmp_path / "artifacts/demos/few", episodes=4)
+    where = (f"results={tmp_path}", "policy.target=nano-state", "demos=few")
+    kerv("build", "datastore", *where)
+    kerv("calibrate", *where, "decodes=0")
+    kerv("train", "target", "name=mine", "target=nano", "target.observation=state", "train.steps=2",
+         "train.validate_every=1", *where[::2])  # fmt: skip
+    rows = {(row.kind, row.name): row for row in run_rows(Database(tmp_path))}
+    assert {key: row.status for key, row in rows.items()} == dict.fromkeys(
+        [("datastore", "nano-state"), ("calibration", "nano-state"), ("target", "mine")], "complete"
+    )
+    assert rows["target", "mine"].command[:3] == ("train", "target", "name=mine")
+    assert (rows["target", "mine"].done, rows["target", "mine"].total) == (2, 2)
+    folder = tmp_path / "artifacts/target/mine"
+    (folder / "log.csv").write_text("step,score\n1,0\n")
+    assert read_log(folder)["step"].tolist() == [1, 2]
+    (csv,) = kerv("runs", "export", "target/mine", where[0]).splitlines()[:1]
+    assert len(Path(csv).read_text().splitlines()) == 3
+
+
+def test_a_curve_has_each_validation_once(tmp_path: Path) -> None:
+    curve = Curve.of(tmp_path / "artifacts/target/mine")
+    curve.write([{"step": 1.0, "score": 9.0}, {"step": 99.0, "score": 9.0}])  # of a run that is gone
+    for steps in (20, 40):
+        loop = quadratic(tmp_path / "artifacts/target/mine")
+        loop.settings.steps, loop.keep = steps, curve.write
+        loop.run()
+    assert curve.read() == loop.history
+    assert len({row["step"] for row in curve.read()}) == len(curve.read())
+
+
+def test_a_store_is_used_by_one_command_and_no_password_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(VARIABLE, raising=False)
+    other, where = Database(tmp_path, f"sqlite:///{tmp_path}/other.db"), f"results={tmp_path}"
+    kerv("build", "target", f"checkpoint={tmp_path}", f"store={other.url}", where, code=1)
+    assert [row.status for row in run_rows(other)] == ["failed"]
+    assert run_rows(Database(tmp_path)) == []
+    assert VARIABLE not in os.environ
+    store = "store=postgresql://me:secret@127.0.0.1:1/kerv"
+    assert "store: postgresql://me@127.0.0.1:1/kerv" in kerv("build", "target", store, "--cfg")
+    line = kerv("runs", "list", store, where, code=1)
+    assert "does not answer" in line
+    assert "secret" not in line
+    for url in ("nonsense", "mysql://server/kerv"):
+        assert "postgresql://USER@HOST/DB" in kerv("runs", "list", f"store={url}", where, code=2)
+
+
+@pytest.mark.parametrize("rows", [[[1]], "nonsense"])
+def test_a_profile_of_something_else_is_one_line(rows: object, tmp_path: Path) -> None:
+    path = tmp_path / "profile.json"
+    path.write_text(
+        json.dumps({"profile": {"prompt": 1, "tokens": 1, "phases": {"verify": {"rows": rows, "seconds": [1]}}}})
+    )
+    with pytest.raises(CheckpointError, match="holds no latency profile"):
+        read_profile(path)
