@@ -58,6 +58,8 @@ def _archive(source: str, scratch: Path) -> Path:
         with urllib.request.urlopen(source, timeout=TIMEOUT) as answer, path.open("wb") as file:
             shutil.copyfileobj(answer, file)
     except (urllib.error.URLError, OSError, ValueError) as error:
+        if isinstance(error, urllib.error.HTTPError):
+            error.close()  # the answer is in it, and with it the connection
         raise KervError(f"source={source} cannot be fetched: {getattr(error, 'reason', error)}") from error
     return path
 
