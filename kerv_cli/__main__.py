@@ -27,10 +27,15 @@ def _end(number: int, frame: FrameType | None) -> None:
     os._exit(130)
 
 
+_UNSAFE = ("<frozen importlib", f"{os.sep}sqlalchemy{os.sep}pool{os.sep}")
+"""Parts of file names whose code must not be interrupted. In the middle of an import, C++ code that runs Python while it
+loads would abort the process. SQLAlchemy's pool prints the traceback of an exception that interrupts it."""
+
+
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Ctrl-C. In the middle of an import it waits: C++ code that runs Python while it loads would abort the process."""
+    """Raise KeyboardInterrupt. Inside code that is unsafe to interrupt, ask again a little later instead."""
     while frame is not None:
-        if frame.f_code.co_filename.startswith("<frozen importlib"):
+        if any(part in frame.f_code.co_filename for part in _UNSAFE):
             _ask_again(number)
             return
         frame = frame.f_back
