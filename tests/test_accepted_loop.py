@@ -24,8 +24,8 @@ from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.tree import ROOT, TokenTree
-from kerv_cli.methods.heisd.rules import ByGroup, ByProposer
-from kerv_cli.methods.spec_vla import Relaxed
+from kerv_cli.methods.heisd.rules import GroupRule, HybridRule
+from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 GROUP_LIMIT, TOKEN_LIMIT = 12, 7
@@ -138,8 +138,8 @@ def assert_same(
         return NearTrees(greedy, name, seed + offset, nodes, spread=4, switching=kind == "hybrid" and not offset)
 
     before, after = (made("retrieval" if seed % 2 else "early", 1) if inside else None), made("drafter", 0)
-    relaxed, sequence = Relaxed(space, strict_dofs), ByGroup(space, GROUP_LIMIT, TOKEN_LIMIT)
-    rules = {"relaxed": relaxed, "sequence": sequence, "hybrid": ByProposer(space, strict_dofs, retrieved=sequence)}
+    relaxed, sequence = RelaxedRule(space, strict_dofs), GroupRule(space, GROUP_LIMIT, TOKEN_LIMIT)
+    rules = {"relaxed": relaxed, "sequence": sequence, "hybrid": HybridRule(space, strict_dofs, retrieved=sequence)}
     acceptance = rules.get(kind)  # none: strict
     parts = Parts(acceptance, Fixed(r), prefill_draft=before, proposer=after)
     result = Decoder(target, parts).decode_prompt(prompt)

@@ -38,8 +38,8 @@ from kerv_cli.methods.calibration import (
 )
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.heisd.rules import BoundaryRanges
-from kerv_cli.methods.kinematics import KinematicThresholdSettings
-from kerv_cli.methods.kinematics.prediction import PREDICTORS, Noise, build_predictor
+from kerv_cli.methods.kerv import KinematicThresholdSettings
+from kerv_cli.methods.kerv.prediction import PREDICTORS, Noise, build_predictor
 from kerv_cli.methods.spec_vla import FixedThresholdSettings
 from kerv_cli.targets.checkpoint import TargetDescription, read_target
 from kerv_cli.training.calibration import CalibrationRun, distribution

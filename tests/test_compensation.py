@@ -16,8 +16,8 @@ from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import Proposer
-from kerv_cli.methods.kinematics import CompensateSettings
-from kerv_cli.methods.kinematics.prediction import Compensation, Hold, Linear, assemble
+from kerv_cli.methods.kerv import CompensateSettings
+from kerv_cli.methods.kerv.prediction import Compensation, Hold, Linear, assemble
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 D, N = 4, 16

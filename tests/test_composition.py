@@ -26,7 +26,7 @@ from kerv_cli.methods.heisd import (
     SimilaritySkipSettings,
 )
 from kerv_cli.methods.jacobi import JacobiProposerSettings
-from kerv_cli.methods.kinematics import CompensateSettings, KinematicThresholdSettings, ScheduleThresholdSettings
+from kerv_cli.methods.kerv import CompensateSettings, KinematicThresholdSettings, ScheduleThresholdSettings
 from kerv_cli.methods.sp_vla import SpeedSkipSettings
 from kerv_cli.methods.spec_vla import FixedThresholdSettings, RelaxedAcceptanceSettings
 

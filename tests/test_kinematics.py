@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from kerv_cli.engine.chunk import WINDOW, ActionHistory
-from kerv_cli.methods.kinematics.prediction import (
+from kerv_cli.methods.kerv.prediction import (
     FILTERS,
     HORIZON,
     PREDICTORS,

@@ -16,7 +16,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import check_label, check_settings
 from kerv_cli.base.places import artifact, find_target, results_dir
 from kerv_cli.base.registry import SETTINGS_GROUPS, parts
-from kerv_cli.methods.kinematics.prediction import MINIMUM
+from kerv_cli.methods.kerv.prediction import MINIMUM
 
 SCHEMAS = {name.replace(" ", "_"): part.settings for name, part in parts("command").items()}
 

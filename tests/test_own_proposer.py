@@ -30,7 +30,7 @@ from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.episodes.policy import check
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.compose import Method
-from kerv_cli.methods.kinematics.prediction import Hold, PredictionProposer
+from kerv_cli.methods.kerv.prediction import Hold, PredictionProposer
 from kerv_cli.methods.merged.proposer import MergedProposer
 from kerv_cli.training.runs import drafter_run
 from kerv_cli.worlds.metaworld.spec import SPEC

@@ -13,13 +13,13 @@ from test_unverified import SHOWN, Near
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.parts import Fixed
 from kerv_cli.methods.merged.proposer import MergedProposer
-from kerv_cli.methods.spec_vla import Relaxed
+from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.methods.streak import StreakSkip, StreakSkipSettings
 
 
 def decoder_of(source: Any, target: MockTarget, draft: Any = None, radius: int = 0, **settings: Any) -> Decoder:
     skip = StreakSkip(StreakSkipSettings(**settings), source)
-    acceptance = Relaxed(target.actions) if radius else None
+    acceptance = RelaxedRule(target.actions) if radius else None
     parts = Parts(acceptance, Fixed(radius), prefill_draft=draft or source, skip=skip)
     made = Decoder(target, parts)
     made.reset("t", 0, np.zeros(3))

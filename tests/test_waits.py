@@ -19,7 +19,7 @@ from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.methods.heisd.rules import HybridProposer, Random, RetrievalProposer
 from kerv_cli.methods.jacobi import JacobiProposer
-from kerv_cli.methods.kinematics.prediction import Hold, Kalman, Noise, PredictionProposer
+from kerv_cli.methods.kerv.prediction import Hold, Kalman, Noise, PredictionProposer
 from kerv_cli.methods.merged.proposer import MergedProposer
 from kerv_cli.targets.compact.trunk import LayerStack
 

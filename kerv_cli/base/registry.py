@@ -32,7 +32,7 @@ MODULES = (
     "kerv_cli.methods.eagle",
     "kerv_cli.methods.early",
     "kerv_cli.methods.scout",
-    "kerv_cli.methods.kinematics",
+    "kerv_cli.methods.kerv",
     "kerv_cli.methods.parallel",
     "kerv_cli.methods.streak",
     "kerv_cli.methods.unverified",

@@ -24,7 +24,7 @@ from kerv_cli.engine.record import Round
 from kerv_cli.engine.tree import ROOT
 from kerv_cli.episodes.policy import decoder_for
 from kerv_cli.methods.eagle.drafter import DrafterProposer
-from kerv_cli.methods.spec_vla import Relaxed
+from kerv_cli.methods.spec_vla import RelaxedRule
 
 _WARM_UP = 2  # cycles that do not count
 _EVICTING = 16 * 2**20  # float32 numbers that are read between decodes: a simulator leaves nothing in the caches
@@ -110,7 +110,7 @@ class Dummy(Proposer):
 def decoders(model: Model) -> list[Decoder]:
     """Decoders whose rounds have all the sizes that a chunk of N tokens can have. Everything drafted is accepted."""
     target, size = model.target, model.size
-    rule, everything = Relaxed(target.actions, strict_dofs=False), Fixed(target.actions.tokens)
+    rule, everything = RelaxedRule(target.actions, strict_dofs=False), Fixed(target.actions.tokens)
 
     def decoder(in_prefill: int = 0, proposer: Proposer | None = None) -> Decoder:
         draft = Dummy(in_prefill) if in_prefill else None

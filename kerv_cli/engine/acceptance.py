@@ -109,19 +109,27 @@ class Acceptance(Protocol):
 
 
 @dataclass(frozen=True)
-class Strict:
-    """A draft token must equal the target's: lossless. Base of rules with other limits."""
+class DistanceRule:
+    """Base of acceptance rules: accepts a draft token within its DoF's largest distance to the target's token."""
 
     space: ActionSpace
 
     def of_drafts_from(self, proposer: str) -> Acceptance:
-        """This rule, whatever the proposer."""
+        """Return the rule for drafts of `proposer`: this one."""
         return self
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """Zero for every DoF (D,)."""
-        return (0,) * self.space.dofs
+        """Return the largest accepted distance per DoF at radius r, in bins (D,)."""
+        raise NotImplementedError
 
     def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
-        """The longest path within the limits, by `accept_by_distance`."""
+        """Return the longest path within the limits. The arguments are those of `accept_by_distance`."""
         return accept_by_distance(tree, target_tokens, start, self.limits(r))
+
+
+class StrictRule(DistanceRule):
+    """Accepts a draft token that equals the target's: lossless."""
+
+    def limits(self, r: int) -> tuple[int, ...]:
+        """Return zero for every DoF (D,)."""
+        return (0,) * self.space.dofs

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kerv_cli.base.spaces import ActionSpace, Observation
-from kerv_cli.engine.acceptance import Acceptance, Strict
+from kerv_cli.engine.acceptance import Acceptance, StrictRule
 from kerv_cli.engine.chunk import ActionHistory, Chunk, Clock, Rejection, Situation, steps_of
 from kerv_cli.engine.draft import EMPTY, Draft
 from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold
@@ -68,7 +68,7 @@ class Decoder:
         self.target, self.parts = target, parts or Parts()
         draft = self.parts.prefill_draft
         self.steps = steps_of(chunk, target.chunk)
-        self.acceptance: Acceptance = self.parts.acceptance or Strict(target.actions)
+        self.acceptance: Acceptance = self.parts.acceptance or StrictRule(target.actions)
         self.threshold: Threshold = self.parts.threshold or Fixed(0)
         size = self.steps * target.actions.dofs
         nodes = max((p.nodes for p in (draft, self.parts.proposer) if p is not None), default=0)

@@ -4,7 +4,7 @@ registration, imports neither torch nor numpy; code that does lies beside it.
     ar                          autoregressive decoding: the absence of every part
     spec_vla                    Spec-VLA: acceptance token by token within one radius; strict acceptance
     eagle                       EAGLE-2: the drafter on the target's hidden states, own and public ones
-    kinematics                  KERV: predictions as drafts and behind a rejection, thresholds that follow the motion
+    kerv                        KERV: predictions as drafts and behind a rejection, thresholds that follow the motion
     heisd                       HeiSD: the datastore and its drafts; two sides of a boundary, verify-skip
     jacobi, parallel            PD-VLA's and OpenVLA-OFT's decoding
     early, merged               ours: a draft before the prefill (`one_pass`)

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.methods.artifacts import Artifact, MadeFor, check_sources
 from kerv_cli.methods.heisd.rules import BoundaryRanges
-from kerv_cli.methods.kinematics.prediction import Noise
+from kerv_cli.methods.kerv.prediction import Noise
 
 FILE = "calibration.json"
 NEVER = 1.01  # s_min of a task that never skips: cosines do not exceed 1

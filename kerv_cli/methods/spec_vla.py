@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from kerv_cli.base.limits import MOST_BINS, number
 from kerv_cli.base.registry import NoSettings, add
-from kerv_cli.engine.acceptance import Strict
+from kerv_cli.engine.acceptance import DistanceRule, StrictRule
 from kerv_cli.engine.parts import Fixed
 
 if TYPE_CHECKING:
@@ -24,13 +24,13 @@ class RelaxedAcceptanceSettings:
 
 
 @dataclass(frozen=True)
-class Relaxed(Strict):
+class RelaxedRule(DistanceRule):
     """A draft token within r bins of the target's is kept. strict_dofs: the space's strict DoFs must match."""
 
     strict_dofs: bool = True
 
     @classmethod
-    def build(cls, settings: RelaxedAcceptanceSettings, context: Context) -> Relaxed:
+    def build(cls, settings: RelaxedAcceptanceSettings, context: Context) -> RelaxedRule:
         """acceptance=relaxed."""
         return cls(context.target.actions, settings.strict_dofs)
 
@@ -39,9 +39,9 @@ class Relaxed(Strict):
         return tuple(0 if self.strict_dofs and strict else r for strict in self.space.is_strict)
 
 
-def strict(settings: NoSettings, context: Context) -> Strict:
+def strict(settings: NoSettings, context: Context) -> StrictRule:
     """acceptance=strict: a draft token must equal the target's, which is lossless."""
-    return Strict(context.target.actions)
+    return StrictRule(context.target.actions)
 
 
 @dataclass
@@ -64,5 +64,5 @@ def fixed(settings: FixedThresholdSettings, context: Context) -> Fixed:
 
 _FILE = "kerv_cli.methods.spec_vla:"
 add("acceptance", "strict", _FILE + "strict")
-add("acceptance", "relaxed", _FILE + "Relaxed.build", RelaxedAcceptanceSettings)
+add("acceptance", "relaxed", _FILE + "RelaxedRule.build", RelaxedAcceptanceSettings)
 add("threshold", "fixed", _FILE + "fixed", FixedThresholdSettings)

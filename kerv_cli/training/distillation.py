@@ -23,7 +23,7 @@ from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.protocol import Target
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterArtifact, DrafterProposer
-from kerv_cli.methods.spec_vla import Relaxed
+from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.training.loop import Metrics
 from kerv_cli.training.observations import Rows, held_out_every, observations_of, prompts_of, steps_of
 from kerv_cli.training.runs import DrafterRun
@@ -183,7 +183,7 @@ class Distillation:
 def acceptance_length(target: Target, drafter: Drafter, prompts: list[Tensor], r: int) -> float:
     """AL (docs/methods.md §7) of decoding `prompts` with a chain of up to 5 drafts at radius r."""
     proposer = DrafterProposer(drafter, target, depth=5, top_k=1, nodes=5)
-    decoder = Decoder(target, Parts(Relaxed(target.actions), Fixed(r), proposer=proposer))
+    decoder = Decoder(target, Parts(RelaxedRule(target.actions), Fixed(r), proposer=proposer))
     chunks = [decoder.decode_prompt(prompt) for prompt in prompts]
     rounds = [r for c in chunks for r in c.rounds if r.tree_size]
     return sum(r.committed for r in rounds) / max(1, len(rounds))

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from kerv_cli.base.registry import NoSettings, add
-from kerv_cli.engine.acceptance import Strict
+from kerv_cli.engine.acceptance import DistanceRule
 
 if TYPE_CHECKING:
     from kerv_cli.methods.context import Context
 
 
-class PositionOnly(Strict):
+class PositionOnly(DistanceRule):
     """Accepts the longest path within its limits, as its base does; another rule overrides `judge`."""
 
     def limits(self, r: int) -> tuple[int, ...]:

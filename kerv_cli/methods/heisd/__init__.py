@@ -78,7 +78,7 @@ class HybridAcceptanceSettings:
     token_limit: int = number(15, 0, MOST_BINS)
 
 
-add("acceptance", "sequence", _RULES + "ByGroup.build", SequenceAcceptanceSettings)
+add("acceptance", "sequence", _RULES + "GroupRule.build", SequenceAcceptanceSettings)
 add("acceptance", "hybrid", _RULES + "by_proposer", HybridAcceptanceSettings)
 
 

@@ -21,7 +21,7 @@ from torch import Tensor
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.engine.acceptance import Acceptance, Accepted, Strict, accept_by_group
+from kerv_cli.engine.acceptance import Acceptance, Accepted, DistanceRule, accept_by_group
 from kerv_cli.engine.chunk import Choice, Chunk
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.parts import Skip
@@ -42,7 +42,7 @@ from kerv_cli.methods.heisd import (
     SimilaritySkipSettings,
 )
 from kerv_cli.methods.heisd.datastore import Datastore, Neighbours
-from kerv_cli.methods.spec_vla import Relaxed
+from kerv_cli.methods.spec_vla import RelaxedRule
 
 CROSS = 0.1  # probability that a path of retrieved groups changes to other neighbours
 LEAST = 3  # positions; fewer have no curvature
@@ -224,7 +224,7 @@ class HybridProposer(Proposer):
 
 
 @dataclass(frozen=True)
-class ByGroup(Strict):
+class GroupRule(DistanceRule):
     """A kinematic group of one control step is accepted or rejected as a whole; strict DoFs must match. group_limit:
     summed bias of a group, token_limit: bias of a token, bins."""
 
@@ -232,7 +232,7 @@ class ByGroup(Strict):
     token_limit: int
 
     @classmethod
-    def build(cls, settings: SequenceAcceptanceSettings, context: Context) -> ByGroup:
+    def build(cls, settings: SequenceAcceptanceSettings, context: Context) -> GroupRule:
         """acceptance=sequence."""
         return cls(context.target.actions, settings.group_limit, settings.token_limit)
 
@@ -247,21 +247,21 @@ class ByGroup(Strict):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ByProposer(Relaxed):
-    """Retrieved drafts by group, all others within one radius, as `Relaxed`."""
+class HybridRule(RelaxedRule):
+    """Retrieved drafts by group, all others within one radius, as `RelaxedRule`."""
 
-    retrieved: ByGroup
+    retrieved: GroupRule
 
     def of_drafts_from(self, proposer: str) -> Acceptance:
         """The rule for drafts of `proposer`."""
         return self.retrieved if proposer == "retrieval" else self
 
 
-def by_proposer(settings: HybridAcceptanceSettings, context: Context) -> ByProposer:
+def by_proposer(settings: HybridAcceptanceSettings, context: Context) -> HybridRule:
     """acceptance=hybrid."""
     space = context.target.actions
-    by_group = ByGroup(space, settings.group_limit, settings.token_limit)
-    return ByProposer(space, settings.strict_dofs, retrieved=by_group)
+    by_group = GroupRule(space, settings.group_limit, settings.token_limit)
+    return HybridRule(space, settings.strict_dofs, retrieved=by_group)
 
 
 class VerifySkip(Skip):

@@ -9,7 +9,7 @@ import numpy as np
 from kerv_cli.engine.chunk import Chunk, Situation
 from kerv_cli.engine.parts import Skip
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.kinematics.prediction import Predictor
+from kerv_cli.methods.kerv.prediction import Predictor
 from kerv_cli.methods.sp_vla import SpeedSkipSettings
 
 

@@ -18,7 +18,7 @@ from kerv_cli.base.registry import NoSettings, find
 from kerv_cli.engine.chunk import WINDOW, Chunk
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.kinematics import CompensateSettings
+from kerv_cli.methods.kerv import CompensateSettings
 
 MINIMUM = 4  # actions that a prediction needs; longer windows were not measurably better on the demonstrations
 HORIZON = 8  # steps ahead that weights are computed for

@@ -14,7 +14,7 @@ from kerv_cli.base.registry import PREFILL, NoSettings, add, find
 if TYPE_CHECKING:
     from kerv_cli.methods.context import Context
 
-_PREDICTION = "kerv_cli.methods.kinematics.prediction:"
+_PREDICTION = "kerv_cli.methods.kerv.prediction:"
 
 _sources = ("drafter", "datastore")  # each has a section
 add("artifact", "calibration", "kerv_cli.methods.calibration:CalibrationArtifact", needs=_sources, by_task=True)
