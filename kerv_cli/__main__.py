@@ -28,8 +28,8 @@ def _end(number: int, frame: FrameType | None) -> None:
 
 
 _UNSAFE = ("<frozen importlib", f"{os.sep}sqlalchemy{os.sep}pool{os.sep}")
-"""Parts of file names whose code must not be interrupted. In the middle of an import, C++ code that runs Python while it
-loads would abort the process. SQLAlchemy's pool prints the traceback of an exception that interrupts it."""
+"""Parts of file names whose code must not be interrupted. In the middle of an import, C++ code that runs Python while
+it loads would abort the process. SQLAlchemy's pool prints the traceback of an exception that interrupts it."""
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
