@@ -20,7 +20,6 @@ import pandas as pd
 from kerv_cli.base.config import as_words, compose
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.places import results_dir, store_of_words
-from kerv_cli.base.settings import ServeSettings
 from kerv_cli.catalogue.entries import RunEntry, find_run, find_runs, matching, store_of
 from kerv_cli.episodes.resolve import resolve, resolve_rollout, study_name
 from kerv_cli.lab.store import ROLLOUT, StudyStore
@@ -33,6 +32,7 @@ from kerv_cli.report.tables import rows_of
 from kerv_cli.report.viewing import save_recording
 from kerv_cli.serve.openpi import EXECUTED, RESET, OpenPi, metadata
 from kerv_cli.serve.policy import Policy as Served
+from kerv_cli.serve.settings import ServeSettings
 from kerv_cli.serve.wire import Message
 
 TABLES = ("settings", "tasks", "episodes")

@@ -90,13 +90,13 @@ def write_policy(results: Path, name: str, observation: str, seed: int = 0) -> N
     import torch
 
     from kerv_cli.base.config import compose
-    from kerv_cli.base.settings import TrainTargetSettings
     from kerv_cli.methods.artifacts import MadeFor
     from kerv_cli.methods.eagle import DrafterSettings
     from kerv_cli.methods.eagle.drafter import Drafter, DrafterArtifact
     from kerv_cli.targets.compact.folder import save_target
     from kerv_cli.targets.compact.target import CompactTarget
     from kerv_cli.training.imitation import vocabulary
+    from kerv_cli.training.settings import TrainTargetSettings
     from kerv_cli.worlds.metaworld.spec import SPEC
 
     torch.manual_seed(seed)

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from kerv_cli.base.registry import find
-from kerv_cli.base.settings import RolloutSettings, RuntimeSettings
+from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.events import OnEvent, Outcome
 from kerv_cli.lab.execute import Prepare, RunEpisode, execute

@@ -16,16 +16,18 @@ from test_calibration import TASKS, write_dataset
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName
-from kerv_cli.base.settings import BuildDatastoreSettings, CalibrateSettings, PolicySettings, RolloutSettings
 from kerv_cli.episodes.policy import check, decoder_for, unseen_tasks
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.eagle.drafter import Drafter
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter
 from kerv_cli.methods.heisd.datastore import Datastore
+from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets import checkpoint
 from kerv_cli.training.calibration import CalibrationRun
 from kerv_cli.training.datastore import DatastoreBuild
+from kerv_cli.training.settings import BuildDatastoreSettings, CalibrateSettings
 
 STUDY = (
     "method=ar",

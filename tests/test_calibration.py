@@ -21,7 +21,6 @@ from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import read_json, sha256_of, write_json
 from kerv_cli.base.places import find_target
 from kerv_cli.base.registry import find
-from kerv_cli.base.settings import CalibrateSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
@@ -51,6 +50,7 @@ from kerv_cli.training.predictor_fit import (
     moving_errors,
     prediction_errors,
 )
+from kerv_cli.training.settings import CalibrateSettings
 from kerv_cli.worlds.demos.dataset import FORMAT, DemoDataset, dataset_hash, episode_path
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, save_episode
 from kerv_cli.worlds.metaworld.spec import SPEC

@@ -18,14 +18,15 @@ from typer.testing import CliRunner
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.files import write_json
-from kerv_cli.base.settings import BuildDatastoreSettings, CalibrateSettings, PolicySettings
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.cli.app import app
 from kerv_cli.methods.calibration import NEVER, Calibration, CalibrationArtifact, Variability
 from kerv_cli.methods.heisd.datastore import Datastore, Manifest, Shard
 from kerv_cli.methods.heisd.rules import BoundaryRanges
+from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.training.calibration import CalibrationRun
 from kerv_cli.training.datastore import DatastoreBuild
+from kerv_cli.training.settings import BuildDatastoreSettings, CalibrateSettings
 from kerv_cli.training.skip_levels import LEAST, Matches, lowest_level, match, skip_section, task_levels
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.metaworld.spec import SPEC

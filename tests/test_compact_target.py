@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.places import shipped_dir
-from kerv_cli.base.settings import TargetSettings
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
 from kerv_cli.methods.artifacts import Request
 from kerv_cli.methods.eagle.drafter import DrafterArtifact
@@ -24,6 +23,7 @@ from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.captured import CapturedCache, bucket
 from kerv_cli.targets.compact.features import places_of, privileged_features, scene_features, scene_width
 from kerv_cli.targets.compact.folder import save_target
+from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Trunk

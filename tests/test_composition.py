@@ -12,8 +12,8 @@ import pytest
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
 from kerv_cli.base.registry import NoSettings
-from kerv_cli.base.settings import RolloutSettings, settings_from
 from kerv_cli.episodes.policy import check as check_rollout
+from kerv_cli.episodes.settings import RolloutSettings, settings_from
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.eagle import DrafterProposerSettings
 from kerv_cli.methods.heisd import (

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from dataclasses import asdict, fields, is_dataclass
 from itertools import chain
+from typing import Any
 
 import pytest
 import yaml
 
 import kerv_cli.cli.app  # noqa: F401 - registers the commands
-from kerv_cli.base import settings as s
 from kerv_cli.base.config import compose, conf_dir, expand, groups, swept_keys, to_yaml
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import description
 from kerv_cli.base.registry import PART_GROUPS, part_of, parts
 from kerv_cli.episodes.resolve import resolve
+from kerv_cli.episodes.settings import RolloutSettings
 
 SCHEMAS = {name.replace(" ", "_"): part.settings for name, part in parts("command").items()}
 # which command each group belongs to
@@ -30,8 +31,17 @@ def test_every_command_composes_and_shows_what_every_setting_is() -> None:
 
 
 def test_every_setting_has_a_description() -> None:
-    kinds = [kind for kind in vars(s).values() if is_dataclass(kind) and kind.__module__ == s.__name__]
-    assert [f"{kind.__name__}.{at.name}" for kind in kinds for at in fields(kind) if not description(at)] == []
+    undescribed: list[str] = []
+
+    def look(value: Any, prefix: str) -> None:
+        for at in fields(value):
+            undescribed.extend([f"{prefix}.{at.name}"] if at.name != "kind" and not description(at) else [])
+            if is_dataclass(at.default_factory):  # the settings of a part are the part's
+                look(getattr(value, at.name), f"{prefix}.{at.name}")
+
+    for command, schema in SCHEMAS.items():
+        look(schema(), command)
+    assert undescribed == []
 
 
 WHOLE = {group: names for group, names in groups().items() if group not in PART_GROUPS}
@@ -49,7 +59,7 @@ def test_every_config_composes(choice: tuple[str, str]) -> None:
 def test_every_config_of_a_part_composes(row: int) -> None:
     """One of every group at a time."""
     names = {group: names[row % len(names)] for group, names in PARTS.items()}
-    settings = compose("rollout", [f"{group}={name}" for group, name in names.items()], s.RolloutSettings)
+    settings = compose("rollout", [f"{group}={name}" for group, name in names.items()], RolloutSettings)
     for group, name in names.items():
         chosen = getattr(settings, group)
         part = part_of(group, chosen.kind)

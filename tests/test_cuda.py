@@ -8,8 +8,9 @@ import pytest
 import torch
 from flips import flipped
 
-from kerv_cli.base.settings import BenchSettings, RuntimeSettings
+from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.bench.model import open_model
+from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.eagle.drafter import DrafterProposer
 from kerv_cli.methods.jacobi import JacobiProposer

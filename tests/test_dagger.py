@@ -11,23 +11,20 @@ from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.settings import (
-    CameraSettings,
-    DemosSettings,
-    PolicySettings,
-    RolloutSettings,
-    WorldSettings,
-)
 from kerv_cli.cli.app import app
 from kerv_cli.episodes.policy import decoder_for
+from kerv_cli.episodes.settings import RolloutSettings
+from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.training.dagger import PolicyActs
 from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.imitation import task_borders
 from kerv_cli.training.loop import draw_samples
+from kerv_cli.training.settings import DemosSettings
 from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.recording import DemoConfig, record, run_expert
 from kerv_cli.worlds.metaworld.spec import SPEC
+from kerv_cli.worlds.settings import CameraSettings, WorldSettings
 from kerv_cli.worlds.spec import EnvironmentSpec
 
 SHORT = CameraSettings()

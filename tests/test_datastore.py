@@ -20,17 +20,19 @@ from typer.testing import CliRunner
 
 from kerv_cli.base.errors import CheckpointError, KervError, StorageError, UnknownName, UsageError
 from kerv_cli.base.files import read_json
-from kerv_cli.base.settings import EVALUATION_SEED, BuildDatastoreSettings, PolicySettings
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.methods.heisd.datastore import Datastore, Manifest, Shard, check_seeds, prompt_key
 from kerv_cli.methods.heisd.rules import neighbour_tree
+from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.checkpoint import TargetDescription, load_target
 from kerv_cli.training import datastore as datastore_build
 from kerv_cli.training.datastore import DatastoreBuild
+from kerv_cli.training.settings import BuildDatastoreSettings
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.metaworld.spec import SPEC
+from kerv_cli.worlds.settings import EVALUATION_SEED
 
 SPACE = SPEC.actions
 TASKS = ("drawer-close-v3", "reach-v3")

@@ -13,22 +13,24 @@ from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName
-from kerv_cli.base.settings import CameraSettings, TargetSettings, TrainDrafterSettings, TrainSettings
 from kerv_cli.cli.app import app
 from kerv_cli.methods.artifacts import MadeFor, Request
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter, choose, choose_with_odds
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.packed import pack
+from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training.early_distillation import EarlyDistillation, EarlySamples, accepted_tokens, measure, teach_early
 from kerv_cli.training.imitation import load_samples
 from kerv_cli.training.observations import split
 from kerv_cli.training.runs import drafter_run
+from kerv_cli.training.settings import TrainDrafterSettings, TrainSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.metaworld.spec import SPEC
+from kerv_cli.worlds.settings import CameraSettings
 
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 

@@ -7,9 +7,9 @@ from dataclasses import asdict
 import pytest
 
 from kerv_cli.base.config import compose, conf_dir
-from kerv_cli.base.settings import RolloutSettings, SweepSettings
 from kerv_cli.episodes.identity import effective, idle_keys, without_effect
 from kerv_cli.episodes.resolve import ResolvedStudy, idle_overrides
+from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 
 
 @pytest.mark.parametrize(

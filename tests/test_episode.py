@@ -9,12 +9,13 @@ import pytest
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.settings import EVALUATION_SEED, RolloutSettings
 from kerv_cli.engine.record import PHASES, EpisodeRecord
 from kerv_cli.episodes import policy as policies_of
 from kerv_cli.episodes import runner as run
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.worlds.metaworld.spec import SPEC
 from kerv_cli.worlds.metaworld.world import MetaWorld
+from kerv_cli.worlds.settings import EVALUATION_SEED
 
 
 def settings(results: Path, *overrides: str) -> RolloutSettings:

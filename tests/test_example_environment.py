@@ -12,11 +12,11 @@ from examples.point_mass import SPEC
 from kerv_cli.base import registry
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.registry import Part
-from kerv_cli.base.settings import CameraSettings
 from kerv_cli.episodes.episode import run_episode
 from kerv_cli.episodes.expert import ExpertDecoder
 from kerv_cli.report.viewing import save_recording
 from kerv_cli.report.viewing.viewer import read_recording
+from kerv_cli.worlds.settings import CameraSettings
 
 
 def test_an_episode_runs_and_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,9 +38,10 @@ from studies_synthetic import (
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import KervError, StorageError, UsageError
-from kerv_cli.base.settings import RolloutSettings, RuntimeSettings
+from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.cli.progress import ProgressDisplay
 from kerv_cli.engine.record import EpisodeRecord
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, WANTED, Database
 from kerv_cli.lab.events import BlockStarted, BlockWaits, EpisodeEnd, Event, SettingFailed, Started
 from kerv_cli.lab.execute import RunEpisode

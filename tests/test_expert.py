@@ -12,7 +12,6 @@ import pandas as pd
 import pytest
 
 from kerv_cli.base.errors import KervError, UnknownName
-from kerv_cli.base.settings import EVALUATION_SEED
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.record import PHASES, EpisodeRecord
 from kerv_cli.episodes.episode import run_episode
@@ -23,6 +22,7 @@ from kerv_cli.report.viewing import save_recording
 from kerv_cli.report.viewing.facts import summary
 from kerv_cli.report.viewing.viewer import read_recording
 from kerv_cli.worlds.metaworld.spec import SPEC
+from kerv_cli.worlds.settings import EVALUATION_SEED
 from kerv_cli.worlds.spec import World
 
 NAME = "window-close-v3"

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.settings import TargetSettings
+from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training.observations import Observations, read_observations
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode, save_episode

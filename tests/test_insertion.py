@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from examples.insertion import SPEC
 
-from kerv_cli.base.settings import CameraSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.recording import DemoConfig, record
+from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import World
 
 TASKS = tuple(SPEC.tasks)

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from studies_synthetic import episode, settings_of, study_of, swept
 
-from kerv_cli.base.settings import RolloutSettings, TimingSettings
 from kerv_cli.engine.record import Delay, EpisodeRecord
+from kerv_cli.episodes.settings import RolloutSettings, TimingSettings
 from kerv_cli.lab.execute import RunEpisode
 from kerv_cli.lab.plan import Setting
 from kerv_cli.lab.store import StudyStore

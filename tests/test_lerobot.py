@@ -15,10 +15,10 @@ from examples.tiny_openvla import write_checkpoint
 from test_openvla import imported, kerv
 from typer.testing import CliRunner
 
-from kerv_cli.base.settings import CameraSettings
 from kerv_cli.cli.app import app
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.recording import DemoConfig, record
+from kerv_cli.worlds.settings import CameraSettings
 
 SIZE = 56
 

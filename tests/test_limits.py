@@ -10,13 +10,14 @@ from typing import Any, get_args, get_type_hints
 import pytest
 
 import kerv_cli.cli.app  # noqa: F401 - registers the commands
-from kerv_cli.base import settings as s
 from kerv_cli.base.config import MOST_POINTS, compose, expand
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import check_label, check_settings
 from kerv_cli.base.places import artifact, find_target, results_dir
 from kerv_cli.base.registry import SETTINGS_GROUPS, parts
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.kerv.prediction import MINIMUM
+from kerv_cli.training.settings import CalibrateSettings
 
 SCHEMAS = {name.replace(" ", "_"): part.settings for name, part in parts("command").items()}
 
@@ -81,7 +82,7 @@ def test_what_is_wrong_or_out_of_range_is_refused_in_one_line(command: str, over
 )
 def test_a_parts_numbers_have_ranges_too(override: str) -> None:
     with pytest.raises(UsageError, match=override.partition("=")[0]):
-        compose("rollout", ["method=heisd", override], s.RolloutSettings)
+        compose("rollout", ["method=heisd", override], RolloutSettings)
 
 
 @pytest.mark.parametrize(
@@ -123,7 +124,7 @@ def test_a_plain_name_or_a_path_is_taken() -> None:
 
 
 def test_limits_that_repeat_a_constant_agree_with_it() -> None:
-    window = next(at for at in fields(s.CalibrateSettings) if at.name == "window")
+    window = next(at for at in fields(CalibrateSettings) if at.name == "window")
     assert window.metadata["limits"][0] == MINIMUM
 
 

@@ -23,7 +23,6 @@ from test_decoding_lossless import RandomTrees, assert_adds_up, decode, plain_gr
 from typer.testing import CliRunner
 
 from kerv_cli.base.errors import KervError
-from kerv_cli.base.settings import BuildTargetSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.decoder import Decoder, Parts
@@ -36,6 +35,7 @@ from kerv_cli.targets.openvla.image import as_in_libero, cropped, pixels_of
 from kerv_cli.targets.openvla.importing import import_checkpoint
 from kerv_cli.targets.openvla.loading import layout
 from kerv_cli.targets.openvla.target import OpenVLATarget
+from kerv_cli.targets.settings import BuildTargetSettings
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from kerv_cli.base.config import compose
-from kerv_cli.base.settings import RolloutSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.episodes.policy import check
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.worlds.demos.recording import DemoConfig, _identity
 from kerv_cli.worlds.metaworld.experts import VERSION, HandlePullSide
 from kerv_cli.worlds.metaworld.spec import SPEC

@@ -21,18 +21,19 @@ from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.settings import RolloutSettings, TrainDrafterSettings, settings_from
 from kerv_cli.base.spaces import Observation
 from kerv_cli.catalogue.entries import find_runs, matching
 from kerv_cli.cli.app import app
 from kerv_cli.engine.chunk import ActionHistory, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.episodes.policy import check
+from kerv_cli.episodes.settings import RolloutSettings, settings_from
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.kerv.prediction import Hold, PredictionProposer
 from kerv_cli.methods.merged.proposer import MergedProposer
 from kerv_cli.training.runs import drafter_run
+from kerv_cli.training.settings import TrainDrafterSettings
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 

@@ -10,17 +10,19 @@ import torch
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.settings import RolloutSettings, TargetSettings, TrainDrafterSettings, TrainTargetSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.episodes.policy import check
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.parallel import ParallelPass
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.packed import pack
+from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training.imitation import check_init, continued_target
 from kerv_cli.training.runs import drafter_run
+from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 WORDS = WordTokenizer.build(["pull the drawer open"])

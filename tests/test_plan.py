@@ -17,10 +17,10 @@ from studies_synthetic import IDENTITY, part, settings_of, study_of, swept, thre
 
 import kerv_cli
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.settings import RolloutSettings
 from kerv_cli.episodes import identity
 from kerv_cli.episodes.code import _meaning, code_hash
 from kerv_cli.episodes.identity import ENGINE, hash_of, work_of
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.plan import Block, Setting, Split, Study, blocks_of, plain_settings, seeds_text, wanted_of
 from kerv_cli.lab.runs import interrupted_since

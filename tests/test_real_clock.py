@@ -17,7 +17,6 @@ from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import KervError
-from kerv_cli.base.settings import EVALUATION_SEED, RolloutSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.cost import Profile
@@ -27,7 +26,9 @@ from kerv_cli.episodes import runner as run
 from kerv_cli.episodes.clock import RealClock, profiled, steps_of
 from kerv_cli.episodes.episode import run_episode
 from kerv_cli.episodes.rows import decodes_table, episode_row
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD
+from kerv_cli.worlds.settings import EVALUATION_SEED
 
 HZ = SPEC.actions.control_hz
 TASK = "drawer-open-v3"

@@ -13,12 +13,12 @@ from typer.testing import CliRunner
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.registry import NoSettings
-from kerv_cli.base.settings import CameraSettings, RolloutSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.episodes.resolve import resolve
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.artifacts import Request
 from kerv_cli.methods.certified import CertifiedSkipSettings, ScopedSettings
 from kerv_cli.methods.certified.certificate import Candidate, Certificate, certified, scoped
@@ -33,6 +33,7 @@ from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.worlds.demos.recording import DemoConfig, record
+from kerv_cli.worlds.settings import CameraSettings
 
 SMALL = ScoutSettings(width=24, rank=4, keypoints=4, cell_width=8, cell_features=2, word_width=4)
 TASK = "drawer-close-v3"

@@ -27,16 +27,17 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from kerv_cli.base.config import compose as compose_settings
-from kerv_cli.base.settings import PolicySettings, ServeSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.methods.artifacts import Artifacts
+from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.serve.guard import Finite
 from kerv_cli.serve.openpi import OpenPi, observation_of
 from kerv_cli.serve.policy import Policy
 from kerv_cli.serve.server import PolicyServer
 from kerv_cli.serve.session import Session
+from kerv_cli.serve.settings import ServeSettings
 from kerv_cli.serve.wire import packed, unpacked
 
 

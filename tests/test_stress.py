@@ -15,14 +15,15 @@ from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.settings import CameraSettings, RolloutSettings, StressSettings, settings_from
 from kerv_cli.cli.app import app
 from kerv_cli.episodes.identity import stress_of, work_of
 from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.runner import Runner, close_worlds
+from kerv_cli.episodes.settings import RolloutSettings, settings_from
 from kerv_cli.worlds import stress as stressing
 from kerv_cli.worlds.demos.dataset import register_recorded
 from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD
+from kerv_cli.worlds.settings import CameraSettings, StressSettings
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.stress.base import objects
 from kerv_cli.worlds.stress.colour import scenery_of

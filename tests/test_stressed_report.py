@@ -10,9 +10,9 @@ import pytest
 from studies_synthetic import episode, settings_of, study_of, swept
 
 from kerv_cli.base.config import compose
-from kerv_cli.base.settings import RolloutSettings, StressSettings, SweepSettings
 from kerv_cli.episodes.identity import stress_of
 from kerv_cli.episodes.resolve import resolve
+from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 from kerv_cli.lab.execute import RunEpisode
 from kerv_cli.lab.plan import Setting
 from kerv_cli.lab.store import StudyStore
@@ -21,6 +21,7 @@ from kerv_cli.report.plots import study_figures
 from kerv_cli.report.report import report
 from kerv_cli.report.stressed import by_kind, is_stressed, summed_table, verdict
 from kerv_cli.report.tables import StudyData, load_study, rows_of
+from kerv_cli.worlds.settings import StressSettings
 
 TASKS = ["reach-v3", "push-v3"]
 EPISODES = 20

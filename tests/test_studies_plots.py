@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from studies_synthetic import part, settings_of, study_of, swept
 
 from kerv_cli.base.registry import Part
-from kerv_cli.base.settings import RolloutSettings
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.report.drawing import COLOURS, INK, STYLE, new_figure, place_labels, setting_colours
 from kerv_cli.report.measures import MICRO
 from kerv_cli.report.plots import has_task_map, series_of, study_figures, task_map

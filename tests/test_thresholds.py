@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import find
-from kerv_cli.base.settings import RolloutSettings
 from kerv_cli.engine.parts import Threshold
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.context import Context
 from kerv_cli.worlds.metaworld.spec import SPEC
 

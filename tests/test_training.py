@@ -22,18 +22,20 @@ from typer.testing import CliRunner
 from kerv_cli.base import files
 from kerv_cli.base.errors import CheckpointError, Interrupted
 from kerv_cli.base.files import sha256_of
-from kerv_cli.base.settings import CameraSettings, TargetSettings, TrainSettings
 from kerv_cli.cli.app import app
 from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.folder import save_target
+from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training import imitation
 from kerv_cli.training.imitation import Imitation, lit, soft_labels, token_loss, vocabulary, waypoints
 from kerv_cli.training.loop import Loop, Metrics, digest, read_state, schedule, write_state
 from kerv_cli.training.runs import run_settings
+from kerv_cli.training.settings import TrainSettings
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.metaworld.spec import SPEC
+from kerv_cli.worlds.settings import CameraSettings
 
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 

@@ -14,13 +14,13 @@ from safetensors.torch import load_file
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.settings import TrainDrafterSettings, TrainTargetSettings
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training import runs
 from kerv_cli.training.runs import TargetRun
+from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset, DemoEntry
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.metaworld.spec import SPEC

@@ -15,16 +15,18 @@ from typer.testing import CliRunner
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.files import sha256_of
-from kerv_cli.base.settings import CameraSettings, TargetSettings, TrainTargetSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.base.views import View, frame_shape, views_of
 from kerv_cli.cli.app import app
 from kerv_cli.targets.compact.packed import pack
+from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.imitation import check_init, continued_target, vocabulary
+from kerv_cli.training.settings import TrainTargetSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.metaworld.spec import SPEC
 from kerv_cli.worlds.metaworld.world import MetaWorld
+from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.stress.base import NO_STRESS, Stress
 
 SIZE = 32

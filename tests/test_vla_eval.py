@@ -43,12 +43,13 @@ from websockets.sync.client import connect
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.settings import RolloutSettings, ServeSettings
 from kerv_cli.catalogue.served import read_served
 from kerv_cli.catalogue.vla_eval import read_evaluations, sides_of
 from kerv_cli.cli.app import app
 from kerv_cli.episodes.runner import Runner
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.serve.policy import Policy
+from kerv_cli.serve.settings import ServeSettings
 from kerv_cli.serve.vla_eval import dim_specs
 from kerv_cli.worlds.vla_eval import MetaWorld
 

@@ -6,8 +6,9 @@ import math
 from dataclasses import dataclass
 
 from kerv_cli.base.config import compose, groups
-from kerv_cli.base.settings import EXPERT, RolloutSettings
 from kerv_cli.engine.cost import Profile
+from kerv_cli.episodes.settings import RolloutSettings
+from kerv_cli.methods.settings import EXPERT
 
 
 @dataclass(frozen=True)

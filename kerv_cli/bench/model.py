@@ -16,24 +16,22 @@ from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.places import target_names
 from kerv_cli.base.runtime import DTYPES, set_up
-from kerv_cli.base.settings import (
-    BenchSettings,
-    PolicySettings,
-    TargetSettings,
-    TrainTargetSettings,
-)
 from kerv_cli.base.spaces import Observation
 from kerv_cli.bench.machine import REPEATS, product_with, timed
+from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.episodes.policy import still_observation
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter
+from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
+from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import Layer
 from kerv_cli.training.imitation import vocabulary
+from kerv_cli.training.settings import TrainTargetSettings
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 _SPARE = 1.15  # memory that must be free, over the weights: the prompt's encoder, caches, one layer twice

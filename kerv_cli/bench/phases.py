@@ -12,9 +12,9 @@ import torch
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import KervError
-from kerv_cli.base.settings import BenchSettings, RolloutSettings
 from kerv_cli.bench.machine import Machine, measure_machine
 from kerv_cli.bench.model import Model, Sizes, blank
+from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.engine.chunk import Chunk, Clock
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
@@ -23,6 +23,7 @@ from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.record import Round
 from kerv_cli.engine.tree import ROOT
 from kerv_cli.episodes.policy import decoder_for
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer
 from kerv_cli.methods.spec_vla import RelaxedRule
 

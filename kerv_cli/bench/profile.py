@@ -7,11 +7,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-from kerv_cli.base.settings import BenchSettings, TargetSettings
 from kerv_cli.bench.machine import Machine
 from kerv_cli.bench.model import Model, Sizes, shape_of
 from kerv_cli.bench.phases import SOURCES, Phase
+from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.engine.cost import KINDS, Profile
+from kerv_cli.targets.compact.settings import TargetSettings
 
 _PER_LAYER = 15e-6  # seconds per layer and pass below which projections do not go: kernels of a captured graph
 _HALF = 2  # bytes of a bfloat16

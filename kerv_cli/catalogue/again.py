@@ -5,10 +5,11 @@ from __future__ import annotations
 import dataclasses
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.settings import CommandSettings, settings_from
+from kerv_cli.base.settings import CommandSettings
 from kerv_cli.catalogue.entries import RunEntry, store_of
 from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.episodes.policy import check
+from kerv_cli.episodes.settings import settings_from
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.plan import Setting, Wanted
 from kerv_cli.lab.store import ROLLOUT

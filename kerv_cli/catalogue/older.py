@@ -18,10 +18,10 @@ from kerv_cli.base.foreign import foreign_table
 from kerv_cli.base.limits import check_label
 from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import SETTINGS_GROUPS, part_of
-from kerv_cli.base.settings import RolloutSettings
 from kerv_cli.catalogue.stored import left_out, take
 from kerv_cli.episodes.identity import ENGINE
 from kerv_cli.episodes.rows import DECODE_SCHEMA, EPISODE_SCHEMA
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import COMPLETE, INTERRUPTED, RUNS, Database, new_id
 from kerv_cli.lab.plan import Setting, Study, Wanted, plain_settings
 from kerv_cli.lab.store import ROLLOUT, SWEEP, Foreign, StudyStore

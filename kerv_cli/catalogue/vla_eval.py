@@ -23,12 +23,12 @@ import numpy as np
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import read_json, visible
 from kerv_cli.base.foreign import foreign_sqlite
-from kerv_cli.base.settings import RolloutSettings, settings_from
 from kerv_cli.base.spaces import ActionSpace, Group
 from kerv_cli.catalogue.served import Served, path_of, read_served
 from kerv_cli.engine.record import UNTIMED, DecodeRecord, EpisodeRecord
 from kerv_cli.episodes.identity import ENGINE, OBSERVATION
 from kerv_cli.episodes.rows import EPISODE_SCHEMA, decodes_table, episode_row
+from kerv_cli.episodes.settings import RolloutSettings, settings_from
 from kerv_cli.lab.plan import Setting, Study, Wanted
 from kerv_cli.lab.store import IMPORT, Foreign, StudyStore
 

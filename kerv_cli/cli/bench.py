@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kerv_cli.base.settings import BenchSettings
+from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import print_table
 

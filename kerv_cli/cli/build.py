@@ -9,14 +9,10 @@ import typer
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.places import artifact, find_target
 from kerv_cli.base.registry import find, load, parts
-from kerv_cli.base.settings import (
-    BuildDatastoreSettings,
-    BuildDrafterSettings,
-    BuildPolicySettings,
-    BuildTargetSettings,
-)
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, print_figures, print_plan, progress_bar
+from kerv_cli.targets.settings import BuildPolicySettings, BuildTargetSettings
+from kerv_cli.training.settings import BuildDatastoreSettings, BuildDrafterSettings
 
 
 @command(

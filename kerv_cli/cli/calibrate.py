@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import typer
 
 from kerv_cli.base.config import compose, to_yaml
-from kerv_cli.base.settings import CalibrateSettings, CalibrateSuccessSettings, SweepSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, console, print_json, print_plan, print_table, progress_bar
+from kerv_cli.episodes.settings import SweepSettings
+from kerv_cli.training.settings import CalibrateSettings, CalibrateSuccessSettings
 
 if TYPE_CHECKING:
     from pathlib import Path

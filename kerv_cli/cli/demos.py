@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kerv_cli.base.durations import about
 from kerv_cli.base.errors import Interrupted, UsageError
+from kerv_cli.base.limits import choice, setting
 from kerv_cli.base.places import artifact, results_dir
-from kerv_cli.base.settings import (
-    EXPERT,
-    DemosExportSettings,
-    DemosImportSettings,
-    DemosSettings,
-    PolicySettings,
-)
+from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import ShowPlan, print_figures, print_plan, print_table, progress_bar
+from kerv_cli.methods.settings import EXPERT, PolicySettings
+from kerv_cli.training.settings import DEMOS, DemosSettings
+from kerv_cli.worlds.settings import DemosImportSettings
 
 if TYPE_CHECKING:
     from kerv_cli.training.dagger import PolicyActs
+
+
+@dataclass
+class DemosExportSettings(CommandSettings):
+    """`kerv demos export`: demonstrations for other tools."""
+
+    format: str = choice("lerobot", "lerobot", help="a LeRobot dataset of version 3")
+    demos: str = setting("mt10", DEMOS)
+    to: str = setting("", "folder; empty: <results>/lerobot/<demos>")
 
 
 @command(

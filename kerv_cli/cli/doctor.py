@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import shutil
 import time
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import typer
 
@@ -14,15 +14,30 @@ from kerv_cli.base.errors import StorageError, UnknownName
 from kerv_cli.base.files import visible
 from kerv_cli.base.findings import Finding, find, need
 from kerv_cli.base.leftovers import left_over, remove
+from kerv_cli.base.limits import number, setting
 from kerv_cli.base.places import check_writable, find_target, results_dir, shipped_dir
-from kerv_cli.base.settings import DoctorSettings
+from kerv_cli.base.settings import RunSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, print_json, print_table
+from kerv_cli.methods.settings import PolicySettings
+from kerv_cli.worlds.settings import EVALUATION_SEED, WorldSettings
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from kerv_cli.worlds.spec import EnvironmentSpec
+
+
+@dataclass
+class DoctorSettings(RunSettings):
+    """`kerv doctor`. With a target or an environment it checks that alone."""
+
+    groups: ClassVar = {"world": "default", "runtime": "cpu"}
+
+    policy: PolicySettings = setting(lambda: PolicySettings(target=""), "the target to check")
+    environment: str | None = setting(None, "the environment to check")
+    seed: int = number(EVALUATION_SEED, 0, 2**31 - 1, help="of the world that is drawn")
+    world: WorldSettings = setting(WorldSettings, "camera and length of an episode")
 
 
 Repair = Annotated[bool, typer.Option("--repair", help="Remove what killed commands left in the results.")]

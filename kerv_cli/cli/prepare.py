@@ -10,9 +10,9 @@ import typer
 from kerv_cli.base.durations import about, duration
 from kerv_cli.base.errors import Interrupted
 from kerv_cli.base.registry import parts
-from kerv_cli.base.settings import PrepareSettings
 from kerv_cli.cli.command import command, typer_command
 from kerv_cli.cli.common import ShowPlan, print_table, results_word
+from kerv_cli.training.settings import PrepareSettings
 
 NOT_OF_STEPS = ("for", "steps")
 """Settings that the steps do not take; demos= is for all of them but the certificate."""

@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated
 
 import typer
 
+from kerv_cli.base.limits import number, setting
 from kerv_cli.base.places import results_dir
-from kerv_cli.base.settings import ReportSettings
+from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, print_json, print_table
+
+
+@dataclass
+class ReportSettings(CommandSettings):
+    """`kerv report`."""
+
+    only: str | None = setting(None, "one study, by name or file; default: all that are there")
+    on: list[str] = setting([], "profiles of 'kerv bench' that price the study's decodes")
+    loss: float = number(3.0, above=0, most=99.9, help="--choose: bound on the loss of success, points")
+
 
 Publish = Annotated[
     bool,

@@ -9,7 +9,6 @@ import typer
 
 from kerv_cli.base.config import to_yaml
 from kerv_cli.base.durations import about
-from kerv_cli.base.settings import RolloutSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import (
     AsJson,
@@ -21,6 +20,7 @@ from kerv_cli.cli.common import (
     results_word,
 )
 from kerv_cli.cli.episodes import count, planned_rollout, run_study
+from kerv_cli.episodes.settings import RolloutSettings
 
 if TYPE_CHECKING:
     from kerv_cli.episodes.identity import Plain

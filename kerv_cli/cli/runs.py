@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from kerv_cli.base.errors import Interrupted, KervError, UsageError
+from kerv_cli.base.limits import setting
 from kerv_cli.base.places import as_path, results_dir
-from kerv_cli.base.settings import CommandSettings, ImportSettings
+from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, console, print_json, print_table, results_word
 
@@ -21,6 +22,16 @@ if TYPE_CHECKING:
     from kerv_cli.catalogue.entries import RunEntry
     from kerv_cli.cli.command import F
     from kerv_cli.report.compare import Comparison, Difference
+
+
+@dataclass(kw_only=True)
+class ImportSettings(CommandSettings):
+    """`kerv runs import`: recordings of vla-eval as a study (docs/vla_eval.md)."""
+
+    name: str = setting("", "of the study; empty: that of its benchmarks")
+    baseline: str = setting("", "label of the setting that the others are compared with; empty: ar, else the first")
+    labels: list[str] = setting([], "of the recordings, in their order; empty: methods, or names of servers")
+
 
 RUNS = "NAME: runs (id, a unique part of it, or last) and results=DIR."
 FILTERS = "NAME: kind=, method=, task=, state=, since= and results=DIR narrow the list."

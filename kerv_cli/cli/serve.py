@@ -8,9 +8,9 @@ import time
 
 import typer
 
-from kerv_cli.base.settings import ServeSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import ShowPlan, print_plan
+from kerv_cli.serve.settings import ServeSettings
 
 
 @command(

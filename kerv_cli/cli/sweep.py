@@ -8,7 +8,6 @@ import typer
 
 from kerv_cli.base.config import Composer, conf_dir, expand, groups, split_words
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.settings import RolloutSettings, SweepSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import (
     AsJson,
@@ -19,6 +18,7 @@ from kerv_cli.cli.common import (
 )
 from kerv_cli.cli.episodes import count, planned_study, print_settings, print_study_plan, run_study
 from kerv_cli.cli.studies import print_study, print_verdict
+from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 
 if TYPE_CHECKING:
     from kerv_cli.episodes.resolve import ResolvedStudy

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import typer
 
-from kerv_cli.base.settings import TrainDrafterSettings, TrainTargetSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan
 from kerv_cli.cli.training import run_training
+from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
 
 
 @command(

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import sha256_of
 from kerv_cli.base.places import results_dir
-from kerv_cli.base.settings import CONSTANT, MEASURED, PROFILE, REAL, RolloutSettings
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.cost import Profile, predicted, read_profile, work_of_record
 from kerv_cli.engine.record import DecodeRecord, Delay
+from kerv_cli.episodes.settings import CONSTANT, MEASURED, PROFILE, REAL, RolloutSettings
 from kerv_cli.methods.compose import Method
 from kerv_cli.worlds.spec import EnvironmentSpec
 

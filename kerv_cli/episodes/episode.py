@@ -10,10 +10,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from kerv_cli.base.settings import CameraSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.record import DecodeRecord, Delay, EpisodeRecord
 from kerv_cli.episodes.clock import RealClock
+from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import World
 
 OnStep = Callable[[int], object]

@@ -15,15 +15,8 @@ from typing import Any
 
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.registry import METHOD_KINDS, part_of
-from kerv_cli.base.settings import (
-    CONSTANT,
-    EXPERT,
-    PROFILE,
-    WAITS,
-    RolloutSettings,
-    TimingSettings,
-    settings_from,
-)
+from kerv_cli.episodes.settings import CONSTANT, PROFILE, WAITS, RolloutSettings, TimingSettings, settings_from
+from kerv_cli.methods.settings import EXPERT
 
 ENGINE = 1
 """Which tokens the code gives. Raised by hand in a change that alters tokens or actions, and in no other:

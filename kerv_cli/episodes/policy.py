@@ -11,15 +11,7 @@ import numpy as np
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.places import find_target
 from kerv_cli.base.runtime import set_up
-from kerv_cli.base.settings import (
-    DEFAULT_TASKS,
-    EXPERT,
-    WAITS,
-    PolicySettings,
-    RolloutSettings,
-    RuntimeSettings,
-    ServeSettings,
-)
+from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.base.views import frame_shape
 from kerv_cli.engine.batched import BatchDecoder
@@ -29,8 +21,10 @@ from kerv_cli.episodes.clock import RealClock
 from kerv_cli.episodes.episode import ActionDecoder
 from kerv_cli.episodes.expert import ExpertDecoder
 from kerv_cli.episodes.identity import OBSERVATION
+from kerv_cli.episodes.settings import DEFAULT_TASKS, WAITS, RolloutSettings
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.compose import Method
+from kerv_cli.methods.settings import EXPERT, MethodSettings, PolicySettings
 from kerv_cli.targets.checkpoint import TargetDescription, described
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.spec import EnvironmentSpec
@@ -42,7 +36,7 @@ CALIBRATION_DECODES = 15
 """Autoregressive decodes whose median is what `rollout.ar_ms` scales."""
 
 
-def artifacts_of(settings: RolloutSettings | ServeSettings) -> Artifacts:
+def artifacts_of(settings: MethodSettings) -> Artifacts:
     """The policy's files on its device; all settings of this process share the loaded objects."""
     device, _ = set_up(settings.runtime)
     return Artifacts(settings.results, settings.policy, settings.datastore, device, settings.runtime.dtype)

@@ -13,15 +13,16 @@ from typing import TypeVar
 
 import numpy as np
 
-from kerv_cli.base.settings import CameraSettings, RolloutSettings, WorldSettings
 from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.episodes.episode import OnStep, run_episode
 from kerv_cli.episodes.policy import batch_decoder_for, clock_for, decoder_for
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.episodes.together import EpisodeEnd, Request, run_together
 from kerv_cli.methods.compose import native_decoder
 from kerv_cli.worlds import spec_of
+from kerv_cli.worlds.settings import CameraSettings, WorldSettings
 from kerv_cli.worlds.spec import World
 from kerv_cli.worlds.stress import NO_STRESS, Stress
 from kerv_cli.worlds.stress import build as build_stress

@@ -17,9 +17,9 @@ from kerv_cli.base.manifests import check_files, read_file
 from kerv_cli.base.places import artifact, beside, find_target
 from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import DTYPES
-from kerv_cli.base.settings import PolicySettings
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.protocol import ReadableTarget, Target
+from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets import checkpoint
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.packed import load_packed

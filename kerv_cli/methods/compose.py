@@ -9,12 +9,12 @@ from typing import Any
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import METHOD_KINDS, PREFILL, Part, part_of
-from kerv_cli.base.settings import MethodSettings
 from kerv_cli.engine.chunk import steps_of
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.protocol import Target
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.parallel import ParallelPass
+from kerv_cli.methods.settings import MethodSettings
 from kerv_cli.targets.checkpoint import TargetDescription
 
 _BATCHED = {

@@ -18,10 +18,10 @@ from kerv_cli.base.files import write_json
 from kerv_cli.base.places import check_not_shipped
 from kerv_cli.base.provenance import provenance
 from kerv_cli.base.registry import METHOD_KINDS, part_of
-from kerv_cli.base.settings import WAITS, RolloutSettings
 from kerv_cli.episodes.identity import ENGINE
 from kerv_cli.episodes.policy import artifacts_of
 from kerv_cli.episodes.resolve import ResolvedStudy
+from kerv_cli.episodes.settings import WAITS, RolloutSettings
 from kerv_cli.lab.plan import Wanted, seeds_text
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.methods.certified.betting import more_to_decide, p_value

@@ -6,8 +6,8 @@ import json
 
 import pandas as pd
 
-from kerv_cli.base.settings import REAL
 from kerv_cli.episodes.identity import Plain
+from kerv_cli.episodes.settings import REAL
 from kerv_cli.report.measures import MICRO, measure
 from kerv_cli.report.tables import StudyData, is_autoregressive, rows_of
 from kerv_cli.report.text import LOST_WON, Column, compared, intervals, lost_won, numbers, p_value, shares, text_frame

@@ -15,7 +15,6 @@ import pandas as pd
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_text
 from kerv_cli.base.provenance import PACKAGES
-from kerv_cli.base.settings import MODEL
 from kerv_cli.episodes.identity import (
     NOT_DETERMINING,
     NOT_DETERMINING_RUNTIME,
@@ -28,6 +27,7 @@ from kerv_cli.episodes.identity import (
 )
 from kerv_cli.lab.plan import Setting, Study, Wanted, seeds_text
 from kerv_cli.lab.store import StudyStore
+from kerv_cli.methods.settings import MODEL
 from kerv_cli.report.measures import MACRO, MICRO, Row, measure
 from kerv_cli.worlds import specs
 

@@ -14,16 +14,18 @@ import numpy as np
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.provenance import stamp
 from kerv_cli.base.registry import find
-from kerv_cli.base.settings import MethodSettings, RolloutSettings, ServeSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.batched import BatchDecoder, Lane
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.episodes.episode import Follower
 from kerv_cli.episodes.policy import artifacts_of, warm_up
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.compose import Method
+from kerv_cli.methods.settings import MethodSettings
 from kerv_cli.serve.guard import HOLD, Finite, StateRange
 from kerv_cli.serve.session import Interface, Session
+from kerv_cli.serve.settings import ServeSettings
 from kerv_cli.worlds import specs
 
 VLA_EVAL = "vla_eval"

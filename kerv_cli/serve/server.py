@@ -20,9 +20,9 @@ import numpy as np
 
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.registry import load
-from kerv_cli.base.settings import ServeSettings
 from kerv_cli.serve.policy import Policy
 from kerv_cli.serve.session import Session
+from kerv_cli.serve.settings import ServeSettings
 
 if TYPE_CHECKING:
     from websockets.http11 import Request, Response

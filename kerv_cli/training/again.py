@@ -7,12 +7,13 @@ from pathlib import Path
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.manifests import read
-from kerv_cli.base.settings import TrainDrafterSettings, TrainTargetSettings, read_settings
+from kerv_cli.base.settings import read_settings
 from kerv_cli.catalogue.again import again_words
 from kerv_cli.catalogue.entries import RunEntry, description_of
 from kerv_cli.lab.database import COMPLETE, Database
 from kerv_cli.lab.runs import run_rows
 from kerv_cli.training.runs import DrafterRun, TargetRun, drafter_run
+from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
 
 
 def training_again(run: RunEntry, results: str) -> TargetRun | DrafterRun:

@@ -15,9 +15,9 @@ from kerv_cli.base.errors import CheckpointError, KervError
 from kerv_cli.base.files import read_mapping, write_json
 from kerv_cli.base.places import artifact, check_not_shipped
 from kerv_cli.base.provenance import provenance_of
-from kerv_cli.base.settings import CalibrateSettings, RolloutSettings
 from kerv_cli.base.spaces import ObservationSpace
 from kerv_cli.engine.decoder import Decoder
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.calibration import (
     BoundarySection,
@@ -38,6 +38,7 @@ from kerv_cli.training.predictor_fit import (
     prediction_errors,
     read_windows,
 )
+from kerv_cli.training.settings import CalibrateSettings
 from kerv_cli.training.skip_levels import skip_section
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import OnProgress

@@ -18,7 +18,6 @@ from kerv_cli.base.files import read_mapping, sha256_of, visible, write_folder, 
 from kerv_cli.base.places import artifact, check_not_shipped
 from kerv_cli.base.provenance import provenance_of
 from kerv_cli.base.runtime import set_up
-from kerv_cli.base.settings import BuildDatastoreSettings
 from kerv_cli.base.spaces import ObservationSpace
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.methods.artifacts import Artifacts
@@ -35,6 +34,7 @@ from kerv_cli.methods.heisd.datastore import (
 )
 from kerv_cli.training.demonstrations import demos_for
 from kerv_cli.training.observations import observations_of, prompts_of, read_chunks, steps_of
+from kerv_cli.training.settings import BuildDatastoreSettings
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode

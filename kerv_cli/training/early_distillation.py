@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kerv_cli.base.settings import TrainSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.protocol import ReadableTarget
@@ -23,6 +22,7 @@ from kerv_cli.training.imitation import soft_labels, token_loss
 from kerv_cli.training.loop import Metrics
 from kerv_cli.training.observations import Rows, observations_of, prompts_of, split, steps_of
 from kerv_cli.training.runs import DrafterRun
+from kerv_cli.training.settings import TrainSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 

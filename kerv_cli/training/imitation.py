@@ -19,15 +19,16 @@ from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.settings import TargetSettings, TrainSettings
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.features import places_of
 from kerv_cli.targets.compact.packed_bfloat16 import has_tiles
+from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training.loop import Metrics
 from kerv_cli.training.observations import Observations, read_chunks, read_observations, split
+from kerv_cli.training.settings import TrainSettings
 from kerv_cli.worlds import specs
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode

@@ -23,9 +23,9 @@ from kerv_cli.base.errors import CheckpointError, Interrupted, KervError
 from kerv_cli.base.files import write_text
 from kerv_cli.base.manifests import read
 from kerv_cli.base.places import RESUME
-from kerv_cli.base.settings import TrainSettings
 from kerv_cli.targets.checkpoint import load_tensors, save_tensors
 from kerv_cli.training.interruption import until_interrupted
+from kerv_cli.training.settings import TrainSettings
 
 Metrics = dict[str, float]
 

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.settings import TargetSettings
 from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.engine.protocol import EncodesMany, Target
+from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.worlds import instruction_of

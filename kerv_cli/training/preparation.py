@@ -10,13 +10,14 @@ from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.places import RESUME
 from kerv_cli.base.registry import parts
-from kerv_cli.base.settings import CalibrateSuccessSettings, PrepareSettings, RolloutSettings, TrainDrafterSettings
 from kerv_cli.catalogue.entries import state_of
 from kerv_cli.episodes.resolve import resolve
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.artifacts import Artifacts, Weights, kind_of, removal
 from kerv_cli.methods.compose import Method
 from kerv_cli.training.demonstrations import demos_for
 from kerv_cli.training.runs import drafter_seconds
+from kerv_cli.training.settings import CalibrateSuccessSettings, PrepareSettings, TrainDrafterSettings
 from kerv_cli.worlds import specs
 
 THERE, MISSING = "there", "missing"

@@ -9,11 +9,11 @@ from typing import Any
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.provenance import provenance_of
 from kerv_cli.base.runtime import set_up
-from kerv_cli.base.settings import BuildDrafterSettings
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterArtifact
 from kerv_cli.methods.eagle.public import Convention, PublicDrafter, read_public
+from kerv_cli.training.settings import BuildDrafterSettings
 
 
 def import_drafter(settings: BuildDrafterSettings) -> tuple[Path, dict[str, Any]]:

@@ -20,7 +20,6 @@ from kerv_cli.base.places import artifact, check_not_shipped, find_target
 from kerv_cli.base.provenance import provenance_of
 from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import set_up
-from kerv_cli.base.settings import TrainDrafterSettings, TrainSettings, TrainTargetSettings
 from kerv_cli.base.views import views_of
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.episodes.runner import success_of
@@ -48,6 +47,7 @@ from kerv_cli.training.imitation import (
     vocabulary,
 )
 from kerv_cli.training.loop import Lesson, Loop, Metrics, check_same_run, stored_identity
+from kerv_cli.training.settings import TrainDrafterSettings, TrainSettings, TrainTargetSettings
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 

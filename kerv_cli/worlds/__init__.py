@@ -13,7 +13,7 @@ from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.registry import add, load, parts
 
 if TYPE_CHECKING:
-    from kerv_cli.base.settings import WorldSettings
+    from kerv_cli.worlds.settings import WorldSettings
     from kerv_cli.worlds.spec import EnvironmentSpec
 
 W = TypeVar("W", bound="WorldSettings")

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kerv_cli.base.errors import RenderingUnavailable
-from kerv_cli.base.settings import CameraSettings
+from kerv_cli.worlds.settings import CameraSettings
 
 if TYPE_CHECKING:
     import mujoco

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Protocol
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.limits import check_settings
 from kerv_cli.base.registry import load
-from kerv_cli.base.settings import CameraSettings
 from kerv_cli.base.views import views_of
+from kerv_cli.worlds.settings import CameraSettings
 
 if TYPE_CHECKING:
     import numpy as np

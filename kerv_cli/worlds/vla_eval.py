@@ -14,9 +14,9 @@ from vla_eval.benchmarks.base import StepBenchmark, StepResult
 from vla_eval.render import configure_mujoco_render
 from vla_eval.specs import IMAGE_RGB, LANGUAGE, POSITION_DELTA, DimSpec
 
-from kerv_cli.base.settings import EVALUATION_SEED, CameraSettings, StressSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.worlds import resolve_tasks, spec_of
+from kerv_cli.worlds.settings import EVALUATION_SEED, CameraSettings, StressSettings
 from kerv_cli.worlds.spec import World
 from kerv_cli.worlds.stress import build as build_stress
 from kerv_cli.worlds.stress import check as check_stress

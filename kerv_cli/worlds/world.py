@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kerv_cli.base.errors import KervError, UsageError
-from kerv_cli.base.settings import CameraSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.base.views import views_of
 from kerv_cli.worlds.camera import Camera
+from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.stress.base import NO_STRESS, Model, ModelChanges, Stress
 

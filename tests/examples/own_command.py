@@ -8,8 +8,9 @@ import typer
 
 from kerv_cli.base.limits import choice, number
 from kerv_cli.base.registry import add
-from kerv_cli.base.settings import EVALUATION_SEED, TaskSettings
+from kerv_cli.base.settings import TaskSettings
 from kerv_cli.cli.common import AsJson, print_json
+from kerv_cli.worlds.settings import EVALUATION_SEED
 
 
 @dataclass

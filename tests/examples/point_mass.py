@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kerv_cli.base.registry import Part, register
-from kerv_cli.base.settings import CameraSettings
 from kerv_cli.base.spaces import ActionSpace, Group, Observation, ObservationSpace, Place
+from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import EnvironmentSpec, Seeds, Task
 from kerv_cli.worlds.world import EpisodeWorld
 

@@ -20,7 +20,6 @@ import torch
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.settings import TargetSettings
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
 from kerv_cli.base.views import frame_shape, views_of
 from kerv_cli.engine.transfer import upload
@@ -35,6 +34,7 @@ from kerv_cli.targets.compact.features import (
     scene_width,
 )
 from kerv_cli.targets.compact.packable import Packable
+from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Trunk
 from kerv_cli.targets.compact.vision import VisionEncoder

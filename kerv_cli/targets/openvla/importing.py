@@ -11,7 +11,6 @@ from kerv_cli.base.files import write_json
 from kerv_cli.base.places import artifact
 from kerv_cli.base.provenance import provenance
 from kerv_cli.base.registry import find, load
-from kerv_cli.base.settings import BuildTargetSettings
 from kerv_cli.base.spaces import ObservationSpace
 from kerv_cli.targets.checkpoint import FORMAT, target_fields
 from kerv_cli.targets.openvla.config import action_space, read_shape, read_statistics
@@ -19,6 +18,7 @@ from kerv_cli.targets.openvla.image import read_normalisations
 from kerv_cli.targets.openvla.loading import check_finite, check_layout, digest_of, layout, open_shards
 from kerv_cli.targets.openvla.prompt import Prompter
 from kerv_cli.targets.openvla.target import OpenVLASettings
+from kerv_cli.targets.settings import BuildTargetSettings
 
 NO_STATE = ObservationSpace(proprioception=(), state=0, places=(), centre=(0.0, 0.0, 0.0))
 

@@ -28,7 +28,6 @@ from kerv_cli.base.files import read_json, write_json
 from kerv_cli.base.limits import check_settings, limits, number
 from kerv_cli.base.manifests import read
 from kerv_cli.base.processes import begin_worker, check_workers
-from kerv_cli.base.settings import CameraSettings
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.camera import choose_backend
 from kerv_cli.worlds.demos.dataset import (
@@ -42,6 +41,7 @@ from kerv_cli.worlds.demos.dataset import (
 )
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode, save_episode
 from kerv_cli.worlds.demos.perturbation import Perturbation, is_perturbed
+from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import EnvironmentSpec, World
 
 _SEEDS_PER_JOB = 5

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import find, load
-from kerv_cli.base.settings import StressSettings
+from kerv_cli.worlds.settings import StressSettings
 from kerv_cli.worlds.stress.base import NO_STRESS, Stress
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from kerv_cli.base.settings import MOST_STRESS
+from kerv_cli.worlds.settings import MOST_STRESS
 
 if TYPE_CHECKING:
     import mujoco

@@ -17,11 +17,11 @@ from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageE
 from kerv_cli.base.files import read_mapping, regular, write_folder, write_json
 from kerv_cli.base.foreign import foreign_table
 from kerv_cli.base.places import as_path
-from kerv_cli.base.settings import DemosImportSettings
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, action_limits
 from kerv_cli.worlds.demos.dataset import FORMAT, DemoDataset, EpisodeEntry, OnProgress, entry_of, episode_path, totals
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, save_episode
 from kerv_cli.worlds.demos.lerobot import layout
+from kerv_cli.worlds.settings import DemosImportSettings
 
 Row: TypeAlias = Mapping[str, Any]
 """A row of a table, or an object of a JSON file."""

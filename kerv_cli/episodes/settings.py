@@ -1,0 +1,102 @@
+"""Settings of rollouts and of studies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.limits import choice, number, setting
+from kerv_cli.base.settings import CommandSettings, TaskSettings, read_settings
+from kerv_cli.methods.settings import EXPERT, MethodSettings
+from kerv_cli.worlds.settings import EVALUATION_SEED, RolloutWorldSettings
+
+WAITS, REAL = "waits", "real"
+MEASURED, CONSTANT, PROFILE = "measured", "constant", "profile"
+
+
+@dataclass
+class TimingSettings:
+    """What the world does while the policy decodes (docs/methods.md §8)."""
+
+    clock: str = choice(WAITS, WAITS, REAL, help="while the policy decodes, the world stands still, or goes on")
+    latency: str = choice(MEASURED, MEASURED, CONSTANT, PROFILE, help="how long a decode takes for the world")
+    latency_ms: float = number(0.0, 0, 600_000, help="latency=constant: milliseconds of a decode")
+    profile: str = setting("", "latency=profile: a document of `kerv bench`, its path or its name in <results>/bench")
+    ar_ms: float = number(
+        0.0, 0, 600_000, help="an autoregressive decode takes so long, others in proportion; 0: as measured or profiled"
+    )
+    delay_compensation: str = choice("none", "none", "chunk", help="chunk: leave a new chunk's stale actions out")
+    batch: int = number(1, 1, 1024, help="episodes that are decoded together; above 1: for success, without times")
+
+    def check_together(self, prefix: str) -> None:
+        """Raises UsageError for latency=profile without a profile, and for a batch in a world that feels its time."""
+        if self.batch > 1 and self.clock == REAL:
+            raise UsageError(
+                f"{prefix}batch={self.batch} with {prefix}clock=real: decodes of a batch have no times, use one of them"
+            )
+        if self.clock == REAL and self.latency == PROFILE and not self.profile:
+            raise UsageError(
+                f"{prefix}latency=profile: name a document of 'kerv bench', {prefix}profile=mt10-vision-float32"
+            )
+
+
+DEFAULT_TASKS = ["MT10"]
+"""Where neither a word nor a target names any."""
+
+
+@dataclass
+class RolloutSettings(MethodSettings, TaskSettings):
+    """`kerv rollout`: episodes of one method."""
+
+    # the method's parts are overridden by its file, so that it comes last
+    groups: ClassVar = {"policy": "vision", "world": "default", "runtime": "cpu", "method": "ar"}
+
+    episodes: int = number(3, 1, 1_000_000, help="episodes per task")
+    # in every setting: that is the pairing
+    seed: int = number(EVALUATION_SEED, 0, 2**31 - 1, help="first seed; episode i has seed + i")
+    world: RolloutWorldSettings = setting(RolloutWorldSettings, "camera, length of an episode, stress")
+    rollout: TimingSettings = setting(TimingSettings, "what the world does while the policy decodes")
+    deviation_every: int = number(0, 0, 1_000_000, help="decodes between two deviation samples; 0: never")
+    record: int = number(1, -1, 1_000_000, help="episodes per task that are saved as .rrd; -1: all")
+    record_size: int = number(240, 8, 4096, help="pixels of the recorded camera")
+
+    def __post_init__(self) -> None:
+        if self.policy.kind == EXPERT:
+            self.method = EXPERT  # it decodes nothing, so that no method's name fits
+
+
+@dataclass
+class StudySettings:
+    """`conf/study/*.yaml`: which settings are compared."""
+
+    name: str = setting("", "of its folder in <results>/studies; empty: that of its file")
+    title: str = setting("", "of its tables and plots")
+    baseline: str = setting("ar", "label of the setting that the others are compared with")
+    common: str = setting("", "overrides of every setting, e.g. task=MT10 episodes=20; the command line's outrank them")
+    settings: dict[str, str] = setting({}, "label -> overrides; comma lists expand into a grid")
+    axis: str = setting("", "key on the plot's x axis, e.g. threshold.r")
+    block: int = number(5, 1, 10_000, help="seeds for which the settings take turns in one process")
+    repeats: int = number(1, 1, 1_000, help="how often every episode is measured")
+    note: str = setting("", "a sentence that says what to see, printed below the table")
+
+
+@dataclass
+class SweepSettings(CommandSettings):
+    """`kerv sweep`: a study. Everything else on the command line goes to each of its settings."""
+
+    groups: ClassVar = {"study": "threshold"}
+
+    study: StudySettings = setting(StudySettings, "which settings are compared: a name of conf/study, or a file")
+    until: str = choice(
+        "done", "done", "decided", help="every planned episode, or until each setting's question is answered"
+    )
+    # timed: settings whose times were not taken in turn with the baseline; changed: episodes of other code
+    rerun: str = choice("never", "never", "timed", "changed", "all", help="what is run again although it is there")
+    loss: float = number(3.0, above=0, most=99.9, help="until=decided: is the loss of success below so many points?")
+
+
+def settings_from(plain: Mapping[str, Any]) -> RolloutSettings:
+    """The settings of a rollout from nested dicts and lists: `read_settings` with its class."""
+    return read_settings(RolloutSettings, plain)
