@@ -17,7 +17,7 @@ from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.training.dagger import PolicyActs
 from kerv_cli.training.demonstrations import open_demos
-from kerv_cli.training.imitation import task_borders
+from kerv_cli.training.imitation import task_weights
 from kerv_cli.training.loop import draw_samples
 from kerv_cli.training.settings import DemosSettings
 from kerv_cli.worlds import spec_of
@@ -44,7 +44,9 @@ def test_balanced_tasks_are_drawn_alike() -> None:
     generator = torch.Generator().manual_seed(0)
 
     def share(balance: float) -> float:
-        return float(tasks[draw_samples(1000, 20_000, generator, task_borders(tasks, balance))].double().mean())
+        weights = task_weights(tasks, balance)
+        drawn = draw_samples(1000, 20_000, generator, None if weights is None else weights.cumsum(0))
+        return float(tasks[drawn].double().mean())
 
     assert share(0.0) == pytest.approx(0.1, abs=0.01)
     assert share(1.0) == pytest.approx(0.5, abs=0.02)

@@ -32,7 +32,7 @@ from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.kerv.prediction import Hold, PredictionProposer
 from kerv_cli.methods.merged.proposer import MergedProposer
-from kerv_cli.training.runs import drafter_run
+from kerv_cli.training.drafter import DrafterRun
 from kerv_cli.training.settings import TrainDrafterSettings
 from kerv_cli.worlds.metaworld.spec import SPEC
 
@@ -151,7 +151,7 @@ def test_it_is_trained_from_the_command_line_and_drafts_in_a_rollout(results: Pa
         return done.output
 
     few = ("demos=few", "drafter.share=0.5", "train.steps=6", "train.batch=8", "train.validate_every=3", "train.lr=0.1")
-    assert "a table of" in kerv("train", "drafter", "drafter=follow", *few, "--plan")
+    assert "table of" in kerv("train", "drafter", "drafter=follow", *few, "--plan")
     assert "score" in kerv("train", "drafter", "drafter=follow", *few)
     described = json.loads((results / "artifacts/follow/learnt/follow.json").read_text())
     assert described["settings"] == {"kind": "follow", "share": 0.5}
@@ -172,4 +172,4 @@ def test_it_is_trained_from_the_command_line_and_drafts_in_a_rollout(results: Pa
 )
 def test_its_training_has_settings_of_its_own(words: list[str], says: str) -> None:
     with pytest.raises(UsageError, match=says):
-        drafter_run(compose("train_drafter", words, TrainDrafterSettings))
+        DrafterRun(compose("train_drafter", words, TrainDrafterSettings))

@@ -20,8 +20,8 @@ from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.training.drafter import DrafterRun
 from kerv_cli.training.imitation import check_init, continued_target
-from kerv_cli.training.runs import drafter_run
 from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
 from kerv_cli.worlds.metaworld.spec import SPEC
 
@@ -131,4 +131,4 @@ def test_no_drafter_is_distilled_from_it(results: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(DemoDataset, "open", classmethod(lambda cls, folder: demos))
     settings = compose("train_drafter", [f"results={results}", "policy.target=parallel"], TrainDrafterSettings)
     with pytest.raises(UsageError, match="no greedy decodes to imitate"):
-        drafter_run(settings)
+        DrafterRun(settings)

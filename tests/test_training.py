@@ -29,8 +29,9 @@ from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training import imitation
 from kerv_cli.training.imitation import Imitation, lit, soft_labels, token_loss, vocabulary, waypoints
-from kerv_cli.training.loop import Loop, Metrics, digest, read_state, schedule, write_state
-from kerv_cli.training.runs import run_settings
+from kerv_cli.training.loop import Loop, Metrics, schedule
+from kerv_cli.training.resume import digest, read_state, write_state
+from kerv_cli.training.run import optimisation_identity
 from kerv_cli.training.settings import TrainSettings
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.demos.recording import DemoConfig, record
@@ -115,7 +116,7 @@ def test_one_request_that_arrives_twice_is_one_and_a_run_without_validation_says
 
 
 def test_scores_with_and_without_success_are_of_different_runs() -> None:
-    alone, some, more = (run_settings(replace(TINY, closed_loop=episodes)) for episodes in (0, 1, 2))
+    alone, some, more = (optimisation_identity(replace(TINY, closed_loop=episodes)) for episodes in (0, 1, 2))
     assert some == more != alone
 
 

@@ -18,9 +18,9 @@ from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
-from kerv_cli.training import runs
-from kerv_cli.training.runs import TargetRun
+from kerv_cli.training.drafter import DrafterRun
 from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
+from kerv_cli.training.target import TargetRun
 from kerv_cli.worlds.demos.dataset import DemoDataset, DemoEntry
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.metaworld.spec import SPEC
@@ -94,7 +94,7 @@ def test_training_changes_the_new_target_and_not_the_old_one(results: Path) -> N
     before = load_file(results / "artifacts/target/old/model.safetensors")
     run = TargetRun(settings(results))
     run.load(lambda done, total: None)
-    samples = run.learnt.training  # type: ignore[attr-defined]
+    samples = run.objective.training  # type: ignore[attr-defined]
     assert samples.chunks.shape[1:] == (8, 4)
     assert samples.words[0].tolist() == WORDS.encode("pull the drawer open", 10)
     run.train(lambda step, metrics: None)
@@ -132,12 +132,12 @@ def test_what_cannot_begin_a_run_is_refused(results: Path) -> None:
         with pytest.raises(UsageError, match="would be overwritten"):
             TargetRun(settings(results, "name=old", same))
     with pytest.raises(UsageError, match=r"train\.init=old: only the training of a target"):
-        runs.drafter_run(compose("train_drafter", ["train.init=old"], TrainDrafterSettings))
+        DrafterRun(compose("train_drafter", ["train.init=old"], TrainDrafterSettings))
     for word in ("colour=0.3", "places=path", "balance=0.5", "closed_loop=2"):
         with pytest.raises(UsageError, match=rf"train\.{word}: only the training of a target has this setting"):
-            runs.drafter_run(compose("train_drafter", [f"train.{word}"], TrainDrafterSettings))
+            DrafterRun(compose("train_drafter", [f"train.{word}"], TrainDrafterSettings))
     for word in ("colour=0.3", "places=path"):
-        with pytest.raises(UsageError, match=rf"train\.{word} is of images, target\.observation=state has none"):
+        with pytest.raises(UsageError, match=rf"train\.{word} needs images, and target\.observation=state has none"):
             TargetRun(settings(results, "target.observation=state", f"train.{word}"))
 
 

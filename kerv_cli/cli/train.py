@@ -22,7 +22,7 @@ from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
 def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Behaviour-clone the target on demonstrations."""
     typer.echo(f"target {settings.name}: {settings.train.steps} steps", err=True)
-    from kerv_cli.training.runs import TargetRun
+    from kerv_cli.training.target import TargetRun
 
     run_training(TargetRun(settings), plan, as_json, "reading demonstrations", "training the target")
 
@@ -39,6 +39,6 @@ def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJso
 def drafter(settings: TrainDrafterSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Train a drafter, or with drafter=early the early one, on the target's own greedy decodes."""
     typer.echo(f"{settings.drafter.kind} drafter of {settings.policy.target}: {settings.train.steps} steps", err=True)
-    from kerv_cli.training.runs import drafter_run
+    from kerv_cli.training.drafter import DrafterRun
 
-    run_training(drafter_run(settings), plan, as_json, "the target's greedy decodes", "training the drafter")
+    run_training(DrafterRun(settings), plan, as_json, "the target's greedy decodes", "training the drafter")

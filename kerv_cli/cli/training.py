@@ -16,7 +16,7 @@ from kerv_cli.cli.common import print_figures, print_json, print_plan, progress_
 
 if TYPE_CHECKING:
     from kerv_cli.lab.runs import Run
-    from kerv_cli.training.runs import DrafterRun, TargetRun
+    from kerv_cli.training.run import TrainingRun
 
 MOST_POINTS = 1000
 """Of a curve, so that a long run does not wait for its tracker; validations are all logged."""
@@ -24,7 +24,7 @@ _MODULES = {"trackio": "trackio", "wandb": "wandb", "tensorboard": "torch.utils.
 
 
 def run_training(
-    run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading: str, training: str, command: Sequence[str] = ()
+    run: TrainingRun, plan: bool, as_json: bool, loading: str, training: str, command: Sequence[str] = ()
 ) -> None:
     """Train with progress, or print the plan.
 
@@ -43,11 +43,11 @@ def run_training(
         print_plan(run.plan(), as_json)
     from kerv_cli.lab.runs import making
 
-    with making(run.settings.results, run.folder_kind, run.folder, command) as record:
+    with making(run.settings.results, run.artifact_kind, run.folder, command) as record:
         _train(run, record, as_json, loading, training)
 
 
-def _train(run: TargetRun | DrafterRun, record: Run, as_json: bool, loading: str, training: str) -> None:
+def _train(run: TrainingRun, record: Run, as_json: bool, loading: str, training: str) -> None:
     from kerv_cli.training.loop import without_subnormals
 
     with without_subnormals(), progress_bar(loading, record) as advance:

@@ -12,11 +12,13 @@ from kerv_cli.catalogue.again import again_words
 from kerv_cli.catalogue.entries import RunEntry, description_of
 from kerv_cli.lab.database import COMPLETE, Database
 from kerv_cli.lab.runs import run_rows
-from kerv_cli.training.runs import DrafterRun, TargetRun, drafter_run
+from kerv_cli.training.drafter import DrafterRun
+from kerv_cli.training.run import TrainingRun
 from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
+from kerv_cli.training.target import TargetRun
 
 
-def training_again(run: RunEntry, results: str) -> TargetRun | DrafterRun:
+def training_again(run: RunEntry, results: str) -> TrainingRun:
     """Return the training with the stored settings, under a free name, or that of an interrupted repetition.
 
     Raises:
@@ -35,7 +37,7 @@ def training_again(run: RunEntry, results: str) -> TargetRun | DrafterRun:
         return TargetRun(dataclasses.replace(read(TrainTargetSettings, value, str(path)), name=name))
     settings = read_settings(TrainDrafterSettings, value)
     others = settings.policy.others | {run.kind: name}
-    return drafter_run(dataclasses.replace(settings, policy=dataclasses.replace(settings.policy, others=others)))
+    return DrafterRun(dataclasses.replace(settings, policy=dataclasses.replace(settings.policy, others=others)))
 
 
 def _free(folder: Path) -> str:

@@ -20,13 +20,13 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.parts import Fixed
-from kerv_cli.engine.protocol import Target
+from kerv_cli.engine.protocol import ReadableTarget, Target
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterArtifact, DrafterProposer
 from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.training.loop import Metrics
 from kerv_cli.training.observations import Rows, held_out_every, observations_of, prompts_of, steps_of
-from kerv_cli.training.runs import DrafterRun
+from kerv_cli.training.settings import TrainDrafterSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
 
@@ -189,15 +189,16 @@ def acceptance_length(target: Target, drafter: Drafter, prompts: list[Tensor], r
     return sum(r.committed for r in rounds) / max(1, len(rounds))
 
 
-class EagleRun(DrafterRun):
+class EagleTraining:
     """`kerv train drafter`: the EAGLE-style drafter."""
 
     artifact = DrafterArtifact()
 
-    def lesson(self, progress: OnProgress) -> Distillation:
-        """The target's states of training and validation."""
-        settings, share = self.settings.drafter, self.settings.train.held_out
-        states, held_out = teach(self.target, self.dataset, settings.samples, share, progress)
-        torch.manual_seed(self.settings.train.seed)
-        drafter = Drafter.beside(settings, self.target).to(self.device)
-        return Distillation(drafter, self.target, states, held_out, settings)
+    def objective(
+        self, target: ReadableTarget, dataset: DemoDataset, settings: TrainDrafterSettings, progress: OnProgress
+    ) -> Distillation:
+        """Decode the demonstrations with the target and make a fresh drafter."""
+        states, held_out = teach(target, dataset, settings.drafter.samples, settings.train.held_out, progress)
+        torch.manual_seed(settings.train.seed)
+        drafter = Drafter.beside(settings.drafter, target).to(target.device)
+        return Distillation(drafter, target, states, held_out, settings.drafter)

@@ -21,8 +21,7 @@ from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter, choose
 from kerv_cli.training.imitation import soft_labels, token_loss
 from kerv_cli.training.loop import Metrics
 from kerv_cli.training.observations import Rows, observations_of, prompts_of, split, steps_of
-from kerv_cli.training.runs import DrafterRun
-from kerv_cli.training.settings import TrainSettings
+from kerv_cli.training.settings import TrainDrafterSettings, TrainSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
@@ -162,17 +161,18 @@ def measure(logits: Tensor, samples: Decodes, strict: Tensor) -> Metrics:
     return metrics
 
 
-class EarlyRun(DrafterRun):
+class EarlyTraining:
     """`kerv train drafter drafter=early`."""
 
     artifact = EarlyArtifact()
 
-    def lesson(self, progress: OnProgress) -> EarlyDistillation:
-        """The target's tokens and pooled prompts."""
-        settings, train = self.settings.drafter, self.settings.train
-        samples = teach_early(self.target, self.dataset, settings, progress)
-        training, held_out = split(samples, train.held_out)
-        torch.manual_seed(train.seed)
-        early = EarlyDrafter.beside(settings, self.target)
+    def objective(
+        self, target: ReadableTarget, dataset: DemoDataset, settings: TrainDrafterSettings, progress: OnProgress
+    ) -> EarlyDistillation:
+        """Decode the demonstrations with the target and make a fresh drafter."""
+        samples = teach_early(target, dataset, settings.drafter, progress)
+        training, held_out = split(samples, settings.train.held_out)
+        torch.manual_seed(settings.train.seed)
+        early = EarlyDrafter.beside(settings.drafter, target)
         early.standardise(training.features)
-        return EarlyDistillation(early.to(self.device), training, held_out, train)
+        return EarlyDistillation(early.to(target.device), training, held_out, settings.train)

@@ -92,13 +92,20 @@ def waypoints(episode: DemoEpisode, steps: np.ndarray, count: int, actions: Acti
     return torch.from_numpy(episode.end_effector[at]).float()
 
 
-def task_borders(tasks: Tensor, balance: float) -> Tensor | None:
-    """(n,) float64: `borders` of `draw_samples` by which a task of share p among the samples is drawn in proportion to
-    p^(1 − balance); None for balance 0, where all samples weigh alike. tasks (n,): index of each sample's task."""
+def task_weights(tasks: Tensor, balance: float) -> Tensor | None:
+    """Return the weights (n,) float64 by which samples are drawn; None if all are drawn alike.
+
+    A task with the share p of the samples is drawn in proportion to p^(1 − balance).
+
+    Args:
+        tasks: (n,) index of each sample's task.
+        balance: 0 draws all samples alike, 1 all tasks.
+    """
     if balance == 0:
         return None
     shares = torch.bincount(tasks).double() / len(tasks)
-    return (shares[tasks] ** -balance).cumsum(0)
+    weights: Tensor = shares[tasks] ** -balance
+    return weights
 
 
 def soft_labels(tokens: int, sigma: float) -> Tensor:
@@ -139,6 +146,7 @@ class Imitation:
         self.module, self.settings, self.device, self.closed_loop = target, settings, target.device, closed_loop
         self.training, self.held_out = split(samples, settings.held_out)
         self.labels = soft_labels(target.actions.tokens, settings.label_sigma).to(self.device)
+        self.weights = task_weights(self.training.tasks, settings.balance)
 
     def __len__(self) -> int:
         return len(self.training)

@@ -16,7 +16,7 @@ from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.artifacts import Artifacts, Weights, kind_of, removal
 from kerv_cli.methods.compose import Method
 from kerv_cli.training.demonstrations import demos_for
-from kerv_cli.training.runs import drafter_seconds
+from kerv_cli.training.drafter import drafter_seconds
 from kerv_cli.training.settings import CalibrateSuccessSettings, PrepareSettings, TrainDrafterSettings
 from kerv_cli.worlds import specs
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from kerv_cli.engine.batched import greedy
+from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.methods.early.drafter import EarlyDrafter
 from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.methods.scout.drafter import Scout, ScoutArtifact, check_sees
@@ -21,7 +22,7 @@ from kerv_cli.training.early_distillation import Decodes, EarlyDistillation, col
 from kerv_cli.training.imitation import position_loss
 from kerv_cli.training.loop import Metrics
 from kerv_cli.training.observations import BATCH, Observations, read_observations, split
-from kerv_cli.training.runs import DrafterRun
+from kerv_cli.training.settings import TrainDrafterSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
 
@@ -87,15 +88,18 @@ class ScoutDistillation(EarlyDistillation):
         return {f"{name}_error_cm": 100 * float(e) for name, e in zip(names, error, strict=True)}
 
 
-class ScoutRun(DrafterRun):
+class ScoutTraining:
     """`kerv train drafter drafter=scout`, for a target that sees."""
 
     artifact = ScoutArtifact()
 
-    def lesson(self, progress: OnProgress) -> ScoutDistillation:
-        """The target's tokens and positions."""
-        settings, train = self.settings.drafter, self.settings.train
-        target = check_sees(self.target)
-        training, held_out = split(teach_scout(target, self.dataset, settings, progress), train.held_out)
-        torch.manual_seed(train.seed)
-        return ScoutDistillation(Scout.beside(settings, target).to(self.device), training, held_out, train)
+    def objective(
+        self, target: ReadableTarget, dataset: DemoDataset, settings: TrainDrafterSettings, progress: OnProgress
+    ) -> ScoutDistillation:
+        """Decode the demonstrations with the target and make a fresh scout."""
+        seeing = check_sees(target)
+        samples = teach_scout(seeing, dataset, settings.drafter, progress)
+        training, held_out = split(samples, settings.train.held_out)
+        torch.manual_seed(settings.train.seed)
+        scout = Scout.beside(settings.drafter, seeing).to(target.device)
+        return ScoutDistillation(scout, training, held_out, settings.train)

@@ -31,7 +31,7 @@ class FollowDrafterSettings:
 
 
 register(Part("artifact", "follow", "examples.own_proposer_table:FollowArtifact"))
-register(Part("drafter", "follow", "examples.own_proposer_table:FollowRun", FollowDrafterSettings))
+register(Part("drafter", "follow", "examples.own_proposer_table:FollowTraining", FollowDrafterSettings))
 register(
     Part(
         "proposer",

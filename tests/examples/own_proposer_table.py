@@ -21,7 +21,8 @@ from kerv_cli.methods.artifacts import Weights, WeightsDescription
 from kerv_cli.methods.context import Context
 from kerv_cli.training.loop import Metrics
 from kerv_cli.training.observations import Rows, split
-from kerv_cli.training.runs import DrafterRun
+from kerv_cli.training.settings import TrainDrafterSettings
+from kerv_cli.worlds.demos.dataset import DemoDataset
 
 
 class FollowTable(nn.Module):
@@ -73,7 +74,7 @@ class Pairs(Rows):
     episodes: Tensor  # (n,)
 
 
-class FollowLesson:
+class FollowObjective:
     """What follows what in the demonstrations."""
 
     def __init__(self, module: FollowTable, training: Pairs, held_out: Pairs) -> None:
@@ -91,23 +92,22 @@ class FollowLesson:
         return {"score": float((module(self.held_out.before).argmax(-1) == self.held_out.after).float().mean())}
 
 
-class FollowRun(DrafterRun):
+class FollowTraining:
     """`kerv train drafter drafter=follow`."""
 
     artifact = FollowArtifact()
 
-    def summary(self) -> str:
-        return f"a table of {self.target_folder}"
-
-    def lesson(self, progress: Callable[[int, int], None]) -> FollowLesson:
-        space, count, pairs = self.target.actions, len(self.dataset.episodes), []
+    def objective(
+        self, target: Any, dataset: DemoDataset, settings: TrainDrafterSettings, progress: Callable[[int, int], None]
+    ) -> FollowObjective:
+        space, count, pairs = target.actions, len(dataset.episodes), []
         for index in range(count):
-            labels = self.dataset.load(index).labels
-            tokens = torch.from_numpy(space.encode(labels[: math.ceil(len(labels) * self.settings.drafter.share)]))
+            labels = dataset.load(index).labels
+            tokens = torch.from_numpy(space.encode(labels[: math.ceil(len(labels) * settings.drafter.share)]))
             pairs.append(Pairs(tokens[:-1], tokens[1:], torch.full((len(tokens) - 1,), index)))
             progress(index + 1, count)
-        table = FollowTable(space.dofs, space.tokens).to(self.device)
-        return FollowLesson(table, *split(Pairs.joined(pairs), self.settings.train.held_out))
+        table = FollowTable(space.dofs, space.tokens).to(target.device)
+        return FollowObjective(table, *split(Pairs.joined(pairs), settings.train.held_out))
 
 
 class FollowProposer(ChainProposer):

@@ -34,6 +34,6 @@ class DrafterProposerSettings:
 
 
 add("artifact", "drafter", _DRAFTER + "DrafterArtifact")
-add("drafter", "eagle", "kerv_cli.training.distillation:EagleRun", DrafterSettings)
+add("drafter", "eagle", "kerv_cli.training.distillation:EagleTraining", DrafterSettings)
 _build = (_DRAFTER + "DrafterProposer.build", DrafterProposerSettings)
 add("proposer", "drafter", *_build, needs=("drafter",), colour=0x56B4E9, when=STATES)

@@ -23,7 +23,7 @@ class EarlySettings:
 
 
 add("artifact", "early", _DRAFTER + "EarlyArtifact")
-add("drafter", "early", "kerv_cli.training.early_distillation:EarlyRun", EarlySettings)
+add("drafter", "early", "kerv_cli.training.early_distillation:EarlyTraining", EarlySettings)
 # chains: it drafts whole chains, so that a merged draft can take it as a source
 _build = _DRAFTER + "EarlyProposer.build"
 add("proposer", "early", _build, needs=("early",), colour=0xD4A6C8, when=PREFILL, chains=True)

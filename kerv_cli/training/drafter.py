@@ -1,0 +1,121 @@
+"""`kerv train drafter`: weights that draft for a target, trained on demonstrations that the target has decoded."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any, Protocol
+
+from torch import nn
+
+from kerv_cli.base.durations import about
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.places import check_not_shipped, find_target
+from kerv_cli.base.registry import find
+from kerv_cli.base.runtime import set_up
+from kerv_cli.engine.protocol import ReadableTarget
+from kerv_cli.methods.artifacts import MadeFor, Weights
+from kerv_cli.targets.checkpoint import load_target, read_target
+from kerv_cli.training.demonstrations import demos_for, subset
+from kerv_cli.training.loop import Objective
+from kerv_cli.training.run import TrainingRun, refuse_unused
+from kerv_cli.training.settings import TrainDrafterSettings
+from kerv_cli.worlds import resolve_tasks
+from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
+
+OF_TARGETS = ("init", "freeze", "balance", "closed_loop", "colour", "places")
+"""Optimisation settings that only the training of a target has."""
+
+
+class TrainableDrafter(Protocol):
+    """What a part of kind `drafter` builds: how one kind of drafter is trained."""
+
+    @property
+    def artifact(self) -> Weights[Any]:
+        """The kind of artifact that the weights become."""
+
+    def objective(
+        self, target: ReadableTarget, dataset: DemoDataset, settings: TrainDrafterSettings, progress: OnProgress
+    ) -> Objective:
+        """Read the demonstrations through the target; return a fresh module, its samples and its loss.
+
+        Args:
+            target: The loaded target, on the device to train on.
+            dataset: The demonstrations.
+            settings: Those of the command; `settings.drafter` has the class that the part names.
+            progress: Called with (done, total).
+        """
+
+
+class DrafterRun(TrainingRun):
+    """`kerv train drafter`.
+
+    Raises:
+        UnknownName: No such kind of drafter.
+        UsageError: Settings of another kind of drafter, or of targets only.
+        CheckpointError: No such target or demonstrations, or another run in the folder.
+    """
+
+    kind = "drafter"
+    settings: TrainDrafterSettings
+
+    def __init__(self, settings: TrainDrafterSettings) -> None:
+        part = find("drafter", settings.drafter.kind, "drafter.kind")
+        if not isinstance(settings.drafter, part.settings):
+            raise UsageError(f"drafter.kind={part.name}: choose drafter={part.name}, each has settings of its own")
+        refuse_unused(settings.train, OF_TARGETS, ": only the training of a target has this setting")
+        self.drafter: TrainableDrafter = part.built()
+        self.artifact = self.drafter.artifact
+        self.target_folder = find_target(settings.results, settings.policy.target)
+        name = settings.policy.named(self.artifact.kind)
+        self.folder = self.artifact.path(settings.results, name, self.target_folder)
+        check_not_shipped(self.folder, f"policy.{self.artifact.kind}")
+        self.settings, dataset = demos_for(settings)
+        self.dataset = subset(dataset, self.settings.task)
+        self.description = read_target(self.target_folder)
+        self.description.check_autoregressive(
+            f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
+        )
+        self.check_folder(f"policy.{self.artifact.kind}")
+
+    @property
+    def artifact_kind(self) -> str:
+        """Kind of the artifact that is made."""
+        return self.artifact.kind
+
+    def plan(self) -> str:
+        """Return one line for --plan: target, observations, steps, time and folder."""
+        drafter, train = asdict(self.settings.drafter), self.settings.train
+        layers = f"{drafter['layers']}-layer " if "layers" in drafter else ""
+        samples = f", greedy decodes of {drafter['samples']} observations" if "samples" in drafter else ""
+        time = about(drafter_seconds(self.artifact.kind, train.steps))
+        return (
+            f"{self.folder}: {layers}{self.artifact.noun} of {self.target_folder}{samples}, {train.steps} steps of "
+            f"{train.batch}, {time}"
+        )
+
+    def load(self, progress: OnProgress) -> None:
+        """Load the target and decode the demonstrations with it.
+
+        Raises:
+            CheckpointError: Target or demonstrations are damaged.
+            UsageError: No such device.
+        """
+        self.device, _ = set_up(self.settings.runtime)
+        target: Any = load_target(self.target_folder, self.device)[0]
+        self.objective = self.drafter.objective(target, self.dataset, self.settings, progress)
+
+    def identity(self) -> dict[str, Any]:
+        """Return the shapes, the target's weights and the tasks."""
+        task = self.settings.task
+        tasks = list(resolve_tasks(task)) if task else []
+        return {"drafter": asdict(self.settings.drafter), "target": self.description.sha256, "task": tasks}
+
+    def write(self, module: nn.Module, provenance: dict[str, Any]) -> None:
+        """Write the drafter's folder."""
+        made_for, stored = MadeFor.of(self.description), self.settings.train.stored
+        self.artifact.save(self.folder, module, made_for, provenance, stored, settings=asdict(self.settings.drafter))
+
+
+def drafter_seconds(kind: str, steps: int) -> float:
+    """Guess the seconds that training takes, from nano and small targets on one core."""
+    return steps * {"scout": 0.4}.get(kind, 0.05)

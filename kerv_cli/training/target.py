@@ -1,0 +1,179 @@
+"""`kerv train target`: a compact policy, cloned from demonstrations."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import nn
+
+from kerv_cli.base.durations import about
+from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.places import artifact, find_target
+from kerv_cli.base.runtime import set_up
+from kerv_cli.base.views import views_of
+from kerv_cli.episodes.runner import success_of
+from kerv_cli.targets.checkpoint import load_target, read_target
+from kerv_cli.targets.compact.folder import save_target
+from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.training.demonstrations import check_spaces, check_tasks, name_of, open_demos, seen_by
+from kerv_cli.training.imitation import (
+    Imitation,
+    check_init,
+    continued_target,
+    load_samples,
+    new_target,
+    vocabulary,
+)
+from kerv_cli.training.run import TrainingRun, refuse_unused
+from kerv_cli.training.settings import TrainTargetSettings
+from kerv_cli.worlds import resolve_tasks, settled, spec_of
+from kerv_cli.worlds.demos.dataset import OnProgress
+
+STATE_EPISODES = 200
+"""Episodes from which the range of states is taken, at most."""
+
+
+class TargetRun(TrainingRun):
+    """`kerv train target`.
+
+    Raises:
+        UsageError: Settings that do not fit together.
+        CheckpointError: No such demonstrations or `train.init`; demonstrations of another environment, camera or
+            tasks; or another run in the folder.
+    """
+
+    kind = "target"
+    settings: TrainTargetSettings
+
+    def __init__(self, settings: TrainTargetSettings) -> None:
+        self.settings = settings
+        settings.demos = settings.demos or name_of(settings.task)
+        self.dataset = open_demos(settings.results, settings.demos, settings.task)
+        settings.task = settings.task or list(self.dataset.manifest.tasks)
+        self.tasks = resolve_tasks(settings.task)
+        self.check_places()
+        self.spec = spec_of(self.tasks[0])
+        self.world = settled(settings.world, self.spec)
+        if settings.target.image_size != settings.world.camera.size:
+            raise UsageError(
+                f"target.image_size={settings.target.image_size} but world.camera.size={settings.world.camera.size}: "
+                "the policy must be shown what it was trained on, set both alike"
+            )
+        self.folder = artifact(settings.results, "target", settings.name)
+        self.init = self.find_init()
+        camera = self.world.camera.name
+        check_spaces(self.dataset, self.spec.actions, self.spec.observation, f"the tasks' environment {self.spec.name}")
+        check_tasks(self.dataset, self.tasks)
+        if settings.target.observation == "vision":
+            shown = "the policy would be shown"
+            self.dataset = seen_by(self.dataset, camera, shown, "set world.camera.name, or record again")
+        # {"init": hash of its weights}; empty for a fresh run
+        self.init_hash = {"init": read_target(self.init).sha256} if self.init else {}
+        self.check_folder("name")
+
+    def check_places(self) -> None:
+        """Refuse what the position loss cannot learn from, and settings of images for a policy that sees none.
+
+        Raises:
+            UsageError: The first of them.
+        """
+        train, manifest = self.settings.train, self.dataset.manifest
+        if not manifest.observation.places:
+            raise UsageError(
+                f"the demonstrations in {self.dataset.path} name no places (of object and goal): a compact policy "
+                "cannot be trained on them"
+            )
+        if self.settings.target.observation == "state":
+            refuse_unused(train, ("colour", "places"), " needs images, and target.observation=state has none")
+        recordings = [manifest.config, *manifest.config.get("joined", ())]
+        if train.places == "path" and train.scene_weight and any(one.get("policy") for one in recordings):
+            raise UsageError(
+                "train.places=path learns from the expert's paths, but a policy acted in some of these demonstrations: "
+                "leave those out of demos=, or set train.places=state or train.scene_weight=0"
+            )
+
+    def find_init(self) -> Path | None:
+        """Return the folder of the target `train.init`; None for a fresh run.
+
+        Raises:
+            UsageError: The run would overwrite it, or has other shapes.
+            CheckpointError: No such target.
+        """
+        name, frozen = self.settings.train.init, self.settings.train.freeze
+        if name is None:
+            if frozen:
+                raise UsageError(f"train.freeze={frozen}: fresh weights would stay as they are; set train.init too")
+            return None
+        folder = find_target(self.settings.results, name)
+        if folder.resolve() == self.folder.resolve():
+            raise UsageError(f"train.init={name} would be overwritten: choose another name=")
+        check_init(self.settings.target, self.world.camera.name, read_target(folder), folder)
+        return folder
+
+    def plan(self) -> str:
+        """Return one line for --plan: demonstrations, tasks, steps, time and folder."""
+        target, train = self.settings.target, self.settings.train
+        episodes = [episode for episode in self.dataset.episodes if episode.task in self.tasks]
+        # a guess for one core: the trunk's weights, and the pixels of every view
+        weights = target.layers * target.width * (4 * target.width + 3 * target.feed_forward)
+        views = len(views_of(self.world.camera.name)) if target.observation == "vision" else 0
+        seconds = train.steps * train.batch * (2.2e-9 * weights + 3e-4 * target.channels * views)
+        return (
+            f"{self.folder}: {target.size} on {target.observation}, {len(episodes)} demonstrations of "
+            f"{len(self.tasks)} tasks, {train.steps} steps of {train.batch} samples, {about(seconds)}"
+            + (f", beginning with {self.init}" if self.init else "")
+        )
+
+    def load(self, progress: OnProgress) -> None:
+        """Read the demonstrations and the weights of `train.init` into memory, and make the target.
+
+        Raises:
+            CheckpointError: One of them is damaged or of another environment.
+        """
+        self.device, _ = set_up(self.settings.runtime)
+        settings, camera, init = self.settings, self.world.camera.name, None
+        if self.init is not None:
+            init, description = load_target(self.init)
+            check_spaces(self.dataset, description.actions, description.observation, f"the target in {self.init}")
+        words = init.words if init else vocabulary(self.dataset.manifest.environment)
+        samples = load_samples(self.dataset, settings.target, words, self.tasks, progress, settings.train.places)
+        if init is None:
+            target = new_target(settings.target, self.dataset, samples, words, camera, settings.train.seed)
+        else:
+            target = continued_target(settings.target, init, camera)
+            modules = dict(target.named_children())
+            for name in settings.train.freeze:
+                if name not in modules:
+                    raise UnknownName("train.freeze", name, modules)
+                modules[name].requires_grad_(False)
+        closed_loop = self.closed_loop if settings.train.closed_loop else None
+        self.objective = Imitation(target.to(self.device), samples, settings.train, closed_loop)
+
+    def identity(self) -> dict[str, Any]:
+        """Return shapes, tasks, views and the hash of the initial weights."""
+        shapes = asdict(self.settings.target)
+        return {"target": shapes, "tasks": self.tasks, "views": self.dataset.views, **self.init_hash}
+
+    def closed_loop(self, target: CompactTarget) -> float:
+        """Return the success rate in [0, 1] over the tasks, on selection seeds."""
+        seeds = self.spec.seeds.selection[: self.settings.train.closed_loop]
+        return success_of(target, self.tasks, seeds, self.world)
+
+    def write(self, module: nn.Module, provenance: dict[str, Any]) -> None:
+        """Write the target's folder."""
+        assert isinstance(module, CompactTarget)
+        environment, stored = self.dataset.manifest.environment, self.settings.train.stored
+        save_target(self.folder, module, environment, provenance | self.init_hash, stored, self.state_range)
+
+    @functools.cached_property
+    def state_range(self) -> list[list[float]]:
+        """[low, high], each (s,): percentiles 0.1 and 99.9 of the states, over at most STATE_EPISODES episodes."""
+        count = len(self.dataset.episodes)
+        chosen = range(0, count, -(-count // STATE_EPISODES))
+        states = np.concatenate([self.dataset.load(index).states for index in chosen])
+        ends: list[list[float]] = np.percentile(states, [0.1, 99.9], axis=0).tolist()
+        return ends
