@@ -55,6 +55,9 @@ PART_GROUPS = (*METHOD_KINDS, "datastore")
 SETTINGS_GROUPS = (*PART_GROUPS, "drafter")
 """All groups of settings whose choices are parts: those of a rollout, and what `kerv train drafter` trains."""
 
+DRAFTING = "draft"
+"""Cost of a proposer whose draft is made of forwards that follow the target's shape (docs/measuring.md)."""
+
 PREFILL, STATES = "prefill", "states"
 """When a proposer can draft: before the prefill, or only behind it because it reads the target's hidden states."""
 
@@ -76,7 +79,7 @@ class Part:
     settings: dataclass of its settings, with defaults; limits by `limits.number`. needs: artifact kinds that these
     settings need, of an artifact those that it is made from. check: raises UsageError for settings that do not fit
     together. colour: 0xRRGGBB of its rows, lines and timeline.
-    traits: further properties that the kind asks for, e.g. when a proposer can draft.
+    traits: what others need to know of the part. Their names are in `docs/extending.md`.
     """
 
     kind: str
@@ -89,12 +92,17 @@ class Part:
     traits: Mapping[str, Any] = field(default_factory=dict)
 
     @property
+    def absent(self) -> bool:
+        """Whether it stands for the absence of a part, e.g. `proposer=none`."""
+        return not self.build
+
+    @property
     def default(self) -> Any:
         """Its settings where none are given."""
         return self.settings(kind=self.name)
 
     def built(self, *arguments: Any, **keywords: Any) -> Any:
-        """Imports and calls `build`; None for a part without one, which stands for the absence of a part."""
+        """Import and call `build`; None for an absent part."""
         return load(self.build)(*arguments, **keywords) if self.build else None
 
     def check_settings(self, settings: Any, what: str) -> None:

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from kerv_cli.base.config import compose, groups
+from kerv_cli.base.registry import DRAFTING, part_of
 from kerv_cli.engine.cost import Profile
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.settings import EXPERT
@@ -33,20 +34,21 @@ def ceilings(profile: Profile, tokens: int) -> list[MethodCeiling]:
 def _ceiling(name: str, profile: Profile, tokens: int) -> MethodCeiling | None:
     settings = compose("rollout", [f"method={name}"], RolloutSettings)
     autoregressive, encode = profile.decode(tokens), profile.seconds("encode", 1)
-    if settings.skip.kind == "always":
-        return None  # drafts are executed unverified: the target's trunk does not run
-    if settings.skip.kind == "parallel":
+    draft, proposer, skip = (
+        part_of(kind, getattr(settings, kind).kind) for kind in ("prefill_draft", "proposer", "skip")
+    )
+    if skip.traits.get("parallel"):
         speedup = autoregressive / (encode + profile.seconds("prefill", profile.prompt + tokens))
         return MethodCeiling(name, "one forward", speedup, speedup)
-    if settings.prefill_draft.kind == settings.proposer.kind == "none":
+    if not skip.traits.get("verifies", True) or (draft.absent and proposer.absent):
         return None
-    if settings.prefill_draft.kind != "none":
+    if not draft.absent:
         least = encode + profile.seconds("prefill", profile.prompt + tokens - 1)
         return MethodCeiling(name, "in the prefill", autoregressive / least, autoregressive / least)
     prefill = encode + profile.seconds("prefill", profile.prompt)
     least = prefill + profile.seconds("verify", tokens - 1)
     free = autoregressive / least
-    if settings.proposer.kind not in ("drafter", "hybrid"):
+    if proposer.traits.get("cost") != DRAFTING:
         return MethodCeiling(name, "one verification", free, free)
     depth = min(int(getattr(settings.proposer, "depth", tokens)), tokens - 2)
     rounds = math.ceil((tokens - 1) / (depth + 1))  # of chains that are always accepted whole

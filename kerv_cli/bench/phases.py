@@ -12,10 +12,12 @@ import torch
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import KervError
+from kerv_cli.base.registry import parts
 from kerv_cli.bench.machine import Machine, measure_machine
 from kerv_cli.bench.model import Model, Sizes, blank
 from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.engine.chunk import Chunk, Clock
+from kerv_cli.engine.cost import FORWARDS
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.parts import Fixed
@@ -31,7 +33,6 @@ _WARM_UP = 2  # cycles that do not count
 _EVICTING = 16 * 2**20  # float32 numbers that are read between decodes: a simulator leaves nothing in the caches
 _TREE = (5, 8, 50)  # depth, children, nodes of EAGLE-2's tree
 _MERGED = 30  # nodes of a merged in-prefill draft
-SOURCES = {"early": "early_unverified", "retrieval": "retrieval_unverified"}
 _TASK = "reach-v3"
 
 Key = tuple[str, int]
@@ -64,7 +65,7 @@ class Phase:
         """The phase in words, for tables."""
         if self.kind == "verify":
             return "one token" if self.rows == 1 else f"verify {self.rows}"
-        return self.kind if self.kind in ("encode", *SOURCES) else f"{self.kind} {self.rows}"
+        return f"{self.kind} {self.rows}" if self.kind in FORWARDS[1:] else self.kind
 
     def as_dict(self) -> dict[str, float | str]:
         """For JSON: the fields, and rates in GB/s and GFLOP/s."""
@@ -179,8 +180,9 @@ def measure(model: Model, machine: Machine, settings: BenchSettings) -> tuple[Ma
 
 def phases_of(seconds: Mapping[Key, Sequence[float]], sizes: Sizes, machine: Machine) -> list[Phase]:
     """The costs by kind and rows. seconds: of every repeat."""
+    order = (*FORWARDS, *source_methods())
     phases, prompt = [], min(rows for kind, rows in seconds if kind == "prefill")
-    for (kind, rows), times in sorted(seconds.items(), key=lambda item: (_ORDER.index(item[0][0]), item[0][1])):
+    for (kind, rows), times in sorted(seconds.items(), key=lambda item: (order.index(item[0][0]), item[0][1])):
         read, flops = sizes.needs(kind, rows, prompt)
         median, p95 = np.percentile(times, [50, 95])
         floor = machine.floor(read, flops)
@@ -188,7 +190,10 @@ def phases_of(seconds: Mapping[Key, Sequence[float]], sizes: Sizes, machine: Mac
     return phases
 
 
-_ORDER = ("encode", "prefill", "verify", "feed", "draft", "tree", *SOURCES)
+def source_methods() -> dict[str, str]:
+    """Kind of a proposer's own cost -> the method whose decodes measure it."""
+    measured = [part.traits for part in parts("proposer").values() if "measured_by" in part.traits]
+    return {traits["cost"]: traits["measured_by"] for traits in measured}
 
 
 def source_decoders(settings: BenchSettings) -> dict[str, Any]:
@@ -198,7 +203,7 @@ def source_decoders(settings: BenchSettings) -> dict[str, Any]:
     try:
         return {
             kind: decoder_for(compose("rollout", [f"method={method}", *words], RolloutSettings), _TASK)
-            for kind, method in SOURCES.items()
+            for kind, method in source_methods().items()
         }
     except KervError:
         return {}

@@ -9,9 +9,9 @@ from typing import Any
 
 from kerv_cli.bench.machine import Machine
 from kerv_cli.bench.model import Model, Sizes, shape_of
-from kerv_cli.bench.phases import SOURCES, Phase
+from kerv_cli.bench.phases import Phase, source_methods
 from kerv_cli.bench.settings import BenchSettings
-from kerv_cli.engine.cost import KINDS, Profile
+from kerv_cli.engine.cost import FORWARDS, Profile
 from kerv_cli.targets.compact.settings import TargetSettings
 
 _PER_LAYER = 15e-6  # seconds per layer and pass below which projections do not go: kernels of a captured graph
@@ -23,7 +23,9 @@ Document = dict[str, Any]
 
 def profile_of(phases: Sequence[Phase], tokens: int) -> Profile:
     """The profile of measured costs, their medians. tokens: N."""
-    points = {kind: sorted((p.rows, p.seconds) for p in phases if p.kind == kind) for kind in KINDS}
+    points = {
+        kind: sorted((p.rows, p.seconds) for p in phases if p.kind == kind) for kind in (*FORWARDS, *source_methods())
+    }
     costs = {kind: tuple(zip(*pairs, strict=True)) for kind, pairs in points.items() if pairs}
     prompt = costs["prefill"][0][0] if "prefill" in costs else 0
     return Profile(int(prompt), {kind: (rows, seconds) for kind, (rows, seconds) in costs.items()}, tokens)
@@ -82,7 +84,7 @@ def projected(
         least = max(passes * _PER_LAYER, p.read / there.bandwidth / reached[0], p.flops / there.flops / reached[1])
         if p.kind == "encode":
             least = p.seconds * here.bandwidth / there.bandwidth
-        elif p.kind in SOURCES:
+        elif p.kind not in FORWARDS:
             least = p.seconds
         projections.append(replace(p, seconds=least, p95=least, least=least, floor=there.floor(p.read, p.flops)))
     return projections

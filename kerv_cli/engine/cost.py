@@ -11,17 +11,15 @@ import numpy as np
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import read_json
+from kerv_cli.base.registry import DRAFTING, parts
 from kerv_cli.engine.record import PARALLEL, DecodeRecord
 
-KINDS = ("encode", "prefill", "verify", "feed", "draft", "tree", "early", "retrieval")
-"""Kinds of a profile's costs: docs/measuring.md."""
+FORWARDS = ("encode", "prefill", "verify", "feed", DRAFTING, "tree")
+"""Kinds of a profile's costs that follow the target's shape: docs/measuring.md. The others are proposers' own."""
 
 FORMAT = 2
 """Of a profile."""
 
-DRAFTER = "drafter"
-_SOURCES = {"early": "early", "merged": "early", "retrieval": "retrieval"}
-"""Proposer -> the cost of its draft. Merged drafts are early ones, and what is retrieved shows otherwise."""
 _WIDE = 32  # nodes from which on a draft of unknown settings is a tree of few levels
 _LEVELS = 5
 _HOST = ("accept", "rectify", "other")
@@ -30,6 +28,15 @@ HOST_PHASES = ("propose", *_HOST)
 READ_PHASES = ("vision", *HOST_PHASES)
 """Phases whose recorded seconds the model reads: of vision only whether there were any."""
 _ABSENT = (1.0, *[0.0] * len(HOST_PHASES))  # of `READ_PHASES` that a record lacks: it encoded, the rest took no time
+
+
+def source_costs() -> dict[str, list[str]]:
+    """Kind of a cost -> the proposers whose drafts have it. Others take the seconds that were recorded."""
+    costs: dict[str, list[str]] = {}
+    for name, part in parts("proposer").items():
+        if "cost" in part.traits:
+            costs.setdefault(part.traits["cost"], []).append(name)
+    return costs
 
 
 @dataclass(frozen=True)
@@ -134,7 +141,7 @@ class Work:
             "tree": self.tree.any(),
             **{kind: count.any() for kind, count in self.sources.items()},
         }
-        return [kind for kind in KINDS if used.get(kind)]
+        return [kind for kind, is_used in used.items() if is_used]
 
 
 def work_of(
@@ -157,16 +164,19 @@ def work_of(
     """
     decodes, decode = len(counts), np.repeat(np.arange(len(counts)), counts)
     mode, proposer = rounds["mode"], rounds["proposer"]
-    drafts, parallel = (rounds["tree_size"] > 0) & (proposer == DRAFTER), mode == PARALLEL
+    costs = source_costs()
+    drafters = costs.pop(DRAFTING, [])
+    drafts, parallel = (rounds["tree_size"] > 0) & np.isin(proposer, drafters), mode == PARALLEL
     has_drafter = np.bincount(decode, drafts, decodes) > 0
     nodes = np.where(parallel, size, rounds["tree_size"])
     depth, top_k = drafter or (_LEVELS, 0)
     tree = drafts & ((nodes >= _WIDE) if drafter is None else top_k > 1)
     levels = np.where(tree, np.minimum(depth, size - rounds["start"] - 1), nodes) * drafts
     host, propose = sum(phases[name] for name in _HOST), np.where(has_drafter, 0.0, phases["propose"])
-    kinds = {kind: [name for name, of in _SOURCES.items() if of == kind] for kind in set(_SOURCES.values())}
-    others = {kind: np.bincount(decode, np.isin(proposer, names), decodes) > 0 for kind, names in kinds.items()}
-    others["retrieval"] |= looked_up
+    others = {kind: np.bincount(decode, np.isin(proposer, names), decodes) > 0 for kind, names in costs.items()}
+    for kind, names in costs.items():
+        if any(parts("proposer")[name].traits.get("looks_up") for name in names):
+            others[kind] |= looked_up
     last = np.diff(decode, append=decodes) > 0
     forward = mode != "skip"
     accepted = np.where(parallel, 0, rounds["accepted"])

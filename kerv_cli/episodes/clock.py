@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import sha256_of
 from kerv_cli.base.places import results_dir
+from kerv_cli.base.registry import DRAFTING
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.cost import Profile, predicted, read_profile, work_of_record
 from kerv_cli.engine.record import DecodeRecord, Delay
@@ -126,7 +127,8 @@ def latency_of(settings: RolloutSettings, target: TargetDescription | None, meas
         scale = ar_seconds / measured if ar_seconds else 1.0
         return lambda decode: scale * decode.seconds
     assert target is not None
-    drafter = ("draft", "feed") if "drafter" in Method.of(settings).needs else ()
+    costs = {part.traits.get("cost") for part in Method.of(settings).parts.values()}
+    drafter = (DRAFTING, "feed") if DRAFTING in costs else ()
     profile = _open_profile(settings.results, timing.profile, ("encode", "prefill", "verify", *drafter))
     whole = profile.decode((settings.chunk or target.chunk) * target.actions.dofs)
     if ar_seconds and not whole:

@@ -41,8 +41,6 @@ NOT_DETERMINING_RUNTIME = frozenset({"workers", "executor", "executor_options"})
 
 _JUDGED = ("acceptance", "threshold", "rectifier")
 """The parts that judge drafts."""
-_WHOLE = ("early", "scout", "retrieval")
-"""The drafts that never lack a whole chunk; where another does, the target decodes behind a proposer."""
 _ARTIFACTS = ("drafter", "early", "datastore", "calibration")
 
 
@@ -163,15 +161,16 @@ def _idle_timing(timing: TimingSettings) -> dict[str, str]:
 def idle_keys(settings: RolloutSettings) -> dict[str, str]:
     """Key of a setting that has no effect -> why."""
     method = settings.parts()
-    names = {kind: method[kind].kind for kind in METHOD_KINDS}
+    parts = {kind: part_of(kind, method[kind].kind) for kind in METHOD_KINDS}
+    draft, proposer, skip, acceptance = (parts[k] for k in ("prefill_draft", "proposer", "skip", "acceptance"))
     idle: dict[str, str] = {}
-    if names["proposer"] == names["prefill_draft"] == "none":
+    if proposer.absent and draft.absent:
         idle |= dict.fromkeys(_JUDGED, f"method {settings.method} drafts nothing")
-    elif names["skip"] == "always" and (names["prefill_draft"] in _WHOLE or names["proposer"] == "none"):
-        idle["rectifier"] = "skip=always verifies nothing, so nothing is rejected"
-    elif names["acceptance"] in ("strict", "sequence"):
-        idle["threshold"] = f"acceptance={names['acceptance']} has no threshold"
-    needed = {need for kind in METHOD_KINDS for need in part_of(kind, names[kind]).needs(method[kind])}
+    elif not skip.traits.get("verifies", True) and (draft.traits.get("drafts_whole_chunk") or proposer.absent):
+        idle["rectifier"] = f"skip={skip.name} verifies nothing, so nothing is rejected"
+    elif not acceptance.traits.get("reads_threshold", True):
+        idle["threshold"] = f"acceptance={acceptance.name} has no threshold"
+    needed = {need for kind, part in parts.items() for need in part.needs(method[kind])}
     for kind in _ARTIFACTS:
         if kind not in needed:
             idle[f"policy.{kind}"] = f"method {settings.method} reads no {kind}"

@@ -22,7 +22,7 @@ from kerv_cli.episodes.episode import ActionDecoder
 from kerv_cli.episodes.expert import ExpertDecoder
 from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.episodes.settings import DEFAULT_TASKS, WAITS, RolloutSettings
-from kerv_cli.methods.artifacts import Artifacts
+from kerv_cli.methods.artifacts import Artifacts, Use
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.settings import EXPERT, MethodSettings, PolicySettings
 from kerv_cli.targets.checkpoint import TargetDescription, described
@@ -67,13 +67,8 @@ def check(settings: RolloutSettings) -> dict[str, str]:
         target.check_autoregressive(f"deviation_every={settings.deviation_every}", "there is no AR to differ from")
     method.check(target, settings.rollout.batch)
     clock.check(settings, spec, target)
-    hashes = artifacts.check(method.needs)
-    method.check_levels(tasks, artifacts.load)
-    if "certificate" in method.needs:
-        certificate = artifacts.load("certificate")
-        certificate.check_world(dataclasses.asdict(settings.world))
-        if certificate.certified is not None and not set(tasks).isdisjoint(certificate.tasks):
-            certificate.check_method(settings.parts(), settings.runtime.dtype)
+    world = dataclasses.asdict(settings.world)
+    hashes = artifacts.check(method.needs, Use(method.settings, settings.runtime.dtype, spec.name, tasks, world))
     # every row of a table has it, so that a privileged policy is recognised
     observation = str(target.settings.get(OBSERVATION, "vision"))
     observation = PRIVILEGED if observation == "state" else observation

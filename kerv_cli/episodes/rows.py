@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from kerv_cli.base.registry import parts
 from kerv_cli.engine.record import PHASES, DecodeRecord, Delay, EpisodeRecord, Round
 
 INT, FLOAT, TEXT, FLAG = pa.int64(), pa.float64(), pa.string(), pa.bool_()
@@ -44,6 +45,11 @@ def _attributes(*names: str, kind: pa.DataType = INT) -> Fields:
     return {name: (kind, attrgetter(name)) for name in names}
 
 
+def _looks_up(proposer: str) -> bool:
+    part = parts("proposer").get(proposer)
+    return part is not None and bool(part.traits.get("looks_up"))
+
+
 _EPISODE: Fields = {
     **_attributes("success", kind=FLAG),
     **_attributes("steps"),  # control steps executed
@@ -62,7 +68,7 @@ _EPISODE: Fields = {
     "skipped_decodes": (INT, _summed(lambda decode: decode.skipped)),
     "unverified_tokens": (INT, _summed(lambda decode: decode.unverified)),  # executed without a target token
     "executed_tokens": (INT, _summed(lambda decode: int(decode.actions.size))),  # steps times DoFs handed over
-    "retrieval_decodes": (INT, _summed(lambda decode: any(r.proposer == "retrieval" for r in decode.rounds))),
+    "retrieval_decodes": (INT, _summed(lambda decode: any(_looks_up(r.proposer) for r in decode.rounds))),
     "deviation_sum": (FLOAT, _summed(lambda decode: decode.deviation)),  # normalised action units, over sampled decodes
     "deviation_count": (INT, _summed(lambda decode: decode.deviation is not None)),
     "delay_decodes": (INT, _delays(lambda delay: 1)),  # decodes during which the world went on

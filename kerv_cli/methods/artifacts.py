@@ -4,7 +4,7 @@ however many settings of a study share them."""
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -38,6 +38,25 @@ class Request:
     description: TargetDescription
     target: Any = None  # a ReadableTarget, as networks read it
     search: Any = None
+
+
+@dataclass(frozen=True)
+class Use:
+    """What the artifacts of a method are used for, before anything is loaded.
+
+    Args:
+        method: Kind -> settings of the method's parts.
+        dtype: Number format of the models.
+        environment: Name of the policy's environment.
+        tasks: Full names of the tasks; empty if a client names them later.
+        world: Camera and horizon; None if they are a client's.
+    """
+
+    method: Mapping[str, Any]
+    dtype: str
+    environment: str
+    tasks: tuple[str, ...] = ()
+    world: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -97,6 +116,7 @@ class Artifact(Generic[T]):
     made = "trained"
     command: tuple[str, ...] = ()
     schema: type[T]
+    seconds = 30.0  # a guess of how long `command` takes
 
     @property
     def again(self) -> str:
@@ -129,9 +149,25 @@ class Artifact(Generic[T]):
         """Kind -> hash of the other artifacts that it was made from; none, where target and demonstrations suffice."""
         return {}
 
-    def brings(self, description: T) -> tuple[str, ...]:
-        """Further kinds that a method with this artifact reads, which the artifact alone knows."""
+    def needs(self, description: T) -> tuple[str, ...]:
+        """Return further kinds that a method with this artifact reads. Only the artifact knows them."""
         return ()
+
+    def check_use(self, description: T, use: Use) -> None:
+        """Refuse a use that the artifact does not fit.
+
+        Raises:
+            UsageError: Another method or world than it was made for.
+            CheckpointError: It lacks something that the method reads.
+        """
+
+    def command_beside(self, kinds: Collection[str]) -> tuple[str, ...]:
+        """Return `command` for a target that has artifacts of these `kinds`."""
+        return self.command
+
+    def is_complete(self, description: T, kinds: Collection[str]) -> bool:
+        """Return whether it has all that `command` would make of the artifacts `kinds`."""
+        return True
 
     def digest(self, path: Path, description: T) -> str:
         """The hash that is part of the identity of results."""
@@ -249,12 +285,17 @@ class Artifacts:
         """Path of the artifact of this kind."""
         return kind_of(kind).path(self.results, self.policy.named(kind), self.folder)
 
-    def check(self, kinds: Iterable[str]) -> dict[str, str]:
-        """Kind -> hash, of the target and of `kinds`.
+    def check(self, kinds: Iterable[str], use: Use | None = None) -> dict[str, str]:
+        """Return kind -> hash, of the target and of `kinds`.
+
+        Args:
+            kinds: Kinds of artifacts.
+            use: What they are for. None: not checked.
 
         Raises:
-            CheckpointError: one is missing, damaged, or was made for another target, or from another artifact than the
+            CheckpointError: One is missing, damaged, or was made for another target, or from another artifact than the
                 one among `kinds`.
+            UsageError: One does not fit its use.
         """
         hashes, sources, todo = {TARGET: self.description.sha256}, [], list(kinds)
         for kind in todo:
@@ -266,9 +307,11 @@ class Artifacts:
                 raise CheckpointError(f"no {files.noun} in {path}: run 'kerv {line}', or name a folder that holds one")
             description = files.checked(path, self.description)
             hashes[kind] = files.digest(path, description)
-            todo += files.brings(description)
+            todo += files.needs(description)
             what = f"the {files.noun} in {path} was {files.made}"
             sources.append((files.sources(description), what, files.anew(path)))
+            if use is not None:
+                files.check_use(description, use)
         for hashes_of_sources, what, again in sources:
             check_sources(hashes_of_sources, hashes, what, again)
         return hashes

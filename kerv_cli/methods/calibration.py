@@ -5,12 +5,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.methods.artifacts import Artifact, MadeFor, check_sources
+from kerv_cli.methods.artifacts import Artifact, MadeFor, Use, check_sources
 from kerv_cli.methods.heisd.rules import BoundaryRanges
 from kerv_cli.methods.kerv.prediction import Noise
 
@@ -89,6 +90,11 @@ class Calibration:
     format: Literal[2] = 2
     kind: Literal["calibration"] = "calibration"
 
+    @property
+    def tasks(self) -> Collection[str]:
+        """Tasks that have levels."""
+        return self.variability
+
     def k_s(self, task: str) -> float:
         """The task's reference level K_S, normalised action units.
 
@@ -157,6 +163,21 @@ class CalibrationArtifact(Artifact[Calibration]):
     def json(self, path: Path) -> Path:
         """`path` itself."""
         return path
+
+    def check_use(self, description: Calibration, use: Use) -> None:
+        """Refuse a task without the reference level that the threshold reads."""
+        if getattr(use.method["threshold"], "k_s", 0.0) is None:
+            for task in use.tasks:
+                description.k_s(task)
+
+    def command_beside(self, kinds: Collection[str]) -> tuple[str, ...]:
+        """Return the command; without a drafter it pre-samples no decodes."""
+        return self.command if "drafter" in kinds else (*self.command, "decodes=0")
+
+    def is_complete(self, description: Calibration, kinds: Collection[str]) -> bool:
+        """Return whether it has a section of each source in `kinds`."""
+        sections = {"drafter": description.variability, "datastore": description.skip}
+        return all(section for kind, section in sections.items() if kind in kinds)
 
     def made_for(self, description: Calibration) -> MadeFor:
         """The target that it was made for."""

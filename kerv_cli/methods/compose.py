@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,13 +17,8 @@ from kerv_cli.methods.parallel import ParallelPass
 from kerv_cli.methods.settings import MethodSettings
 from kerv_cli.targets.checkpoint import TargetDescription
 
-_BATCHED = {
-    ("none", "none", "none"): "ar",
-    ("early", "none", "always"): "early_unverified",
-    ("scout", "none", "always"): "scout_unverified",
-    ("none", "none", "parallel"): "parallel",
-}
-"""Kinds of prefill_draft, proposer and skip -> the method that is made of them."""
+DRAFTS = ("prefill_draft", "proposer")
+"""Kinds of parts that draft."""
 
 
 def is_parallel(target: object) -> bool:
@@ -81,8 +76,8 @@ class Method:
         proposer, boundary, draft = (self.parts[kind] for kind in ("proposer", "boundary", "prefill_draft"))
         if bool(proposer.traits.get("sides")) != bool(boundary.traits.get("chooses")):
             raise UsageError(
-                f"proposer={proposer.name} with boundary={boundary.name}: a boundary chooses between the two sides of "
-                "proposer=hybrid, which needs one other than always"
+                f"proposer={proposer.name} with boundary={boundary.name}: "
+                + ("name a boundary that chooses" if proposer.traits.get("sides") else "nothing to choose from")
             )
         if draft.traits["when"] != PREFILL:
             raise UsageError(
@@ -100,15 +95,14 @@ class Method:
             )
         if parallel and not has_pass:
             raise UsageError("this target decodes all tokens at once and nothing else: use method=parallel")
-        drafts = {kind: self.parts[kind].name for kind in ("prefill_draft", "proposer")}
-        idle = [f"{kind}={name}" for kind, name in drafts.items() if name != "none"]
+        idle = [f"{kind}={self.parts[kind].name}" for kind in DRAFTS if not self.parts[kind].absent]
         if has_pass and idle:
             raise UsageError(f"skip=parallel with {idle[0]}: nothing is drafted, leave it out")
 
     def _check_skip(self) -> None:
         """What executes drafts unverified has one source that drafts whole chunks before the prefill."""
         skip, draft = self.parts["skip"], self.parts["prefill_draft"]
-        joined = bool(skip.traits.get("merges")) and draft.name == "merged"
+        joined = skip.traits.get("merges") and draft.traits.get("merged")
         if skip.traits.get("takes_draft") and not draft.traits.get("chains") and not joined:
             raise UsageError(
                 f"skip={skip.name} with prefill_draft={draft.name}: it executes what one source drafts before "
@@ -119,30 +113,16 @@ class Method:
         """Several episodes at a time go through the same forwards."""
         if batch == 1:
             return
-        names = {kind: part.name for kind, part in self.parts.items()}
-        if (names["prefill_draft"], names["proposer"], names["skip"]) not in _BATCHED:
-            *others, last = _BATCHED.values()
-            raise UsageError(
-                f"{key}={batch} with method={self.name}: {', '.join(others)} and {last} alone decode several "
-                "episodes at once, leave it out"
-            )
-        if names["prefill_draft"] != "none" and names["threshold"] != "fixed":
-            raise UsageError(
-                f"{key}={batch} with threshold={names['threshold']}: its radius follows one episode's "
-                "decodes, use threshold=fixed"
-            )
-
-    def check_levels(self, tasks: Iterable[str], artifact: Callable[[str], Any]) -> None:
-        """Refuses a calibration without the reference levels of these tasks, where the threshold reads them.
-
-        Raises:
-            CheckpointError: one is missing.
-        """
-        threshold = self.settings["threshold"]
-        if self.parts["threshold"].needs(threshold) and getattr(threshold, "k_s", 0.0) is None:
-            calibration = artifact("calibration")
-            for task in tasks:
-                calibration.k_s(task)
+        draft, proposer, skip, threshold = (self.parts[k] for k in ("prefill_draft", "proposer", "skip", "threshold"))
+        if not (
+            draft.traits.get("batchable")
+            and proposer.absent
+            and skip.traits.get("batchable")
+            and (draft.absent or skip.traits.get("takes_draft"))
+        ):
+            raise UsageError(f"{key}={batch}: method={self.name} decodes one episode at a time. Leave {key} out")
+        if not draft.absent and not threshold.traits.get("batchable"):
+            raise UsageError(f"{key}={batch}: threshold={threshold.name} follows one episode. Use threshold=fixed")
 
     def decoder(self, target: Target, artifact: Callable[[str], Any], task: str = "") -> Decoder:
         """The decoder of the method around a target. artifact: kind -> the loaded artifact; called for the kinds in

@@ -47,4 +47,6 @@ class ParallelPass(Skip):
 
 
 _BUILD = "kerv_cli.methods.parallel:ParallelPass.build"
-add("skip", "parallel", _BUILD, colour=0x17BECF, parallel=True)  # a parallel target's own decoding
+add(
+    "skip", "parallel", _BUILD, colour=0x17BECF, parallel=True, verifies=False, batchable=True
+)  # a parallel target's own decoding

@@ -63,6 +63,6 @@ def fixed(settings: FixedThresholdSettings, context: Context) -> Fixed:
 
 
 _FILE = "kerv_cli.methods.spec_vla:"
-add("acceptance", "strict", _FILE + "strict")
+add("acceptance", "strict", _FILE + "strict", reads_threshold=False)
 add("acceptance", "relaxed", _FILE + "RelaxedRule.build", RelaxedAcceptanceSettings)
-add("threshold", "fixed", _FILE + "fixed", FixedThresholdSettings)
+add("threshold", "fixed", _FILE + "fixed", FixedThresholdSettings, batchable=True)

@@ -21,6 +21,7 @@ from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.episodes.episode import Follower
 from kerv_cli.episodes.policy import artifacts_of, warm_up
 from kerv_cli.episodes.settings import RolloutSettings
+from kerv_cli.methods.artifacts import Use
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.settings import MethodSettings
 from kerv_cli.serve.guard import HOLD, Finite, StateRange
@@ -52,14 +53,14 @@ class Policy:
         self.artifacts = artifacts_of(settings)
         self.task = self._task()
         self.method = Method.of(settings)
-        self.method.check(self.artifacts.description, settings.batch, "batch")
-        self.identity = self.artifacts.check(self.method.needs)
-        if "certificate" in self.method.needs:
-            self.artifacts.load("certificate").check_environment(self.artifacts.description.environment)
+        description = self.artifacts.description
+        self.method.check(description, settings.batch, "batch")
+        use = Use(self.method.settings, settings.runtime.dtype, description.environment)
+        self.identity = self.artifacts.check(self.method.needs, use)
         self.interface = self._interface()
         self.range = self._range()
-        self.by_task = not self.task and bool(self._task_artifacts())
-        if self.by_task and settings.protocol != VLA_EVAL and self._task_artifacts() != ["certificate"]:
+        self.by_task = not self.task and bool(self._artifacts_with("by_task"))
+        if self.by_task and settings.protocol != VLA_EVAL and self._artifacts_with("needs_task"):
             raise UsageError(
                 f"method={settings.method}: its levels or drafts differ between tasks: name one with task=NAME"
             )
@@ -113,18 +114,16 @@ class Policy:
         low, high = (np.array(ends)[: None if interface.privileged else len(names)] for ends in stored)
         return StateRange(low, high, names, self.settings.margin)
 
-    def _task_artifacts(self) -> list[str]:
-        """Kinds of the method's artifacts whose levels differ between tasks."""
-        return sorted(kind for kind in self.method.needs if find("artifact", kind).traits.get("by_task"))
+    def _artifacts_with(self, trait: str) -> list[str]:
+        return sorted(kind for kind in self.method.needs if find("artifact", kind).traits.get(trait))
 
     def _any_task(self) -> str:
         """The task of the settings; without one, where a client names its tasks, one for which the method has
         levels."""
         if not self.by_task or self.settings.protocol != VLA_EVAL:
             return self.task
-        artifact = self.artifacts.load(self._task_artifacts()[0])
-        named = (getattr(artifact, field, None) for field in ("variability", "tasks", "shards"))
-        return next((task for tasks in named for task in tasks or ()), "")
+        artifact = self.artifacts.load(self._artifacts_with("by_task")[0])
+        return next(iter(artifact.tasks), "")
 
     @contextlib.contextmanager
     def session(self) -> Iterator[Session]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.places import RESUME
-from kerv_cli.base.registry import parts
+from kerv_cli.base.registry import find, parts
 from kerv_cli.catalogue.entries import state_of
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings
@@ -17,7 +17,7 @@ from kerv_cli.methods.artifacts import Artifacts, Weights, kind_of, removal
 from kerv_cli.methods.compose import Method
 from kerv_cli.training.demonstrations import demos_for
 from kerv_cli.training.drafter import drafter_seconds
-from kerv_cli.training.settings import CalibrateSuccessSettings, PrepareSettings, TrainDrafterSettings
+from kerv_cli.training.settings import PrepareSettings, TrainDrafterSettings
 from kerv_cli.worlds import specs
 
 THERE, MISSING = "there", "missing"
@@ -49,17 +49,16 @@ def plan(settings: PrepareSettings) -> list[Step]:
     kinds = needs(tuple(settings.methods), bool(description.cameras), runnable)
     steps: list[Step] = []
     for kind in kinds:
-        command = list(kind_of(kind).command)
-        if command[0] == "calibrate" and "drafter" not in kinds:
-            command.append("decodes=0")  # they are the drafter's
+        files = kind_of(kind)
+        command = list(files.command_beside(kinds))
         if command[0] == "train" and settings.steps:
             command.append(f"train.steps={settings.steps}")
         state = _state(artifacts, kind, kinds)
-        seconds = 120.0 if kind == "certificate" else 30.0
+        seconds = files.seconds
         if command[0] == "train":
             seconds = drafter_seconds(kind, compose("train_drafter", command[2:], TrainDrafterSettings).train.steps)
         steps.append(Step(kind, state, tuple(command), 0.0 if state == THERE else seconds))
-    if any(step.state != THERE and step.kind != "certificate" for step in steps):
+    if any(step.state != THERE and not find("artifact", step.kind).traits.get("study") for step in steps):
         demos_for(settings)
     return steps
 
@@ -84,13 +83,15 @@ def needs(methods: tuple[str, ...], sees: bool, runnable: bool = True) -> tuple[
         if methods and not sees and seeing & set(method.needs):
             raise UsageError(f"for={name}: it needs a target that sees, this one reads the state")
         kinds |= set(method.needs)
-    if "certificate" in kinds and sees and runnable:  # its candidates run before one of them is certified
-        candidates = resolve([f"study={CalibrateSuccessSettings.groups['study']}"]).settings.values()
-        kinds |= {kind for settings in candidates for kind in Method.of(settings).needs}
+    studies = {kind: part.traits["study"] for kind, part in artifacts.items() if "study" in part.traits}
+    for study in [studies[kind] for kind in kinds & set(studies)] if sees and runnable else ():
+        kinds |= {
+            kind for settings in resolve([f"study={study}"]).settings.values() for kind in Method.of(settings).needs
+        }
     if not sees:
         kinds -= seeing
     if not runnable:
-        kinds -= {"certificate"}
+        kinds -= set(studies)
     order = dict.fromkeys(kind for name, part in artifacts.items() for kind in (*part.needs(None), name))
     return tuple(kind for kind in order if kind in kinds and kind_of(kind).command)
 
@@ -112,9 +113,8 @@ def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
         if isinstance(files, Weights):
             raise CheckpointError(f"{str(error).split(': ')[0]}: {removal(kind, path)}") from error
         return "of other artifacts"
-    if kind == "calibration":
-        lacks = [name for name, part in (("variability", "drafter"), ("skip", "datastore")) if part in kinds]
-        return MISSING if any(not getattr(described, name) for name in lacks) else THERE
+    if not files.is_complete(described, kinds):
+        return MISSING
     state = state_of(path, kind) if isinstance(files, Weights) else THERE
     if state == "complete" and (path / RESUME).is_file() and not (path / "curves.png").is_file():
         return "without curves"  # the disk was full at the training's end

@@ -1,4 +1,4 @@
-"""Example: a predictor of your own, for what a rectifier fills in: the mean of the last two actions."""
+"""Example: a predictor of your own, which drafts and fills in after a rejection: the mean of the last two actions."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kerv_cli.base.registry import NoSettings, add
+from kerv_cli.base.registry import PREFILL, NoSettings, add
 
 if TYPE_CHECKING:
     from kerv_cli.methods.context import Context
+    from kerv_cli.methods.kerv.prediction import PredictionProposer
 
 
 class Mean:
@@ -29,4 +30,10 @@ def build(settings: NoSettings, context: Context) -> Mean:
     return Mean(context.target.actions.is_strict)
 
 
-add("predictor", "mean", f"{__name__}:build")
+def propose(settings: NoSettings, context: Context) -> PredictionProposer:
+    from kerv_cli.methods.kerv.prediction import PredictionProposer
+
+    return PredictionProposer(build(settings, context))
+
+
+add("proposer", "mean", f"{__name__}:propose", when=PREFILL, chains=True, predictor=f"{__name__}:build")

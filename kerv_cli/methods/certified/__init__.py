@@ -29,7 +29,7 @@ class ScopedSettings:
 def check_scoped(settings: ScopedSettings) -> None:
     """Raises UsageError for a draft elsewhere that cannot draft whole chunks before the prefill."""
     outside = find("proposer", settings.outside, "prefill_draft.outside")
-    if outside.name != "merged" and not outside.traits.get("chains"):
+    if not (outside.traits.get("merged") or outside.traits.get("chains")):
         raise UsageError(
             f"prefill_draft.outside={outside.name}: it does not draft whole chunks from the prompt; set "
             "prefill_draft.outside=merged, or a source of merged drafts, e.g. early"
@@ -44,7 +44,7 @@ def _needs(settings: ScopedSettings) -> tuple[str, ...]:
 
 _CERTIFICATE = "kerv_cli.methods.certified.certificate:"
 
-add("artifact", "certificate", _CERTIFICATE + "CertificateArtifact", sees=True, by_task=True)
+add("artifact", "certificate", _CERTIFICATE + "CertificateArtifact", sees=True, by_task=True, study="certify")
 add("proposer", "scoped", _CERTIFICATE + "scoped", ScopedSettings, _needs, check_scoped, when=PREFILL, chains=True)
 add(
     "skip",

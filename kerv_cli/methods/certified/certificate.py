@@ -16,7 +16,7 @@ from kerv_cli.base.registry import part_of
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.parts import Skip
 from kerv_cli.engine.proposer import Proposer
-from kerv_cli.methods.artifacts import Artifact, MadeFor
+from kerv_cli.methods.artifacts import Artifact, MadeFor, Use
 from kerv_cli.methods.certified import CertifiedSkipSettings, ScopedSettings
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.streak import StreakSkipSettings
@@ -142,7 +142,7 @@ class Certificate:
 class CertificateArtifact(Artifact[Certificate]):
     """`certificate/` beside the target: certificate.json."""
 
-    kind, noun, made = "certificate", "certificate", "issued"
+    kind, noun, made, seconds = "certificate", "certificate", "issued", 120.0
     command = ("calibrate", "success")
     schema = Certificate
 
@@ -154,8 +154,16 @@ class CertificateArtifact(Artifact[Certificate]):
         """The drafters whose drafts were certified."""
         return description.drafts
 
-    def brings(self, description: Certificate) -> tuple[str, ...]:
-        """What the certified draft reads."""
+    def check_use(self, description: Certificate, use: Use) -> None:
+        """Refuse another environment, world or, on its tasks, method."""
+        description.check_environment(use.environment)
+        if use.world is not None:
+            description.check_world(use.world)
+        if description.certified is not None and not set(use.tasks).isdisjoint(description.tasks):
+            description.check_method(use.method, use.dtype)
+
+    def needs(self, description: Certificate) -> tuple[str, ...]:
+        """Return what the certified draft reads."""
         if description.certified is None:
             return ()
         source = description.certified.source

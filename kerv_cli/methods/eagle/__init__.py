@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kerv_cli.base.limits import MOST_TOKENS, number
-from kerv_cli.base.registry import STATES, add
+from kerv_cli.base.registry import DRAFTING, STATES, add
 
 _DRAFTER = "kerv_cli.methods.eagle.drafter:"
 
@@ -36,4 +36,4 @@ class DrafterProposerSettings:
 add("artifact", "drafter", _DRAFTER + "DrafterArtifact")
 add("drafter", "eagle", "kerv_cli.training.distillation:EagleTraining", DrafterSettings)
 _build = (_DRAFTER + "DrafterProposer.build", DrafterProposerSettings)
-add("proposer", "drafter", *_build, needs=("drafter",), colour=0x56B4E9, when=STATES)
+add("proposer", "drafter", *_build, needs=("drafter",), colour=0x56B4E9, when=STATES, cost=DRAFTING)

@@ -24,6 +24,16 @@ class EarlySettings:
 
 add("artifact", "early", _DRAFTER + "EarlyArtifact")
 add("drafter", "early", "kerv_cli.training.early_distillation:EarlyTraining", EarlySettings)
-# chains: it drafts whole chains, so that a merged draft can take it as a source
-_build = _DRAFTER + "EarlyProposer.build"
-add("proposer", "early", _build, needs=("early",), colour=0xD4A6C8, when=PREFILL, chains=True)
+add(
+    "proposer",
+    "early",
+    _DRAFTER + "EarlyProposer.build",
+    needs=("early",),
+    colour=0xD4A6C8,
+    when=PREFILL,
+    chains=True,
+    drafts_whole_chunk=True,
+    batchable=True,
+    cost="early",
+    measured_by="early_unverified",
+)

@@ -7,7 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, number
-from kerv_cli.base.registry import PREFILL, STATES, add
+from kerv_cli.base.registry import DRAFTING, PREFILL, STATES, add
 
 _DATASTORE, _RULES = "kerv_cli.methods.heisd.datastore:", "kerv_cli.methods.heisd.rules:"
 
@@ -33,9 +33,21 @@ class QdrantSearchSettings:
     path: str | None = None  # a folder of qdrant-client's local mode, for one process at a time
 
 
-add("artifact", "datastore", _DATASTORE + "DatastoreArtifact", by_task=True)
-_retrieval = (_RULES + "RetrievalProposer.build", RetrievalProposerSettings, ("datastore",))
-add("proposer", "retrieval", *_retrieval, colour=0x009E73, when=PREFILL, chains=True)
+add("artifact", "datastore", _DATASTORE + "DatastoreArtifact", by_task=True, needs_task=True)
+add(
+    "proposer",
+    "retrieval",
+    _RULES + "RetrievalProposer.build",
+    RetrievalProposerSettings,
+    needs=("datastore",),
+    colour=0x009E73,
+    when=PREFILL,
+    chains=True,
+    drafts_whole_chunk=True,
+    looks_up=True,
+    cost="retrieval",
+    measured_by="retrieval_unverified",
+)
 add("datastore", "exact", _DATASTORE + "ExactIndex")
 add("datastore", "qdrant", "kerv_cli.methods.heisd.qdrant:QdrantIndex", QdrantSearchSettings)
 
@@ -53,7 +65,7 @@ class HybridProposerSettings:
 
 
 _hybrid = (_RULES + "HybridProposer.build", HybridProposerSettings, ("drafter", "datastore"))
-add("proposer", "hybrid", *_hybrid, when=STATES, sides=True)
+add("proposer", "hybrid", *_hybrid, when=STATES, sides=True, cost=DRAFTING)
 
 
 # --- which drafts are good enough (§2.1)
@@ -78,7 +90,7 @@ class HybridAcceptanceSettings:
     token_limit: int = number(15, 0, MOST_BINS)
 
 
-add("acceptance", "sequence", _RULES + "GroupRule.build", SequenceAcceptanceSettings)
+add("acceptance", "sequence", _RULES + "GroupRule.build", SequenceAcceptanceSettings, reads_threshold=False)
 add("acceptance", "hybrid", _RULES + "by_proposer", HybridAcceptanceSettings)
 
 

@@ -14,7 +14,7 @@ On disk: `vectors.npy` (rows, d) float32 or float16, `payload.parquet`, `project
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -214,6 +214,11 @@ class Datastore:
             part = registry.find("datastore", search.kind, "datastore.kind")
             index = part.built(parts["vectors"], parts["seeds"], parts["shards"], manifest.content, search)
         return cls(manifest, **parts, index=index)
+
+    @property
+    def tasks(self) -> Collection[str]:
+        """Tasks that have entries."""
+        return self.shards
 
     @property
     def content(self) -> str:

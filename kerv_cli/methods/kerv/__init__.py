@@ -7,9 +7,9 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
-from kerv_cli.base.errors import UsageError
+from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, number
-from kerv_cli.base.registry import PREFILL, NoSettings, add, find
+from kerv_cli.base.registry import PREFILL, NoSettings, Part, add, parts
 
 if TYPE_CHECKING:
     from kerv_cli.methods.context import Context
@@ -17,7 +17,14 @@ if TYPE_CHECKING:
 _PREDICTION = "kerv_cli.methods.kerv.prediction:"
 
 _sources = ("drafter", "datastore")  # each has a section
-add("artifact", "calibration", "kerv_cli.methods.calibration:CalibrationArtifact", needs=_sources, by_task=True)
+add(
+    "artifact",
+    "calibration",
+    "kerv_cli.methods.calibration:CalibrationArtifact",
+    needs=_sources,
+    by_task=True,
+    needs_task=True,
+)
 
 # --- predictors, and proposers that draft by them (§3.1, §6)
 
@@ -27,10 +34,24 @@ for _name, _fitted, _colour in (
     ("kalman", True, 0xD55E00),  # a filter reads the noise that `kerv calibrate` fitted
     ("damped", True, 0xA0522D),
 ):
-    add("predictor", _name, _PREDICTION + "predictor_of", fitted=_fitted)
     _drafts = (_PREDICTION + "PredictionProposer.build", NoSettings, ("calibration",) if _fitted else ())
-    add("proposer", _name, *_drafts, colour=_colour, when=PREFILL, chains=True)
-add("predictor", "draft", fitted=False)  # of a rectifier only: the rejected draft's remaining tokens
+    _predictor = _PREDICTION + "predictor_of"
+    add("proposer", _name, *_drafts, colour=_colour, when=PREFILL, chains=True, predictor=_predictor)
+
+DRAFT = "draft"
+"""`rectifier.predictor` that fills from the rejected draft instead of from a kinematic predictor."""
+
+
+def find_predictor(name: str) -> Part:
+    """Return the proposer that predicts under this name. Fills in as well as drafts.
+
+    Raises:
+        UnknownName: No proposer of that name has a predictor.
+    """
+    predictors = {key: part for key, part in parts("proposer").items() if "predictor" in part.traits}
+    if name not in predictors:
+        raise UnknownName("rectifier.predictor", name, [*predictors, DRAFT])
+    return predictors[name]
 
 
 # --- what happens after a rejection (§3.1)
@@ -51,8 +72,9 @@ class CompensateSettings:
 
 def check_compensate(settings: CompensateSettings) -> None:
     """Raises UnknownName for a predictor that does not exist, UsageError for one that lacks the target's token."""
-    find("predictor", settings.predictor, "rectifier.predictor")
-    if settings.predictor == "draft" and not settings.use_target_token:
+    if settings.predictor != DRAFT:
+        find_predictor(settings.predictor)
+    elif not settings.use_target_token:
         raise UsageError(
             "rectifier.predictor=draft goes on behind the target's token: leave rectifier.use_target_token=true"
         )
@@ -60,7 +82,7 @@ def check_compensate(settings: CompensateSettings) -> None:
 
 def needs_of_compensation(settings: CompensateSettings) -> tuple[str, ...]:
     """What the predictor reads."""
-    return ("calibration",) if find("predictor", settings.predictor).traits.get("fitted") else ()
+    return () if settings.predictor == DRAFT else find_predictor(settings.predictor).needs(None)
 
 
 _compensation = (_PREDICTION + "Compensation.build", CompensateSettings)

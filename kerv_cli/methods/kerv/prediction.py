@@ -14,17 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kerv_cli.base.registry import NoSettings, find
+from kerv_cli.base.registry import NoSettings, load
 from kerv_cli.engine.chunk import WINDOW, Chunk
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.kerv import CompensateSettings
+from kerv_cli.methods.kerv import DRAFT, CompensateSettings, find_predictor
 
 MINIMUM = 4  # actions that a prediction needs; longer windows were not measurably better on the demonstrations
 HORIZON = 8  # steps ahead that weights are computed for
-
-DRAFT = "draft"
-"""`rectifier.predictor` that fills from the rejected draft instead of from a kinematic predictor."""
 
 
 @dataclass(frozen=True)
@@ -241,8 +238,8 @@ class Compensation:
     @classmethod
     def build(cls, settings: CompensateSettings, context: Context) -> Compensation:
         """rectifier=compensate."""
-        name = "hold" if settings.predictor == DRAFT else settings.predictor
-        return cls(settings, find("predictor", name).built(NoSettings(name), context))
+        name = Hold.name if settings.predictor == DRAFT else settings.predictor
+        return cls(settings, load(find_predictor(name).traits["predictor"])(NoSettings(name), context))
 
     @property
     def uses_target_token(self) -> bool:

@@ -38,4 +38,4 @@ def needs_of_sources(settings: MergedProposerSettings) -> tuple[str, ...]:
 
 _BUILD = "kerv_cli.methods.merged.proposer:MergedProposer.build"
 _parts = (_BUILD, MergedProposerSettings, needs_of_sources, check_merged)
-add("proposer", "merged", *_parts, colour=0xCC79A7, when=PREFILL)
+add("proposer", "merged", *_parts, colour=0xCC79A7, when=PREFILL, merged=True, cost="early")

@@ -24,5 +24,14 @@ class ScoutSettings(EarlySettings):
 
 add("artifact", "scout", "kerv_cli.methods.scout.drafter:ScoutArtifact", sees=True)
 add("drafter", "scout", "kerv_cli.training.scout_distillation:ScoutTraining", ScoutSettings)
-_build = "kerv_cli.methods.scout.drafter:ScoutProposer.build"
-add("proposer", "scout", _build, needs=("scout",), colour=0x7BC8A4, when=PREFILL, chains=True)
+add(
+    "proposer",
+    "scout",
+    "kerv_cli.methods.scout.drafter:ScoutProposer.build",
+    needs=("scout",),
+    colour=0x7BC8A4,
+    when=PREFILL,
+    chains=True,
+    drafts_whole_chunk=True,
+    batchable=True,
+)
