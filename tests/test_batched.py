@@ -253,9 +253,9 @@ def test_a_batch_of_real_episodes_is_what_they_are_one_by_one(policies: Path, po
 
 def test_what_cannot_be_batched_is_refused(policies: Path) -> None:
     target, batch = "policy.target=nano-state", "rollout.batch=8"
-    with pytest.raises(UsageError, match="method=spec_vla: ar, early_unverified, scout_unverified and parallel alone"):
+    with pytest.raises(UsageError, match="method=spec_vla"):
         policies_of.check(settings(policies, target, batch, "method=spec_vla"))
-    with pytest.raises(UsageError, match="threshold=schedule: its radius follows one episode"):
+    with pytest.raises(UsageError, match="threshold=schedule"):
         policies_of.check(settings(policies, target, batch, "method=early_unverified", "threshold=schedule"))
     with pytest.raises(UsageError, match="policy=expert with rollout"):
         policies_of.check(settings(policies, batch, "policy=expert"))
@@ -415,6 +415,4 @@ def test_a_batch_refuses_a_method_in_one_line(policies: Path) -> None:
     words = ["policy=state", "policy.target=nano-state", f"results={policies}", "method=naive_sd", "rollout.batch=4"]
     run = CliRunner().invoke(app, ["rollout", *words])
     assert run.exit_code == 2
-    assert (
-        "rollout.batch=4 with method=naive_sd: ar, early_unverified, scout_unverified and parallel alone" in run.stderr
-    )
+    assert "rollout.batch=4: method=naive_sd" in run.stderr
