@@ -9,7 +9,7 @@ CODE := kerv_cli tests scripts
 test test-cpus: export OMP_NUM_THREADS := 1
 
 .NOTPARALLEL:
-.PHONY: help setup test test-cpus demo torture lint format pages docs lock clean
+.PHONY: help setup test test-cpus demo torture lint format wheel pages docs lock clean
 
 help: ## list these rules
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -35,7 +35,7 @@ demo: setup ## run the demo study; ends with its verdict, its page and a recordi
 torture: setup ## kill commands, break their disk, damage their files, at random (MINUTES=1)
 	@$(BIN)/python -m pytest -s tests/reliability/torture.py
 
-lint: setup ## check style, types and which room imports which
+lint: setup ## check style, types, and that rooms import only what lies below
 	@$(BIN)/ruff check $(CODE)
 	@$(BIN)/ruff format --check $(CODE)
 	@$(BIN)/mypy
@@ -44,6 +44,9 @@ lint: setup ## check style, types and which room imports which
 format: setup ## rewrite the code in the project's style
 	@$(BIN)/ruff check --fix --quiet $(CODE)
 	@$(BIN)/ruff format $(CODE)
+
+wheel: setup ## build the wheel into dist/
+	@$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --no-build-isolation --wheel-dir dist .
 
 pages: setup ## fill the figures of README.md and results/README.md from results/tables
 	@$(BIN)/python scripts/figures.py README.md results/README.md
