@@ -18,8 +18,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import torch
 
-from kerv_cli.engine.chunk import Clock
 from kerv_cli.engine.decoder import Decoder
+from kerv_cli.engine.stopwatch import Stopwatch
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.target import CompactTarget
 
@@ -84,15 +84,17 @@ def main(name: str, repeats: int) -> bool:
     seconds, same = [], True
     for seed in range(repeats):
         prompt = torch.randn(1, target.max_prompt, target.width, generator=torch.Generator().manual_seed(seed))
-        clock = Clock(target.device)
-        chunk = decoder.decode_prompt(prompt, clock)
+        stopwatch = Stopwatch(target.device)
+        chunk = decoder.decode_prompt(prompt, stopwatch)
         cached = decoder.cache.buffer[:, :, 0, :, : target.max_prompt].numpy()
         order = np.arange(plain.channels).reshape(half, 2).T.ravel()  # packed keys have their halves side by side
         plain.begin(cached[:, 0][..., order], cached[:, 1], chunk.size)
         begun, tokens = time.perf_counter(), chunk.tokens[:1]
         for _ in range(chunk.size - 1):
             tokens.append(plain(tokens[-1]))
-        seconds.append((clock.phases["verify"] / (chunk.size - 1), (time.perf_counter() - begun) / (chunk.size - 1)))
+        seconds.append(
+            (stopwatch.phases["verify"] / (chunk.size - 1), (time.perf_counter() - begun) / (chunk.size - 1))
+        )
         same &= tokens == chunk.tokens
     ours, theirs = np.array(seconds).T * 1e3
     print(

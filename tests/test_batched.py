@@ -24,7 +24,8 @@ from typer.testing import CliRunner
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
-from kerv_cli.engine.batched import BatchDecoder, Lane
+from kerv_cli.engine.batched import BatchDecoder
+from kerv_cli.engine.chunk import EpisodeState
 from kerv_cli.engine.cost import Profile
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.parts import Fixed
@@ -61,16 +62,16 @@ def shown(count: int) -> list[Observation]:
 def decoded(decoder: Decoder, observations: Sequence[Observation], history: int = 0) -> tuple[list[Any], list[Any]]:
     """The records of a decoder's decodes, one by one and together, after `history` executed actions."""
     together = BatchDecoder(decoder)
-    lanes, alone = [], []
+    states, alone = [], []
     for place, observation in enumerate(observations):
-        lane = together.lane()
-        for follower in (decoder, lane):
+        state = together.new_episode()
+        for follower in (decoder, state):
             follower.reset("", 0, HOME)
             for step in range(history):
                 follower.observe(np.full(4, 0.05 * place - 0.1 * step), HOME)
         alone.append(decoder.decode(observation))
-        lanes.append(lane)
-    return alone, together.decode(lanes, observations)
+        states.append(state)
+    return alone, together.decode(states, observations)
 
 
 def same(alone: Sequence[Any], together: Sequence[Any]) -> None:
@@ -134,7 +135,7 @@ def test_prompts_of_different_lengths_are_decoded_apart() -> None:
     assert len({policy.encode(one).shape[1] for one in seen}) == 3
     alone = Decoder(policy)
     together = BatchDecoder(alone)
-    found = together.decode([together.lane() for _ in seen], seen)
+    found = together.decode([together.new_episode() for _ in seen], seen)
     for one, record in zip(seen, found, strict=True):
         alone.reset("", 0, HOME)
         assert alone.decode(one).tokens == record.tokens
@@ -184,9 +185,9 @@ def stubs() -> type[Stub]:
 class Forwards(BatchDecoder):
     """Notes how many episodes each decode had."""
 
-    def decode(self, lanes: Sequence[Lane], observations: Sequence[Observation]) -> list[Any]:
-        self.sizes.append(len(lanes))
-        return super().decode(lanes, observations)
+    def decode(self, episodes: Sequence[EpisodeState], observations: Sequence[Observation]) -> list[Any]:
+        self.sizes.append(len(episodes))
+        return super().decode(episodes, observations)
 
 
 def test_the_next_episode_begins_where_one_ends_and_every_world_is_closed(stubs: type[Stub]) -> None:

@@ -12,7 +12,7 @@ from examples.own_target import SEVEN, MockTarget
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.errors import CheckpointError, KervError
 from kerv_cli.base.spaces import ActionSpace, Group, Observation
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
@@ -248,6 +248,21 @@ def test_a_drafter_drafts_the_same_tree_from_a_cache_of_fixed_shapes() -> None:
         proposer = DrafterProposer(drafter, target, 5, 4, 20)
         drafted.append([r.drafted for r in decode(target, proposer, prompt).rounds])
     assert drafted[0] == drafted[1]
+
+
+@pytest.mark.parametrize("token", [-1, ACTIONS.tokens])
+@pytest.mark.parametrize("where", ["proposer", "prefill_draft"])
+def test_a_token_out_of_range_is_refused_with_its_proposers_name(where: str, token: int) -> None:
+    target = random_target(1, 1, 1, 1)
+
+    class Wrong(Proposer):
+        name = "mine"
+
+        def propose(self, chunk: Chunk, depth: int) -> Draft:
+            return Draft.of([0, token])
+
+    with pytest.raises(KervError, match=f"'mine' drafted token {token}"):
+        Decoder(target, Parts(**{where: Wrong()})).decode_prompt(random_prompt(target, 1))
 
 
 # on a target that is no transformer: any action space, prompts of any length

@@ -89,10 +89,10 @@ def test_an_unverified_decode_never_runs_the_targets_encoder(
     assert all(record.forwards == 0 and record.phases["vision"] == 0 for record in records)
     assert len({record.actions.tobytes() for record in records}) == 3  # it looks
     batch = BatchDecoder(unverified)
-    lanes = [batch.lane() for _ in seen]
-    for lane in lanes:
-        lane.reset(TASK, 1, np.zeros(3))
-    for one, together in zip(records, batch.decode(lanes, seen), strict=True):
+    episodes = [batch.new_episode() for _ in seen]
+    for state in episodes:
+        state.reset(TASK, 1, np.zeros(3))
+    for one, together in zip(records, batch.decode(episodes, seen), strict=True):
         assert (one.actions == together.actions).all()
 
 

@@ -16,13 +16,14 @@ from kerv_cli.base.registry import parts
 from kerv_cli.bench.machine import Machine, measure_machine
 from kerv_cli.bench.model import Model, Sizes, blank
 from kerv_cli.bench.settings import BenchSettings
-from kerv_cli.engine.chunk import Chunk, Clock
+from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.cost import FORWARDS
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.record import Round
+from kerv_cli.engine.stopwatch import Stopwatch
 from kerv_cli.engine.tree import ROOT
 from kerv_cli.episodes.policy import decoder_for
 from kerv_cli.episodes.settings import RolloutSettings
@@ -73,21 +74,21 @@ class Phase:
         return {"name": self.name, **asdict(self), **rates, "share": self.share}
 
 
-class Laps(Clock):
-    """A clock that keeps every lap, (phase, seconds)."""
+class Laps(Stopwatch):
+    """A stopwatch that keeps every lap, (phase, seconds)."""
 
     def __init__(self, device: torch.device) -> None:
         self.laps: list[tuple[str, float]] = []
         super().__init__(device)
 
     def lap(self, phase: str) -> None:
-        """Ends a phase; see `Clock.lap`."""
+        """Ends a phase; see `Stopwatch.lap`."""
         before = self.phases[phase]
         super().lap(phase)
         self.laps.append((phase, self.phases[phase] - before))
 
     def stop(self) -> float:
-        """Seconds in all; see `Clock.stop`."""
+        """Seconds in all; see `Stopwatch.stop`."""
         seconds = super().stop()
         if self.events is not None:
             pairs = itertools.pairwise(self.events)
@@ -165,7 +166,7 @@ def measure(model: Model, machine: Machine, settings: BenchSettings) -> tuple[Ma
             prompt = model.target.encode(model.observation)
             clock.lap("vision")
             chunk = decoder.decode_prompt(prompt, clock)
-            decoder.actions_of(chunk)
+            chunk.actions()
             clock.stop()
             costs += costs_of(decoder, prompt.shape[1], chunk.rounds, clock.laps)
         for kind, source in sources.items():

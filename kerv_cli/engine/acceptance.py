@@ -1,11 +1,14 @@
-"""Which drafts are good enough (docs/methods.md §2.1). Pure functions of tokens; the longest accepted path wins, ties
-go to the smaller summed distance, then to the node proposed first. Nothing heavy is imported here."""
+"""Which drafts are good enough (docs/methods.md §2.1). This file imports nothing heavy.
+
+The longest accepted path wins. Of equally long ones the one with the smaller summed distance to the target tokens wins,
+and of those the one that was proposed first.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from kerv_cli.engine.tree import ROOT, TokenTree
 
@@ -16,36 +19,29 @@ Bounds = Sequence[tuple[int, int]]
 """Per DoF: the first DoF of its kinematic group, and one past the last (`ActionSpace.bounds`)."""
 
 
-@dataclass(frozen=True)
-class Accepted:
-    """Result of an acceptance rule. path: node indices of the best accepted path, from depth 0 down. rejected: the
-    child of its last node that is nearest to the target token there; None without children."""
+class Accepted(NamedTuple):
+    """Result of an acceptance rule.
+
+    Attributes:
+        path: Nodes of the best accepted path, from depth 0 down.
+        rejected: The child of the path's last node that is nearest to the target token; None if it has no children.
+    """
 
     path: tuple[int, ...]
     rejected: int | None
 
 
 def accept_by_distance(tree: TokenTree, target_tokens: Sequence[int], start: int, limits: Sequence[int]) -> Accepted:
-    """Accepts a node when its parent is accepted and abs(token − target token behind the parent) ≤ its DoF's limit.
+    """Accept a node if its parent is accepted and its token is within its DoF's limit of the target token.
 
-    target_tokens: 1 + n, the first for the position after the last committed token, then after each node.
-    start: index in the chunk of the nodes of depth 0. limits: r per DoF, in bins; all zero is strict.
+    Args:
+        tree: The draft, n nodes.
+        target_tokens: 1 + n tokens: the target's after the last committed token, then after each node.
+        start: Index in the chunk of the nodes of depth 0.
+        limits: Largest accepted distance per DoF, in bins. All zero is strict acceptance.
     """
-    dofs = len(limits)
-    lengths = [0] * len(tree)  # accepted length down to this node; 0: rejected
-    distances = [0] * len(tree)
-    best, best_length, best_distance = ROOT, 0, 0
-    for i, (token, parent, depth) in enumerate(zip(tree.tokens, tree.parents, tree.depths, strict=True)):
-        if parent != ROOT and not lengths[parent]:
-            continue
-        distance = abs(token - target_tokens[parent + 1])
-        if distance > limits[(start + depth) % dofs]:
-            continue
-        lengths[i] = depth + 1
-        distances[i] = distance + (distances[parent] if parent != ROOT else 0)
-        if lengths[i] > best_length or (lengths[i] == best_length and distances[i] < best_distance):
-            best, best_length, best_distance = i, lengths[i], distances[i]
-    return Accepted(tuple(tree.path_to(best)), nearest_child(tree, best, target_tokens))
+    alone = [(dof, dof + 1) for dof in range(len(limits))]  # every DoF is a group of its own
+    return accept_by_group(tree, target_tokens, start, limits, group_limit=max(limits), bounds=alone)
 
 
 def accept_by_group(
@@ -57,40 +53,42 @@ def accept_by_group(
     group_limit: int,
     bounds: Bounds,
 ) -> Accepted:
-    """HeiSD's `sequence` rule: a kinematic group of one control step is accepted or not as a whole.
+    """Accept or reject a kinematic group of one control step as a whole (HeiSD's `sequence` rule).
 
-    A group is accepted when the biases of its tokens, abs(token − target token behind its parent), are each ≤ the limit
-    of their DoF and sum to at most `group_limit`. A rejected group ends the path at its first token. So does an
-    incomplete one: where a path leaves the tree inside a group, that group's tokens are not accepted. `start` may lie
-    inside a group: its remaining tokens are then judged as a group of their own. In the decode loop the committed ones
-    are target tokens, with bias 0: accepted paths end with a whole group, and only a bonus begins another.
+    A group is accepted if each of its tokens is within its DoF's limit of the target token after its parent, and if
+    these distances sum to at most `group_limit`. A group that is rejected, or that the tree holds only in part, ends
+    the path at its first token. `start` may be inside a group. Its remaining tokens are then a group of their own: the
+    committed ones are target tokens, because accepted paths end with a whole group and only a bonus begins another.
 
-    target_tokens, start, limits: as in `accept_by_distance`. `rejected` is the first token of the group that ended the
-    path.
+    Args:
+        tree: The draft, n nodes.
+        target_tokens: 1 + n tokens: the target's after the last committed token, then after each node.
+        start: Index in the chunk of the nodes of depth 0.
+        limits: Largest accepted distance per DoF, in bins.
+        group_limit: Largest accepted sum of a group's distances, in bins.
+        bounds: The group of each DoF.
     """
-    dofs = len(limits)
-    alive = [False] * len(tree)  # no limit is broken down to this node
-    biases = [0] * len(tree)  # summed within the node's group
-    distances = [0] * len(tree)  # summed along the path
+    alive = [False] * len(tree)  # whether no limit is broken on the path to this node
+    in_group = [0] * len(tree)  # distances summed within the node's group
+    distances = [0] * len(tree)  # distances summed along the path
     best, best_length, best_distance = ROOT, 0, 0
     for i, (token, parent, depth) in enumerate(zip(tree.tokens, tree.parents, tree.depths, strict=True)):
         if parent != ROOT and not alive[parent]:
             continue
-        dof = (start + depth) % dofs
+        dof = (start + depth) % len(limits)
         first, end = bounds[dof]
-        bias = abs(token - target_tokens[parent + 1])
-        biases[i] = bias if parent == ROOT or dof == first else bias + biases[parent]
-        alive[i] = bias <= limits[dof] and biases[i] <= group_limit
-        distances[i] = bias if parent == ROOT else bias + distances[parent]
-        if not alive[i] or dof + 1 != end:
-            continue
-        if depth + 1 > best_length or (depth + 1 == best_length and distances[i] < best_distance):
+        distance = abs(token - target_tokens[parent + 1])
+        in_group[i] = distance if parent == ROOT or dof == first else distance + in_group[parent]
+        distances[i] = distance if parent == ROOT else distance + distances[parent]
+        alive[i] = distance <= limits[dof] and in_group[i] <= group_limit
+        is_whole = dof + 1 == end
+        if alive[i] and is_whole and (depth + 1, -distances[i]) > (best_length, -best_distance):
             best, best_length, best_distance = i, depth + 1, distances[i]
     return Accepted(tuple(tree.path_to(best)), nearest_child(tree, best, target_tokens))
 
 
 def nearest_child(tree: TokenTree, node: int, target_tokens: Sequence[int]) -> int | None:
-    """The child of `node` (or ROOT) whose token is nearest to the target token behind `node`; None without children."""
+    """Return the child of `node` (or of ROOT) that is nearest to the target token after it; None without children."""
     children = [i for i, parent in enumerate(tree.parents) if parent == node]
     return min(children, key=lambda i: abs(tree.tokens[i] - target_tokens[node + 1]), default=None)
 
@@ -99,13 +97,13 @@ class Acceptance(Protocol):
     """An acceptance rule: which nodes of a draft are as good as the target's tokens."""
 
     def of_drafts_from(self, proposer: str) -> Acceptance:
-        """The rule for drafts of `proposer`."""
+        """Return the rule for drafts of `proposer`."""
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """Largest accepted distance per DoF at radius r, bins (D,)."""
+        """Return the largest accepted distance per DoF at radius r, in bins (D,)."""
 
     def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
-        """The longest accepted path; arguments as `accept_by_distance`, r in bins."""
+        """Return the longest accepted path at radius r. The other arguments are those of `accept_by_distance`."""
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,8 @@
-"""What the parts of a decode share: the clock, the actions and positions before the decode, the chunk."""
+"""The chunk that a decode fills, and what a decoder remembers of the running episode."""
 
 from __future__ import annotations
 
-import itertools
 import math
-import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -16,61 +13,19 @@ from torch import Tensor
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation
+from kerv_cli.engine.draft import check_tokens
 from kerv_cli.engine.protocol import Cache
-from kerv_cli.engine.record import PARALLEL, PHASES, Round
+from kerv_cli.engine.record import PARALLEL, DecodeRecord, Round
 
 Mode = Literal["retrieval", "drafter"]
 WINDOW = 10  # KERV's action context AC, control steps
 
 
-class Clock:
-    """Stopwatch of one decode: seconds per phase.
-
-    On CUDA it synchronises when it is made and when it stops, and nowhere between: laps are events in the stream, read
-    at the end, so that measuring phases does not keep the host from running ahead.
-    """
-
-    def __init__(self, device: torch.device) -> None:
-        self.phases = dict.fromkeys(PHASES, 0.0)
-        self.events: list[tuple[str, torch.cuda.Event]] | None = None
-        if device.type == "cuda":
-            torch.cuda.synchronize()
-            self.events = [("", _event())]
-        self.began = self.last = time.perf_counter()
-
-    def lap(self, phase: str) -> None:
-        """Adds the time since the last lap to `phase`; on CUDA the device's time, added when the clock stops."""
-        if self.events is not None:
-            self.events.append((phase, _event()))
-            return
-        now = time.perf_counter()
-        self.phases[phase] += now - self.last
-        self.last = now
-
-    def stop(self) -> float:
-        """Seconds since the clock was made; the time since the last lap is added to `other`."""
-        self.lap("other")
-        if self.events is not None:
-            torch.cuda.synchronize()
-            self.last = time.perf_counter()
-            for (_, begin), (phase, end) in itertools.pairwise(self.events):
-                self.phases[phase] += begin.elapsed_time(end) / 1000.0
-            self.phases["other"] += max(0.0, self.last - self.began - sum(self.phases.values()))
-        return self.last - self.began
-
-
-def _event() -> torch.cuda.Event:
-    """An event with a time, recorded in the current stream."""
-    event = torch.cuda.Event(enable_timing=True)
-    event.record()
-    return event
-
-
 def steps_of(chunk: int, trained: int) -> int:
-    """Control steps of a chunk: `chunk`, or, where that is 0, as many as the target was trained for.
+    """Return the control steps of a chunk: `chunk`, or `trained` if it is 0.
 
     Raises:
-        UsageError: more than it was trained for.
+        UsageError: `chunk` is more than the target was trained for.
     """
     if not 0 <= chunk <= trained:
         raise UsageError(f"chunk={chunk}: the target was trained for {trained} control steps")
@@ -81,45 +36,65 @@ class ActionHistory:
     """The last `window` executed actions, normalised and continuous."""
 
     def __init__(self, dofs: int, window: int = WINDOW) -> None:
-        self.dofs = dofs
-        self._actions: deque[np.ndarray] = deque(maxlen=window)
-        self._stacked = np.zeros((0, dofs))  # these actions as one array, which nobody writes to
-        self._stacked.flags.writeable = False
+        self.window, self._actions = window, np.zeros((0, dofs))
 
     def append(self, action: np.ndarray) -> None:
-        """An action (D,) in [-1, 1] was executed."""
-        self._actions.append(np.asarray(action, dtype=np.float64))
-        self._stacked = np.array(self._actions)
-        self._stacked.flags.writeable = False
+        """Add an executed action (D,) in [-1, 1]."""
+        self._actions = np.concatenate([self._actions, action[None]])[-self.window :]
 
     def values(self, pending: np.ndarray | None = None) -> np.ndarray:
-        """(m, D), oldest first, m ≤ window.
+        """Return the actions (m, D) with m ≤ window, oldest first.
 
-        pending: (k, D) steps of the present chunk that are decided but not yet executed. They are appended as
-        if executed, so that the next step is one step ahead instead of k + 1.
+        Args:
+            pending: Steps (k, D) of the present chunk that are decided but not executed yet. They count as executed, so
+                that the next step is one step ahead instead of k + 1.
         """
         if pending is None or not len(pending):
-            return self._stacked
-        steps = np.concatenate([self._stacked, np.asarray(pending, dtype=np.float64)])
-        return steps[-(self._actions.maxlen or 0) :]
+            return self._actions
+        return np.concatenate([self._actions, pending])[-self.window :]
 
 
 @dataclass(frozen=True)
 class Situation:
-    """The episode before a decode. history: executed actions, normalised, oldest first. path: measured end-effector
-    positions (3,), metres. random: the boundary's generator, seeded per episode."""
+    """The running episode, as the parts of a method see it."""
 
     task: str
     history: ActionHistory
-    path: list[np.ndarray] = field(default_factory=list)
-    random: np.random.Generator = field(default_factory=np.random.default_rng)
+    path: list[np.ndarray] = field(default_factory=list)  # measured end-effector positions (3,), metres
+    random: np.random.Generator = field(default_factory=np.random.default_rng)  # the boundary's, seeded per episode
+
+
+class EpisodeState:
+    """What a decoder remembers of the running episode: its actions, its positions, and how often it decoded."""
+
+    def __init__(self, space: ActionSpace, cameras: tuple[str, ...]) -> None:
+        self.space, self.cameras, self.decodes = space, cameras, 0
+        self.situation = Situation("", ActionHistory(space.dofs))
+
+    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
+        """Begin an episode, with the end effector at (3,) metres."""
+        random = np.random.default_rng(seed)
+        self.situation = Situation(task, ActionHistory(self.space.dofs), [np.asarray(end_effector)], random)
+        self.decodes = 0
+
+    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
+        """Note an executed action (D,), after which the end effector is at (3,) metres."""
+        self.situation.history.append(self.space.normalise(action))
+        self.situation.path.append(np.asarray(end_effector))
+
+    def finish(self, success: bool) -> None:
+        """End the episode."""
 
 
 @dataclass(frozen=True)
 class Rejection:
-    """What a verification found behind the accepted path. draft: the rejected draft's tokens behind its rejected token.
-    target: target tokens behind the rejected token and behind those; valid only if the tokens before them had been
-    right."""
+    """What a verification computed after the accepted path.
+
+    Attributes:
+        draft: Tokens of the rejected draft after its rejected token.
+        target: Target tokens after the rejected token and after each of `draft`. They are right only if the tokens
+            before them are.
+    """
 
     draft: tuple[int, ...] = ()
     target: tuple[int, ...] = ()
@@ -127,47 +102,38 @@ class Rejection:
 
 @dataclass(frozen=True)
 class Choice:
-    """A boundary's decision: which side drafts, and F where the decision used it."""
+    """A boundary's decision: which side of a hybrid proposer drafts."""
 
     mode: Mode
-    metric: float | None = None
+    metric: float | None = None  # F (docs/methods.md §4.4), if the decision used it
 
 
+@dataclass(eq=False)
 class Chunk:
-    """The N tokens of one decode. Only its own methods change what is committed; the parts of a method read it.
+    """The N tokens of one decode. Parts of a method read it; only its own methods commit tokens.
 
-    prompt: (1, P, E), encoded when it is first read: a chunk that nothing of the target's decodes costs no encoding.
-    observation: what is decoded, where there is one. size: N. limits: r per DoF in bins; early drafters choose their
-    tokens by it. choice: which side drafts, where a boundary decides. The cache holds the prompt and every committed
-    token but the last; `hidden` (1, P + c − 1, E) are the target's states there after the prefill, which committed c
-    tokens.
+    The cache holds the prompt and every committed token but the last.
     """
 
-    def __init__(
-        self,
-        prompt: Tensor | Callable[[], Tensor],
-        steps: int,
-        space: ActionSpace,
-        cache: Cache,
-        situation: Situation,
-        limits: tuple[int, ...] = (),
-        choice: Choice | None = None,
-        observation: Observation | None = None,
-    ) -> None:
-        self._prompt, self.space, self.cache, self.situation = prompt, space, cache, situation
-        self.observation = observation
-        self.size, self.limits, self.choice = steps * space.dofs, limits, choice
-        self.tokens: list[int] = []
-        self.rounds: list[Round] = []
-        self.rejection = Rejection()
-        self.hidden = torch.empty(0)
-        # vectors (n,) that the host reads in the same copy as the next forward's target tokens, and their receivers
-        self.reads: list[tuple[Tensor, Callable[[np.ndarray], None]]] = []
-        self.forwards = 0
-        self._differences: list[float] = []  # of judged tokens, |draft − target token| in normalised action units
-        self.similarity: float | None = None  # cosine of the best stored chunk, where one was looked up
-        self.reason: str | None = None  # as in `DecodeRecord`
-        self.closed: np.ndarray | None = None  # (steps, D) normalised actions, once a rectifier ended the chunk
+    encoding: Tensor | Callable[[], Tensor]  # the prompt, or a function that encodes it
+    steps: int  # H
+    space: ActionSpace
+    cache: Cache
+    situation: Situation
+    limits: tuple[int, ...] = ()  # r per DoF, bins; early drafters choose their tokens by it
+    choice: Choice | None = None  # None: the method has no boundary
+    observation: Observation | None = None
+    tokens: list[int] = field(default_factory=list)  # committed
+    rounds: list[Round] = field(default_factory=list)
+    rejection: Rejection = Rejection()  # of the last round
+    hidden: Tensor = field(default_factory=lambda: torch.empty(0))  # (1, P + c − 1, E) after a prefill of c tokens
+    # vectors (n,) that are read together with the next forward's target tokens, and who receives them
+    reads: list[tuple[Tensor, Callable[[np.ndarray], None]]] = field(default_factory=list)
+    forwards: int = 0
+    similarity: float | None = None  # cosine of the best stored chunk, if one was looked up
+    reason: str | None = None  # as in `DecodeRecord`
+    closed: np.ndarray | None = None  # (steps, D) normalised actions, once a rectifier ended the chunk
+    _differences: list[float] = field(default_factory=list)  # |draft − target| of judged tokens, normalised units
 
     @property
     def dofs(self) -> int:
@@ -175,21 +141,16 @@ class Chunk:
         return self.space.dofs
 
     @property
-    def steps(self) -> int:
-        """H, control steps."""
-        return self.size // self.dofs
+    def size(self) -> int:
+        """N."""
+        return self.steps * self.space.dofs
 
     @property
     def prompt(self) -> Tensor:
-        """(1, P, E)."""
-        if not isinstance(self._prompt, Tensor):
-            self._prompt = self._prompt()
-        return self._prompt
-
-    @property
-    def encoded(self) -> bool:
-        """Whether the target encoded the observation."""
-        return isinstance(self._prompt, Tensor)
+        """The prompt (1, P, E), encoded when it is first read. Skipped chunks never pay for encoding."""
+        if not isinstance(self.encoding, Tensor):
+            self.encoding = self.encoding()
+        return self.encoding
 
     @property
     def prompt_length(self) -> int:
@@ -203,22 +164,28 @@ class Chunk:
 
     @property
     def variability(self) -> float | None:
-        """K: mean difference of draft and target over the judged tokens, normalised action units; None where none was
-        judged. Strict DoFs are left out: one flip would outweigh all others (docs/methods.md §3.2)."""
+        """K: mean difference of draft and target tokens, normalised action units; None if none was judged.
+
+        Strict DoFs are left out: one flip would outweigh all others (docs/methods.md §3.2).
+        """
         return float(np.mean(self._differences)) if self._differences else None
 
     def distance(self, tokens: Sequence[int], others: Sequence[int]) -> float:
-        """Mean absolute difference of two token sequences from a chunk's first token on, normalised action units;
-        infinite where a strict DoF's tokens differ."""
+        """Return the mean absolute difference of two beginnings of this chunk, in normalised action units.
+
+        It is infinite if a strict DoF's tokens differ.
+        """
         first, second = np.array(tokens), np.array(others)
         if (first != second)[self.space.strict_tokens(len(first))].any():
             return math.inf
         return float(np.abs(self.space.values_of(first) - self.space.values_of(second)).mean())
 
     def targets_along(self, chain: Sequence[int]) -> list[int] | None:
-        """The target's tokens along a drafted chain, from the chunk's first verification; None where that judged
-        another draft, or less than all but the last token of the chain. The next round forgets what lies behind the
-        rejection: call it before."""
+        """Return the target's tokens along a drafted chain, from the chunk's first verification.
+
+        None if that verification judged another draft, or fewer than all but the last token of the chain. Call it
+        before the next round, which forgets what follows the rejection.
+        """
         if not self.rounds:
             return None
         verification, rejection = self.rounds[-1], self.rejection
@@ -228,7 +195,13 @@ class Chunk:
         return [*verification.target_tokens[: len(verification.drafted)], *rejection.target[: len(rejection.draft)]]
 
     def commit(self, record: Round, tokens: Sequence[int], rejection: Rejection | None = None) -> None:
-        """Commits `tokens` after a forward. record: of its round."""
+        """Commit the tokens of one forward.
+
+        Args:
+            record: The forward's round.
+            tokens: What is committed.
+            rejection: What the forward computed after a rejected token.
+        """
         self.forwards += 1
         self.tokens += tokens
         self.rounds.append(record)
@@ -239,20 +212,79 @@ class Chunk:
             moving = ~self.space.strict_tokens(self.size)[record.start : record.start + len(drafted)]
             self._differences += np.abs(drafted - targets)[moving].tolist()
 
-    def skip(self, tokens: Sequence[int], proposer: str) -> None:
-        """Takes all N tokens from `proposer`, without a verification."""
-        self.tokens = list(tokens[: self.size])
-        self.rounds.append(Round("skip", proposer, 0, tuple(self.tokens), (), self.size, self.size, 0, ()))
+    def commit_token(self, token: int) -> None:
+        """Commit the one token of a forward without a draft."""
+        mode, start = "decode" if self.tokens else "prefill", len(self.tokens)
+        self.commit(Round(mode, start=start, target_tokens=(token,), committed=1), [token])
 
     def commit_at_once(self, tokens: Sequence[int]) -> None:
-        """Commits all N tokens after one pass of a parallel target."""
-        self.commit(Round(PARALLEL, "none", 0, (), tuple(tokens), 0, self.size, 0, ()), tokens)
+        """Commit all N tokens of a parallel target's one pass."""
+        self.commit(Round(PARALLEL, target_tokens=tuple(tokens), committed=self.size), tokens)
+
+    def skip(self, tokens: Sequence[int], proposer: str) -> None:
+        """Take all N tokens from `proposer`, without a verification.
+
+        Raises:
+            KervError: A token is out of range.
+        """
+        check_tokens(np.asarray(tokens), self.space.tokens, proposer)
+        self.tokens = list(tokens[: self.size])
+        drafted = tuple(self.tokens)
+        self.rounds.append(Round("skip", proposer, drafted=drafted, accepted=self.size, committed=self.size))
 
     def close(self, values: np.ndarray, with_target_token: bool) -> None:
-        """Ends the chunk with values (steps, D), normalised: its committed tokens, then predictions. with_target_token:
-        whether the target token at the rejected position stays committed."""
+        """End the chunk with actions that are partly predicted.
+
+        Args:
+            values: Normalised actions (steps, D): the committed tokens' values, then predictions.
+            with_target_token: Whether the target token at the rejected position stays committed.
+        """
         if not with_target_token:
             del self.tokens[-1]
             self.rounds[-1] = replace(self.rounds[-1], committed=self.rounds[-1].accepted)  # without the bonus
         del self.tokens[values.size :]
         self.closed = values
+
+    def actions(self) -> np.ndarray:
+        """Return the complete chunk's actions (steps, D), float32, environment units."""
+        if self.closed is None:
+            return actions_of(self.space, self.tokens)
+        return self.space.unnormalise(self.closed).astype(np.float32)
+
+    def record(self, actions: np.ndarray, seconds: float, phases: dict[str, float]) -> DecodeRecord:
+        """Return the record of the complete chunk. The arguments are those of `DecodeRecord`."""
+        modes = [one.mode for one in self.rounds]
+        drafters = (one.mode if one.mode in ("skip", PARALLEL) else one.proposer for one in self.rounds)
+        return DecodeRecord(
+            tokens=tuple(self.tokens),
+            actions=actions,
+            size=self.size,
+            forwards=self.forwards,
+            rounds=tuple(self.rounds),
+            mode=next((name for name in drafters if name != "none"), "ar"),
+            seconds=seconds,
+            phases=phases,
+            compensated=0 if self.closed is None else max(0, self.closed.size - len(self.tokens)),
+            variability=self.variability,
+            skipped="skip" in modes,
+            similarity=self.similarity,
+            metric=self.choice.metric if self.choice is not None else None,
+            reason=self.reason,
+        )
+
+
+def actions_of(space: ActionSpace, tokens: Sequence[int]) -> np.ndarray:
+    """Return the actions (steps, D) of whole control steps' tokens, float32, environment units."""
+    return space.decode(np.array(tokens).reshape(-1, space.dofs)).astype(np.float32)
+
+
+def deviation(space: ActionSpace, actions: np.ndarray, autoregressive: np.ndarray) -> float:
+    """Return the mean absolute difference of two chunks, in normalised action units.
+
+    Args:
+        space: The action space.
+        actions: The executed actions (h, D).
+        autoregressive: Autoregressive decoding's actions (H, D). Only the first h ≤ H count.
+    """
+    gap = space.normalise(actions) - space.normalise(autoregressive[: len(actions)])
+    return float(np.abs(gap).mean())

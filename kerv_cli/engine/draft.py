@@ -1,16 +1,17 @@
-"""What a proposer drafts: a `TokenTree` whose tokens may still lie on the target's device, with the positions and masks
-of the forward that verifies it."""
+"""What a proposer drafts: tokens that may still be on the GPU, with the positions and mask of their verification."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from kerv_cli.base.errors import KervError
 from kerv_cli.engine.transfer import upload
 from kerv_cli.engine.tree import ROOT, TokenTree
 
@@ -19,12 +20,14 @@ HOST = torch.device("cpu")
 
 @dataclass(frozen=True)
 class Draft:
-    """n tokens to verify. Those on the target's device are read together with the target's tokens, so that the host
-    waits once.
+    """n tokens to verify. Those on the GPU are read together with the target's tokens, so that the CPU waits once.
 
-    tokens: (n,) int64. parents: (n,) int64; None: a chain. levels: of a tree whose parents lie on the device, at most.
-    choose: where only some rows are nodes of the tree to judge: gives that tree and the row of each of its nodes, once
-    `Chunk.reads` are read.
+    Attributes:
+        tokens: (n,) int64.
+        parents: (n,) int64; None for a chain.
+        levels: Maximum depth of the tree. Needed only when `parents` is on the GPU.
+        choose: Returns the tree to judge and the row of each of its nodes, after `Chunk.reads` are read. Needed only
+            when some rows are no nodes of that tree.
     """
 
     tokens: Tensor
@@ -34,36 +37,47 @@ class Draft:
 
     @classmethod
     def of(cls, tokens: Sequence[int], parents: Sequence[int] | None = None) -> Draft:
-        """A draft of the host's numbers, as `TokenTree.build` takes them."""
+        """Return a draft of numbers on the CPU. The arguments are those of `TokenTree.build`."""
         return cls(_vector(tokens), None if parents is None else _vector(parents))
 
     def __len__(self) -> int:
         return self.tokens.shape[0]
 
+    def check(self, vocabulary: int, proposer: str) -> None:
+        """Refuse tokens out of range; see `check_tokens`. Tokens on the GPU come from a head and are in range."""
+        if self.tokens.device == HOST:
+            check_tokens(self.tokens.numpy(), vocabulary, proposer)
+
     @cached_property
     def tree(self) -> TokenTree:
-        """A draft of the host as a tree; errors as `TokenTree.build`."""
+        """The tree of a draft on the CPU."""
         return TokenTree.build(self.tokens.tolist(), None if self.parents is None else self.parents.tolist())
 
     @property
     def remote(self) -> list[Tensor]:
-        """Of tokens and parents, those that lie on the device."""
+        """Tokens and parents that are on the GPU."""
         return [x for x in (self.tokens, self.parents) if x is not None and x.device != HOST]
 
+    def judged(self, remote: Sequence[np.ndarray]) -> tuple[TokenTree, Sequence[int]]:
+        """Return the tree to judge and the row of each node, given what was read of `remote`."""
+        if self.choose is not None:
+            return self.choose()
+        tree = TokenTree.build(*(vector.astype(np.int64).tolist() for vector in remote)) if remote else self.tree
+        return tree, range(len(self))
+
     def tokens_on(self, device: torch.device) -> Tensor:
-        """(n,) int64."""
+        """Return the tokens (n,) on a device."""
         return upload(self.tokens, device) if self.tokens.device == HOST else self.tokens
 
-    def tokens_behind(self, token: int, device: torch.device) -> Tensor:
-        """(1 + n,) int64: `token`, then the draft's."""
+    def tokens_after(self, token: int, device: torch.device) -> Tensor:
+        """Return `token` and the draft's tokens, (1 + n,) int64."""
         if self.tokens.device == HOST:
             return upload(np.concatenate([[token], self.tokens.numpy()]), device)
         return torch.cat([torch.full_like(self.tokens[:1], token), self.tokens])
 
     @cached_property
     def ancestors(self) -> np.ndarray | Tensor | None:
-        """(n, n) bool: row i sees row j if j is i or an ancestor of i. An array where the parents lie on the host; None
-        for a chain."""
+        """Whether row j is row i or an ancestor of it, (n, n) bool, where the parents are; None for a chain."""
         if self.parents is None:
             return None
         if self.parents.device != HOST:
@@ -72,7 +86,7 @@ class Draft:
         return None if parents == list(range(ROOT, len(self) - 1)) else ancestors_of(parents)
 
     def positions(self, start: int, before: int, device: torch.device) -> Tensor:
-        """Positions (before + n,) of `before` tokens from `start` on and the rows behind them."""
+        """Return the positions (before + n,) of `before` tokens from position `start`, and of the rows after them."""
         stop, seen = start + before, self.ancestors
         if seen is None:
             return torch.arange(start, stop + len(self), device=device)
@@ -82,16 +96,16 @@ class Draft:
         return torch.cat([torch.arange(start, stop, device=device), stop + depths])
 
     def visible(self, before: int) -> np.ndarray | Tensor | None:
-        """(before + n, before + n) bool: which tokens each of `before` causal tokens and the n rows behind them attends
-        to; None where all are causal."""
+        """Return which new tokens each new token attends to; None if all are causal.
+
+        The new tokens are `before` causal ones and then the n rows: (before + n, before + n) bool.
+        """
         seen, size = self.ancestors, before + len(self)
         if seen is None:
             return None
-        if isinstance(seen, np.ndarray):
-            on_host = np.tri(size, dtype=bool)
-            on_host[before:, before:] = seen
-            return on_host
-        mask = torch.ones(size, size, dtype=torch.bool, device=seen.device).tril_()
+        mask: Any = np.tri(size, dtype=bool)
+        if isinstance(seen, Tensor):
+            mask = torch.ones(size, size, dtype=torch.bool, device=seen.device).tril_()
         mask[before:, before:] = seen
         return mask
 
@@ -103,8 +117,19 @@ def _vector(numbers: Sequence[int]) -> Tensor:
 EMPTY = Draft.of(())
 
 
+def check_tokens(tokens: np.ndarray, vocabulary: int, proposer: str) -> None:
+    """Refuse drafted tokens (n,) that are out of range.
+
+    Raises:
+        KervError: A token is negative, or not below `vocabulary`.
+    """
+    if tokens.size and not (tokens.min() >= 0 and tokens.max() < vocabulary):
+        wrong = next(token for token in tokens.tolist() if not 0 <= token < vocabulary)
+        raise KervError(f"the proposer '{proposer}' drafted token {wrong}: tokens are 0 to {vocabulary - 1}")
+
+
 def ancestors_of(parents: Sequence[int]) -> np.ndarray:
-    """`Draft.ancestors` of n parents on the host."""
+    """Return `Draft.ancestors` of n parents on the CPU."""
     paths: list[int] = []  # bit j of number i: node i sees node j
     for i, parent in enumerate(parents):
         paths.append(1 << i | (paths[parent] if parent != ROOT else 0))
@@ -114,7 +139,7 @@ def ancestors_of(parents: Sequence[int]) -> np.ndarray:
 
 
 def ancestors_on_device(parents: Tensor, levels: int) -> Tensor:
-    """`Draft.ancestors` of parents (n,) on their device, of a tree of at most so many levels."""
+    """Return `Draft.ancestors` of parents (n,) on their device, for a tree of at most `levels` levels."""
     n, nodes = parents.shape[0], torch.arange(parents.shape[0], device=parents.device)
     reached = ((parents[:, None] == nodes) | (nodes[:, None] == nodes)).float()
     for _ in range((levels - 1).bit_length() if n else 0):  # paths of 1, 2, 4, … steps

@@ -1,5 +1,7 @@
-"""What the decode loop asks of a method's parts besides its proposers (`proposer.py`) and acceptance rule
-(`acceptance.py`). Nothing heavy is imported here."""
+"""What the decode loop asks of a threshold, a rectifier, a boundary and a skip rule. This file imports nothing heavy.
+
+Proposers are in `proposer.py`, acceptance rules in `acceptance.py`.
+"""
 
 from __future__ import annotations
 
@@ -15,16 +17,16 @@ if TYPE_CHECKING:
 
 
 class Threshold(Protocol):
-    """Gives the acceptance radius r of every decode, from the variability K of the decodes before it."""
+    """Chooses the acceptance radius r of every decode, from the variability K of the decodes before it."""
 
     def reset(self) -> None:
-        """A new episode begins."""
+        """Begin an episode."""
 
     def radius(self) -> int:
-        """r of the next decode, in bins."""
+        """Return r of the next decode, in bins."""
 
     def update(self, variability: float | None) -> None:
-        """A decode ended; its kinematic variability K in normalised action units, None where nothing was compared."""
+        """End a decode, whose kinematic variability K is in normalised action units; None if nothing was compared."""
 
 
 class Fixed:
@@ -34,66 +36,65 @@ class Fixed:
         self.r = r
 
     def reset(self) -> None:
-        """Nothing to reset."""
+        """Do nothing."""
 
     def radius(self) -> int:
-        """r."""
+        """Return r, in bins."""
         return self.r
 
     def update(self, variability: float | None) -> None:
-        """K is not used."""
+        """Do nothing."""
 
 
 class Rectifier(Protocol):
-    """Ends a chunk after a rejection, by what it predicts."""
+    """Ends a chunk after a rejection, with what it predicts."""
 
     @property
     def uses_target_token(self) -> bool:
         """Whether the target's token at the rejected position stays committed."""
 
     def reset(self) -> None:
-        """A new episode begins."""
+        """Begin an episode."""
 
     def next_decode(self) -> None:
-        """A decode ended."""
+        """End a decode."""
 
     def close(self, chunk: Chunk) -> bool:
-        """Ends the chunk after a rejection, if what is missing can be predicted -> whether it did."""
+        """End the chunk after a rejection if what is missing can be predicted, and return whether it did."""
 
 
 class Boundary(Protocol):
     """Chooses the side of a hybrid proposer that drafts the next chunk."""
 
     def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
-        """path (n, 3): the episode's measured positions up to now, metres, oldest first; the newest `window` count."""
+        """Choose by the measured positions (n, 3) of the episode up to now, metres, oldest first."""
 
     def numbers(self, task: str, seed: int) -> np.random.Generator:
-        """Generator for one episode; depends on the boundary's seed, the task and the episode's seed alone."""
+        """Return the generator of an episode. It depends on the boundary's seed, the task and the seed alone."""
 
 
 class Skip(ABC):
-    """Decides, before the target verifies anything, whether a chunk is executed without a verification. phase: of
-    `PHASES`, the one that the time of `take` is added to."""
+    """Decides before the prefill whether a chunk is executed without a verification."""
 
-    phase = "propose"
+    phase = "propose"  # of `PHASES`, for the time of `take`
 
     def begin(self, task: str, seed: int) -> None:  # noqa: B027 - most rules keep nothing between decodes
-        """A new episode begins."""
+        """Begin an episode."""
 
     def finish(self, success: bool) -> None:  # noqa: B027
-        """An episode ended."""
+        """End the episode."""
 
     @abstractmethod
     def take(self, chunk: Chunk) -> bool:
-        """Completes the chunk, if it may be executed unverified -> whether it did."""
+        """Complete the chunk if it may be executed unverified, and return whether it did."""
 
     def verified(self, chunk: Chunk) -> None:  # noqa: B027
-        """The prefill of a chunk that was not taken has judged the in-prefill draft."""
+        """Learn from the verdict, after the prefill has verified a draft that was not skipped."""
 
 
 @runtime_checkable
 class TakesMany(Protocol):
-    """A skip rule that can take the chunks of several episodes together."""
+    """A skip rule that can complete the chunks of several episodes together."""
 
     def take_many(self, chunks: Sequence[Chunk], cache: Callable[[int], Cache]) -> None:
-        """Completes B chunks. cache: rows -> an empty one."""
+        """Complete B chunks. `cache` returns an empty cache of so many rows."""

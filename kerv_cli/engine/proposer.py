@@ -1,5 +1,4 @@
-"""What drafts: the base of proposers, and that of those that draft a chain of the host's tokens (docs/extending.md).
-Nothing heavy is imported here."""
+"""Base classes of proposers (docs/extending.md). This file imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -14,11 +13,12 @@ if TYPE_CHECKING:
 
 
 class Proposer:
-    """Drafts a tree behind the committed tokens.
+    """Drafts a tree of the tokens after the committed ones.
 
-    name: in the record, e.g. `drafter`. needs_states: whether it reads the target's hidden states, so that it cannot
-    draft before the prefill. nodes: most rows of its drafts, for which the cache has room; 0: as many as the chunk has
-    tokens.
+    Attributes:
+        name: Name in the record, e.g. `drafter`.
+        needs_states: Whether it reads the target's hidden states. It then cannot draft before the prefill.
+        nodes: Maximum number of rows in a draft, for which the cache has room; 0 for as many as the chunk has tokens.
     """
 
     name = ""
@@ -26,44 +26,47 @@ class Proposer:
     nodes = 0
 
     def reset(self) -> None:
-        """A new episode begins."""
+        """Begin an episode."""
 
     def prepare(self, chunk: Chunk) -> None:
-        """Called before the prefill; adds the vectors that it needs on the host to `chunk.reads`."""
+        """Prepare for the prefill: add the vectors that the CPU needs to `chunk.reads`."""
 
     def begin(self, chunk: Chunk) -> None:
-        """Called once per chunk, when the prompt is encoded and the first tokens are committed."""
+        """Begin a chunk, after its prefill has committed the first tokens."""
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """A draft of at most `depth` levels; an empty one where it has none."""
+        """Return a draft of at most `depth` levels, or an empty one."""
         raise NotImplementedError
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
-        """Tokens were committed behind chunk index `first`, the last token before them; hidden (1, T, E) are the
-        target's states at chunk indices first … first + T − 1. target_tokens: the round's 1 + n argmax tokens, those
-        behind rejected nodes included."""
+        """Learn from a round.
+
+        Args:
+            chunk: The chunk, with the round's tokens committed.
+            first: Chunk index of the last token that was committed before the round.
+            hidden: The target's states (1, T, E) at chunk indices first … first + T − 1.
+            target_tokens: The round's 1 + n target tokens, those after rejected nodes included.
+        """
 
 
 class ChainProposer(Proposer):
-    """Drafts chains on the host. One that does so before the prefill (trait `chains`) is a source of merged drafts and
-    of unverified chunks."""
+    """Drafts chains on the CPU. If it drafts before the prefill, it can be merged or executed unverified."""
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """The first chain; an empty draft where there is none."""
+        """Return the first chain, or an empty draft."""
         from kerv_cli.engine.draft import EMPTY, Draft
 
         chains = self.chains(chunk, depth)
         return Draft.of(chains[0]) if chains else EMPTY
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Drafts of the tokens behind the committed ones, best first, at most `depth` tokens each; an empty list where
-        it has no draft."""
+        """Return drafts of the tokens after the committed ones, best first, of at most `depth` tokens each."""
         raise NotImplementedError
 
     def tokens_of(self, chunks: Sequence[Chunk]) -> list[list[int]]:
-        """The first chains of B chunks of which nothing is committed, N tokens each."""
+        """Return the first chains of B chunks of which nothing is committed, N tokens each."""
         return [self.chains(chunk, chunk.size)[0] for chunk in chunks]
 
     def is_sure(self, chunk: Chunk) -> bool:
-        """Whether it expects its first chain to be accepted whole."""
+        """Return whether it expects its first chain to be accepted whole."""
         return False

@@ -18,19 +18,23 @@ from kerv_cli.base.spaces import ActionSpace, Observation
 class Cache(Protocol):
     """The keys and values of forwarded tokens, in buffers of `capacity` slots.
 
-    Slots 0 … length − 1 are valid. `forward` writes its new tokens behind them.
+    Slots 0 … length − 1 are valid. `forward` writes its new tokens after them and raises `length`.
     """
 
     length: int
     capacity: int
 
     def compact(self, start: int, slots: Tensor) -> None:
-        """Commits a path: moves the entries at `slots` (n,), increasing and from `start` on, to start, start + 1, … and
-        sets the length behind them."""
+        """Commit a path: move the entries at `slots` to start, start + 1, … and set `length` to start + n.
+
+        Args:
+            start: First slot after the committed tokens.
+            slots: The path's slots (n,), increasing, none before `start`.
+        """
 
 
 class Target(Protocol):
-    """A policy that decodes actions as tokens; without drafts every token takes one forward."""
+    """A policy that decodes actions as tokens."""
 
     @property
     def actions(self) -> ActionSpace:
@@ -38,11 +42,11 @@ class Target(Protocol):
 
     @property
     def chunk(self) -> int:
-        """H, control steps it was trained to decode at once."""
+        """H, the control steps that it was trained to decode at once."""
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras whose images `encode` reads; no others are drawn."""
+        """Names of the cameras whose images `encode` reads. No others are drawn."""
 
     @property
     def width(self) -> int:
@@ -57,44 +61,48 @@ class Target(Protocol):
         """Device of the weights."""
 
     def encode(self, observation: Observation) -> Tensor:
-        """The prompt's embeddings (1, P, E); P may differ from observation to observation. The state behind the
-        prompt's last token predicts the chunk's first token."""
+        """Return the prompt's embeddings (1, P, E). P may differ between observations.
+
+        The hidden state of the prompt's last token predicts the chunk's first token.
+        """
 
     def embed(self, tokens: Tensor) -> Tensor:
-        """Action tokens (B, T) int64 -> (B, T, E)."""
+        """Return the embeddings (B, T, E) of action tokens (B, T) int64."""
 
     def new_cache(self, batch: int, capacity: int) -> Cache:
-        """An empty cache for `capacity` tokens."""
+        """Return an empty cache for `capacity` tokens."""
 
     def forward(
         self, x: Tensor, positions: Tensor, cache: Any = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
-        """Hidden states (B, T, E) of the new tokens x (B, T, E) at `positions` (T,), behind the cached ones. cache:
-        from `new_cache`, or None.
+        """Return the hidden states (B, T, E) of new tokens after the cached ones.
 
-        seen (T, T) bool says which of the new tokens each new token attends to; all attend to every cached one. None:
-        the new tokens are causal. It is an array; on another device than a CPU it may be a tensor there.
+        Args:
+            x: Embeddings of the new tokens (B, T, E).
+            positions: Their positions (T,).
+            cache: From `new_cache`, or None. All new tokens attend to every cached one.
+            seen: Which new tokens each new token attends to, (T, T) bool; None if they are causal. An array, or on a
+                GPU also a tensor.
         """
 
     def head(self, hidden: Tensor) -> Tensor:
-        """hidden (..., E) -> logits over the action tokens (..., V)."""
+        """Return the logits over the action tokens (..., V) of hidden states (..., E)."""
 
 
 @runtime_checkable
 class EncodesMany(Protocol):
-    """A target that encodes several observations faster than one after the other."""
+    """A target that encodes several observations faster together than one after the other."""
 
     def encode_many(self, observations: Sequence[Observation]) -> Tensor:
-        """The prompts (B, P, E) of B observations."""
+        """Return the prompts (B, P, E) of B observations."""
 
 
 class ReadableTarget(Target, Protocol):
-    """A target whose prompt has named parts and whose layers have known shapes; drafters and the datastore read
-    them."""
+    """A target whose prompt has named parts and whose layers have known shapes, for drafters and the datastore."""
 
     @property
     def segments(self) -> Mapping[str, slice]:
-        """Slice of the prompt by the name of its part."""
+        """Name of a part of the prompt -> its slice."""
 
     @property
     def pooled_width(self) -> int:
@@ -102,7 +110,7 @@ class ReadableTarget(Target, Protocol):
 
     @property
     def heads(self) -> int:
-        """Attention heads of a layer."""
+        """Number of attention heads of a layer."""
 
     @property
     def feed_forward(self) -> int:
@@ -113,16 +121,20 @@ class ReadableTarget(Target, Protocol):
         """Number format of the weights."""
 
     def pooled(self, prompt: Tensor) -> Tensor:
-        """prompt (B, P, E) -> (B, F): the prompt as one vector, the input of the early drafter."""
+        """Return the prompts (B, P, E) as one vector each, (B, F): the input of the early drafter."""
 
 
 class ParallelTarget(Target, Protocol):
-    """A target that was trained to decode all N tokens of a chunk at once, and only so."""
+    """A target that decodes all N tokens of a chunk at once, and only so."""
 
     @property
     def parallel(self) -> bool:
         """True."""
 
     def parallel_pass(self, prompt: Tensor, cache: Any = None) -> Tensor:
-        """prompt (B, P, E) -> hidden states (B, N, E) of the chunk's tokens, in one forward. cache: an empty one with
-        room for P + N tokens."""
+        """Return the hidden states (B, N, E) of the chunk's tokens, in one forward.
+
+        Args:
+            prompt: (B, P, E).
+            cache: An empty one with room for P + N tokens, or None.
+        """

@@ -1,4 +1,4 @@
-"""Records of a decode and of an episode, as frozen dataclasses. Rerun files, tables and plots are made from them alone.
+"""Records of a decode and of an episode. Rerun files, tables and plots are made from them alone.
 
 Notation (docs/methods.md §0): D degrees of freedom, H control steps in a chunk, N = H·D tokens of a chunk.
 """
@@ -16,7 +16,7 @@ PARALLEL = "parallel"
 """Mode of a round, and of its decode, in which the target decoded all tokens at once."""
 
 PHASES = ("vision", "prefill", "propose", "verify", "accept", "rectify", "other")
-"""Phases of a decode's inference time; their seconds add up to `DecodeRecord.seconds`. vision: `Target.encode`."""
+"""Phases of a decode. Their seconds add up to `DecodeRecord.seconds`. vision is `Target.encode`."""
 
 UNTIMED = dict.fromkeys(PHASES, math.nan)
 """Phases of a decode that was computed together with others and has no time of its own."""
@@ -26,20 +26,29 @@ UNTIMED = dict.fromkeys(PHASES, math.nan)
 class Round:
     """One round of a decode: a draft and the target tokens it was compared with.
 
-    `drafted` is the judged path: the accepted tokens followed, where there was a rejection, by the rejected candidate
-    that was nearest to the target token. `target_tokens` are the target's argmax tokens at the same positions and, when
-    the whole path was accepted and places are left, one more: the bonus.
+    Attributes:
+        mode: "prefill" (token 0), "decode" (one token), "verify" (a tree), "skip" (no forward) or PARALLEL.
+        proposer: Name of the proposer that drafted, or "none".
+        start: Number of tokens committed before this round.
+        drafted: The judged path: the accepted tokens and, after a rejection, the rejected candidate that is nearest to
+            the target token.
+        target_tokens: The target's tokens at the same positions. If the whole path was accepted and places are left,
+            one more: the bonus.
+        accepted: Number of accepted draft tokens.
+        committed: Number of committed tokens: accepted ones and the bonus.
+        tree_size: Number of verified nodes.
+        threshold: r per DoF, in bins. Empty if no acceptance rule ran.
     """
 
-    mode: str  # "prefill" (token 0), "decode" (one token), "verify" (a tree), "skip" (no forward), PARALLEL
-    proposer: str  # which proposer drafted: "none", "drafter", "retrieval", "early", "hold", "kalman", ...
-    start: int  # tokens committed before this round
-    drafted: tuple[int, ...]
-    target_tokens: tuple[int, ...]
-    accepted: int  # draft tokens accepted
-    committed: int  # tokens committed by this round: accepted + bonus
-    tree_size: int  # nodes verified
-    threshold: tuple[int, ...]  # r per DoF, in bins; empty where no acceptance rule with a threshold ran
+    mode: str
+    proposer: str = "none"
+    start: int = 0
+    drafted: tuple[int, ...] = ()
+    target_tokens: tuple[int, ...] = ()
+    accepted: int = 0
+    committed: int = 0
+    tree_size: int = 0
+    threshold: tuple[int, ...] = ()
 
     @property
     def is_verification(self) -> bool:
@@ -49,27 +58,22 @@ class Round:
 
 @dataclass(frozen=True)
 class Delay:
-    """What the world did while the policy decoded (docs/methods.md §8), in control steps but for `seconds`.
+    """What the world did while the policy decoded (docs/methods.md §8)."""
 
-    observed: the step at which the observation was taken. steps: latency, rounded up. carried, held: how many of them
-    executed the chunk in hand on, and held the last action; fewer than `steps` where the episode ended. dropped: first
-    actions of the new chunk that were left out.
-    """
-
-    seconds: float
-    steps: int
-    observed: int
-    carried: int = 0
-    held: int = 0
-    dropped: int = 0
+    seconds: float  # latency
+    steps: int  # the same in control steps, rounded up
+    observed: int  # control step at which the observation was taken
+    carried: int = 0  # steps that executed the chunk before; carried + held < steps if the episode ended
+    held: int = 0  # steps that held the last action
+    dropped: int = 0  # first actions of the new chunk that were left out
 
 
 @dataclass(frozen=True)
 class DecodeRecord:
     """One call of the decoder: from an observation to the actions to execute."""
 
-    tokens: tuple[int, ...]  # committed tokens, in order; N of them unless the rest of the chunk was dropped
-    actions: np.ndarray  # (steps, D) float32, environment units, what is executed; steps <= H
+    tokens: tuple[int, ...]  # committed tokens in order: N of them, unless the rest of the chunk was dropped
+    actions: np.ndarray  # (steps, D) float32, environment units, what is executed; steps ≤ H
     forwards: int  # target forwards, prefill included
     rounds: tuple[Round, ...]
     mode: str  # proposer of the first round that drafted; "skip": not verified; PARALLEL; "ar": no draft; "expert"
@@ -79,31 +83,33 @@ class DecodeRecord:
     size: int = 0  # N; 0: as many as `tokens`
     skipped: bool = False  # executed without a verification
     variability: float | None = None  # K of this decode (§3.2), normalised action units
-    similarity: float | None = None  # best retrieval similarity, where one was looked up
-    metric: float | None = None  # fused hybrid-boundary metric F (§4.4)
-    reason: str | None = None  # why a skip rule executed the draft unverified or had it verified, where it says so
-    deviation: float | None = None  # mean abs difference to AR's chunk from the same observation, where sampled
+    similarity: float | None = None  # best retrieval similarity; None: nothing was retrieved
+    metric: float | None = None  # F of the hybrid boundary (§4.4)
+    reason: str | None = None  # why a skip rule executed the draft unverified, or had it verified
+    deviation: float | None = None  # mean abs difference to AR's chunk from the same observation; None: not sampled
     delay: Delay | None = None  # None: the world waited
 
     @property
     def delay_steps(self) -> int | None:
-        """Control steps that the world went on during the decode; None: it waited."""
+        """Control steps that the world went on during the decode; None if it waited."""
         return None if self.delay is None else self.delay.steps
 
     @property
     def unverified(self) -> int:
-        """Tokens handed over for execution without a target token on their accepted path: all of a skipped decode's and
-        of a parallel one's, else what a prediction or a rejected draft filled."""
+        """Number of executed tokens without a target token on their accepted path.
+
+        All of a skipped or parallel decode's, else those that a prediction or a rejected draft filled.
+        """
         return len(self.tokens) if self.skipped or self.mode == PARALLEL else self.compensated
 
     @property
     def verifications(self) -> int:
-        """Rounds in which the target verified a tree."""
+        """Number of rounds in which the target verified a tree."""
         return sum(r.is_verification for r in self.rounds)
 
     @property
     def first_rejected(self) -> int | None:
-        """Index in the chunk of the first rejected token of the first verification; N if none; None if no tree."""
+        """Index in the chunk of the first verification's first rejected token; N if none, None if no tree."""
         for r in self.rounds:
             if r.is_verification:
                 return r.start + r.accepted if r.accepted < len(r.drafted) else self.size or len(self.tokens)
@@ -111,7 +117,7 @@ class DecodeRecord:
 
 
 def path_length(points: np.ndarray) -> float:
-    """Summed distances between successive points (n, 3), metres; 0 for fewer than two."""
+    """Return the summed distances between successive points (n, 3), metres; 0 for fewer than two points."""
     return float(np.linalg.norm(np.diff(points.astype(np.float64), axis=0), axis=1).sum())
 
 
@@ -132,33 +138,32 @@ class EpisodeRecord:
     path: np.ndarray  # (T + 1, 3) float32, end-effector positions, metres
     gripper: np.ndarray  # (T + 1,) float32, gripper opening, 0..1
     initial_state: np.ndarray  # (n,) float64, equal for episodes of a task that begin alike
-    frames: dict[int, np.ndarray] = field(default_factory=dict)  # control step -> (h, w, 3) uint8, only where logged
-    wall_seconds: float = 0.0  # whole episode, simulation and rendering included; its share where several ran at once
-    # object, goal, … -> (T + 1, 3) metres, only where logged
-    places: dict[str, np.ndarray] = field(default_factory=dict)
+    frames: dict[int, np.ndarray] = field(default_factory=dict)  # control step -> (h, w, 3) uint8, if recorded
+    wall_seconds: float = 0.0  # whole episode with simulation and rendering; its share if several ran at once
+    places: dict[str, np.ndarray] = field(default_factory=dict)  # object, goal, … -> (T + 1, 3) metres, if recorded
 
     @property
     def seconds(self) -> float:
-        """Inference time of the episode; NaN where it was not timed."""
+        """Inference time of the episode; NaN if it was not timed."""
         return sum(d.seconds for d in self.decodes)
 
     @property
     def timed(self) -> bool:
-        """Whether its decodes have times; those of a batch have none."""
+        """Whether its decodes have times. Those of a batch have none."""
         return not math.isnan(self.seconds)
 
     @property
     def forwards(self) -> int:
-        """Target forwards of the episode."""
+        """Number of target forwards."""
         return sum(d.forwards for d in self.decodes)
 
     @property
     def path_length(self) -> float:
-        """The end effector's way, metres."""
+        """Length of the end effector's path, metres."""
         return path_length(self.path)
 
     @property
     def jerk(self) -> float:
-        """Root mean square of the third difference of the end effector's positions, m/s³; NaN below three steps."""
+        """Root mean square of the third difference of the end effector's positions, m/s³; NaN for under 3 steps."""
         third = np.diff(self.path.astype(np.float64), n=3, axis=0) * self.space.control_hz**3
         return float(np.sqrt((third**2).sum(axis=1).mean())) if len(third) else math.nan

@@ -1,8 +1,8 @@
-"""Draft tokens as a tree, which an acceptance rule judges. Nothing heavy is imported here.
+"""Draft tokens as a tree, which an acceptance rule judges. This file imports nothing heavy.
 
-Node i has a token, a parent (−1: the last committed token) and a depth (0 for the first drafted position). Parents come
-before their children. A node at depth d behind `committed` tokens is chunk token committed + d, which gives its control
-step and DoF (docs/methods.md §2).
+Node i has a token, a parent (−1 is the last committed token) and a depth (0 is the first drafted position). Parents
+come before their children. A node at depth d after `committed` tokens is chunk token committed + d, which gives its
+control step and DoF (docs/methods.md §2).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ ROOT = -1
 
 @dataclass(frozen=True)
 class TokenTree:
-    """A draft on the host: tokens, parents and depths of n nodes, parent before child."""
+    """A draft on the CPU: tokens, parents and depths of n nodes."""
 
     tokens: tuple[int, ...]
     parents: tuple[int, ...]
@@ -23,10 +23,10 @@ class TokenTree:
 
     @classmethod
     def build(cls, tokens: Sequence[int], parents: Sequence[int] | None = None) -> TokenTree:
-        """A tree of n tokens with n parents; without parents one path.
+        """Build a tree of n tokens and n parents, or a chain if `parents` is None.
 
         Raises:
-            ValueError: a parent at or behind its child.
+            ValueError: A parent does not come before its child.
         """
         n = len(tokens)
         if parents is None:
@@ -42,7 +42,7 @@ class TokenTree:
         return len(self.tokens)
 
     def down_from(self, node: int) -> list[int]:
-        """`node` and the nodes below it along first children, down to a leaf."""
+        """Return `node` and its first child, that child's first child, and so on to a leaf."""
         nodes = [node]
         for i in range(node + 1, len(self)):
             if self.parents[i] == nodes[-1]:
@@ -50,7 +50,7 @@ class TokenTree:
         return nodes
 
     def path_to(self, node: int) -> list[int]:
-        """Nodes from depth 0 down to `node`; empty for the root."""
+        """Return the nodes from depth 0 to `node`. The path to the root is empty."""
         path: list[int] = []
         while node != ROOT:
             path.append(node)
@@ -59,17 +59,16 @@ class TokenTree:
 
 
 def merge(chains: Sequence[Sequence[int]]) -> TokenTree:
-    """A prefix tree of several drafts; common beginnings become one path."""
+    """Return the prefix tree of several drafts. Common beginnings become one path."""
     tokens: list[int] = []
     parents: list[int] = []
     children: dict[tuple[int, int], int] = {}
     for chain in chains:
         node = ROOT
-        for token in chain:
-            key = (node, int(token))
-            if key not in children:
-                children[key] = len(tokens)
-                tokens.append(int(token))
+        for token in map(int, chain):
+            if (node, token) not in children:
+                children[node, token] = len(tokens)
+                tokens.append(token)
                 parents.append(node)
-            node = children[key]
+            node = children[node, token]
     return TokenTree.build(tokens, parents)

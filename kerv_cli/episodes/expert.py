@@ -7,8 +7,8 @@ import torch
 
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.chunk import Clock
 from kerv_cli.engine.record import DecodeRecord
+from kerv_cli.engine.stopwatch import Stopwatch
 from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.spec import Expert
 
@@ -44,9 +44,9 @@ class ExpertDecoder:
         """
         if self.expert is None:
             raise KervError("the expert does not know its task yet: reset it before decoding")
-        clock = Clock(torch.device("cpu"))
+        stopwatch = Stopwatch(torch.device("cpu"))
         action = self.expert(observation)
-        seconds = clock.stop()
+        seconds = stopwatch.stop()
         if action.shape != (self.dofs,) or not np.isfinite(action).all():
             raise KervError(f"the expert of {self.task} answered {action} to a state it cannot read")
         return DecodeRecord(
@@ -56,7 +56,7 @@ class ExpertDecoder:
             rounds=(),
             mode=MODE,
             seconds=seconds,
-            phases=clock.phases,
+            phases=stopwatch.phases,
         )
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:

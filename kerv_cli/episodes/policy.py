@@ -142,10 +142,7 @@ def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
         artifacts = artifacts_of(settings)
         decoder = of_method = Method.of(settings).decoder(artifacts.target, artifacts.load, task)
         if settings.deviation_every > 0:
-            of_method.every, of_method.reference = (
-                settings.deviation_every,
-                Decoder(artifacts.target, chunk=settings.chunk),
-            )
+            of_method.deviation_every = settings.deviation_every
     warm_up(decoder, task, spec.observation, settings.world.camera.size)
     return decoder
 

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.batched import BatchDecoder, Lane
+from kerv_cli.engine.batched import BatchDecoder
+from kerv_cli.engine.chunk import EpisodeState
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
 from kerv_cli.episodes.episode import episode
 from kerv_cli.worlds.spec import World
@@ -46,7 +47,7 @@ def run_together(
     to different tasks as long as there are enough of them, because a world costs more than a reset.
     """
     queue = _Queue(requests)
-    slots: list[_Slot[K]] = [_Slot(decoder.lane(), open_world) for _ in range(min(batch, queue.count))]
+    slots: list[_Slot[K]] = [_Slot(decoder.new_episode(), open_world) for _ in range(min(batch, queue.count))]
     try:
         while True:
             for slot in slots:
@@ -58,7 +59,7 @@ def run_together(
             if not live:
                 return
             began = time.perf_counter()
-            decodes = decoder.decode([slot.lane for slot in live], [slot.observation for slot in live])
+            decodes = decoder.decode([slot.state for slot in live], [slot.observation for slot in live])
             share = (time.perf_counter() - began) / len(live)
             for slot, decode in zip(live, decodes, strict=True):
                 slot.seconds += share
@@ -88,8 +89,8 @@ class _Queue(Generic[K]):
 class _Slot(Generic[K]):
     """A slot of the batch: its open world and the episode that runs in it. seconds: time of that episode so far."""
 
-    def __init__(self, lane: Lane, open_world: OpenWorld) -> None:
-        self.lane, self.open_world = lane, open_world
+    def __init__(self, state: EpisodeState, open_world: OpenWorld) -> None:
+        self.state, self.open_world = state, open_world
         self.task, self.seconds = "", 0.0
         self.world: World | None = None
         self.request: Request[K] | None = None
@@ -122,7 +123,7 @@ class _Slot(Generic[K]):
         if self.world is None or self.task != request.task:
             self.close()
             self.world, self.task = self.open_world(request.task), request.task
-        return episode(self.world, self.lane, request.seed)
+        return episode(self.world, self.state, request.seed)
 
     def close(self) -> None:
         """Closes the world."""

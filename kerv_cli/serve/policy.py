@@ -15,7 +15,8 @@ from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.provenance import stamp
 from kerv_cli.base.registry import find
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.batched import BatchDecoder, Lane
+from kerv_cli.engine.batched import BatchDecoder
+from kerv_cli.engine.chunk import EpisodeState
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.episodes.episode import Follower
@@ -142,7 +143,7 @@ class Policy:
 
     def _client_decoder(self, task: str) -> Follower:
         if self._together is not None:
-            return self._together.decoder.lane()
+            return self._together.decoder.new_episode()
         return self._idle.pop() if self._idle else self._decoder(task)
 
     def _decode(self, decoder: Any, observation: Observation) -> DecodeRecord:
@@ -180,7 +181,7 @@ def check_finite(decoder: Decoder | BatchDecoder) -> None:
 
 @dataclass(frozen=True)
 class _Request:
-    lane: Lane
+    episode: EpisodeState
     observation: Observation
     answer: Future[DecodeRecord] = field(default_factory=Future)
 
@@ -195,9 +196,9 @@ class Together:
     _arrived: threading.Condition = field(default_factory=threading.Condition)
     _waiting: list[_Request] = field(default_factory=list)
 
-    def decode(self, lane: Lane, observation: Observation) -> DecodeRecord:
+    def decode(self, episode: EpisodeState, observation: Observation) -> DecodeRecord:
         """The record of one client's observation. Whoever has the turn decodes for all who wait."""
-        mine = _Request(lane, observation)
+        mine = _Request(episode, observation)
         with self._arrived:
             self._waiting.append(mine)
             self._arrived.notify_all()
@@ -212,7 +213,7 @@ class Together:
     def _settle(self, batch: Sequence[_Request]) -> None:
         """Decodes the batch; where that fails, one by one, so that one client's fault is no other's."""
         try:
-            records = self.decoder.decode([one.lane for one in batch], [one.observation for one in batch])
+            records = self.decoder.decode([one.episode for one in batch], [one.observation for one in batch])
             check_finite(self.decoder)
             for one, record in zip(batch, records, strict=True):
                 one.answer.set_result(record)

@@ -7,8 +7,8 @@ import time
 import pytest
 import torch
 
-from kerv_cli.engine.chunk import Clock
 from kerv_cli.engine.record import PHASES
+from kerv_cli.engine.stopwatch import Stopwatch
 
 
 class Event:
@@ -31,7 +31,7 @@ def test_phases_add_up_to_the_decode(device: str, monkeypatch: pytest.MonkeyPatc
     waits: list[str] = []
     monkeypatch.setattr(torch.cuda, "synchronize", lambda: waits.append("wait"))
     monkeypatch.setattr(torch.cuda, "Event", Event)
-    clock = Clock(torch.device(device))
+    clock = Stopwatch(torch.device(device))
     for phase in ("vision", "prefill", "verify", "verify"):
         time.sleep(0.002)
         clock.lap(phase)
