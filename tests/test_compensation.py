@@ -147,9 +147,9 @@ def test_one_forward_whatever_is_rejected(wrong: int, use_target_token: bool) ->
     # where the target's own token was the last one nothing is missing, and nothing was predicted
     assert (chunk.closed is None) == (known == N)
     steps = max(1, -(-known // D))
-    actions, predicted = decoder.actions_of(chunk)
+    actions = chunk.actions()
     assert actions.shape == (steps, D)
-    assert predicted == steps * D - known
+    assert chunk.compensated == steps * D - known
     assert actions.reshape(-1)[:known] == pytest.approx(SPACE.values_of(np.array(truth[:known], dtype=int)), abs=1e-6)
 
 
@@ -170,7 +170,7 @@ def test_what_the_rejected_draft_had_goes_before_the_prediction(wrong: int) -> N
         expected[end - 1] = expected[end - 1 - D] if end > D else PAST.values()[-1][D - 1]
     assert chunk.closed is not None
     assert chunk.closed.reshape(-1) == pytest.approx(expected)
-    assert decoder.actions_of(chunk)[1] == end - wrong - 1
+    assert chunk.compensated == end - wrong - 1
 
 
 @pytest.mark.parametrize("wrong", range(2 * D - 1))

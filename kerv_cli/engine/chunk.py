@@ -163,6 +163,11 @@ class Chunk:
         return 0 if self.closed is not None else self.size - len(self.tokens)
 
     @property
+    def compensated(self) -> int:
+        """Number of the actions' values that a rectifier predicted."""
+        return 0 if self.closed is None else max(0, self.closed.size - len(self.tokens))
+
+    @property
     def variability(self) -> float | None:
         """K: mean difference of draft and target tokens, normalised action units; None if none was judged.
 
@@ -264,7 +269,7 @@ class Chunk:
             mode=next((name for name in drafters if name != "none"), "ar"),
             seconds=seconds,
             phases=phases,
-            compensated=0 if self.closed is None else max(0, self.closed.size - len(self.tokens)),
+            compensated=self.compensated,
             variability=self.variability,
             skipped="skip" in modes,
             similarity=self.similarity,
