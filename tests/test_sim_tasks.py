@@ -34,33 +34,26 @@ def test_difficulty_groups_have_the_published_sizes():
     assert set(sizes) == set(DIFFICULTIES)
 
 
-@pytest.mark.parametrize("name", ["drawer-open", "drawer-open-v3"])
-def test_the_version_suffix_is_optional(name):
-    assert SPEC.task(name) is TASKS["drawer-open-v3"]
-    assert spec_of(name) is SPEC
-
-
 def test_suites_expand_in_order_without_duplicates():
+    assert spec_of("drawer-open") is spec_of("drawer-open-v3") is SPEC  # the suffix is optional
     resolved = resolve_tasks(["window-open", "MT10", "window-open-v3", "hammer"])
     assert resolved[0] == "window-open-v3"
     assert resolved[1:10] == tuple(name for name in SUITES["MT10"] if name != "window-open-v3")
     assert resolved[10:] == ("hammer-v3",)
     assert resolve_tasks(["mt50"]) == tuple(TASKS)
-    with pytest.raises(UnknownName, match="MT10"):
-        resolve_tasks(["MT11"])
-    with pytest.raises(UsageError, match="at least one"):
-        resolve_tasks([])
 
 
 def test_names_are_looked_for_in_every_environment():
     assert set(specs()) == {"metaworld", "insertion"}
     assert spec_of("fetch-peg") is specs()["insertion"]
     assert resolve_tasks(["insertion"]) == ("insert-peg", "fetch-peg")
-    with pytest.raises(UnknownName, match="did you mean insert-peg"):
-        resolve_tasks(["inser-peg"])
-    with pytest.raises(UnknownName, match="did you mean drawer-open-v3"):
-        spec_of("drawer-opn-v3")
     assert {"MT10", "INSERTION", "reach-v3", "insert-peg"} <= set(task_names())
+    for wrong in (["MT11"], ["inser-peg"], ["drawer-opn-v3"]):
+        with pytest.raises(UnknownName):
+            resolve_tasks(wrong)
+    for wrong in ([], ["reach", "insert-peg"]):
+        with pytest.raises(UsageError):
+            resolve_tasks(wrong)
 
 
 def test_every_spec_fits_together():
@@ -72,10 +65,8 @@ def test_every_spec_fits_together():
         assert spec.observation.state >= len(spec.observation.proprioception) > 3
 
 
-def test_seeds_of_one_purpose_are_refused_for_another():
-    seeds = SPEC.seeds
-    seeds.check([100_000, 2_000_000], "evaluation", "seed")
-    with pytest.raises(UsageError, match="seed: seed 99999 is for selection; seeds for evaluation are 100000 to"):
-        seeds.check([100_000, 99_999], "evaluation", "seed")
-    with pytest.raises(UsageError, match="seed -1 is none; seeds for training are 0 to 49999"):
-        seeds.check([-1], "training", "demos")
+@pytest.mark.parametrize(("seeds", "purpose"), [([100_000, 99_999], "evaluation"), ([-1], "training")])
+def test_seeds_of_one_purpose_are_refused_for_another(seeds, purpose):
+    SPEC.seeds.check([100_000, 2_000_000], "evaluation", "seed")
+    with pytest.raises(UsageError, match=f"seed {seeds[-1]} "):
+        SPEC.seeds.check(seeds, purpose, "demos")

@@ -320,7 +320,7 @@ def test_the_benchmark_is_reached_without_a_simulator() -> None:
     [
         ({"tasks": "reech"}, "unknown task or suite 'reech'"),
         ({"camera": "corner9"}, "unknown camera 'corner9'"),
-        ({"horizon": 501}, "between 1 and 500"),
+        ({"horizon": 501}, "horizon=501"),
         ({"stress": "earthquake", "stress_level": 1}, "unknown world.stress.kind|unknown stress"),
         ({"seed": -1}, "seed"),
     ],

@@ -28,7 +28,6 @@ from kerv_cli.methods.settings import EXPERT, MethodSettings, PolicySettings
 from kerv_cli.targets.checkpoint import TargetDescription, described
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.spec import EnvironmentSpec
-from kerv_cli.worlds.stress import check as check_stress
 
 PRIVILEGED = "state (privileged)"
 WARM_UP_DECODES = 6
@@ -54,7 +53,7 @@ def check(settings: RolloutSettings) -> dict[str, str]:
     tasks = tasks_of(settings)
     spec = spec_of(tasks[0])
     _check_seeds(settings, spec)
-    check_stress(settings.world.stress, spec)
+    spec.check_stress(settings.world.stress)
     if settings.policy.kind == EXPERT:
         _check_expert(settings, spec)
         experts = ";".join(f"{task} {spec.experts[task]}" for task in sorted(tasks) if task in spec.experts)

@@ -26,7 +26,6 @@ from kerv_cli.worlds.settings import CameraSettings, WorldSettings
 from kerv_cli.worlds.spec import World
 from kerv_cli.worlds.stress import NO_STRESS, Stress
 from kerv_cli.worlds.stress import build as build_stress
-from kerv_cli.worlds.world import EpisodeWorld
 
 K = TypeVar("K")
 
@@ -47,17 +46,14 @@ def open_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) -
     _opened.move_to_end(key)
     while len(_opened) > _WORLDS:
         _opened.popitem(last=False)[1].close()
-    return _stressed(_opened[key], stress)
+    _opened[key].stress = stress
+    return _opened[key]
 
 
 def new_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) -> World:
     """A new world for a task, which the caller closes; see `open_world`."""
-    return _stressed(spec_of(task).open_world(task, settings.camera, settings.horizon), stress)
-
-
-def _stressed(world: World, stress: Stress) -> World:
-    if isinstance(world, EpisodeWorld):
-        world.stress = stress
+    world = spec_of(task).open_world(task, settings.camera, settings.horizon)
+    world.stress = stress
     return world
 
 

@@ -1,6 +1,6 @@
-"""The registered environments, their tasks and suites. Registers kerv's own environment and its kinds of stress.
+"""The registered environments, their tasks and suites. Registers Meta-World and the kinds of stress.
 
-Imports nothing heavy until a spec is asked for: a spec imports numpy, a world its simulator.
+Imports nothing heavy: a spec imports numpy, a world its simulator.
 """
 
 from __future__ import annotations
@@ -18,46 +18,45 @@ if TYPE_CHECKING:
 
 W = TypeVar("W", bound="WorldSettings")
 
-KIND = "environment"
-NAMES = "names"
-"""Trait of an environment's part: `module:tuple` of its suites and tasks, importable without numpy, for completion."""
-
 
 def specs() -> Mapping[str, EnvironmentSpec]:
-    """Name -> specification of every registered environment."""
-    return {name: load(part.build) for name, part in parts(KIND).items()}
+    """Return the specification of every registered environment by name."""
+    return {name: load(part.build) for name, part in parts("environment").items()}
 
 
 def spec_of(task: str) -> EnvironmentSpec:
-    """The environment that has the task, given by its full or its short name.
+    """Return the environment that has a task.
+
+    Args:
+        task: Full or short name.
 
     Raises:
-        UnknownName: no environment has it; the message names the nearest tasks. UsageError: several have it.
+        UnknownName: No environment has the task.
+        UsageError: Several environments have it.
     """
-    environments = specs()
-    owners = [spec for spec in environments.values() if spec.full_name(task) is not None]
+    owners = [spec for spec in specs().values() if spec.full_name(task) is not None]
     if not owners:
-        raise UnknownName("task", task, [name for spec in environments.values() for name in spec.tasks])
+        raise UnknownName("task", task, [name for spec in specs().values() for name in spec.tasks])
     if len(owners) > 1:
         raise UsageError(f"task '{task}' is one of {' and of '.join(spec.name for spec in owners)}: rename one of them")
     return owners[0]
 
 
 def instruction_of(task: str) -> str:
-    """The instruction of a task of any environment. UnknownName: no environment has it."""
+    """Return the instruction of a task of any environment; errors as `spec_of`."""
     return spec_of(task).task(task).instruction
 
 
 def resolve_tasks(names: Sequence[str]) -> tuple[str, ...]:
-    """Full task names for a list of tasks and suites (`MT10`, `mt50`): order kept, duplicates dropped.
+    """Return the full names of tasks and suites (`MT10`, `mt50`) in order, each once.
 
     Raises:
-        UnknownName: a name that is neither a task nor a suite.
-        UsageError: no name, or tasks of several environments, whose action spaces may differ.
+        UnknownName: A name is neither a task nor a suite.
+        UsageError: There is no name, or the tasks are of several environments, whose action spaces may differ.
     """
     if not names:
         raise UsageError("name at least one task or suite: task=NAME")
-    environments = list(specs().values())
+    environments = specs().values()
     tasks: dict[str, str] = {}  # full name -> environment
     for name in names:
         matches = {full: spec.name for spec in environments for full in spec.expand(name)}
@@ -66,44 +65,45 @@ def resolve_tasks(names: Sequence[str]) -> tuple[str, ...]:
         tasks |= matches
     owners = list(dict.fromkeys(tasks.values()))
     if len(owners) > 1:
-        raise UsageError(f"task={','.join(names)}: tasks of {' and '.join(owners)} cannot be mixed: name one's")
+        raise UsageError(f"task={','.join(names)}: choose tasks of one environment, {' or '.join(owners)}")
     return tuple(tasks)
 
 
 def stands_for_tasks(name: str) -> bool:
-    """Whether demonstrations of this name are of the task or the suite that has it, in small letters."""
+    """Return whether `name` is a task or a suite in small letters, as demonstrations of it are called."""
     return name == name.lower() and any(spec.expand(name) for spec in specs().values())
 
 
 def task_names() -> Iterator[str]:
-    """Suites and tasks of all environments, for completion."""
-    for part in parts(KIND).values():
-        if NAMES in part.traits:
-            yield from load(part.traits[NAMES])
+    """Yield the suites and tasks of all environments, for completion."""
+    for part in parts("environment").values():
+        if "names" in part.traits:  # `module:tuple`, importable without numpy
+            yield from load(part.traits["names"])
         else:
             spec = load(part.build)
             yield from (*spec.suites, *spec.tasks)
 
 
 def settled(world: W, spec: EnvironmentSpec) -> W:
-    """World settings with the environment's own camera and horizon where `world` leaves them open.
+    """Return world settings with the environment's own camera and horizon where `world` leaves them open.
 
     Raises:
-        UnknownName: the environment has no such camera. UsageError: a horizon that it cannot run.
+        UnknownName: The environment has no such camera.
+        UsageError: The simulator cannot run that horizon.
     """
     camera = replace(world.camera, name=spec.camera_name(world.camera.name))
     return replace(world, camera=camera, horizon=spec.control_steps(world.horizon))
 
 
 add("environment", "metaworld", "kerv_cli.worlds.metaworld.spec:SPEC", names="kerv_cli.worlds.metaworld.tasks:NAMES")
-for _name, _made_by, _needed in (
-    ("push", "push:Push", ("actions", "position")),
-    ("actuation", "actuation:Actuation", ("actions",)),
+for _name, _class, _needed in (
+    ("push", "actions:Push", ("actions", "position")),
+    ("actuation", "actions:Actuation", ("actions",)),
     ("sensor", "sensor:Sensor", ("images",)),
-    ("light", "light:Light", ("model",)),
-    ("colour", "colour:Colour", ("model",)),
-    ("camera", "camera:CameraJitter", ("model",)),
+    ("light", "scene:Light", ("model",)),
+    ("colour", "scene:Colour", ("model",)),
+    ("camera", "scene:CameraJitter", ("model",)),
     ("object", "objects:Objects", ("model", "range")),
 ):
-    add("stress", _name, f"kerv_cli.worlds.stress.{_made_by}", needed=_needed)
+    add("stress", _name, f"kerv_cli.worlds.stress.{_class}", needed=_needed)
 add("stress", "none", needed=())

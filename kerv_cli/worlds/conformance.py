@@ -1,4 +1,4 @@
-"""Checks that an environment keeps the protocols of worlds and experts, on one task."""
+"""Checks that an environment keeps the protocols of worlds and experts, on its first task."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ SIZE = 48  # pixels of a frame
 
 
 def check_environment(spec: EnvironmentSpec, seed: int) -> list[Finding]:
-    """One finding per check, on the specification's first task. seed: of the episodes."""
+    """Return one finding per check. `seed` is that of the first episode."""
     checks = {
-        "same seed, same episode": _repeats,
-        "another seed, another start": _differs,
-        "observation": _observation,
-        "frames": _frames,
+        "same seed, same episode": _check_repeats,
+        "another seed, another start": _check_starts_differ,
+        "observation": _check_observation,
+        "frames": _check_frames,
     }
     if spec.expert_class:
-        checks["expert"] = _expert
+        checks["expert"] = _check_expert
     return [find(what, functools.partial(check, spec, seed)) for what, check in checks.items()]
 
 
@@ -31,8 +31,8 @@ def _open(spec: EnvironmentSpec) -> World:
     return spec.open_world(next(iter(spec.tasks)), CameraSettings(size=SIZE))
 
 
-def _repeats(spec: EnvironmentSpec, seed: int) -> str:
-    """Two episodes of one seed are equal to the last bit, whether frames are drawn or not."""
+def _check_repeats(spec: EnvironmentSpec, seed: int) -> str:
+    """Compare two episodes of one seed to the last bit, one with frames and one without."""
     states: list[list[np.ndarray]] = [[], []]
     for drawn in (False, True):
         random = np.random.default_rng(7)
@@ -47,8 +47,7 @@ def _repeats(spec: EnvironmentSpec, seed: int) -> str:
     return f"{STEPS} steps, with and without frames"
 
 
-def _differs(spec: EnvironmentSpec, seed: int) -> str:
-    """Three seeds do not all begin with one initial state."""
+def _check_starts_differ(spec: EnvironmentSpec, seed: int) -> str:
     starts = set()
     with _open(spec) as world:
         for one in range(seed, seed + 3):
@@ -58,21 +57,15 @@ def _differs(spec: EnvironmentSpec, seed: int) -> str:
     return f"{len(starts)} of 3 seeds begin differently"
 
 
-def _observation(spec: EnvironmentSpec, seed: int) -> str:
-    """Shapes are as specified, and the state begins with the proprioception."""
+def _check_observation(spec: EnvironmentSpec, seed: int) -> str:
     with _open(spec) as world:
-        seen, space = world.reset(seed), spec.observation
-        right = seen.state.shape == (space.state,) and seen.proprioception.shape == (len(space.proprioception),)
-        need(right, f"state {seen.state.shape}, proprioception {seen.proprioception.shape}: not as specified")
-        same = np.array_equal(seen.state[: len(seen.proprioception)], seen.proprioception)
-        need(same, "the state does not begin with the proprioception")
-        hand = f"end_effector {world.end_effector.shape}, gripper {world.gripper}: (3,) and 0 to 1 wanted"
-        need(world.end_effector.shape == (3,) and 0 <= world.gripper <= 1, hand)
+        shape, wanted = world.reset(seed).state.shape, (spec.observation.state,)
+        need(shape == wanted, f"the state has shape {shape}, not {wanted}")
+        need(0 <= world.gripper <= 1, f"gripper is {world.gripper}, not between 0 and 1")
         return f"instruction '{world.instruction}'"
 
 
-def _frames(spec: EnvironmentSpec, seed: int) -> str:
-    """Every camera draws a frame of the right shape that is not of one colour."""
+def _check_frames(spec: EnvironmentSpec, seed: int) -> str:
     with _open(spec) as world:
         world.reset(seed)
         for name, image in world.observe(spec.cameras).images.items():
@@ -82,8 +75,7 @@ def _frames(spec: EnvironmentSpec, seed: int) -> str:
     return ", ".join(spec.cameras)
 
 
-def _expert(spec: EnvironmentSpec, seed: int) -> str:
-    """The expert's actions lie within the limits."""
+def _check_expert(spec: EnvironmentSpec, seed: int) -> str:
     with _open(spec) as world:
         expert, observation, space = spec.expert(world.task), world.reset(seed), spec.actions
         for _ in range(STEPS):

@@ -1,155 +1,85 @@
-"""The specification of an environment, as data, and the protocols of its simulator: a world and an expert.
-
-Imports nothing heavy, so that completion can read the tables of tasks.
-"""
+"""An environment: its constants as data (`EnvironmentSpec`), and the base class of its simulators (`World`)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import ClassVar, Self, TypeAlias
 
-from kerv_cli.base.errors import UnknownName, UsageError
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.limits import check_settings
-from kerv_cli.base.registry import load
+from kerv_cli.base.registry import find, load
+from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
 from kerv_cli.base.views import views_of
-from kerv_cli.worlds.settings import CameraSettings
+from kerv_cli.worlds.settings import CameraSettings, StressSettings
+from kerv_cli.worlds.stress.base import NO_STRESS, Stress
+from kerv_cli.worlds.task import Task
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import ArrayLike, NDArray
+Expert: TypeAlias = Callable[[Observation], NDArray[np.float64]]
+"""Scripted controller of one task: observation to action (D,) within the limits. It keeps no memory."""
 
-    from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
-
-
-@dataclass(frozen=True)
-class Task:
-    """One manipulation task.
-
-    name: unique over all environments. instruction: given to the policy. difficulty: the group of tasks that are
-    averaged together.
-    """
-
-    name: str
-    instruction: str
-    difficulty: str
+_LACKS = {
+    "position": "its actions have no group 'position'",
+    "model": "its world has no MuJoCo model",
+    "range": "its world cannot widen the range of initial states",
+}
+"""What a kind of stress can need, and the message for an environment that lacks it."""
 
 
 @dataclass(frozen=True)
 class Seeds:
-    """Three disjoint ranges of episode seeds, so that training, tuning and reported episodes never share an initial
-    state.
-    """
+    """Three disjoint ranges of episode seeds. Training, tuning and reported episodes never share an initial state."""
 
     training: range = range(50_000)
     selection: range = range(50_000, 100_000)
     evaluation: range = range(100_000, 2**31)
 
     def check(self, seeds: Iterable[int], purpose: str, what: str) -> None:
-        """Refuses seeds that are not for `purpose`: training, selection or evaluation. what: their name in the message.
+        """Refuse seeds that are not meant for a purpose.
+
+        Args:
+            seeds: Seeds to check.
+            purpose: `training`, `selection` or `evaluation`.
+            what: Name of the seeds in the message.
 
         Raises:
-            UsageError: the first seed outside the range.
+            UsageError: A seed lies outside the purpose's range.
         """
         allowed: range = getattr(self, purpose)
-        wrong = next((seed for seed in seeds if seed not in allowed), None)
-        if wrong is None:
-            return
-        kinds = [name for name in ("training", "selection", "evaluation") if wrong in getattr(self, name)]
-        kind = f"is for {kinds[0]}" if kinds else "is none"
-        raise UsageError(f"{what}: seed {wrong} {kind}; seeds for {purpose} are {allowed.start} to {allowed.stop - 1}")
-
-
-class World(Protocol):
-    """One task's simulator, reused over episodes. Open it in the process that uses it.
-
-    spec: its environment. task: full name. instruction: given to the policy. camera: the default view of `frame`.
-    horizon: control steps per episode. steps: executed since the reset. success: the task's flag at this step; it may
-    be lost again. succeeded: whether it was set at any step of this episode.
-    """
-
-    spec: EnvironmentSpec
-    task: str
-    instruction: str
-    camera: CameraSettings
-    horizon: int
-    steps: int
-    success: bool
-    succeeded: bool
-
-    def reset(self, seed: int) -> Observation:
-        """Starts the episode of `seed`, the same on every machine with the same simulator versions.
-
-        Raises:
-            UsageError: a negative seed.
-        """
-
-    def step(self, action: ArrayLike) -> Observation:
-        """Executes one control step of an action (D,) in environment units, clipped to the action space's limits.
-
-        Raises:
-            KervError: past the horizon, before the first reset, or an action that is not D finite numbers.
-        """
-
-    def frame(self, camera: CameraSettings | None = None) -> NDArray[np.uint8]:
-        """(size, size, 3) uint8 RGB, upright, of the current state; several views lie side by side, `frame_shape`.
-        camera: another view than the world's own.
-
-        Raises:
-            RenderingUnavailable: nothing can be drawn here.
-        """
-
-    def observe(self, cameras: Sequence[str]) -> Observation:
-        """The latest observation with a new image of each of `cameras`; no other camera is drawn."""
-
-    @property
-    def observation(self) -> Observation:
-        """The latest observation, without images. Raises KervError before the first reset."""
-
-    @property
-    def done(self) -> bool:
-        """Whether the episode succeeded at any step so far, or reached the horizon."""
-
-    @property
-    def initial_state(self) -> NDArray[np.float64]:
-        """(n,) numbers that, with the task, rebuild the episode's start, e.g. the object's position."""
-
-    @property
-    def end_effector(self) -> NDArray[np.float64]:
-        """(3,) metres, in the simulator's world frame."""
-
-    @property
-    def gripper(self) -> float:
-        """Opening, 0 closed to 1 open; 1 where there is no gripper."""
-
-    def close(self) -> None:
-        """Frees simulator and graphics; a later reset builds them anew."""
-
-    def __enter__(self) -> World: ...
-
-    def __exit__(self, *exception: object) -> None: ...
-
-
-class Expert(Protocol):
-    """A scripted controller of one task. It reads the privileged state and keeps none of its own."""
-
-    def __call__(self, observation: Observation) -> NDArray[np.float64]:
-        """The action (D,) in environment units, within the action space's limits."""
+        for seed in seeds:
+            if seed not in allowed:
+                kinds = (name for name in ("training", "selection", "evaluation") if seed in getattr(self, name))
+                raise UsageError(
+                    f"{what}: seed {seed} is for {next(kinds, 'nothing')}; "
+                    f"seeds for {purpose} are {allowed.start} to {allowed.stop - 1}"
+                )
 
 
 @dataclass(frozen=True)
 class EnvironmentSpec:
-    """The specification of an environment: all its constants, and where its simulator is.
+    """All constants of an environment, and where its simulator is.
 
-    name: as registered. actions: with the environment's limits as normalisation. observation: the privileged state
-    begins with the proprioception. tasks: by full name. suites: name in capitals -> full task names. difficulties:
-    groups of tasks, in the order of tables. horizon: control steps of an episode, the most that the simulator runs.
-    cameras: names; the first is the default. seeds: see `Seeds`. world_class, expert_class: `module:class`, called
-    with (spec, task, camera, horizon) and with (spec, task); a recording has no world, an environment may have no
-    experts. upside_down: cameras whose raw images are rotated by 180 degrees. suffix: ending of all full task names,
-    which users may leave out. packages: those whose versions determine the physics. grip: actions of the strict DoFs
-    that close and that open the gripper; empty where there is none. experts: task -> name of its expert, where that is
-    another than the simulator's own: it determines what a recording holds and what policy=expert does.
+    Attributes:
+        name: Name in the registry.
+        actions: Action space, normalised by the environment's limits.
+        observation: Observation space. The privileged state begins with the proprioception.
+        tasks: Tasks by full name.
+        suites: Suite name in capitals to full task names.
+        difficulties: Groups of tasks, in the order of tables.
+        horizon: Control steps of an episode, and the most that the simulator runs.
+        cameras: Names of the cameras. The first is the default.
+        world_class: `module:class` of a `World`. Empty for a recording.
+        expert_class: `module:class`, called with (spec, task). Returns an `Expert`. Empty without experts.
+        upside_down: Cameras whose raw images are rotated by 180 degrees.
+        suffix: Ending of all full task names. Users may leave it out.
+        packages: Packages whose versions determine the physics.
+        grip: Actions of the strict DoFs that close and open the gripper. Empty without a gripper.
+        seeds: Ranges of episode seeds.
+        experts: Task to the name of its expert, for tasks whose expert is kerv's instead of the simulator's.
     """
 
     name: str
@@ -170,14 +100,14 @@ class EnvironmentSpec:
     experts: Mapping[str, str] = field(default_factory=dict)
 
     def full_name(self, task: str) -> str | None:
-        """The task's full name; None when it is none of this environment's."""
+        """Return the task's full name, or None if this environment does not have it."""
         return next((name for name in (task, task + self.suffix) if name in self.tasks), None)
 
     def task(self, name: str) -> Task:
-        """The task of that full or short name.
+        """Return the task of a full or short name.
 
         Raises:
-            UnknownName: there is none; the message names the nearest ones.
+            UnknownName: There is no such task.
         """
         full = self.full_name(name)
         if full is None:
@@ -185,16 +115,16 @@ class EnvironmentSpec:
         return self.tasks[full]
 
     def expand(self, name: str) -> tuple[str, ...]:
-        """Full names of the suite's tasks, or of the one task; empty when the environment knows neither."""
-        suite = self.suites.get(name.upper())
+        """Return the full names of a suite's tasks or of one task. Empty if there is neither."""
         full = self.full_name(name)
-        return suite or ((full,) if full else ())
+        return self.suites.get(name.upper()) or ((full,) if full else ())
 
     def camera_name(self, name: str) -> str:
-        """`name`, or the environment's first camera where it is empty. Several views are joined, see `views_of`.
+        """Return `name`, or the environment's first camera if it is empty. Joined names are several views.
 
         Raises:
-            UnknownName: the environment has no such camera. UsageError: an impossible view.
+            UnknownName: The environment has no such camera.
+            UsageError: A view is impossible.
         """
         for view in views_of(name) if name else ():
             if view.camera not in self.cameras:
@@ -202,28 +132,48 @@ class EnvironmentSpec:
         return name or self.cameras[0]
 
     def camera(self, settings: CameraSettings | None = None) -> CameraSettings:
-        """A copy of the settings with the name of a camera of this environment, by default its first.
+        """Return the settings with a camera of this environment, by default its first.
 
         Raises:
-            UnknownName: the environment has no such camera. UsageError: an impossible view, or a number out of range.
+            UnknownName: The environment has no such camera.
+            UsageError: A view is impossible or a number is out of range.
         """
         settings = settings or CameraSettings()
         check_settings(settings, "camera")
         return replace(settings, name=self.camera_name(settings.name))
 
     def control_steps(self, horizon: int) -> int:
-        """Control steps of an episode; 0: the environment's own horizon.
+        """Return the control steps of an episode. 0 means the environment's own horizon.
 
         Raises:
-            UsageError: more than the simulator runs.
+            UsageError: The simulator does not run that many.
         """
         if not 0 <= horizon <= self.horizon:
-            raise UsageError(f"horizon must lie between 1 and {self.horizon} control steps in {self.name}: {horizon}")
+            raise UsageError(f"horizon={horizon}: {self.name} runs 1 to {self.horizon} control steps")
         return horizon or self.horizon
 
+    def check_stress(self, settings: StressSettings) -> None:
+        """Refuse a kind of stress that this environment cannot have.
+
+        Raises:
+            UnknownName: There is no such kind.
+            UsageError: The environment lacks something that the kind needs.
+        """
+        if not settings.active:
+            return
+        offered = load(self.world_class).stressable if self.world_class else frozenset()
+        offered |= {"position"} & {group.name for group in self.actions.groups}
+        for need in find("stress", settings.kind).traits["needed"]:
+            if need not in offered:
+                why = _LACKS[need] if self.world_class else "it is a recording"
+                raise UsageError(f"world.stress.kind={settings.kind}: not possible in {self.name}: {why}")
+
     def standstill(self, opening: float) -> NDArray[np.float64]:
-        """The action (D,), environment units, that leaves the robot where it is: the middle of every DoF's limits, and
-        of the strict ones the present opening of the gripper (0 closed to 1 open)."""
+        """Return the action (D,) that leaves the robot where it is.
+
+        Args:
+            opening: Present opening of the gripper, 0 closed to 1 open. It stays.
+        """
         action = self.actions.middle.copy()
         if self.grip:
             closed, opened = self.grip
@@ -231,21 +181,175 @@ class EnvironmentSpec:
         return action
 
     def open_world(self, task: str, camera: CameraSettings | None = None, horizon: int = 0) -> World:
-        """A world of the task; its simulator is built at the first reset.
+        """Return a world of the task. It builds its simulator at the first reset.
 
         Raises:
-            UnknownName: no such task or camera. UsageError: a horizon that the simulator cannot run, or a recording.
+            UnknownName: There is no such task or camera.
+            UsageError: The simulator cannot run that horizon, or the environment is a recording.
         """
         if not self.world_class:
             raise UsageError(f"{self.name} is a recording: nothing can be executed in it")
-        return load(self.world_class)(self, task, camera, horizon)
+        world: World = load(self.world_class)(self, task, camera, horizon)
+        return world
 
     def expert(self, task: str) -> Expert:
-        """The scripted expert of the task.
+        """Return the scripted expert of the task.
 
         Raises:
-            UnknownName: a task that does not exist. UsageError: the environment has no experts.
+            UnknownName: There is no such task.
+            UsageError: The environment has no experts.
         """
         if not self.expert_class:
             raise UsageError(f"{self.name} has no scripted experts: record demonstrations with its own tools")
-        return load(self.expert_class)(self, task)
+        expert: Expert = load(self.expert_class)(self, task)
+        return expert
+
+
+class World(ABC):
+    """One task's simulator, reused over episodes. Open it in the process that uses it.
+
+    A subclass implements `_start`, `_advance`, `_draw` and `initial_state`. It builds its simulator at the first reset.
+    The same seed must give the same episode on every machine with the same simulator versions.
+
+    Attributes:
+        spec: Environment.
+        task: Full name.
+        instruction: Sentence that the policy reads.
+        camera: Default view of `frame`.
+        horizon: Control steps of an episode.
+        steps: Control steps since the reset.
+        success: Success flag of the latest step. Later steps may lose it again.
+        succeeded: Whether `success` was set at any step of this episode.
+        stress: Shift of the episodes, from the next reset on.
+        stressable: What a stress can change in this world (docs/stress.md). Add `range` if `_start` widens the range
+            of initial states by `stress.spread`.
+    """
+
+    stressable: ClassVar[frozenset[str]] = frozenset({"actions", "images"})
+
+    def __init__(
+        self, spec: EnvironmentSpec, task: str, camera: CameraSettings | None = None, horizon: int = 0
+    ) -> None:
+        """Check names and numbers; errors as `EnvironmentSpec.open_world`."""
+        entry = spec.task(task)
+        self.spec, self.task, self.instruction = spec, entry.name, entry.instruction
+        self.camera, self.horizon = spec.camera(camera), spec.control_steps(horizon)
+        self.steps, self.success, self.succeeded = 0, False, False
+        self.stress: Stress = NO_STRESS
+        self._observation: Observation | None = None
+
+    @abstractmethod
+    def _start(self, seed: int) -> NDArray[np.float64]:
+        """Put the simulator into the episode's initial state. Return the privileged state (s,)."""
+
+    @abstractmethod
+    def _advance(self, action: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
+        """Execute an action (D,) within the limits. Return the privileged state (s,) and the success flag."""
+
+    @abstractmethod
+    def _draw(self, camera: CameraSettings) -> NDArray[np.uint8]:
+        """Return the image (size, size, 3) of one camera, uint8 RGB, upright."""
+
+    @property
+    @abstractmethod
+    def initial_state(self) -> NDArray[np.float64]:
+        """Numbers (n,) that, with the task, rebuild the episode's start, e.g. the object's position."""
+
+    @property
+    def observation(self) -> Observation:
+        """Latest observation, without images. Raises KervError before the first reset."""
+        if self._observation is None:
+            raise KervError(f"{self.task}: reset the world before using it")
+        return self._observation
+
+    @property
+    def done(self) -> bool:
+        """Whether the episode succeeded at any step so far, or reached the horizon."""
+        self.observation  # noqa: B018 - raises before the first reset
+        return self.succeeded or self.steps >= self.horizon
+
+    @property
+    def end_effector(self) -> NDArray[np.float64]:
+        """Position (3,) in metres: the first three numbers of the proprioception."""
+        return self.observation.proprioception[:3].copy()
+
+    @property
+    def gripper(self) -> float:
+        """Opening of the gripper, 0 closed to 1 open. 1 without a gripper."""
+        names, values = self.spec.observation.proprioception, self.observation.proprioception
+        return float(values[names.index("gripper")]) if "gripper" in names else 1.0
+
+    def reset(self, seed: int) -> Observation:
+        """Start the episode of a seed and draw its stress.
+
+        Raises:
+            UsageError: The seed is negative.
+        """
+        if seed < 0:
+            raise UsageError(f"episode seed must be 0 or more, not {seed}")
+        self.stress.begin(self.task, seed, self.spec.actions)
+        state = self._start(seed)
+        self.steps, self.success, self.succeeded = 0, False, False
+        return self._observe_state(state)
+
+    def step(self, action: ArrayLike) -> Observation:
+        """Execute one control step.
+
+        Args:
+            action: (D,) in environment units. It is clipped to the limits, then changed by the stress.
+
+        Raises:
+            KervError: The episode has ended or not begun, or the action is not D finite numbers.
+        """
+        executed = np.asarray(action, dtype=np.float64)
+        space = self.spec.actions
+        if executed.shape != (space.dofs,) or not np.isfinite(executed).all():
+            raise KervError(f"{self.task}: an action is {space.dofs} finite numbers, not {action!r}")
+        self.observation  # noqa: B018 - raises before the first reset
+        if self.steps >= self.horizon:
+            raise KervError(f"{self.task}: the episode ended at step {self.steps}, its horizon: reset the world")
+        executed = self.stress.act(np.clip(executed, space.low, space.high), self.steps)
+        state, self.success = self._advance(executed)
+        self.succeeded = self.succeeded or self.success
+        self.steps += 1
+        return self._observe_state(state)
+
+    def _observe_state(self, state: NDArray[np.float64]) -> Observation:
+        proprioception = state[: len(self.spec.observation.proprioception)]
+        self._observation = Observation(proprioception, state, self.instruction)
+        return self._observation
+
+    def frame(self, camera: CameraSettings | None = None) -> NDArray[np.uint8]:
+        """Return the current frame (size, size x views, 3) for a recording, uint8 RGB. A stress of images leaves it.
+
+        Args:
+            camera: Another view than the world's own.
+
+        Raises:
+            RenderingUnavailable: Nothing can be drawn here.
+        """
+        self.observation  # noqa: B018 - raises before the first reset
+        return self._picture(self.camera if camera is None else self.spec.camera(camera), stressed=False)
+
+    def observe(self, cameras: Sequence[str]) -> Observation:
+        """Return the latest observation with a new image of each of `cameras`. No other camera is drawn."""
+        seen = self.observation
+        own = {name: self.spec.camera(replace(self.camera, name=name)) for name in cameras}
+        return seen.with_images({name: self._picture(camera, stressed=True) for name, camera in own.items()})
+
+    def _picture(self, camera: CameraSettings, stressed: bool) -> NDArray[np.uint8]:
+        parts = []
+        for view in views_of(camera.name):
+            image = self._draw(replace(camera, name=view.camera, fovy=view.fovy or camera.fovy))
+            parts.append(self.stress.see(view.name, image, self.steps) if stressed else image)
+        return np.concatenate(parts, axis=1)
+
+    def close(self) -> None:
+        """End the episode. A subclass also frees its simulator; a later reset builds it anew."""
+        self._observation = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()

@@ -1,6 +1,6 @@
 """Lengths of vectors with the same last bit on every CPU.
 
-numpy's norms are OpenBLAS's, whose kernels differ in that bit. What a seed draws and what a world does must not.
+numpy's norms call OpenBLAS, whose kernels differ in the last bit. Draws and worlds must not.
 """
 
 from __future__ import annotations
@@ -10,12 +10,15 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-_SPLIT = 2.0**27 + 1.0  # Dekker's: parts a double into two halves whose products are exact
+_SPLIT = 2.0**27 + 1.0  # Dekker's constant: splits a double into two halves whose products are exact
 
 
 def length(vector: NDArray[np.float64]) -> float:
-    """Length of a vector (n,). Its sum of squares is rounded once per number, as by a fused multiply-add: so do the
-    kernels for AVX-512, with which the datasets so far were recorded, at up to 31 numbers."""
+    """Return the length of a vector (n,).
+
+    The sum of squares is rounded once per number, like a fused multiply-add. OpenBLAS's AVX-512 kernels do the same for
+    up to 31 numbers, and they recorded the first datasets.
+    """
     total = 0.0
     for number in vector.tolist():
         shifted = _SPLIT * number
@@ -26,6 +29,6 @@ def length(vector: NDArray[np.float64]) -> float:
 
 
 def unit_vector(random: np.random.Generator, size: int) -> NDArray[np.float64]:
-    """(size,) of length 1, in a direction that is uniform over the sphere."""
+    """Return a vector (size,) of length 1 in a uniformly random direction."""
     drawn = random.normal(size=size)
     return np.asarray(drawn / length(drawn))

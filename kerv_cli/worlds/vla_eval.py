@@ -19,8 +19,6 @@ from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.settings import EVALUATION_SEED, CameraSettings, StressSettings
 from kerv_cli.worlds.spec import World
 from kerv_cli.worlds.stress import build as build_stress
-from kerv_cli.worlds.stress import check as check_stress
-from kerv_cli.worlds.world import EpisodeWorld
 
 
 class MetaWorld(StepBenchmark):
@@ -72,7 +70,7 @@ class MetaWorld(StepBenchmark):
         self.camera = self.spec.camera(CameraSettings(camera, size=image_size))
         self.horizon = self.spec.control_steps(horizon)
         settings = StressSettings(stress, stress_level)
-        check_stress(settings, self.spec)
+        self.spec.check_stress(settings)
         self.stress, self.send_images, self.privileged = build_stress(settings), send_images, privileged
         self.world: World | None = None
 
@@ -86,8 +84,7 @@ class MetaWorld(StepBenchmark):
         if self.world is None or self.world.task != task["name"]:
             self.cleanup()
             self.world = self.spec.open_world(task["name"], self.camera, self.horizon)
-            if isinstance(self.world, EpisodeWorld):
-                self.world.stress = self.stress
+            self.world.stress = self.stress
         return self.world.reset(self.seed + int(task.get("episode_idx", 0)))
 
     def step(self, action: dict[str, Any]) -> StepResult:

@@ -6,19 +6,18 @@ import numpy as np
 
 from kerv_cli.base.registry import add
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.worlds.stress.base import Array, Stress, level_of
-
-LEVELS = (0.05, 0.1, 0.2, 0.4)  # of half a DoF's range
+from kerv_cli.worlds.stress.base import Array, Stress
 
 
 class Drift(Stress):
     kind = "drift"
+    levels = (0.05, 0.1, 0.2, 0.4)  # of half a DoF's range
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
         self._low, self._high = np.array(space.low), np.array(space.high)
         super().begin(task, seed, space)
-        side = self.draws.random().choice([-1.0, 1.0], space.dofs)
-        self._offset = side * level_of(LEVELS, self.level) * (self._high - self._low) / 2
+        side = self.generator().choice([-1.0, 1.0], space.dofs)
+        self._offset = side * self.amount * (self._high - self._low) / 2
 
     def act(self, action: Array, step: int) -> Array:
         return np.clip(action + self._offset, self._low, self._high)

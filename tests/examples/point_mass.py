@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from kerv_cli.base.registry import Part, register
 from kerv_cli.base.spaces import ActionSpace, Group, Observation, ObservationSpace, Place
 from kerv_cli.worlds.settings import CameraSettings
-from kerv_cli.worlds.spec import EnvironmentSpec, Seeds, Task
-from kerv_cli.worlds.world import EpisodeWorld
+from kerv_cli.worlds.spec import EnvironmentSpec, Seeds, World
+from kerv_cli.worlds.task import Task
 
 NEAR = 0.01  # metres from the goal that count as there
 
@@ -41,7 +41,7 @@ SPEC = EnvironmentSpec(
 register(Part("environment", SPEC.name, f"{__name__}:SPEC"))
 
 
-class PointWorld(EpisodeWorld):
+class PointWorld(World):
     """The state is the point and the goal, (x, y, z) each; z is 0."""
 
     def _start(self, seed: int) -> NDArray[np.float64]:

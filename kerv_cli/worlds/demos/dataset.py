@@ -17,7 +17,8 @@ from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.worlds import stands_for_tasks
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode
 from kerv_cli.worlds.demos.frames import EncodedFrames
-from kerv_cli.worlds.spec import EnvironmentSpec, Task
+from kerv_cli.worlds.spec import EnvironmentSpec
+from kerv_cli.worlds.task import Task
 
 OnProgress = Callable[[int, int], object]
 """Called with (done, total) after every episode or batch of a long work."""

@@ -7,28 +7,27 @@ from kerv_cli.worlds.metaworld.experts import OURS, VERSION
 from kerv_cli.worlds.metaworld.tasks import DIFFICULTIES, SUFFIX, SUITES, TASKS
 from kerv_cli.worlds.spec import EnvironmentSpec
 
-_OBJECTS = 18  # numbers of a time step: hand xyz, gripper opening, then position and rotation of two objects
+_STEP = 18  # numbers of a time step: hand xyz, gripper opening, then position and rotation of two objects
 
 SPEC = EnvironmentSpec(
     name="metaworld",
     actions=ActionSpace(
-        # hand displacement per axis (1 is 1 cm) and gripper (+1 closes)
-        names=("dx", "dy", "dz", "gripper"),
+        names=("dx", "dy", "dz", "gripper"),  # displacement of the hand (1 is 1 cm); +1 closes the gripper
         groups=(Group("position", 3), Group("gripper", 1)),
         strict=("gripper",),
         control_hz=80.0,
-        low=(-1.0, -1.0, -1.0, -1.0),
-        high=(1.0, 1.0, 1.0, 1.0),
+        low=(-1.0,) * 4,
+        high=(1.0,) * 4,
     ),
     observation=ObservationSpace(
-        # hand [0:4], first object [4:11], second object [11:18], the step before's 18 numbers [18:36], goal [36:39]
+        # hand [0:4], first object [4:11], second object [11:18], the same one step earlier [18:36], goal [36:39]
         proprioception=("x", "y", "z", "gripper"),
         state=39,
         places=(Place("object", 4), Place("goal", 36)),
         centre=(0.0, 0.7, 0.15),
         extra_places=(Place("second object", 11),),
-        extra=tuple(range(7, _OBJECTS)),
-        previous=(_OBJECTS, _OBJECTS),
+        extra=tuple(range(7, _STEP)),
+        previous=(_STEP, _STEP),
     ),
     tasks=TASKS,
     suites=SUITES,

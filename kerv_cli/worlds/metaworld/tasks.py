@@ -1,21 +1,20 @@
-"""The 50 tasks of Meta-World v3: names, instructions, difficulty groups, suites. Imports nothing heavy.
+"""The 50 tasks of Meta-World v3: names, instructions, difficulty groups, suites.
 
-Tasks are joined by name, never by index: published tables order them differently.
+Join tasks by name, never by index: published tables order them differently.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-from kerv_cli.worlds.spec import Task
+from kerv_cli.worlds.task import Task
 
 SUFFIX = "-v3"
 DIFFICULTIES = ("easy", "medium", "hard", "very_hard")
 """The groups of published macro averages."""
 
-
-# Difficulty -> task name without suffix -> instruction: at most ten lower-case words. The public table has one sentence
-# for push and push-back; these 50 are distinct and describe what the experts do.
+# Difficulty -> task name without suffix -> instruction of at most ten lower-case words. The public table has the same
+# sentence for push and push-back. These 50 differ and describe what the experts do.
 _INSTRUCTIONS: dict[str, dict[str, str]] = {
     "easy": {
         "button-press": "press the button",
@@ -78,33 +77,25 @@ _INSTRUCTIONS: dict[str, dict[str, str]] = {
 }
 
 _MT10 = (
-    "reach",
-    "push",
-    "pick-place",
-    "door-open",
-    "drawer-open",
-    "drawer-close",
-    "button-press-topdown",
-    "peg-insert-side",
-    "window-open",
-    "window-close",
+    "reach push pick-place door-open drawer-open drawer-close button-press-topdown peg-insert-side window-open "
+    "window-close"
 )
 
-
-def _all_tasks() -> Mapping[str, Task]:
-    tasks = [
-        Task(f"{stem}{SUFFIX}", instruction, difficulty)
+TASKS: Mapping[str, Task] = {
+    name: Task(name, instruction, difficulty)
+    for name, instruction, difficulty in sorted(
+        (f"{stem}{SUFFIX}", instruction, difficulty)
         for difficulty, group in _INSTRUCTIONS.items()
         for stem, instruction in group.items()
-    ]
-    return {task.name: task for task in sorted(tasks, key=lambda task: task.name)}
-
-
-TASKS: Mapping[str, Task] = _all_tasks()
+    )
+}
 """All 50 tasks by full name, in alphabetical order."""
 
-SUITES: Mapping[str, tuple[str, ...]] = {"MT10": tuple(f"{stem}{SUFFIX}" for stem in _MT10), "MT50": tuple(TASKS)}
-"""Suite name -> full task names."""
+SUITES: Mapping[str, tuple[str, ...]] = {
+    "MT10": tuple(f"{stem}{SUFFIX}" for stem in _MT10.split()),
+    "MT50": tuple(TASKS),
+}
+"""Suite name to full task names."""
 
 NAMES = (*SUITES, *TASKS)
 """Suites and tasks, for completion."""

@@ -1,7 +1,7 @@
-"""Meta-World tasks behind the World protocol, and their scripted experts.
+"""Meta-World tasks as worlds, and their scripted experts.
 
-Meta-World ignores `env.reset(seed=...)`. An episode is defined by its initial state (object and goal placement,
-Meta-World's `rand_vec`), taken from `MT1(task, seed // 50)`.
+Meta-World ignores `env.reset(seed=...)`. An episode follows from its initial state: the placement of object and goal,
+Meta-World's `rand_vec`, taken from `MT1(task, seed // 50)`.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from numpy.typing import NDArray
 from kerv_cli.base.spaces import Observation
 from kerv_cli.worlds.camera import load_mujoco
 from kerv_cli.worlds.metaworld.experts import OURS
+from kerv_cli.worlds.mujoco_world import MujocoWorld
 from kerv_cli.worlds.spec import EnvironmentSpec
-from kerv_cli.worlds.world import MujocoWorld
 
 _TASKS_PER_BENCHMARK = 50
 
 
 @functools.lru_cache(maxsize=256)
 def _placements(task: str, benchmark_seed: int) -> tuple[Any, ...]:
-    """The 50 `metaworld.Task`s of `MT1(task, benchmark_seed)`. Costs 0.4 to 1 s: it resets the task 100 times."""
+    """Return the 50 `metaworld.Task`s of `MT1(task, benchmark_seed)`. Takes up to 1 s: it resets the task 100 times."""
     load_mujoco()
     import metaworld
 
@@ -46,7 +46,7 @@ def _quiet_simulator() -> Iterator[None]:
 
 
 class MetaWorld(MujocoWorld):
-    """Seed s is task `s % 50` of `MT1(task, seed=s // 50)`. The simulator is built at the first reset."""
+    """Seed s is task `s % 50` of `MT1(task, seed=s // 50)`."""
 
     stressable = MujocoWorld.stressable | {"range"}
 
@@ -54,7 +54,7 @@ class MetaWorld(MujocoWorld):
 
     @property
     def initial_state(self) -> NDArray[np.float64]:
-        """(3,) or (6,) float64: object and goal placement of this episode, metres."""
+        """Object and goal placement of this episode, (3,) or (6,) float64, metres."""
         self.observation  # noqa: B018 - raises before the first reset
         return np.array(self._env._last_rand_vec, dtype=np.float64)
 
@@ -63,15 +63,16 @@ class MetaWorld(MujocoWorld):
         if self._env is None:
             self._env = pickle.loads(placement.data)["env_cls"]()
         self._env.set_task(placement)
-        if self.stress.spread != 1.0:
-            return self._start_outside()
-        state, _ = self._env.reset()
+        with contextlib.nullcontext() if self.stress.spread == 1.0 else self._wider_placement():
+            state, _ = self._env.reset()
         return np.array(state, dtype=np.float64)
 
-    def _start_outside(self) -> NDArray[np.float64]:
-        """Starts an episode whose placement is moved horizontally away from the centre of its range by
-        `stress.spread`; returns the state (s,). Where the task refuses a placement, e.g. an object too close to its
-        goal, the move is halved until it is accepted."""
+    @contextlib.contextmanager
+    def _wider_placement(self) -> Iterator[None]:
+        """Make resets move the placement horizontally away from the centre of its range by `stress.spread`.
+
+        The task can refuse a placement, e.g. an object too close to its goal. Then the move is halved until it accepts.
+        """
         env = self._env
         inside, space = env._last_rand_vec, env._random_reset_space
         outwards = (self.stress.spread - 1.0) * (inside - (space.low + space.high) / 2)
@@ -90,10 +91,9 @@ class MetaWorld(MujocoWorld):
 
         env.reset_model = reset_outside
         try:
-            state, _ = env.reset()
+            yield
         finally:
             del env.reset_model, env._get_state_rand_vec
-        return np.array(state, dtype=np.float64)
 
     def _advance(self, action: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
         state, _, _, _, info = self._env.step(action)
@@ -111,7 +111,7 @@ class MetaWorld(MujocoWorld):
         return model, data
 
     def close(self) -> None:
-        """Frees simulator and graphics; the next reset builds them anew."""
+        """Free simulator and graphics. The next reset builds them anew."""
         super().close()
         if self._env is not None:
             self._env.close()
@@ -119,10 +119,10 @@ class MetaWorld(MujocoWorld):
 
 
 class MetaWorldExpert:
-    """Meta-World's scripted controller of one task, or ours where there is one (`experts.OURS`)."""
+    """Scripted controller of one task: Meta-World's, or kerv's (`experts.OURS`)."""
 
     def __init__(self, spec: EnvironmentSpec, task: str) -> None:
-        """Raises UnknownName for a task that does not exist."""
+        """Find the controller. Raises UnknownName if there is no such task."""
         name = spec.task(task).name
         load_mujoco()
         from metaworld.policies import ENV_POLICY_MAP
@@ -131,7 +131,7 @@ class MetaWorldExpert:
         self._policy: Any = {**ENV_POLICY_MAP, **OURS}[name]()
 
     def __call__(self, observation: Observation) -> NDArray[np.float64]:
-        """The expert's action (4,), clipped: raw outputs reach 25, so clip before any use."""
+        """Return the expert's action (4,), clipped: raw outputs reach 25."""
         with _quiet_simulator():
             action = self._policy.get_action(observation.state)
         return np.clip(np.asarray(action, dtype=np.float64), *self._limits)

@@ -1,15 +1,11 @@
-"""The base of every kind of stress: its hooks in an episode, its random numbers and its changes of a model."""
+"""Base of every kind of stress: its hooks in an episode, its random numbers and its changes of a model."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-
-from kerv_cli.worlds.settings import MOST_STRESS
 
 if TYPE_CHECKING:
     import mujoco
@@ -18,108 +14,86 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Model: TypeAlias = "mujoco.MjModel"
-L = TypeVar("L")
-
-
-@dataclass(frozen=True)
-class Draws:
-    """Random numbers of one episode. They follow from task, seed, kind and level alone, so that every method meets the
-    same shift."""
-
-    task: str
-    seed: int
-    kind: str
-    level: int
-
-    def random(self, purpose: str = "", step: int = 0) -> np.random.Generator:
-        """A generator of its own for each purpose and control step."""
-        return np.random.default_rng([self.seed, step, *f"{self.kind} {self.level} {self.task} {purpose}".encode()])
 
 
 class ModelChanges:
-    """Arrays of a MuJoCo model that a stress changes, with their values before the change."""
+    """Arrays of a MuJoCo model that a stress changes, with their original values."""
 
     def __init__(self) -> None:
-        self._before: list[tuple[NDArray[Any], NDArray[Any]]] = []
+        self._originals: list[tuple[NDArray[Any], NDArray[Any]]] = []
 
     def keep(self, *arrays: NDArray[Any]) -> None:
-        """Remembers the values of views into a model, before they are changed."""
-        self._before.extend((array, array.copy()) for array in arrays)
+        """Remember the values of views into a model. Call it before changing them."""
+        self._originals.extend((array, array.copy()) for array in arrays)
 
     def restore(self) -> None:
-        """Puts all values back, the last change first."""
-        while self._before:
-            array, values = self._before.pop()
+        """Write all values back, the last change first."""
+        while self._originals:
+            array, values = self._originals.pop()
             array[...] = values
 
 
 class Stress:
-    """A shift of a stated size, drawn anew for every episode. A kind overrides the hooks that it needs; this class
-    shifts nothing.
+    """A shift of a stated size, drawn anew for every episode. This base class shifts nothing.
 
-    kind: its name. level: 1 to MOST_STRESS. spread: factor by which the range of initial states is widened around its
-    centre. changes_model: whether `change` does anything.
+    A kind overrides the hooks that it needs. It takes random numbers from `generator` alone, so that every method meets
+    the same shift.
+
+    Attributes:
+        kind: Name.
+        levels: Size of the shift at each level, from 1 on.
+        changes_model: Whether `change` does anything.
+        level: Chosen level. 0 is no shift.
+        amount: The entry of `levels` for the chosen level.
+        spread: Factor that widens the range of initial states around its centre.
     """
 
-    kind = "none"
-    changes_model = False
+    kind: ClassVar[str] = "none"
+    levels: ClassVar[tuple[Any, ...]] = ()
+    changes_model: ClassVar[bool] = False
+    spread = 1.0
 
     def __init__(self, level: int = 0) -> None:
         self.level = level
-        self.spread = 1.0
+        self.amount: Any = self.levels[level - 1] if level else None
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """Fixes the episode's random numbers, before its reset. space: of the actions that `act` gets."""
-        self.draws = Draws(task, seed, self.kind, self.level)
+        """Fix the episode's random numbers, before its reset.
+
+        Args:
+            task: Full name of the task.
+            seed: Seed of the episode.
+            space: Space of the actions that `act` gets.
+        """
+        self._task, self._seed = task, seed
+
+    def generator(self, purpose: str = "", step: int = 0) -> np.random.Generator:
+        """Return a generator that depends on task, seed, kind and level, and on purpose and control step, alone."""
+        text = f"{self.kind} {self.level} {self._task} {purpose}"
+        return np.random.default_rng([self._seed, step, *text.encode()])
 
     def change(self, model: Model, changes: ModelChanges) -> None:
-        """Changes the MjModel of an episode that was just reset; `changes.keep` comes before each change."""
+        """Change the MjModel of an episode that was just reset. Call `changes.keep` before each change."""
 
     def act(self, action: Array, step: int) -> Array:
-        """The action (D,) that is executed instead of the clipped `action`. Called once per control step, in order."""
+        """Return the action (D,) to execute instead of the clipped `action`. Called once per control step, in order."""
         return action
 
     def see(self, camera: str, image: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
-        """The image (size, size, 3) that the policy gets instead of `image`, at a control step."""
+        """Return the image (size, size, 3) that the policy sees instead of `image` at a control step."""
         return image
 
 
 NO_STRESS = Stress()
 
 
-@dataclass
-class Spells:
-    """Spells of a fixed length that begin at random, at a mean rate, while none lasts.
-
-    steps: control steps of a spell. chance: that one begins, per control step.
-    """
-
-    steps: int
-    chance: float
-    _left: int = field(default=0, init=False)
-
-    @classmethod
-    def per_second(cls, rate: float, seconds: float, control_hz: float) -> Spells:
-        """rate: spells per second without one."""
-        return cls(max(1, round(seconds * control_hz)), min(1.0, rate / control_hz))
-
-    def goes_on(self, random: np.random.Generator) -> tuple[bool, bool]:
-        """Whether a spell lasts in this control step, and whether it begins in it."""
-        begins = self._left == 0 and bool(random.random() < self.chance)
-        if begins:
-            self._left = self.steps
-        lasts = self._left > 0
-        self._left -= lasts
-        return lasts, begins
-
-
-def either(random: np.random.Generator, factor: float) -> float:
-    """`factor` or its inverse."""
+def factor_or_inverse(random: np.random.Generator, factor: float) -> float:
+    """Return `factor` or 1 / `factor`, each with probability one half."""
     return factor if random.random() < 0.5 else 1.0 / factor
 
 
 def robot_roots(model: Model) -> set[int]:
-    """Ids of the root bodies that an actuator moves."""
+    """Return the ids of the root bodies that an actuator moves."""
     import mujoco
 
     joints = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
@@ -128,15 +102,3 @@ def robot_roots(model: Model) -> set[int]:
         body = model.jnt_bodyid[target] if kind in joints else model.site_bodyid[target]
         roots.add(int(model.body_rootid[body]))
     return roots
-
-
-def objects(model: Model) -> list[int]:
-    """Ids of the bodies that move on joints of their own and are no part of a robot."""
-    robots = robot_roots(model)
-    return [b for b in range(1, model.nbody) if model.body_dofnum[b] > 0 and model.body_rootid[b] not in robots]
-
-
-def level_of(levels: Sequence[L], level: int) -> L:
-    """The numbers of level 1 to MOST_STRESS."""
-    assert len(levels) == MOST_STRESS
-    return levels[level - 1]

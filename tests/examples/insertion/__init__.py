@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from kerv_cli.base.registry import Part, register
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, Place
-from kerv_cli.worlds.spec import EnvironmentSpec, Task
+from kerv_cli.worlds.spec import EnvironmentSpec
+from kerv_cli.worlds.task import Task
 
 SPEC = EnvironmentSpec(
     name="insertion",

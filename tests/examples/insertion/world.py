@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kerv_cli.worlds.mujoco_world import MujocoWorld
 from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.vectors import length
-from kerv_cli.worlds.world import MujocoWorld
 
 from .pose import (
     GRASP,
