@@ -98,7 +98,7 @@ def test_what_is_missing_or_damaged_gets_one_line_and_exit_code_1(policies: Path
     weights.write_bytes(weights.read_bytes()[:-7])
     assert "does not match its description" in one_line(kerv("rollout", *common, "policy.target=nano-state"), 1)
     shutil.copytree(results / "artifacts/drafter/nano-state", results / "wrong")
-    wrong = ["method=spec_vla", "policy.target=nano-vision", f"policy.drafter={results}/wrong"]
+    wrong = ["method=spec_vla", "policy.target=nano-vision", f"policy.artifacts.drafter={results}/wrong"]
     assert "was trained for target" in one_line(kerv("rollout", *common, *wrong), 1)
     assert "demonstrations" in one_line(kerv("train", "target", "name=new", f"results={results}"), 1)
 

@@ -95,7 +95,7 @@ def test_every_part_of_a_preset_can_be_replaced(method: str) -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_settings_survive_a_file(method: str) -> None:
-    asked = composed(f"method={method}", "threshold=change", "+policy.others={own: mine}")
+    asked = composed(f"method={method}", "threshold=change", "policy.artifacts={own: mine}")
     plain = dataclasses.asdict(asked)
     assert settings_from(plain) == asked
     again = settings_from(json.loads(json.dumps(plain)))

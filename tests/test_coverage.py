@@ -20,8 +20,8 @@ from kerv_cli.worlds import resolve_tasks
 @pytest.mark.parametrize(
     ("words", "command"),
     [
-        ("policy.scout=m method=scout_unverified", "train drafter drafter=scout policy.target=mt10-vision"),
-        ("policy.certificate=m method=one_pass_certified", "calibrate success policy.target=mt10-vision"),
+        ("policy.artifacts.scout=m method=scout_unverified", "train drafter drafter=scout policy.target=mt10-vision"),
+        ("policy.artifacts.certificate=m method=one_pass_certified", "calibrate success policy.target=mt10-vision"),
     ],
 )
 def test_a_missing_artifact_with_a_name_is_answered_with_the_command_that_makes_it(

@@ -250,7 +250,14 @@ def test_a_single_episode_cannot_be_held_out() -> None:
 
 
 def test_it_trains_from_the_command_line_and_drafts_for_its_target_alone(results: Path) -> None:
-    words = ["train", "drafter", "drafter=early", "demos=few", "policy.target=nano-vision", "policy.early=whole"]
+    words = [
+        "train",
+        "drafter",
+        "drafter=early",
+        "demos=few",
+        "policy.target=nano-vision",
+        "policy.artifacts.early=whole",
+    ]
     words += ["drafter.width=32", "drafter.rank=8", "train.batch=8", "train.steps=4", "train.held_out=0.34"]
     done = CliRunner().invoke(app, [*words, f"results={results}"])
     assert done.exit_code == 0, done.output

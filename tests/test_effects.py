@@ -21,8 +21,8 @@ from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
         ("method=naive_sd threshold.r=5", "threshold.r=5"),
         ("method=spec_vla threshold.r=5", ""),
         ("method=spec_vla acceptance=sequence threshold.r=5", "threshold.r=5"),
-        ("method=spec_vla policy.datastore=mine", "policy.datastore=mine"),
-        ("method=spec_vla policy.drafter=mine", ""),
+        ("method=spec_vla policy.artifacts.datastore=mine", "policy.artifacts.datastore=mine"),
+        ("method=spec_vla policy.artifacts.drafter=mine", ""),
         ("method=spec_vla datastore=exact", "datastore=exact"),
         ("method=early_unverified rectifier=compensate", "rectifier=compensate"),
         ("method=one_pass_streak prefill_draft=scout skip=always rectifier=compensate", "rectifier=compensate"),
@@ -49,6 +49,6 @@ def test_no_rectifier_counts_in_the_shipped_methods_that_verify_nothing() -> Non
 def test_a_sweep_names_what_none_of_its_settings_reads() -> None:
     written = {"a": "method=ar threshold.r=3", "b": "method=spec_vla"}
     settings = {label: compose("rollout", text.split(), RolloutSettings) for label, text in written.items()}
-    common = ("acceptance=relaxed", "policy.early=mine", "runtime.workers=2")
+    common = ("acceptance=relaxed", "policy.artifacts.early=mine", "runtime.workers=2")
     found = idle_overrides(ResolvedStudy(SweepSettings(), settings, written, common))
-    assert list(found) == ["a: threshold.r=3", "policy.early=mine"]
+    assert list(found) == ["a: threshold.r=3", "policy.artifacts.early=mine"]

@@ -87,7 +87,7 @@ def test_deviation_is_sampled_and_zero_for_ar_itself(policies: Path) -> None:
 def test_what_cannot_run_is_refused_beforehand(policies: Path) -> None:
     with pytest.raises(UsageError, match="trained on 96 pixels"):
         policies_of.check(settings(policies, "policy.target=nano-vision", "world.camera.size=64"))
-    drafter = f"policy.drafter={policies}/artifacts/drafter/nano-state"
+    drafter = f"policy.artifacts.drafter={policies}/artifacts/drafter/nano-state"
     mixed = settings(policies, "policy.target=nano-vision", "method=spec_vla", drafter)
     with pytest.raises(CheckpointError, match="was trained for target"):
         policies_of.check(mixed)

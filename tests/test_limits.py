@@ -58,7 +58,7 @@ WRONG = [
     ("rollout", "runtime.threads=99999", "runtime.threads=99999: from 1 to 256"),
     ("rollout", "runtime.dtype=float64", "unknown runtime.dtype 'float64'"),
     ("rollout", "world.camera.fovy=nan", "world.camera.fovy=nan: above 0, at most 179"),
-    ("rollout", "policy.others={a:[1]}", "policy.others="),
+    ("rollout", "policy.artifacts={drafter:[1]}", "policy.artifacts.drafter"),
     ("train_target", "train.steps=0", "train.steps=0: from 1 to"),
     ("train_target", "target.width=33", "target.width=33 must be a multiple of 2 x target.heads=6"),
     ("train_target", "target.image_size=90", "target.image_size=90 must be a multiple of 8 x target.grid=4"),

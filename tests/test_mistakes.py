@@ -79,7 +79,10 @@ ANSWERS = [
     ("sweep study=demo method=ar", "study 'demo' sets method itself: leave it out"),
     ("sweep threshold.r=1,2,3", "of which study? name one, study=NAME: 'kerv sweep' lists them; 'kerv rollout -m'"),
     # artifacts and policies
-    ("calibrate success", "is there, as a part of a shipped policy: policy.certificate=NAME makes one of yours"),
+    (
+        "calibrate success",
+        "is there, as a part of a shipped policy: policy.artifacts.certificate=NAME makes one of yours",
+    ),
     ("serve method=heisd", "its levels or drafts differ between tasks: name one with task=NAME"),
     ("serve method=spec_vla proposer=retrieval task=rech", "unknown task 'rech': did you mean reach-v3?"),
     ("serve policy=expert", "policy=expert: it acts in the simulator's worlds and cannot be served"),

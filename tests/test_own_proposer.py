@@ -38,7 +38,7 @@ from kerv_cli.worlds.metaworld.spec import SPEC
 
 
 def settings_of(results: Path, *overrides: str, name: str = "mine") -> RolloutSettings:
-    words = [f"results={results}", "policy.target=nano-state", f"+policy.others.follow={name}", *overrides]
+    words = [f"results={results}", "policy.target=nano-state", f"policy.artifacts.follow={name}", *overrides]
     return compose("rollout", words, RolloutSettings)
 
 
@@ -143,7 +143,7 @@ def test_its_weights_are_a_run_of_the_results_folder(results: Path) -> None:
 
 def test_it_is_trained_from_the_command_line_and_drafts_in_a_rollout(results: Path) -> None:
     write_dataset(results / "artifacts/demos/few")
-    policy = ("policy.target=nano-state", "+policy.others.follow=learnt", f"results={results}")
+    policy = ("policy.target=nano-state", "policy.artifacts.follow=learnt", f"results={results}")
 
     def kerv(*words: str) -> str:
         done = CliRunner().invoke(app, [*words, *policy])

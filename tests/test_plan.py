@@ -280,7 +280,7 @@ def test_reasons_name_what_changed(database: Database, monkeypatch: pytest.Monke
     repeated = study_of({"ar": settings_of("ar")}, ["reach-v3"], repeats=2)
     assert why(split_of(database, repeated)) == {"new repeat"}
     idle = settings_of("spec_vla", 3)
-    idle.policy.datastore = "mine"  # not read
+    idle.policy.artifacts["datastore"] = "mine"  # not read
     assert reason(idle) == ""
     monkeypatch.setattr(identity.work_of, "__defaults__", (4,))
     monkeypatch.setattr("kerv_cli.lab.plan.ENGINE", 4)

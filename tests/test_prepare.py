@@ -134,12 +134,14 @@ def test_the_remedy_for_weights_of_another_target_works_as_it_is_typed(results: 
     assert (remove[:3], train) == (["runs", "rm", "drafter/mine"], ["train", "drafter"])
     train = [*train, MINE]
     another = kerv(*train, "train.lr=0.5", "--plan", code=1)
-    assert "choose another policy.drafter=, or remove it with 'kerv runs rm drafter/mine'" in another
+    assert "choose another policy.artifacts.drafter=, or remove it with 'kerv runs rm drafter/mine'" in another
     kerv(*remove, "--yes")
     kerv(*train, *fast)
     assert "1 task, " in kerv(*rollout)
-    assert "4000 steps of 64, about 3 min (a guess)" in kerv("train", "drafter", MINE, "policy.drafter=b", "--plan")
-    few = kerv("train", "drafter", MINE, "policy.drafter=b", "train.steps=400", "--plan")
+    assert "4000 steps of 64, about 3 min (a guess)" in kerv(
+        "train", "drafter", MINE, "policy.artifacts.drafter=b", "--plan"
+    )
+    few = kerv("train", "drafter", MINE, "policy.artifacts.drafter=b", "train.steps=400", "--plan")
     assert "400 steps of 64, about 20 s (a guess)" in few
 
 
@@ -157,7 +159,7 @@ def test_an_artifact_is_shown_with_the_settings_that_it_was_made_with() -> None:
     quick = ["demos=few", "task=[reach-v3]", "train.steps=1", "train.batch=2"]
     made = {
         "target/new": ["train", "target", "target=nano", "name=new", "target.observation=state", *quick],
-        "early/one": ["train", "drafter", "drafter=early", "policy.target=new", "policy.early=one", *quick],
+        "early/one": ["train", "drafter", "drafter=early", "policy.target=new", "policy.artifacts.early=one", *quick],
         "calibration/new": ["calibrate", "policy.target=new", *quick[:2], "decodes=0", "held_out=0.5"],
     }
     for name, words in made.items():

@@ -129,7 +129,14 @@ def test_packed_weights_give_the_same_draft(target: CompactTarget, scout: Scout,
 
 
 def test_it_is_trained_from_the_command_line_for_its_target_alone(results: Path) -> None:
-    words = ["train", "drafter", "drafter=scout", "demos=few", "policy.target=nano-vision", "policy.scout=mine"]
+    words = [
+        "train",
+        "drafter",
+        "drafter=scout",
+        "demos=few",
+        "policy.target=nano-vision",
+        "policy.artifacts.scout=mine",
+    ]
     words += ["drafter.width=24", "drafter.rank=4", "train.batch=8", "train.steps=4", "train.scene_steps=2"]
     done = CliRunner().invoke(app, [*words, "train.held_out=0.34", "train.validate_every=4", f"results={results}"])
     assert done.exit_code == 0, done.output
@@ -142,7 +149,7 @@ def test_it_is_trained_from_the_command_line_for_its_target_alone(results: Path)
         check_sees(state)
     rollout = ["rollout", "method=scout_unverified", f"task={TASK}", "episodes=1", "record=0", "world.horizon=12"]
     rollout += ["policy.target=nano-vision", f"results={results}"]
-    assert CliRunner().invoke(app, [*rollout, "policy.scout=mine"]).exit_code == 0
+    assert CliRunner().invoke(app, [*rollout, "policy.artifacts.scout=mine"]).exit_code == 0
     missing = CliRunner().invoke(app, rollout)
     assert missing.exit_code == 1
     assert "no scout in" in missing.stderr
@@ -261,7 +268,7 @@ def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results: Pat
     assert refused.exit_code == 2
     assert "with a policy of metaworld: the certificate is of elsewhere" in refused.stderr
     written.write_text(issued)
-    few = CliRunner().invoke(app, [*words[:-2], "margin=1", "policy.certificate=few", "--json"])
+    few = CliRunner().invoke(app, [*words[:-2], "margin=1", "policy.artifacts.certificate=few", "--json"])
     assert few.exit_code == 0, few.output
     assert "nothing is certified" in few.stdout
     wrong = CliRunner().invoke(app, [*words, "seed=100000"])
@@ -293,5 +300,5 @@ def test_settings_of_other_conditions_get_no_certificate(
 
 
 def test_the_shipped_study_of_certificates_passes(policies: Path) -> None:
-    words = ["study=certify", "proposer=none", "policy.target=nano-vision", "policy.certificate=mine"]
+    words = ["study=certify", "proposer=none", "policy.target=nano-vision", "policy.artifacts.certificate=mine"]
     assert folder_of(resolve([*words, f"results={policies}"])) == policies / "artifacts/certificate/mine"

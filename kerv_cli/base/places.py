@@ -142,7 +142,7 @@ def find_target(results: str, name: str) -> Path:
 
 def check_not_shipped(path: Path, word: str) -> None:
     """Refuses to replace an artifact of a shipped policy. path: where it is to be written. word: the setting that names
-    another place, e.g. `policy.scout`.
+    another place, e.g. `policy.artifacts.scout`.
 
     Raises:
         UsageError: there is one beside the shipped target, and no training of the user's made it.

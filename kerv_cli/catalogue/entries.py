@@ -30,6 +30,7 @@ from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.lab.database import COMPLETE, EPISODES, RUNNING, SETTINGS, STUDIES, WANTED, Database
 from kerv_cli.lab.runs import RunRow, forget, run_rows
 from kerv_cli.lab.store import IMPORT, ROLLOUT, SWEEP, StudyStore
+from kerv_cli.methods.settings import with_artifacts
 
 OLDER = ("risk", "score")
 """Kinds of artifacts that an older kerv made."""
@@ -229,7 +230,7 @@ def command_of(run: RunEntry) -> tuple[str, ...]:
     if run.has_episodes or name not in parts("command"):
         return run.command
     schema, described = parts("command")[name].settings, _described(run.folder, run.kind)
-    stored = described["provenance"].get("settings") or described
+    stored = with_artifacts(described["provenance"].get("settings") or described)
     settings = {at.name: stored[at.name] for at in fields(schema) if at.name in stored}
     chosen = [
         f"{group}={value}"

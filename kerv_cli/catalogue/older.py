@@ -25,6 +25,7 @@ from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import COMPLETE, INTERRUPTED, RUNS, Database, new_id
 from kerv_cli.lab.plan import Setting, Study, Wanted, plain_settings
 from kerv_cli.lab.store import ROLLOUT, SWEEP, Foreign, StudyStore
+from kerv_cli.methods.settings import with_artifacts
 
 _FOLDERS = {"studies": SWEEP, "rollouts": ROLLOUT}
 _PLANS = "[!.]*/plan.yaml"
@@ -103,7 +104,7 @@ def completed(stored: Mapping[str, Any]) -> dict[str, Any]:
 
     A part that is not registered here keeps its settings as they are.
     """
-    plain = dataclasses.asdict(read(RolloutSettings, stored, "a stored setting", tolerant=True))
+    plain = dataclasses.asdict(read(RolloutSettings, with_artifacts(stored), "a stored setting", tolerant=True))
     for group in SETTINGS_GROUPS:
         value = stored.get(group)
         if isinstance(value, Mapping):

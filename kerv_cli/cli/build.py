@@ -7,7 +7,7 @@ from pathlib import Path
 import typer
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.places import artifact, find_target
+from kerv_cli.base.places import artifact
 from kerv_cli.base.registry import find, load, parts
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, print_figures, print_plan, progress_bar
@@ -61,20 +61,19 @@ def policy(settings: BuildPolicySettings) -> None:
 @command(
     "build drafter",
     BuildDrafterSettings,
-    keys="checkpoint policy.target policy.drafter positions mask results",
+    keys="checkpoint policy.target policy.artifacts positions mask results",
     examples=(
         "kerv build drafter checkpoint=models/eagle policy.target=openvla",
-        "kerv build drafter checkpoint=models/eagle policy.target=openvla policy.drafter=public mask=prompt",
+        "kerv build drafter checkpoint=models/eagle policy.target=openvla policy.artifacts.drafter=public mask=prompt",
     ),
 )
 def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
     """Check a drafter in the public EAGLE or Spec-VLA layout and copy it beside its target."""
     from kerv_cli.lab.runs import making
-    from kerv_cli.methods.eagle.drafter import DrafterArtifact
+    from kerv_cli.methods.artifacts import Artifacts
     from kerv_cli.training.public_drafter import import_drafter
 
-    target = find_target(settings.results, settings.policy.target)
-    folder = DrafterArtifact().path(settings.results, settings.policy.drafter, target)
+    folder = Artifacts(settings.results, settings.policy).path("drafter")
     with making(settings.results, "drafter", folder):
         folder, figures = import_drafter(settings)
     print_figures("drafter", figures, folder, as_json)

@@ -114,10 +114,10 @@ OF_TEST = {at.name for at in fields(CalibrateSuccessSettings)} - {at.name for at
 @command(
     "calibrate success",
     CalibrateSuccessSettings,
-    keys="study margin delta task episodes policy.target policy.certificate runtime.workers results",
+    keys="study margin delta task episodes policy.target policy.artifacts runtime.workers results",
     examples=(
         "kerv calibrate success policy.target=mine",
-        "kerv calibrate success policy.certificate=mine margin=3 episodes=50 --plan",
+        "kerv calibrate success policy.artifacts.certificate=mine margin=3 episodes=50 --plan",
     ),
     each="rollout",
 )

@@ -30,7 +30,7 @@ def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJso
 @command(
     "train drafter",
     TrainDrafterSettings,
-    keys="policy.target drafter demos task policy.drafter policy.early train.steps log runtime.device",
+    keys="policy.target drafter demos task policy.artifacts train.steps log runtime.device",
     examples=(
         "kerv train drafter policy.target=mine demos=mt10",
         "kerv train drafter drafter=early policy.target=mine",

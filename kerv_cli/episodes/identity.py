@@ -13,8 +13,9 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
+from kerv_cli.base import registry
 from kerv_cli.base.errors import KervError
-from kerv_cli.base.registry import METHOD_KINDS, part_of
+from kerv_cli.base.registry import METHOD_KINDS, PART_GROUPS, part_of
 from kerv_cli.episodes.settings import CONSTANT, PROFILE, WAITS, RolloutSettings, TimingSettings, settings_from
 from kerv_cli.methods.settings import EXPERT
 
@@ -41,7 +42,6 @@ NOT_DETERMINING_RUNTIME = frozenset({"workers", "executor", "executor_options"})
 
 _JUDGED = ("acceptance", "threshold", "rectifier")
 """The parts that judge drafts."""
-_ARTIFACTS = ("drafter", "early", "datastore", "calibration")
 
 
 def hash_of(value: object) -> str:
@@ -171,11 +171,13 @@ def idle_keys(settings: RolloutSettings) -> dict[str, str]:
     elif not acceptance.traits.get("reads_threshold", True):
         idle["threshold"] = f"acceptance={acceptance.name} has no threshold"
     needed = {need for kind, part in parts.items() for need in part.needs(method[kind])}
-    for kind in _ARTIFACTS:
-        if kind not in needed:
-            idle[f"policy.{kind}"] = f"method {settings.method} reads no {kind}"
-    if "datastore" not in needed:
-        idle["datastore"] = f"method {settings.method} reads no datastore"
+    artifacts = registry.parts("artifact")
+    if not any(artifacts[kind].traits.get("names_more") for kind in needed):
+        for kind in artifacts.keys() - needed:
+            idle[f"policy.artifacts.{kind}"] = f"method {settings.method} reads no {kind}"
+    for group in PART_GROUPS[len(METHOD_KINDS) :]:
+        if group not in needed:
+            idle[group] = f"method {settings.method} reads no {group}"
     idle |= _idle_timing(settings.rollout)
     batch = settings.rollout.batch
     if batch > 1:

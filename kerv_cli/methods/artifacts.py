@@ -269,6 +269,8 @@ class Artifacts:
         self, results: str, policy: PolicySettings, search: Any = None, device: str = "cpu", dtype: str = "float32"
     ) -> None:
         self.results, self.policy, self.search, self.device, self.dtype = results, policy, search, device, dtype
+        for kind in policy.artifacts:
+            find("artifact", kind, "policy.artifacts")
         self.folder = find_target(results, policy.target)
 
     @functools.cached_property
@@ -283,7 +285,7 @@ class Artifacts:
 
     def path(self, kind: str) -> Path:
         """Path of the artifact of this kind."""
-        return kind_of(kind).path(self.results, self.policy.named(kind), self.folder)
+        return kind_of(kind).path(self.results, self.policy.artifacts.get(kind), self.folder)
 
     def check(self, kinds: Iterable[str], use: Use | None = None) -> dict[str, str]:
         """Return kind -> hash, of the target and of `kinds`.
@@ -318,10 +320,10 @@ class Artifacts:
 
     def _making(self, files: Artifact[Any]) -> tuple[str, ...]:
         """Words of the command that makes an artifact of the policy: beside its target, or of the name that it has."""
-        target, name = f"policy.target={self.policy.target}", getattr(self.policy, files.kind, None)
+        target, name = f"policy.target={self.policy.target}", self.policy.artifacts.get(files.kind)
         if name is None or "/" in name:
             return "prepare", target
-        return *files.command, target, f"policy.{files.kind}={name}"
+        return *files.command, target, f"policy.artifacts.{files.kind}={name}"
 
     def load(self, kind: str) -> Any:
         """The artifact, for the loaded target; one object per process.

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from kerv_cli.base.limits import choice, number, setting
-from kerv_cli.base.registry import METHOD_KINDS
+from kerv_cli.base.registry import METHOD_KINDS, parts
 from kerv_cli.base.settings import RunSettings, part
 
 MODEL, EXPERT = "model", "expert"
+
+
+def _unnamed() -> dict[str, str | None]:
+    return dict.fromkeys(parts("artifact"))
 
 
 @dataclass
@@ -18,17 +23,17 @@ class PolicySettings:
 
     kind: str = choice(MODEL, MODEL, EXPERT, help="expert: the environment's script, privileged, no decoding")
     target: str = setting("mt10-vision", "the policy's weights")
-    drafter: str | None = setting(None, "default: the one beside the target")
-    early: str | None = setting(None, "the early drafter; default: the one beside the target")
-    scout: str | None = setting(None, "the drafter with eyes of its own; default: the one beside the target")
-    certificate: str | None = setting(None, "of success; default: the one beside the target")
-    datastore: str | None = setting(None, "default: the one beside the target")
-    calibration: str | None = setting(None, "default: the one beside the target")
-    others: dict[str, str] = setting({}, "artifacts of parts that are not kerv's: kind -> name")
+    artifacts: dict[str, str | None] = setting(_unnamed, "name of each artifact; null: the one beside the target")
 
-    def named(self, kind: str) -> str | None:
-        """The name given for the artifact of this kind, None without one."""
-        return self.others.get(kind) or getattr(self, kind, None)
+
+def with_artifacts(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return stored settings with the names of artifacts in one mapping. Version 0.1.0 has a key for each kind."""
+    policy = settings.get("policy")
+    if not isinstance(policy, Mapping) or "artifacts" in policy:
+        return dict(settings)
+    named = {kind: policy.get(kind) for kind in parts("artifact")} | dict(policy.get("others", {}))
+    kept = {key: value for key, value in policy.items() if key not in (*named, "others")}
+    return {**settings, "policy": {**kept, "artifacts": {kind: name for kind, name in named.items() if name}}}
 
 
 # descriptions of settings that several commands have

@@ -50,8 +50,8 @@ def folder_of(resolved: ResolvedStudy) -> Path:
     seeds = range(first.seed, first.seed + first.episodes)
     spec_of(tasks[0]).seeds.check(seeds, "selection", f"seed={first.seed}")
     artifacts = artifacts_of(first)
-    folder = CertificateArtifact().path(first.results, first.policy.certificate, artifacts.folder)
-    check_not_shipped(folder, "policy.certificate")
+    folder = artifacts.path(CertificateArtifact.kind)
+    check_not_shipped(folder, "policy.artifacts.certificate")
     return folder
 
 

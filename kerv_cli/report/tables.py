@@ -218,8 +218,7 @@ def _origin(setting: Setting, episodes: pd.DataFrame) -> Sections:
     weights = {
         "policy.kind": policy.get("kind", MODEL),
         "target": policy["target"],
-        "drafter": policy.get("drafter"),
-        "early": policy.get("early"),
+        "artifacts": _joined(f"{kind}={name}" for kind, name in policy.get("artifacts", {}).items() if name),
         OBSERVATION: setting.identity.get(OBSERVATION, ""),
         **{f"{name}_sha256": value for name, value in sorted(setting.identity.items()) if name != OBSERVATION},
     }

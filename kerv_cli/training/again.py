@@ -12,6 +12,7 @@ from kerv_cli.catalogue.again import again_words
 from kerv_cli.catalogue.entries import RunEntry, description_of
 from kerv_cli.lab.database import COMPLETE, Database
 from kerv_cli.lab.runs import run_rows
+from kerv_cli.methods.settings import with_artifacts
 from kerv_cli.training.drafter import DrafterRun
 from kerv_cli.training.run import TrainingRun
 from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
@@ -35,9 +36,9 @@ def training_again(run: RunEntry, results: str) -> TrainingRun:
     name = rows[0].name if rows and rows[0].status != COMPLETE else _free(run.folder)
     if run.kind == "target":
         return TargetRun(dataclasses.replace(read(TrainTargetSettings, value, str(path)), name=name))
-    settings = read_settings(TrainDrafterSettings, value)
-    others = settings.policy.others | {run.kind: name}
-    return DrafterRun(dataclasses.replace(settings, policy=dataclasses.replace(settings.policy, others=others)))
+    settings = read_settings(TrainDrafterSettings, with_artifacts(value))
+    policy = dataclasses.replace(settings.policy, artifacts=settings.policy.artifacts | {run.kind: name})
+    return DrafterRun(dataclasses.replace(settings, policy=policy))
 
 
 def _free(folder: Path) -> str:

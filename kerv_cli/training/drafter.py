@@ -13,7 +13,7 @@ from kerv_cli.base.places import check_not_shipped, find_target
 from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import set_up
 from kerv_cli.engine.protocol import ReadableTarget
-from kerv_cli.methods.artifacts import MadeFor, Weights
+from kerv_cli.methods.artifacts import Artifacts, MadeFor, Weights
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.training.demonstrations import demos_for, subset
 from kerv_cli.training.loop import Objective
@@ -66,16 +66,15 @@ class DrafterRun(TrainingRun):
         self.drafter: TrainableDrafter = part.built()
         self.artifact = self.drafter.artifact
         self.target_folder = find_target(settings.results, settings.policy.target)
-        name = settings.policy.named(self.artifact.kind)
-        self.folder = self.artifact.path(settings.results, name, self.target_folder)
-        check_not_shipped(self.folder, f"policy.{self.artifact.kind}")
+        self.folder = Artifacts(settings.results, settings.policy).path(self.artifact.kind)
+        check_not_shipped(self.folder, f"policy.artifacts.{self.artifact.kind}")
         self.settings, dataset = demos_for(settings)
         self.dataset = subset(dataset, self.settings.task)
         self.description = read_target(self.target_folder)
         self.description.check_autoregressive(
             f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
         )
-        self.check_folder(f"policy.{self.artifact.kind}")
+        self.check_folder(f"policy.artifacts.{self.artifact.kind}")
 
     @property
     def artifact_kind(self) -> str:

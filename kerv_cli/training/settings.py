@@ -94,7 +94,7 @@ class DemonstrationSettings(TaskSettings):
 
 @dataclass
 class TrainDrafterSettings(DemonstrationSettings):
-    """`kerv train drafter`: policy.target is imitated; policy.drafter, policy.early: name of the new one."""
+    """`kerv train drafter`: policy.target is imitated; policy.artifacts.KIND: name of the new one."""
 
     # drafter=early has optimisation settings of its own, so that it comes behind train
     groups: ClassVar = {"policy": "vision", "train": "drafter", "drafter": "eagle", "runtime": "auto"}
@@ -116,7 +116,7 @@ class PrepareSettings(DemonstrationSettings):
 
 @dataclass
 class BuildDrafterSettings(RunSettings):
-    """`kerv build drafter`: a drafter in the public EAGLE or Spec-VLA layout. policy.drafter: its new name."""
+    """`kerv build drafter`: a drafter in the public EAGLE or Spec-VLA layout. policy.artifacts.drafter: its new name."""
 
     groups: ClassVar = {"policy": "vision", "runtime": "cpu"}
 

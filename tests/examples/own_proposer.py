@@ -3,7 +3,7 @@
 This one is light: it says what there is, so that `--cfg`, completion and wrong overrides are answered before torch is
 imported. `KERV_PLUGINS=examples.own_proposer` registers it; then `kerv train drafter drafter=follow` trains it, and
 `kerv rollout proposer=follow`, `prefill_draft=follow` and `prefill_draft=merged prefill_draft.sources=[follow]` draft
-with it; `+policy.others.follow=NAME` names its weights where they do not lie beside the target.
+with it; `policy.artifacts.follow=NAME` names its weights where they do not lie beside the target.
 """
 
 from __future__ import annotations

@@ -44,7 +44,15 @@ def _needs(settings: ScopedSettings) -> tuple[str, ...]:
 
 _CERTIFICATE = "kerv_cli.methods.certified.certificate:"
 
-add("artifact", "certificate", _CERTIFICATE + "CertificateArtifact", sees=True, by_task=True, study="certify")
+add(
+    "artifact",
+    "certificate",
+    _CERTIFICATE + "CertificateArtifact",
+    sees=True,
+    by_task=True,
+    names_more=True,
+    study="certify",
+)
 add("proposer", "scoped", _CERTIFICATE + "scoped", ScopedSettings, _needs, check_scoped, when=PREFILL, chains=True)
 add(
     "skip",
