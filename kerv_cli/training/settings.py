@@ -116,7 +116,7 @@ class PrepareSettings(DemonstrationSettings):
 
 @dataclass
 class BuildDrafterSettings(RunSettings):
-    """`kerv build drafter`: a drafter in the public EAGLE or Spec-VLA layout. policy.artifacts.drafter: its new name."""
+    """`kerv build drafter`: a drafter in the public EAGLE or Spec-VLA layout, named policy.artifacts.drafter."""
 
     groups: ClassVar = {"policy": "vision", "runtime": "cpu"}
 
