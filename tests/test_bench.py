@@ -40,10 +40,9 @@ def work(*rounds: Played, looked_up: bool = False, drafter: tuple[int, int] | No
 
 def test_a_recorded_decode_becomes_its_forwards() -> None:
     found = work(PREFILL, ("verify", 1, 14, 3, "drafter"), ("decode", 5, 0, 0, "none"))
-    assert found.prefill.tolist() == [True, False, False]
-    assert found.nodes.tolist() == [0, 14, 0]
-    assert found.levels.tolist() == [0, 14, 0]
-    assert found.feeds.tolist() == [True, True, False]
+    rows = {kind: calls.rows.tolist() for kind, calls in found.calls.items()}
+    assert rows == {"encode": [1], "prefill": [0], "verify": [15, 1], "feed": [0, 4], "draft": [14]}
+    assert found.calls["feed"].with_prompt.tolist() == [True, False]
     assert (found.host.tolist(), found.propose.tolist()) == ([0.375], [0.0])  # the drafter's: by the profile
     assert found.needs == ["encode", "prefill", "verify", "feed", "draft"]
 
@@ -60,12 +59,11 @@ def test_early_and_retrieved_drafts_have_costs_and_others_take_what_was_recorded
 
 def test_a_parallel_decode_is_one_forward_over_prompt_and_chunk() -> None:
     found = work(("parallel", 0, 0, 0, "none"))
-    assert (found.nodes.tolist(), found.prefill.tolist()) == ([16], [True])
+    assert (found.calls["prefill"].rows.tolist(), found.needs) == ([16], ["encode", "prefill"])
 
 
 def test_a_skipped_decode_has_no_forward() -> None:
     found = work(("skip", 0, 0, 16, "early"))
-    assert len(found.nodes) == 0
     assert found.needs == ["encode", "early"]
     blind = work(("skip", 0, 0, 16, "scout"), vision=0.0)  # the target never encoded
     assert (blind.needs, blind.propose.tolist(), blind.host.tolist()) == ([], [0.5], [0.375])
@@ -75,8 +73,7 @@ def test_a_skipped_decode_has_no_forward() -> None:
 
 def test_a_tree_has_the_levels_of_its_settings_and_of_the_chunk() -> None:
     rounds = (PREFILL, ("verify", 1, 50, 4, "drafter"), ("verify", 13, 50, 1, "drafter"))
-    assert work(*rounds, drafter=(5, 8)).levels.tolist() == [0, 5, 2]
-    assert work(*rounds, drafter=(5, 8)).tree.tolist() == [False, True, True]
+    assert work(*rounds, drafter=(5, 8)).calls["tree"].rows.tolist() == [5, 2]
 
 
 def test_bytes_and_operations_of_a_forward() -> None:

@@ -132,12 +132,12 @@ def test_what_is_not_there_is_refused(results: Path) -> None:
 
 def test_shipped_profiles_can_price_what_ships(tmp_path: Path) -> None:
     from kerv_cli.base.places import shipped_dir
-    from kerv_cli.engine.cost import FORWARDS, missing, read_profile, source_costs
+    from kerv_cli.engine.cost import FORWARDS, read_profile, source_costs
 
     shipped = sorted((shipped_dir().parent / "bench").glob("*.json"))
     for path in shipped:
         profile = read_profile(path)
-        assert missing([*FORWARDS, *source_costs()], profile) == []
+        assert profile.lacks([*FORWARDS, *source_costs()]) == []
         assert {"target", "dtype", "device_name"} <= set(profile.about)
     assert [machine.name for machine in open_profiles(tmp_path, [path.stem for path in shipped])] == [
         path.stem for path in shipped

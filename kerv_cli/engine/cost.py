@@ -1,11 +1,12 @@
-"""The cost model of a decode: its rounds, and their seconds by a latency profile (docs/measuring.md)."""
+"""The cost model of a decode: the forwards of its rounds, priced by a latency profile (docs/measuring.md)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,23 +16,20 @@ from kerv_cli.base.registry import DRAFTING, parts
 from kerv_cli.engine.record import PARALLEL, DecodeRecord
 
 FORWARDS = ("encode", "prefill", "verify", "feed", DRAFTING, "tree")
-"""Kinds of a profile's costs that follow the target's shape: docs/measuring.md. The others are proposers' own."""
+"""Kinds of costs that follow the target's shape (docs/measuring.md). The others are proposers' own."""
 
 FORMAT = 2
-"""Of a profile."""
+"""Format of a profile's file."""
 
-_WIDE = 32  # nodes from which on a draft of unknown settings is a tree of few levels
-_LEVELS = 5
-_HOST = ("accept", "rectify", "other")
-HOST_PHASES = ("propose", *_HOST)
-"""Phases of a recorded decode whose seconds do not depend on the target's size, where the drafter does not draft."""
-READ_PHASES = ("vision", *HOST_PHASES)
-"""Phases whose recorded seconds the model reads: of vision only whether there were any."""
-_ABSENT = (1.0, *[0.0] * len(HOST_PHASES))  # of `READ_PHASES` that a record lacks: it encoded, the rest took no time
+READ_PHASES = ("vision", "propose", "accept", "rectify", "other")
+"""Phases whose recorded seconds the model reads. Of vision it only reads whether there were any."""
+
+_WIDE = 32  # nodes from which a draft of unknown settings counts as a tree
+_LEVELS = 5  # of such a tree
 
 
 def source_costs() -> dict[str, list[str]]:
-    """Kind of a cost -> the proposers whose drafts have it. Others take the seconds that were recorded."""
+    """Return the proposers of each kind of cost. Other proposers cost the seconds that were recorded."""
     costs: dict[str, list[str]] = {}
     for name, part in parts("proposer").items():
         if "cost" in part.traits:
@@ -41,11 +39,13 @@ def source_costs() -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class Profile:
-    """Seconds of every forward by its rows, and of drafts. Between measured rows times are interpolated, behind the
-    last ones continued in a straight line.
+    """Seconds of every kind of forward and draft, by the number of its rows.
 
-    prompt: P. phases: kind -> (rows, seconds), rows increasing. tokens: N of the chunks. about: target, machine,
-    versions.
+    Attributes:
+        prompt: P.
+        phases: Kind of a cost -> its measured numbers of rows, increasing, and their seconds.
+        tokens: N of the chunks.
+        about: Target, machine, versions.
     """
 
     prompt: int
@@ -53,12 +53,19 @@ class Profile:
     tokens: int = 0
     about: Mapping[str, Any] = field(default_factory=dict)
 
+    def lacks(self, kinds: Iterable[str]) -> list[str]:
+        """Return those kinds of costs that the profile does not have."""
+        return [kind for kind in kinds if not self.phases.get(kind, ((), ()))[0]]
+
     def seconds(self, kind: str, rows: int) -> float:
-        """Of one phase of so many rows."""
+        """Return the seconds of one forward or draft."""
         return float(self.times(kind, np.array([rows]))[0])
 
     def times(self, kind: str, rows: np.ndarray) -> np.ndarray:
-        """`seconds` of every number of rows (n,)."""
+        """Return the seconds (n,) of several numbers of rows (n,).
+
+        They are interpolated between measured rows and continued in a straight line after the last ones.
+        """
         measured, times = self.phases[kind]
         seconds: np.ndarray = np.interp(rows, measured, times)
         if len(measured) > 1:
@@ -67,26 +74,25 @@ class Profile:
         return seconds
 
     def decode(self, tokens: int) -> float:
-        """Of an autoregressive decode of N tokens."""
-        return (
-            self.seconds("encode", 1) + self.seconds("prefill", self.prompt) + (tokens - 1) * self.seconds("verify", 1)
-        )
+        """Return the seconds of an autoregressive decode of N tokens."""
+        first = self.seconds("encode", 1) + self.seconds("prefill", self.prompt)
+        return first + (tokens - 1) * self.seconds("verify", 1)
 
     def drafting(self, depth: int) -> float:
-        """A chain of `depth` tokens from the drafter."""
-        return self.seconds("draft", depth) if depth else 0.0
+        """Return the seconds of a chain of `depth` tokens from the drafter."""
+        return self.seconds(DRAFTING, depth) if depth else 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the profile as JSON values."""
         phases = {kind: {"rows": list(rows), "seconds": list(seconds)} for kind, (rows, seconds) in self.phases.items()}
         return {"format": FORMAT, "prompt": self.prompt, "tokens": self.tokens, "phases": phases}
 
 
 def read_profile(path: Path) -> Profile:
-    """The profile in the document of a bench.
+    """Read the profile in a document of `kerv bench`.
 
     Raises:
-        CheckpointError: no such document, or one of another format.
+        CheckpointError: No such document, one of another format, or times that cannot be.
     """
     document = read_json(path)
     try:
@@ -102,46 +108,47 @@ def read_profile(path: Path) -> Profile:
     if stored.get("format") != FORMAT:
         target = about.get("target", "TARGET")
         raise CheckpointError(f"{path} has another format than {FORMAT}: measure it with 'kerv bench target={target}'")
+    for kind, (rows, seconds) in phases.items():
+        increases = len(rows) == len(seconds) and list(rows) == sorted(set(rows))
+        if not increases or not all(0 <= value < math.inf for value in seconds):
+            raise CheckpointError(f"{path} has impossible times of the phase '{kind}'")
     return profile
+
+
+class Calls(NamedTuple):
+    """All m forwards or drafts of one kind in some decodes.
+
+    Attributes:
+        decode: (m,) index of the decode.
+        rows: (m,) number of rows, without the prompt's.
+        with_prompt: (m,) bool, whether the prompt's rows come on top.
+    """
+
+    decode: np.ndarray
+    rows: np.ndarray
+    with_prompt: np.ndarray
 
 
 @dataclass(frozen=True)
 class Work:
-    """What some decodes did, flat: n rounds with a forward of the target, of `len(host)` decodes.
+    """What some decodes did.
 
-    decode: (n,) which decode. prefill: (n,) bool. nodes, accepted: (n,) of the draft. levels: (n,) of the drafter's
-    draft, 0 where it did not draft; tree: (n,) bool, more than a chain. feeds: (n,) bool, the drafter is fed behind it.
-    host: (decodes,) seconds, as recorded, of acceptance and all else that does not depend on the target's size, but for
-    proposing. encoded: (decodes,) bool, whether the target encoded the observation. propose: seconds of proposing, 0
-    where the drafter, which follows the target's shape, drafted. sources: kind -> (decodes,) bool, whether there was
-    such a draft besides.
+    Attributes:
+        calls: Kind of a cost that follows the target's shape -> its calls.
+        sources: Kind of a proposer's own cost -> (decodes,) bool, whether there was such a draft.
+        host: (decodes,) recorded seconds that do not depend on the target's size, without proposing.
+        propose: (decodes,) recorded seconds of proposing; 0 if the drafter drafted, which follows the target's shape.
     """
 
-    decode: np.ndarray
-    prefill: np.ndarray
-    nodes: np.ndarray
-    accepted: np.ndarray
-    levels: np.ndarray
-    tree: np.ndarray
-    feeds: np.ndarray
-    host: np.ndarray
-    encoded: np.ndarray
-    propose: np.ndarray
+    calls: Mapping[str, Calls]
     sources: Mapping[str, np.ndarray]
+    host: np.ndarray
+    propose: np.ndarray
 
     @property
     def needs(self) -> list[str]:
         """The kinds of costs that price it."""
-        used = {
-            "encode": self.encoded.any(),
-            "prefill": self.prefill.any(),
-            "verify": (~self.prefill).any(),
-            "feed": self.feeds.any(),
-            "draft": (self.levels[~self.tree] > 1).any(),
-            "tree": self.tree.any(),
-            **{kind: count.any() for kind, count in self.sources.items()},
-        }
-        return [kind for kind, is_used in used.items() if is_used]
+        return [*self.calls, *self.sources]
 
 
 def work_of(
@@ -152,89 +159,81 @@ def work_of(
     size: int,
     drafter: tuple[int, int] | None = None,
 ) -> Work:
-    """The work of some decodes.
+    """Return the work of some decodes.
 
     Args:
-        rounds: of all decodes, one behind the other: mode, proposer, start, tree_size, accepted, (n,) each.
-        counts: (decodes,) rounds of each.
-        phases: (decodes,) seconds of each of `READ_PHASES`.
-        looked_up: (decodes,) bool: something was retrieved.
+        rounds: Mode, proposer, start, tree_size and accepted of the rounds of all decodes, (n,) each.
+        counts: Number of rounds of each decode, (decodes,).
+        phases: Recorded seconds of each of `READ_PHASES`, (decodes,).
+        looked_up: Whether something was retrieved, (decodes,) bool.
         size: N.
-        drafter: the proposer's `depth` and `top_k`; None: not recorded, a draft of many nodes is then a tree.
+        drafter: The proposer's `depth` and `top_k`; None if unknown. A draft of many nodes is then a tree.
     """
     decodes, decode = len(counts), np.repeat(np.arange(len(counts)), counts)
-    mode, proposer = rounds["mode"], rounds["proposer"]
+    mode, proposer, start = rounds["mode"], rounds["proposer"], rounds["start"]
     costs = source_costs()
-    drafters = costs.pop(DRAFTING, [])
-    drafts, parallel = (rounds["tree_size"] > 0) & np.isin(proposer, drafters), mode == PARALLEL
+    drafts = (rounds["tree_size"] > 0) & np.isin(proposer, costs.pop(DRAFTING, []))
     has_drafter = np.bincount(decode, drafts, decodes) > 0
-    nodes = np.where(parallel, size, rounds["tree_size"])
+    nodes = np.where(mode == PARALLEL, size, rounds["tree_size"])
+    accepted = np.where(mode == PARALLEL, 0, rounds["accepted"])
     depth, top_k = drafter or (_LEVELS, 0)
-    tree = drafts & ((nodes >= _WIDE) if drafter is None else top_k > 1)
-    levels = np.where(tree, np.minimum(depth, size - rounds["start"] - 1), nodes) * drafts
-    host, propose = sum(phases[name] for name in _HOST), np.where(has_drafter, 0.0, phases["propose"])
-    others = {kind: np.bincount(decode, np.isin(proposer, names), decodes) > 0 for kind, names in costs.items()}
+    trees = drafts & ((nodes >= _WIDE) if drafter is None else top_k > 1)
+    forward, prefill = mode != "skip", start == 0
+    feeds = forward & has_drafter[decode] & (np.diff(decode, append=decodes) == 0)  # not after the last round
+
+    def calls(chosen: np.ndarray, rows: np.ndarray, with_prompt: np.ndarray | bool = False) -> Calls:
+        return Calls(decode[chosen], rows[chosen], np.broadcast_to(with_prompt, rows.shape)[chosen])
+
+    encoded = np.flatnonzero(phases["vision"])
+    found = {
+        "encode": Calls(encoded, np.ones(len(encoded), int), np.zeros(len(encoded), bool)),
+        "prefill": calls(forward & prefill, nodes, True),
+        "verify": calls(forward & ~prefill, 1 + nodes),
+        "feed": calls(feeds, accepted + ~prefill, prefill),
+        DRAFTING: calls(drafts & ~trees, nodes),
+        "tree": calls(trees, np.minimum(depth, size - start - 1)),
+    }
+    sources = {kind: np.bincount(decode, np.isin(proposer, names), decodes) > 0 for kind, names in costs.items()}
     for kind, names in costs.items():
         if any(parts("proposer")[name].traits.get("looks_up") for name in names):
-            others[kind] |= looked_up
-    last = np.diff(decode, append=decodes) > 0
-    forward = mode != "skip"
-    accepted = np.where(parallel, 0, rounds["accepted"])
+            sources[kind] |= looked_up
     return Work(
-        decode=decode[forward],
-        prefill=(rounds["start"] == 0)[forward],
-        nodes=nodes[forward],
-        accepted=accepted[forward],
-        levels=levels[forward],
-        tree=tree[forward],
-        feeds=(has_drafter[decode] & ~last)[forward],
-        host=np.asarray(host),
-        encoded=phases["vision"] != 0,
-        propose=propose,
-        sources=others,
+        calls={kind: of_kind for kind, of_kind in found.items() if len(of_kind.decode)},
+        sources={kind: drafted for kind, drafted in sources.items() if drafted.any()},
+        host=phases["accept"] + phases["rectify"] + phases["other"],
+        propose=np.where(has_drafter, 0.0, phases["propose"]),
     )
 
 
 def work_of_record(decode: DecodeRecord) -> Work:
-    """The work of a decode that was just recorded."""
+    """Return the work of a decode that was just recorded."""
     names = ("mode", "proposer", "start", "tree_size", "accepted")
     return work_of(
         {name: np.array([getattr(one, name) for one in decode.rounds]) for name in names},
         np.array([len(decode.rounds)]),
-        {name: np.array([decode.phases.get(name, absent)]) for name, absent in zip(READ_PHASES, _ABSENT, strict=True)},
+        {name: np.array([decode.phases.get(name, float(name == "vision"))]) for name in READ_PHASES},
         np.array([decode.similarity is not None]),
         decode.size or len(decode.tokens),
     )
 
 
 def predicted(work: Work, profile: Profile) -> float:
-    """`prices` of all decodes, summed."""
+    """Return the summed `prices` of all decodes."""
     return float(prices(work, profile).sum())
 
 
 def prices(work: Work, profile: Profile) -> np.ndarray:
-    """(decodes,) seconds by the cost model: the profile's costs of the forwards, of the drafter's passes and of the
-    states it is fed, of early and retrieved drafts, and the recorded host seconds. Where the profile lacks the costs of
-    those drafts, they take what was recorded."""
-    rows = work.nodes + np.where(work.prefill, profile.prompt, 1)
-    seconds = np.zeros(len(rows))
-    for kind, chosen in (("prefill", work.prefill), ("verify", ~work.prefill)):
-        seconds[chosen] = profile.times(kind, rows[chosen]) if chosen.any() else 0.0
-    trees = "tree" if profile.phases.get("tree", ((), ()))[0] else "draft"
-    for kind, chosen in (("draft", (work.levels > 0) & ~work.tree), (trees, work.tree)):
-        if chosen.any():
-            seconds[chosen] += profile.times(kind, work.levels[chosen])
-    if work.feeds.any():
-        fed = work.accepted + np.where(work.prefill, profile.prompt, 1)
-        seconds += np.where(work.feeds, profile.times("feed", fed), 0.0)
-    total = work.encoded * profile.seconds("encode", 1) + work.host + np.bincount(work.decode, seconds, len(work.host))
-    used = {kind: drafts for kind, drafts in work.sources.items() if drafts.any()}
-    if missing(list(used), profile):
-        return np.asarray(total + work.propose)
-    drafting = sum((drafts * profile.seconds(kind, 1) for kind, drafts in used.items()), np.zeros(len(total)))
-    return np.asarray(total + np.where(drafting > 0, drafting, work.propose))
+    """Return the seconds (decodes,) of each decode by the cost model.
 
-
-def missing(needs: Sequence[str], profile: Profile) -> list[str]:
-    """The kinds of costs that a profile lacks."""
-    return [kind for kind in needs if not profile.phases.get(kind, ((), ()))[0]]
+    Forwards, drafts and the states fed to the drafter cost what the profile says, all else the recorded seconds. If the
+    profile lacks a proposer's own cost, its drafts cost the recorded seconds too.
+    """
+    total = np.array(work.host, dtype=float)
+    for kind, (decode, rows, with_prompt) in work.calls.items():
+        known = DRAFTING if kind == "tree" and profile.lacks([kind]) else kind
+        total += np.bincount(decode, profile.times(known, rows + with_prompt * profile.prompt), len(total))
+    drafting = np.zeros(len(total))
+    if not profile.lacks(work.sources):
+        for kind, drafted in work.sources.items():
+            drafting += drafted * profile.seconds(kind, 1)
+    return total + np.where(drafting > 0, drafting, work.propose)

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.places import as_path, shipped_dir
-from kerv_cli.engine.cost import READ_PHASES, Profile, Work, missing, prices, read_profile, work_of
+from kerv_cli.engine.cost import READ_PHASES, Profile, Work, prices, read_profile, work_of
 from kerv_cli.episodes.identity import batch_of
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MICRO, Row, decodes, measure
@@ -155,8 +155,7 @@ def _check(named: NamedProfile, works: Mapping[str, LabelWork]) -> None:
     """Raises UsageError for a profile that cannot price the study."""
     target = named.profile.about.get("target", "TARGET")
     for label, label_work in works.items():
-        needs = label_work.work.needs
-        if lacks := missing(needs, named.profile):
+        if lacks := named.profile.lacks(label_work.work.needs):
             raise UsageError(
                 f"on={named.name}: no cost of '{lacks[0]}', which setting '{label}' needs: measure it with "
                 f"'kerv bench target={target}'"
