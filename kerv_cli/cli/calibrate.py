@@ -9,7 +9,7 @@ import typer
 
 from kerv_cli.base.config import compose, to_yaml
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan, console, print_json, print_plan, print_table, progress_bar
+from kerv_cli.cli.common import AsJson, ShowPlan, print_json, print_plan, print_table, progress_bar
 from kerv_cli.episodes.settings import SweepSettings
 from kerv_cli.training.settings import CalibrateSettings, CalibrateSuccessSettings
 
@@ -18,9 +18,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from kerv_cli.lab.runs import Run
     from kerv_cli.methods.calibration import Calibration
-    from kerv_cli.training.calibration import CalibrationRun
 
 
 @command(
@@ -39,28 +37,12 @@ def calibrate(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
     from kerv_cli.lab.runs import making
 
     with making(settings.results, "calibration", run.path.parent) as record:
-        calibration = _calibrate(run, record)
+        calibration = run.run(lambda title: progress_bar(title, record))
     _tasks(calibration, run.path)
     _errors(calibration)
     _skip(calibration)
     for line in run.notes:
         typer.echo(line)
-
-
-def _calibrate(run: CalibrationRun, record: Run) -> Calibration:
-    with progress_bar("reading demonstrations", record) as advance:
-        run.load(advance)
-    variability, skip = {}, None
-    if run.settings.decodes:
-        with progress_bar("pre-sampling", record) as advance:
-            variability = run.presample(advance)
-    with progress_bar("boundary ranges", record) as advance:
-        boundary = run.boundary(advance)
-    if run.stored:
-        with progress_bar("skip levels", record) as advance:
-            skip = run.skip(advance)
-    with console(stderr=True).status("fitting the predictors"):
-        return run.finish(variability, boundary, skip)
 
 
 def _tasks(calibration: Calibration, path: Path) -> None:

@@ -1,7 +1,7 @@
-"""Calibrates verify-skip (docs/methods.md §4.3; HeiSD): the similarity s_min of each task, from a datastore.
+"""Calibrate verify-skip: the similarity s_min of each task, from a datastore (docs/methods.md §4.3; HeiSD).
 
-An entry's key is looked up among the other episodes of its task, and the best neighbour's chunk is compared with the
-entry's own, the expert's next actions. The neighbour's chunk would have been executed without verification.
+Each entry is looked up among the other episodes of its task. The best neighbour's chunk, which would have been executed
+without verification, is compared with the entry's own: the expert's next actions.
 """
 
 from __future__ import annotations
@@ -19,9 +19,12 @@ from kerv_cli.worlds.demos.dataset import OnProgress
 if TYPE_CHECKING:
     from kerv_cli.methods.heisd.datastore import Datastore
 
-ENTRIES = 4000  # looked up per task, evenly spread; on MT10, levels from 1000 did not hold on other episodes
-LEAST = 20  # entries above a level; fewer do not support it
-LOW, HIGH = 2.0, 1 / 3  # wrong chunks that the bounds of s_min allow, as multiples of what s_min itself allows
+ENTRIES = 4000
+"""Entries looked up per task, evenly spread. On MT10, levels from 1000 did not hold on other episodes."""
+LEAST = 20
+"""Entries that must be above a level to support it."""
+LOW, HIGH = 2.0, 1 / 3
+"""The bounds of s_min allow this multiple of the wrong chunks that s_min allows."""
 
 
 @dataclass(frozen=True)
@@ -30,51 +33,50 @@ class Matches:
 
     similarity: np.ndarray  # (n,) float32, cosine
     error: np.ndarray  # (n,) mean absolute difference of the two chunks, normalised action units
-    strict: np.ndarray  # (n,) bool, some token of a strict DoF differs
+    strict: np.ndarray  # (n,) bool, whether a token of a strict DoF differs
 
     def good(self, epsilon: float) -> np.ndarray:
-        """(n,) bool: the error is at most epsilon and all tokens of strict DoFs are the expert's. The gripper is judged
-        apart, because a wrong one hardly changes the mean over all DoFs and drops the object."""
+        """Return (n,) bool: the error is at most epsilon, and all tokens of strict DoFs are the expert's.
+
+        The gripper is judged apart: a wrong one hardly changes the mean over all DoFs, but drops the object.
+        """
         return (self.error <= epsilon) & ~self.strict
 
 
-def neighbours_elsewhere(store: Datastore, task: str, entries: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Leave-one-episode-out: up to `entries` evenly spread entries of `task` and their best neighbours in other
-    episodes.
-
-    Rows (n,), cosines (n,) float32 and the neighbours' chunks (n, N) int64; n is 0 where the datastore holds a single
-    episode of the task.
+def match(store: Datastore, task: str) -> Matches:
+    """Compare up to ENTRIES entries of a task with their best neighbours in other episodes; none for one episode.
 
     Raises:
-        UnknownName: a task that the datastore does not hold.
+        UnknownName: The datastore does not hold the task.
     """
     if task not in store.shards:
         raise UnknownName("task of the datastore", task, store.shards)
     shard = store.shards[task]
-    count = min(entries, shard.stop - shard.start) if len(np.unique(store.seeds[shard])) > 1 else 0
+    count = min(ENTRIES, shard.stop - shard.start) if len(np.unique(store.seeds[shard])) > 1 else 0
     rows = np.linspace(shard.start, shard.stop - 1, count).astype(int)
-    similarity, chunks = np.zeros(count, np.float32), np.zeros((count, store.tokens.shape[1]), np.int64)
+    similarity, drafts = np.zeros(count, np.float32), np.zeros((count, store.tokens.shape[1]), np.int64)
     for i, row in enumerate(rows):
         neighbours = store.query(store.vectors[row], task, 1, without=int(store.seeds[row]))
-        similarity[i], chunks[i] = neighbours.similarity[0], neighbours.chunks[0]
-    return rows, similarity, chunks
-
-
-def match(store: Datastore, task: str) -> Matches:
-    """The entries of `neighbours_elsewhere`, with the neighbours' chunks compared to their own."""
-    space = store.manifest.actions
-    rows, similarity, drafts = neighbours_elsewhere(store, task, ENTRIES)
-    expert = store.tokens[rows].astype(np.int64)
+        similarity[i], drafts[i] = neighbours.similarity[0], neighbours.chunks[0]
+    space, expert = store.manifest.actions, store.tokens[rows].astype(np.int64)
     error = np.abs(space.values_of(drafts) - space.values_of(expert)).mean(1)
     strict = (drafts != expert)[:, space.strict_tokens(expert.shape[1])].any(1)
     return Matches(similarity, error, strict)
 
 
 def lowest_level(similarity: np.ndarray, good: np.ndarray, confidence: float, least: int = LEAST) -> float | None:
-    """The lowest similarity s such that of the entries with similarity ≥ s at least the share `confidence` is good.
+    """Return the lowest similarity s such that at least the share `confidence` of the entries from s on is good.
 
-    similarity (n,), good (n,) bool. Entries of equal similarity count together. None where no level has `least`
-    entries above it and enough good ones among them.
+    Entries of equal similarity count together.
+
+    Args:
+        similarity: (n,) of the entries.
+        good: (n,) bool.
+        confidence: Share of good entries.
+        least: Entries that a level needs.
+
+    Returns:
+        The similarity; None if no level has that many good entries.
     """
     order = np.argsort(-similarity, kind="stable")
     ranked = similarity[order]
@@ -85,11 +87,10 @@ def lowest_level(similarity: np.ndarray, good: np.ndarray, confidence: float, le
 
 
 def task_levels(matches: Matches, epsilon: float, confidence: float) -> SkipLevel:
-    """s_min of one task, the bounds between which feedback may move it, and the share of decodes it would skip.
+    """Return a task's s_min, the bounds between which feedback may move it, and the share of decodes it would skip.
 
-    low ≤ s_min ≤ high: the same level where twice and where a third of the wrong chunks are allowed (at a confidence
-    of 0.9: 0.8 and 0.967). Where no level is that good, high is the largest similarity seen, where hardly
-    anything is skipped. A task without an s_min has NEVER for all three and never skips.
+    The bounds low ≤ s_min ≤ high allow twice and a third of the wrong chunks: 0.8 and 0.967 for a confidence of 0.9. If
+    no level is good enough for high, it is the largest similarity seen. If none is for s_min, all three are NEVER.
     """
     good, wrong = matches.good(epsilon), 1 - confidence
     s_min = lowest_level(matches.similarity, good, confidence)
@@ -109,17 +110,12 @@ def task_levels(matches: Matches, epsilon: float, confidence: float) -> SkipLeve
 
 
 def skip_section(
-    store: Datastore,
-    tasks: Sequence[str],
-    epsilon: float,
-    confidence: float,
-    on_progress: OnProgress,
+    store: Datastore, tasks: Sequence[str], epsilon: float, confidence: float, progress: OnProgress
 ) -> SkipSection | None:
-    """The calibration's section `skip`: levels of those `tasks` that the datastore holds, and its hash. None where it
-    holds none of them."""
+    """Return the levels of those tasks that the datastore holds; None if it holds none of them."""
     levels = {}
     for done, task in enumerate(tasks, 1):
         if task in store.shards:
             levels[task] = task_levels(match(store, task), epsilon, confidence)
-        on_progress(done, len(tasks))
+        progress(done, len(tasks))
     return SkipSection(store.content, epsilon, confidence, levels) if levels else None
