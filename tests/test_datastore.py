@@ -368,10 +368,10 @@ def test_what_cannot_be_built_is_refused_at_once(
 
 def test_demonstrations_that_do_not_fit_the_target_are_refused(copy: Path) -> None:
     write_demos(copy / "artifacts/demos/few", LENGTHS, tail=2)
-    with pytest.raises(CheckpointError, match="2 labels behind an episode's end, chunks of 4 need 3"):
+    with pytest.raises(CheckpointError, match="2 labels after an episode's end, chunks of 4 need 3"):
         DatastoreBuild(asked(copy)).build()
     write_demos(copy / "artifacts/demos/few", LENGTHS, size=32)
-    with pytest.raises(CheckpointError, match="frames have 32 pixels, the policy takes 96"):
+    with pytest.raises(CheckpointError, match="32 x 32 pixels, the policy takes 96"):
         DatastoreBuild(asked(copy, "nano-vision")).build()
     assert opened(copy)[0].manifest.rows == 52  # what was there still is
 

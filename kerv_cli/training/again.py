@@ -1,9 +1,9 @@
-"""Trains again what was trained, from the settings that its description holds."""
+"""Repeat a training with the settings that its description holds (`kerv runs rerun`)."""
 
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
+import itertools
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.manifests import read
@@ -20,28 +20,25 @@ from kerv_cli.training.target import TargetRun
 
 
 def training_again(run: RunEntry, results: str) -> TrainingRun:
-    """Return the training with the stored settings, under a free name, or that of an interrupted repetition.
+    """Return the training with the stored settings: an unfinished repetition, or a new one as `NAME-again`.
 
     Raises:
         CheckpointError: Its description is missing, damaged or of another version.
     """
-    path = run.folder / f"{run.kind}.json"
-    training = description_of(run).get("settings")
-    if not isinstance(training, dict):
+    path, stored = run.folder / f"{run.kind}.json", description_of(run).get("settings")
+    if not isinstance(stored, dict):
         command = "target" if run.kind == "target" else "drafter"
         raise CheckpointError(f"{path} does not say how it was trained: train anew with 'kerv train {command}'")
-    value = training | {"results": results}
-    words = tuple(again_words(run, results))
-    rows = [row for row in run_rows(Database(results), run.kind) if row.command == words]
-    name = rows[0].name if rows and rows[0].status != COMPLETE else _free(run.folder)
+    command_words = tuple(again_words(run, results))
+    rows = [row for row in run_rows(Database(results), run.kind) if row.command == command_words]
+    if rows and rows[0].status != COMPLETE:
+        name = rows[0].name
+    else:
+        names = (f"{run.folder.name}-again{number if number > 1 else ''}" for number in itertools.count(1))
+        name = next(candidate for candidate in names if not (run.folder.parent / candidate).exists())
+    stored = stored | {"results": results}
     if run.kind == "target":
-        return TargetRun(dataclasses.replace(read(TrainTargetSettings, value, str(path)), name=name))
-    settings = read_settings(TrainDrafterSettings, with_artifacts(value))
+        return TargetRun(dataclasses.replace(read(TrainTargetSettings, stored, str(path)), name=name))
+    settings = read_settings(TrainDrafterSettings, with_artifacts(stored))
     policy = dataclasses.replace(settings.policy, artifacts=settings.policy.artifacts | {run.kind: name})
     return DrafterRun(dataclasses.replace(settings, policy=policy))
-
-
-def _free(folder: Path) -> str:
-    """Return `NAME-again` or `NAME-again2`, …: the first that is no folder yet."""
-    names = (f"{folder.name}-again{number if number > 1 else ''}" for number in range(1, 1000))
-    return next(candidate for candidate in names if not (folder.parent / candidate).exists())

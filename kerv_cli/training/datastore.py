@@ -1,4 +1,4 @@
-"""Builds a datastore: encodes the demonstrations with the target and writes them atomically (docs/methods.md §4.1)."""
+"""`kerv build datastore`: encode the demonstrations with the target (docs/methods.md §4.1)."""
 
 from __future__ import annotations
 
@@ -39,18 +39,20 @@ from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
-BATCH = 128  # observations encoded at once
+BATCH = 128
+"""Observations encoded together, at most."""
 KEYS = ("vision", "scene", "proprioception")
-"""Parts of the prompt that can be part of a key. The instruction is none: it is the same for all entries of a task."""
+"""Parts of the prompt that a key can have. The instruction is the same for all entries of a task."""
 
 
 @dataclass(frozen=True)
 class Entries:
-    """One episode's part of the datastore: n rows in step order."""
+    """The n entries of one episode, in step order."""
 
     keys: np.ndarray  # (n, d) float32
     tokens: np.ndarray  # (n, N) uint8
-    steps: np.ndarray  # (n,) int64, control steps since the start
+    seed: np.ndarray  # (n,) int64
+    step: np.ndarray  # (n,) int64, control steps since the start
     left: np.ndarray  # (n,) int64, control steps until the success
 
 
@@ -58,39 +60,46 @@ class Entries:
 def entries_of(
     target: ReadableTarget, episode: DemoEpisode, segments: Sequence[str], stride: int, space: ObservationSpace
 ) -> Entries:
-    """Every `stride`-th observation of the episode as a key, with the expert's next H clean actions as its tokens.
-    segments: parts of the prompt that make the key. space: of the demonstrations' observations.
+    """Return every `stride`-th observation as a key, with the expert's next H clean actions as its tokens.
+
+    Args:
+        target: Encodes the observations.
+        episode: A demonstration.
+        segments: Parts of the prompt that make the key.
+        stride: Observations between two entries.
+        space: Observation space of the demonstrations.
 
     Raises:
-        CheckpointError: too few labels, or frames of another size than the target takes.
+        CheckpointError: Too few labels, or frames of another size than the target takes.
     """
     steps = steps_of(episode, bool(target.cameras))[::stride]
     tokens = target.actions.encode(read_chunks(episode, steps, target.chunk)).reshape(len(steps), -1)
     observations = observations_of(target, episode, steps, space)
     size = -(-len(steps) // -(-len(steps) // BATCH))  # equal batches
     keys = [prompt_key(prompt, target, segments) for prompt in prompts_of(target, observations, size)]
-    return Entries(np.concatenate(keys), tokens.astype(np.uint8), steps.astype(np.int64), episode.steps - steps)
+    seed = np.full(len(steps), episode.seed)
+    return Entries(np.concatenate(keys), tokens.astype(np.uint8), seed, steps.astype(np.int64), episode.steps - steps)
 
 
 def directions(keys: np.ndarray, count: int) -> np.ndarray:
-    """keys (n, d) -> (d, count) float32: the orthonormal directions that hold most of their squared length."""
+    """Return (d, count) float32: the orthonormal directions with most of the squared length of keys (n, d)."""
     values, vectors = np.linalg.eigh(keys.T.astype(np.float64) @ keys)
     leading: np.ndarray = vectors[:, np.argsort(-values)[:count]].astype(np.float32)
     return leading
 
 
 class DatastoreBuild:
-    """`kerv build datastore`. The constructor checks that it can be built, before anything heavy starts.
+    """Checks that a datastore can be built; `build` builds it.
 
     Raises:
-        CheckpointError: no such target or demonstrations, demonstrations of another environment, evaluation seeds among
-            them, a task without an episode.
-        UsageError: an unknown part of the prompt, a folder that holds something else.
+        CheckpointError: No such target or demonstrations, demonstrations of another environment or with evaluation
+            seeds, or a task without an episode.
+        UsageError: An unknown part of the prompt, or a folder that holds something else.
     """
 
     def __init__(self, settings: BuildDatastoreSettings) -> None:
-        settings, dataset = demos_for(settings)
-        self.settings, self.dataset = settings, dataset
+        self.settings, self.dataset = demos_for(settings)
+        settings = self.settings
         tasks = sorted(resolve_tasks(settings.task or list(self.dataset.manifest.tasks)))
         self.device, _ = set_up(settings.runtime)
         self.artifacts = Artifacts(settings.results, settings.policy, device=self.device, dtype=settings.runtime.dtype)
@@ -104,77 +113,67 @@ class DatastoreBuild:
         if settings.name:
             self.folder = artifact(settings.results, "datastore", settings.name)
         check_not_shipped(self.folder, "name")
-        entries = self.dataset.episodes  # of every task the first ones by seed
+        entries = self.dataset.episodes
         by_seed = sorted(range(len(entries)), key=lambda i: entries[i].seed)
         most = settings.episodes or None
         self.chosen = {name: [i for i in by_seed if entries[i].task == name][:most] for name in tasks}
+        self.seeds = {name: [entries[i].seed for i in chosen] for name, chosen in self.chosen.items()}
         check_seeds(self.seeds, self.dataset.path)
         manifest = self.folder / "manifest.json"
         kind = read_mapping(manifest).get("kind") if manifest.is_file() else None
         if kind != "datastore" and (self.folder.is_file() or visible(self.folder)):
             raise UsageError(f"{self.folder} exists and is no datastore: give the new one another name")
 
-    @property
-    def seeds(self) -> dict[str, list[int]]:
-        """Seeds of the episodes that go in, per task."""
-        return {name: [self.dataset.episodes[i].seed for i in chosen] for name, chosen in self.chosen.items()}
-
     def plan(self) -> str:
-        """One line for --plan: episodes, tasks, target and folder."""
-        episodes = [i for chosen in self.chosen.values() for i in chosen]
-        steps = sum(self.dataset.episodes[i].steps for i in episodes)
+        """Return one line for --plan: episodes, tasks, target and folder."""
+        episodes = [self.dataset.episodes[i] for chosen in self.chosen.values() for i in chosen]
         return (
-            f"{self.folder}: {len(episodes)} demonstrations of {len(self.chosen)} tasks, {steps} control steps, "
-            f"through {self.artifacts.folder}, keys from {' + '.join(self.settings.key)}"
+            f"{self.folder}: {len(episodes)} demonstrations of {len(self.chosen)} tasks, "
+            f"{sum(episode.steps for episode in episodes)} control steps, through {self.artifacts.folder}, keys from "
+            f"{' + '.join(self.settings.key)}"
         )
 
     def build(self, progress: OnProgress = lambda done, total: None) -> Datastore:
-        """Writes the datastore atomically, replacing an older one.
+        """Write the datastore atomically, in the place of an older one.
 
         Raises:
-            CheckpointError: too few labels, or frames of another size than the target takes.
-            StorageError: writing failed.
+            CheckpointError: Too few labels, or frames of another size than the target takes.
+            StorageError: The disk refused.
         """
         target: Any = self.artifacts.target
-        space = self.dataset.manifest.observation
-        total, parts, seeds, shards, rows = sum(map(len, self.chosen.values())), [], [], {}, 0
+        space, settings = self.dataset.manifest.observation, self.settings
+        total, parts, shards, rows = sum(map(len, self.chosen.values())), list[Entries](), {}, 0
         for name, chosen in self.chosen.items():
             first = rows
             for index in chosen:
-                episode = self.dataset.load(index)
-                parts.append(entries_of(target, episode, self.settings.key, self.settings.stride, space))
-                seeds.append(np.full(len(parts[-1].steps), episode.seed))
-                rows += len(parts[-1].steps)
+                parts.append(entries_of(target, self.dataset.load(index), settings.key, settings.stride, space))
+                rows += len(parts[-1].step)
                 progress(len(parts), total)
             shards[name] = Shard((first, rows), tuple(self.seeds[name]))
-        files = self._arrays(parts, np.concatenate(seeds), shards)
+        columns = {name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])}
+        files = self._contents(columns, shards)
         write_folder(self.folder, lambda folder: self._write(folder, files, shards), replace=True)
         return Datastore.open(self.folder, self.artifacts.description)
 
-    def _arrays(self, parts: list[Entries], seeds: np.ndarray, shards: Mapping[str, Shard]) -> dict[str, Any]:
-        """File name -> its contents, an array or a table."""
-        keys, files = np.concatenate([p.keys for p in parts]), {}
+    def _contents(self, columns: dict[str, np.ndarray], shards: Mapping[str, Shard]) -> dict[str, Any]:
+        """Return file name -> its array or table."""
+        keys, tokens, files = columns.pop("keys"), columns.pop("tokens"), {}
         if self.settings.components:
             files[PROJECTION] = directions(keys, self.settings.components)
             keys = projected(keys, files[PROJECTION])
-        tokens = np.concatenate([p.tokens for p in parts])
+        files[VECTORS] = keys.astype(np.float16 if self.settings.half else np.float32)
         counts = [shard.rows[1] - shard.rows[0] for shard in shards.values()]
-        columns = {
-            "task": pa.DictionaryArray.from_arrays(
-                np.repeat(np.arange(len(shards), dtype=np.int32), counts), [*shards]
-            ),
-            "seed": seeds,
-            "step": np.concatenate([p.steps for p in parts]),
-            "left": np.concatenate([p.left for p in parts]),
+        task = np.repeat(np.arange(len(shards), dtype=np.int32), counts)
+        table = {
+            "task": pa.DictionaryArray.from_arrays(task, [*shards]),
+            **columns,
             "tokens": pa.FixedSizeListArray.from_arrays(pa.array(tokens.ravel()), tokens.shape[1]),
         }
-        files[VECTORS] = keys.astype(np.float16 if self.settings.half else np.float32)
-        return {**files, PAYLOAD: pa.table(columns)}
+        return {**files, PAYLOAD: pa.table(table)}
 
     def _write(self, folder: Path, files: Mapping[str, Any], shards: dict[str, Shard]) -> None:
-        """Writes every file, and last the manifest with their hashes."""
         for name, content in files.items():
-            # written to memory first: numpy and pyarrow report a full disk without its errno
+            # in memory first: numpy and pyarrow report a full disk without its errno
             buffer = io.BytesIO()
             if name == PAYLOAD:
                 pq.write_table(content, buffer, compression="zstd")

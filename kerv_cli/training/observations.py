@@ -1,5 +1,4 @@
-"""Reads demonstrations as observations: `read_observations` as the batches of a compact target, which trains on them,
-`observations_of` as any target gets them in an episode. Training, distillation, datastore and calibration read here."""
+"""Read demonstrations as observations: for training a compact target in batches, or as any target sees them."""
 
 from __future__ import annotations
 
@@ -28,26 +27,25 @@ BATCH = 64
 
 @dataclass(frozen=True)
 class Rows:
-    """Base of dataclasses with one row per sample: of tensors, encoded frames, or None for frames that are not seen."""
+    """Base of dataclasses with one row per sample: tensors, encoded frames, or None for frames that are not seen."""
 
     def __len__(self) -> int:
         return next(len(x) for x in vars(self).values() if x is not None)
 
     def where(self, chosen: Tensor) -> Self:
-        """The rows that `chosen` selects: a mask (n,) bool, or indices."""
+        """Return the rows that a mask (n,) or indices select."""
         return type(self)(*(None if x is None else x[chosen] for x in vars(self).values()))
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """All rows of `parts`, in order."""
-        columns = ([getattr(part, field.name) for part in parts] for field in fields(cls))
-        return cls(*map(_joined, columns))
+        """Return all rows of `parts`, in order."""
+        return cls(*(_joined([getattr(part, field.name) for part in parts]) for field in fields(cls)))
 
 
-def _joined(column: Sequence[Any]) -> Any:
+def _joined(column: list[Any]) -> Any:
     if isinstance(column[0], EncodedFrames):
         return EncodedFrames.joined(column)
-    return None if column[0] is None else torch.cat(list(column))
+    return None if column[0] is None else torch.cat(column)
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ class Observations(Rows):
     steps: Tensor  # (n,) int64, control steps since the start of the episode
 
     def inputs(self, indices: Tensor, device: torch.device) -> Inputs:
-        """The observations at `indices` (B,) as a batch on `device`."""
+        """Return the observations at `indices` (B,) as a batch on `device`."""
         images = None
         if self.frames is not None:
             images = torch.from_numpy(self.frames[indices].pixels()).to(device).permute(0, 3, 1, 2)
@@ -75,11 +73,17 @@ def read_observations(
     words: WordTokenizer,
     chosen: slice | np.ndarray = slice(None),
 ) -> Observations:
-    """The observations of a stored episode that a policy of these settings learns from: those with a frame, for a state
-    policy every step. chosen: which of them, default all.
+    """Return the observations of an episode from which a compact policy learns.
+
+    Args:
+        episode: A stored episode.
+        settings: Shapes of the policy. One that sees gets the steps with a frame, another every step.
+        space: Observation space of the demonstrations.
+        words: The policy's vocabulary.
+        chosen: Which of the observations; by default all.
 
     Raises:
-        CheckpointError: frames of another size than the policy takes.
+        CheckpointError: Frames of another size than the policy takes.
     """
     sees, frames = settings.observation == "vision", None
     steps = steps_of(episode, sees)[chosen]
@@ -94,29 +98,35 @@ def read_observations(
 
 
 def read_chunks(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarray:
-    """(n, H, D) float32: the expert's next H = `chunk` clean actions from each of `steps` (n,), environment units. A
-    chunk that begins near the end takes labels recorded beyond the success, never those of another episode.
+    """Return (n, H, D) float32: the expert's next H = `chunk` clean actions from each of `steps` (n,) on.
+
+    A chunk that begins near the end takes labels that were recorded after the success.
 
     Raises:
-        CheckpointError: too few labels were recorded beyond the success.
+        CheckpointError: Too few of them were recorded.
     """
     check_tail(episode, chunk, f"chunks of {chunk}")
     return np.stack([episode.labels[t : t + chunk] for t in steps])
 
 
 def steps_of(episode: DemoEpisode, sees: bool) -> np.ndarray:
-    """Control steps (n,) whose observation is recorded: for a policy that sees those with a frame, else all."""
+    """Return the control steps (n,) with a recorded observation: for a policy that sees, those with a frame."""
     return episode.frame_steps if sees else np.arange(episode.steps)
 
 
 def observations_of(
     target: Target, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace
 ) -> list[Observation]:
-    """The observations at some control steps (n,) of a demonstration, as the target takes them; all its cameras see the
-    recorded frame. space: the demonstrations'.
+    """Return the observations at control steps (n,) of a demonstration; all cameras see the recorded frame.
+
+    Args:
+        target: Its cameras and, if it has one, its `frame_shape` decide what is read.
+        episode: The demonstration.
+        steps: Control steps (n,).
+        space: Observation space of the demonstrations.
 
     Raises:
-        CheckpointError: cameras, but no frame of one of the steps, or frames of another size than `frame_shape`.
+        CheckpointError: A step without a frame, or frames of another size.
     """
     pictures: list[dict[str, np.ndarray]] = [{} for _ in steps]
     if target.cameras:
@@ -135,7 +145,7 @@ def observations_of(
 
 
 def prompts_of(target: Target, observations: Iterable[Observation], size: int = BATCH) -> Iterator[Tensor]:
-    """The prompts (B, P, E) of the observations, in order, at most `size` together and those of one length alone."""
+    """Yield the prompts (B, P, E) of the observations in order, at most `size` of one length together."""
     remaining = iter(observations)
     while batch := list(itertools.islice(remaining, size)):
         if isinstance(target, EncodesMany):
@@ -145,40 +155,39 @@ def prompts_of(target: Target, observations: Iterable[Observation], size: int = 
         yield from (torch.cat(list(equal)) for _, equal in itertools.groupby(prompts, lambda prompt: prompt.shape[1]))
 
 
-def check_tail(episode: DemoEpisode, steps: int, what: str) -> None:
-    """Checks that an episode has `steps` labels from each of its control steps on. what: their use, for the message.
+def check_tail(episode: DemoEpisode, steps: int, use: str) -> None:
+    """Refuse an episode with fewer than `steps` labels from its last control step on.
 
     Raises:
-        CheckpointError: too few labels were recorded beyond the success.
+        CheckpointError: Too few labels were recorded after the success; the message names their `use`.
     """
     tail = len(episode.labels) - episode.steps
     if tail < steps - 1:
         raise CheckpointError(
-            f"the demonstrations have {tail} labels behind an episode's end, {what} need {steps - 1}: "
+            f"the demonstrations have {tail} labels after an episode's end, {use} need {steps - 1}: "
             "record them again with a longer tail"
         )
 
 
 def check_frames(episode: DemoEpisode, size: int) -> None:
-    """Checks that an episode's frames are views of the policy's size in pixels, side by side.
+    """Refuse frames that are not views of the policy's size in pixels, side by side.
 
     Raises:
-        CheckpointError: they are not.
+        CheckpointError: They are not.
     """
     height, width = episode.frames.shape[1:3]
     if height != size or width % size:
-        pixels = f"{height}" if height == width else f"{height} x {width}"
         raise CheckpointError(
-            f"the demonstrations' frames have {pixels} pixels, the policy takes {size}: "
+            f"the demonstrations' frames have {height} x {width} pixels, the policy takes {size}: "
             "set target.image_size or record again with world.camera.size"
         )
 
 
 def held_out_every(episodes: int, share: float) -> int:
-    """k, of so many episodes of which every k-th is held out. share: above 0, at most 0.5.
+    """Return k: every k-th of the episodes is held out, for a share above 0 and at most 0.5.
 
     Raises:
-        CheckpointError: a single episode.
+        CheckpointError: A single episode.
     """
     if episodes < 2:
         raise CheckpointError("one demonstration cannot be both trained on and held out: record at least two")
@@ -189,12 +198,12 @@ S = TypeVar("S", bound=Rows)
 
 
 def split(samples: S, share: float) -> tuple[S, S]:
-    """(training, held out) by whole episodes, of samples with a tensor `episodes`. Every k-th episode is held out, so
-    that each task, plain and perturbed, is in both parts. share: above 0, at most
-    0.5.
+    """Return (training, held out) by whole episodes; `samples` has a tensor `episodes`.
+
+    Every k-th episode is held out, so that each task, plain and perturbed, is in both parts.
 
     Raises:
-        CheckpointError: a single episode.
+        CheckpointError: A single episode.
     """
     episodes: Tensor = getattr(samples, "episodes")  # noqa: B009
     every = held_out_every(int(episodes.max()) + 1, share)
