@@ -157,5 +157,5 @@ def test_a_recording_may_show_further_views_than_the_target_sees(camera: str, ac
     if accepted:
         assert acts_of("mt10-vision", SPEC, settings).sha256
     else:
-        with pytest.raises(UsageError, match="or join further views behind it"):
+        with pytest.raises(UsageError, match="add further views"):
             acts_of("mt10-vision", SPEC, settings)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import re
 import shutil
@@ -13,6 +14,8 @@ import pytest
 from test_calibration import write_dataset
 from typer.testing import CliRunner
 
+from kerv_cli.base import files
+from kerv_cli.base.places import RESUME
 from kerv_cli.cli.app import app
 from kerv_cli.episodes.resolve import resolve, resolve_rollout
 from kerv_cli.training.preparation import needs
@@ -105,15 +108,31 @@ def test_prepare_makes_what_is_missing_and_skips_what_is_there(results: Path) ->
     for place in ("early/mine/early.json", "datastore/mine/manifest.json", "calibration/mine/calibration.json"):
         assert (results / "artifacts" / place).is_file()
     assert kerv("prepare", MINE, "--plan").count("there") == 4
-    curves = results / "artifacts/early/mine/curves.png"
-    curves.unlink()  # as after a full disk
-    kerv("prepare", MINE, "for=one_pass", "steps=2")
-    assert curves.is_file()
     shutil.rmtree(results / "artifacts/datastore/mine")
     assert "missing" in kerv("prepare", MINE, "--plan")
     path = results / "artifacts/drafter/mine/drafter.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"target": "0" * 64}))
     assert "kerv runs rm drafter/mine'" in kerv("prepare", MINE, "--plan", code=1)
+
+
+@pytest.mark.usefixtures("few_validations")
+@pytest.mark.parametrize("file", [RESUME, "log.csv", "curves.png"])
+def test_prepare_ends_with_all_files_after_a_full_disk(
+    results: Path, monkeypatch: pytest.MonkeyPatch, file: str
+) -> None:
+    replace = files.os.replace
+
+    def full(source: object, target: Path) -> None:
+        if Path(target).name == file:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        replace(source, target)
+
+    words = ("prepare", MINE, "for=one_pass", "steps=2")
+    with monkeypatch.context() as patch:
+        patch.setattr(files.os, "replace", full)
+        assert "the disk is full" in kerv(*words, code=1)
+    kerv(*words)
+    assert {RESUME, "log.csv", "curves.png"} <= {path.name for path in (results / "artifacts/early/mine").iterdir()}
 
 
 def typed(line: str) -> Iterator[list[str]]:
@@ -125,8 +144,8 @@ def typed(line: str) -> Iterator[list[str]]:
 def test_the_remedy_for_weights_of_another_target_works_as_it_is_typed(results: Path) -> None:
     rollout = ("rollout", "method=spec_vla", "task=reach", MINE, "--plan")
     fast = ("train.steps=1", "train.batch=2", "drafter.samples=40")
-    for files in (results / "artifacts/drafter/mine").iterdir():
-        files.unlink()
+    for path in (results / "artifacts/drafter/mine").iterdir():
+        path.unlink()
     kerv("train", "drafter", MINE, *fast)
     path = results / "artifacts/drafter/mine/drafter.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"target": "0" * 64}))

@@ -1,7 +1,7 @@
 """DAgger: a policy moves the robot, the expert labels the states that it visits (Ross, Gordon, Bagnell 2011).
 
-The policy decodes by any method. So the states that a drafter's unverified chunks lead to are recorded with
-`method=scout_unverified`, for the drafter to be trained on.
+The policy may decode by any method. `method=scout_unverified` records the states that a drafter's unverified chunks
+lead to, to train the drafter on.
 """
 
 from __future__ import annotations
@@ -26,32 +26,37 @@ from kerv_cli.worlds.spec import EnvironmentSpec, World
 
 
 class PolicyActor:
-    """A policy decodes chunks and executes them whole. For a share of the chunks, drawn by task and seed, the expert
-    acts instead; then the policy decodes anew. The decoder is never told that an episode has ended: nothing that it
-    would remember makes an episode depend on those before it in the same process. decoder_of: task -> its decoder.
-    actions: those of the current chunk that are not executed yet."""
+    """Executes whole chunks of a policy, and for a share of the chunks, drawn by task and seed, the expert's actions.
+
+    The decoder is never told that an episode has ended, so that no episode depends on those before it.
+
+    Args:
+        decoder_of: Makes the decoder of a task.
+        expert_share: Share of chunks in which the expert acts.
+    """
 
     def __init__(self, decoder_of: Callable[[str], Decoder], expert_share: float) -> None:
         self.decoder_of, self.share = functools.cache(decoder_of), expert_share
-        self.actions: deque[NDArray[np.float64]] = deque()
-        self.expert_steps = 0
-        self.executed: NDArray[np.float32] | None = None
 
     def reset(self, world: World, seed: int) -> None:
-        """Begins an episode in a world that was reset."""
+        """Begin an episode in a world that was reset."""
         self.world = world
         self.random = np.random.default_rng([seed, *world.task.encode()])
-        self.actions.clear()
-        self.expert_steps, self.executed = 0, None
+        self.actions: deque[NDArray[np.float64]] = deque()  # of the current chunk, not executed yet
+        self.expert_steps = 0
+        self.executed: NDArray[np.float32] | None = None
         self.decoder = self.decoder_of(world.task)
         self.decoder.reset(world.task, seed, world.end_effector)
 
     def act(self, label: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The action (D,) to execute now, of the policy or, in the expert's chunks, the expert's `label`."""
+        """Return the action (D,) to execute now: the policy's or, in the expert's chunks, the expert's `label`."""
         if self.executed is not None:
             self.decoder.observe(self.executed, self.world.end_effector)
         if not self.actions and not self.expert_steps:
-            self._decide()
+            if self.random.random() < self.share:
+                self.expert_steps = self.decoder.steps
+            else:
+                self.actions = deque(self.decoder.decode(self.world.observe(self.decoder.cameras)).actions)
         if self.expert_steps:
             self.expert_steps -= 1
             action = label
@@ -60,29 +65,28 @@ class PolicyActor:
         self.executed = np.asarray(action, dtype=np.float32)
         return np.asarray(action, dtype=np.float64)
 
-    def _decide(self) -> None:
-        if self.random.random() < self.share:
-            self.expert_steps = self.decoder.steps
-        else:
-            self.actions = deque(self.decoder.decode(self.world.observe(self.decoder.cameras)).actions)
-
 
 @dataclass(frozen=True)
 class PolicyActs:
-    """Makes the actor of a recording. sha256: of the target, where that decodes as it was trained to; else a hash of
-    the method and of all weights."""
+    """Makes the actor of a recording, in the process that records.
+
+    Attributes:
+        settings: Settings of the recording.
+        sha256: Hash of the target if it decodes as it was trained to, else of the method and of all weights.
+    """
 
     settings: DemosSettings
     sha256: str
 
     @classmethod
     def of(cls, settings: DemosSettings, spec: EnvironmentSpec) -> PolicyActs:
-        """The settings' policy, for worlds of an environment. The recording may show further views behind those that
-        the target sees, for a target that will see them.
+        """Check the settings' policy for worlds of an environment.
+
+        The recording may show further views after those that the target sees, for a target that will see them.
 
         Raises:
-            UsageError: no such target, frames of another camera, a method that does not fit.
-            CheckpointError: an artifact is missing or damaged, or the policy is of another environment.
+            UsageError: No such target, frames of another camera, or a method that does not fit.
+            CheckpointError: An artifact is missing or damaged, or the policy is of another environment.
         """
         name, world = settings.policy.target, settings.world
         description = _artifacts(settings).description
@@ -92,17 +96,17 @@ class PolicyActs:
         if views and not f"{camera}+".startswith(f"{views[0]}+"):
             raise UsageError(
                 f"policy.target={name} sees {views[0]}, the recording would show {camera}: set "
-                f"world.camera.name={views[0]}, or join further views behind it"
+                f"world.camera.name={views[0]}, or add further views after it"
             )
         if not _is_plain(settings):
             Method.of(settings).check(description)
         return cls(settings, _hash(settings))
 
     def __call__(self, config: DemoConfig) -> PolicyActor:
-        """The actor, in the process that records.
+        """Return the actor.
 
         Raises:
-            CheckpointError: other weights than those that the recording began with.
+            CheckpointError: The weights are not those that the recording began with.
         """
         torch.set_num_threads(1)
         if _hash(self.settings) != self.sha256:
@@ -120,7 +124,7 @@ class PolicyActs:
 
 
 def _is_plain(settings: DemosSettings) -> bool:
-    """Whether no method and no chunk was chosen: the target decodes as it was trained to."""
+    """Return whether the target decodes as it was trained to: no method and no chunk was chosen."""
     return not settings.chunk and settings.parts() == DemosSettings().parts()
 
 

@@ -1,4 +1,4 @@
-"""The demonstrations that a command learns from: one dataset, or several that add up, of all tasks or some."""
+"""The demonstrations that a command learns from: one dataset or several joined ones, of all tasks or some."""
 
 from __future__ import annotations
 
@@ -20,20 +20,25 @@ from kerv_cli.worlds import resolve_tasks, specs, stands_for_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset
 
 S = TypeVar("S", bound=DemonstrationSettings)
-"""Settings of what is made for a target from demonstrations."""
 
 
 def name_of(tasks: Sequence[str]) -> str:
-    """The name of demonstrations of these tasks and suites, where none is given."""
+    """Return the default name of demonstrations of these tasks and suites."""
     return "-".join(tasks or DEFAULT_TASKS).lower()
 
 
 def open_demos(results: str, names: str, tasks: Sequence[str] = (), episodes: int = 0) -> DemoDataset:
-    """The dataset of that name; several, e.g. `mt50+mt50-dagger`, are joined in that order. A folder of that very
-    name comes first. tasks, episodes: for the command that records what is missing; none and 0: its defaults.
+    """Open a dataset, or several joined ones such as `mt50+mt50-dagger`.
+
+    Args:
+        results: The results folder.
+        names: The name; a folder of exactly this name comes first.
+        tasks: For the command that records what is missing; empty: its default.
+        episodes: Per task, for the same command; 0: its default.
 
     Raises:
-        UsageError: no folder name. CheckpointError: one is missing, unfinished or damaged, or they do not add up.
+        UsageError: No folder name.
+        CheckpointError: One is missing, unfinished or damaged, or they do not fit together.
     """
     whole = artifact(results, "demos", names)
     folders = [whole] if whole.is_dir() else [artifact(results, "demos", name) for name in names.split("+")]
@@ -42,9 +47,9 @@ def open_demos(results: str, names: str, tasks: Sequence[str] = (), episodes: in
         try:
             datasets.append(DemoDataset.open(folder))
         except CheckpointError as error:
-            words = command_to_go_on(results, "demos", folder)
-            if words and not (folder / "manifest.json").exists():
-                line = shlex.join(["kerv", *words])
+            command = command_to_go_on(results, "demos", folder)
+            if command and not (folder / "manifest.json").exists():
+                line = shlex.join(["kerv", *command])
                 raise CheckpointError(f"the demonstrations in {folder} are unfinished: go on with '{line}'") from error
             if folder.is_dir():
                 raise
@@ -57,27 +62,28 @@ def _remedy(results: str, folder: Path, tasks: Sequence[str], episodes: int) -> 
     tasks = [folder.name] if stands_for_tasks(folder.name) else tasks
     name = [] if folder.name == name_of(tasks) else [f"name={folder.name}"]
     task = [f"task={tasks[0]}" if len(tasks) == 1 else f"task=[{','.join(tasks)}]"] if tasks else []
-    words = [*name, *task, *([f"episodes={episodes}"] if episodes else [])]
+    command = ["kerv demos", *name, *task, *([f"episodes={episodes}"] if episodes else [])]
     stored = sorted(path.parent.name for path in (results_dir(results) / "artifacts/demos").glob("*/manifest.json"))
     others = f", or name others: demos={' or demos='.join(stored)}" if stored else ""
-    return f"record them with '{' '.join(['kerv demos', *words])}'{others}"
+    return f"record them with '{' '.join(command)}'{others}"
 
 
 def demos_for(settings: S) -> tuple[S, DemoDataset]:
-    """The demonstrations that something is made from for a target: those that it was trained on, where none are named.
-    Also the settings with what they leave open: the demonstrations' name, and, where those have tasks that the target
-    does not know, the tasks that it does; no task stands for all.
+    """Open the demonstrations from which something is made for a target: by default those it was trained on.
+
+    Returns:
+        The settings with the demonstrations' name, and with the tasks that the target knows if the demonstrations hold
+        more; and the demonstrations.
 
     Raises:
-        UsageError: no such target. CheckpointError: as `open_demos`, or they are of another environment, or for a
-            compact target of other views.
+        UsageError: No such target.
+        CheckpointError: As `open_demos`, or they are of another environment, or show a compact target other views.
     """
     target = described(find_target(settings.results, settings.policy.target), "target", TargetDescription)
     origin = target.provenance.get("demos") if not settings.demos else None
     config = origin.get("config") if isinstance(origin, dict) else None
     episodes = config.get("episodes", 0) if isinstance(config, dict) else 0
     name, tasks = settings.demos or target.demos or name_of(()), settings.task
-    names = resolve_tasks(tasks) if tasks else ()
     asked = tasks if settings.demos else ()  # the target's own are recorded whole
     dataset = open_demos(settings.results, name, asked or target.tasks, episodes)
     check_spaces(dataset, target.actions, target.observation, "the target")
@@ -85,19 +91,19 @@ def demos_for(settings: S) -> tuple[S, DemoDataset]:
         camera = specs()[dataset.manifest.environment].camera_name(target.cameras[0])
         dataset = seen_by(dataset, camera, "the target sees", f"record them with world.camera.name={camera}")
     if dataset.manifest.environment == target.environment:
-        check_tasks(dataset, names)
-    recorded = list(dataset.manifest.tasks)
-    trained = resolve_tasks(target.tasks) if target.tasks and not tasks else ()
-    if set(recorded) - set(trained):
-        tasks = tasks or [task for task in recorded if task in trained]
+        check_tasks(dataset, resolve_tasks(tasks) if tasks else ())
+    if target.tasks and not tasks:
+        recorded, trained = dataset.manifest.tasks, resolve_tasks(target.tasks)
+        if set(recorded) - set(trained):
+            tasks = [task for task in recorded if task in trained]
     return replace(settings, demos=name, task=tasks), dataset
 
 
 def check_tasks(dataset: DemoDataset, names: Sequence[str]) -> None:
-    """Refuses demonstrations that lack one of these tasks, by their full names.
+    """Refuse demonstrations that lack one of these tasks, by their full names.
 
     Raises:
-        CheckpointError: the first one without an episode.
+        CheckpointError: The first one without an episode.
     """
     recorded = list(dict.fromkeys(entry.task for entry in dataset.episodes))
     for task in names:
@@ -109,10 +115,10 @@ def check_tasks(dataset: DemoDataset, names: Sequence[str]) -> None:
 
 
 def check_spaces(dataset: DemoDataset, actions: ActionSpace, observation: ObservationSpace, owner: str) -> None:
-    """Refuses demonstrations of another environment. actions, observation: spaces of `owner`, e.g. "the target".
+    """Refuse demonstrations with other spaces than those of `owner`, e.g. "the target".
 
     Raises:
-        CheckpointError: other actions or observations.
+        CheckpointError: Other actions or observations.
     """
     where = f"the demonstrations in {dataset.path}"
     dataset.manifest.actions.check_same(actions, where, owner)
@@ -121,11 +127,10 @@ def check_spaces(dataset: DemoDataset, actions: ActionSpace, observation: Observ
 
 
 def seen_by(dataset: DemoDataset, camera: str, who: str, remedy: str) -> DemoDataset:
-    """The dataset with the views of `camera` alone, where further ones were recorded behind them. who, remedy: for the
-    message.
+    """Return the dataset with the views of `camera` alone, if it recorded further ones after them.
 
     Raises:
-        CheckpointError: its frames begin with other views.
+        CheckpointError: Its frames begin with other views; `who` and `remedy` complete the message.
     """
     recorded = dataset.manifest.config["camera"]["name"]
     if recorded == camera:
@@ -139,7 +144,8 @@ def subset(dataset: DemoDataset, tasks: Sequence[str]) -> DemoDataset:
     """Return the dataset with only the episodes of `tasks` (tasks and suites). No tasks: the whole dataset.
 
     Raises:
-        UnknownName: no such task. CheckpointError: the dataset has none of a task.
+        UnknownName: No such task.
+        CheckpointError: The dataset has no episode of a task.
     """
     if not tasks:
         return dataset

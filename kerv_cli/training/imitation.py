@@ -1,8 +1,8 @@
-"""Behaviour cloning of the target on demonstrations.
+"""Behaviour cloning of a compact target: samples, losses, validation, and the network to begin with.
 
 One sample is one recorded control step: the observation, and the expert's next H clean actions as tokens. Validation
-uses held-out *episodes*. Token accuracy does not show success (two policies with the same accuracy can differ by half
-of the tasks), so the score is the success of closed-loop episodes where the settings ask for them.
+uses held-out episodes. Token accuracy does not show success: two policies with the same accuracy can differ by half of
+the tasks. So success in closed-loop episodes dominates the score if the settings ask for it.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 WITHIN = 9
-"""Bins; validation reports the share of tokens that are off by at most this many (the relaxed radius of Spec-VLA)."""
+"""Validation reports the share of tokens that are off by at most this many bins: Spec-VLA's relaxed radius."""
 VALIDATED = 2048
-"""Most samples of a validation."""
+"""Samples of a validation, at most."""
 
 
 @dataclass(frozen=True)
@@ -54,42 +54,57 @@ def load_samples(
     settings: TargetSettings,
     words: WordTokenizer,
     task_names: tuple[str, ...],
-    on_progress: OnProgress = lambda done, total: None,
+    progress: OnProgress = lambda done, total: None,
     places: str = "state",
 ) -> Samples:
-    """Reads the tasks' episodes, one of each at least, into memory. places: as `train.places`.
+    """Read the tasks' episodes into memory; `places` as in `TrainSettings`.
 
     Raises:
-        CheckpointError: too few labels or frames of another size.
+        CheckpointError: Too few labels or frames of another size.
     """
-    chosen = [i for i, e in enumerate(dataset.episodes) if e.task in task_names]
+    chosen = [i for i, entry in enumerate(dataset.episodes) if entry.task in task_names]
     parts = []
     for number, index in enumerate(chosen):
         episode = dataset.load(index)
         observations = read_observations(episode, settings, dataset.manifest.observation, words)
-        chunks = torch.from_numpy(read_chunks(episode, observations.steps.numpy(), settings.chunk)).float()
-        episodes = torch.full((len(observations),), number)
-        tasks = torch.full_like(episodes, task_names.index(episode.task))
+        steps, count = observations.steps.numpy(), len(observations)
         learnt = places_of(observations.states, dataset.manifest.observation)
         if places == "path":
-            learnt = waypoints(episode, observations.steps.numpy(), learnt.shape[1], dataset.manifest.actions)
-        parts.append(Samples(**vars(observations), chunks=chunks, places=learnt, episodes=episodes, tasks=tasks))
-        on_progress(number + 1, len(chosen))
+            learnt = waypoints(episode, steps, learnt.shape[1], dataset.manifest.actions)
+        sample = Samples(
+            **vars(observations),
+            chunks=torch.from_numpy(read_chunks(episode, steps, settings.chunk)).float(),
+            places=learnt,
+            episodes=torch.full((count,), number),
+            tasks=torch.full((count,), task_names.index(episode.task)),
+        )
+        parts.append(sample)
+        progress(number + 1, len(chosen))
     return Samples.joined(parts)
 
 
 def waypoints(episode: DemoEpisode, steps: np.ndarray, count: int, actions: ActionSpace) -> Tensor:
-    """(n, K, 3) float32 for K = `count`: where the hand is when strict DoFs (a gripper) next change, K − 1 times behind
-    each of `steps` (n,), and at the episode's end, metres. Positions that a demonstration itself shows, without a
-    simulator's state. A change: the expert's command moves by more than an eighth of its range in one control step; one
-    that does not come is the end."""
+    """Return where the hand will be when the gripper changes, and at the episode's end.
+
+    The demonstration itself shows these positions, without a simulator's state. The gripper changes when a strict DoF
+    of the expert's command moves by more than an eighth of its range in one control step.
+
+    Args:
+        episode: A demonstration.
+        steps: (n,) control steps.
+        count: K positions: of the next K − 1 changes after a step, and of the end. A missing change is the end.
+        actions: The action space.
+
+    Returns:
+        (n, K, 3) float32, metres.
+    """
     commands = episode.labels[: episode.steps, actions.is_strict]
     changes = np.flatnonzero((abs(np.diff(commands, axis=0)) > actions.half[actions.is_strict] / 4).any(-1)) + 1
     last = episode.steps - 1
     times = np.append(changes, [last] * count)
     first = np.searchsorted(changes, steps, side="right")
-    at = np.concatenate([times[first[:, None] + np.arange(count - 1)], np.full((len(steps), 1), last)], 1)
-    return torch.from_numpy(episode.end_effector[at]).float()
+    reached = np.concatenate([times[first[:, None] + np.arange(count - 1)], np.full((len(steps), 1), last)], 1)
+    return torch.from_numpy(episode.end_effector[reached]).float()
 
 
 def task_weights(tasks: Tensor, balance: float) -> Tensor | None:
@@ -109,7 +124,7 @@ def task_weights(tasks: Tensor, balance: float) -> Tensor | None:
 
 
 def soft_labels(tokens: int, sigma: float) -> Tensor:
-    """(V, V) row per true bin of V = `tokens`: a discrete Gaussian of `sigma` bins; the identity for sigma 0."""
+    """Return (V, V): row v is a discrete Gaussian of `sigma` bins around v; one-hot for sigma 0."""
     bins = torch.arange(tokens, dtype=torch.float32)
     if sigma <= 0:
         return torch.eye(tokens)
@@ -117,14 +132,21 @@ def soft_labels(tokens: int, sigma: float) -> Tensor:
 
 
 def token_loss(logits: Tensor, tokens: Tensor, labels: Tensor) -> Tensor:
-    """Mean cross-entropy of logits (B, N, V) with the soft labels of tokens (B, N)."""
+    """Return the mean cross-entropy of logits (B, N, V) with the soft labels of tokens (B, N)."""
     return -(labels[tokens] * F.log_softmax(logits.float(), -1)).sum(-1).mean()
 
 
+def position_loss(estimated: Tensor, places: Tensor) -> Tensor:
+    """Return the smooth L1 of estimated positions (B, K, 3) metres, in units of 2 cm."""
+    return F.smooth_l1_loss(estimated / 0.02, places / 0.02, beta=1.0) * 0.5
+
+
 def lit(images: Tensor, indices: Tensor, step: int, spread: float) -> Tensor:
-    """images (B, 3, h, w) uint8 under random light: each colour is multiplied by the exponential of a smooth field,
-    whose standard deviation is drawn from 0 to `spread` per image. The field depends on the sample's index (B,) and the
-    step alone. Places in the image stay where they are."""
+    """Return images (B, 3, h, w) uint8 under random light, a function of the samples' indices (B,) and the step.
+
+    Each colour is multiplied by the exponential of a smooth field, with a standard deviation drawn from 0 to `spread`
+    per image. Nothing moves.
+    """
     draws = [np.random.default_rng((step, index)) for index in indices.tolist()]
     fields = np.stack([spread * r.uniform() * r.normal(size=(3, 3, 3)) for r in draws])
     factors = torch.from_numpy(fields).float().to(images.device).exp()
@@ -133,8 +155,14 @@ def lit(images: Tensor, indices: Tensor, step: int, spread: float) -> Tensor:
 
 
 class Imitation:
-    """Losses and metrics of one training run. closed_loop: a target's success in [0, 1], which then dominates the
-    score; None: not measured."""
+    """The objective of a target.
+
+    Args:
+        target: The module to train, on its device.
+        samples: All samples; whole episodes of them are held out.
+        settings: Optimisation settings.
+        closed_loop: Measures a target's success in [0, 1], which then dominates the score.
+    """
 
     def __init__(
         self,
@@ -147,77 +175,78 @@ class Imitation:
         self.training, self.held_out = split(samples, settings.held_out)
         self.labels = soft_labels(target.actions.tokens, settings.label_sigma).to(self.device)
         self.weights = task_weights(self.training.tasks, settings.balance)
+        self.learns_places = bool(target.cameras and settings.scene_weight)
 
     def __len__(self) -> int:
         return len(self.training)
 
     def tokens(self, samples: Samples, indices: Tensor) -> Tensor:
-        """The chunks of `samples` at `indices` (B,) as tokens (B, N) int64."""
+        """Return the chunks at `indices` (B,) as tokens (B, N) int64."""
         encoded = self.module.actions.encode(samples.chunks[indices].numpy())
         return torch.from_numpy(encoded).flatten(1).to(self.device)
 
     @contextlib.contextmanager
     def precision(self) -> Iterator[None]:
-        """bfloat16 autocast where the settings ask for it, on a GPU or a CPU with AMX: another CPU is slower with it,
-        by a third with AVX512-BF16, several times without. With AMX attention is computed by its formula: the backward
-        pass of the fused kernel takes four times as long there."""
+        """Compute in bfloat16 if the settings ask for it, on a GPU or a CPU with AMX; other CPUs are slower with it.
+
+        With AMX the attention is computed by its formula: the fused kernel's backward pass takes four times as long.
+        """
         gpu = self.device.type != "cpu"
         bf16 = self.settings.bf16 and (gpu or has_tiles())
-        fused = gpu or not bf16
-        kernels = [SDPBackend.MATH] + [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION] * fused
+        kernels = [SDPBackend.MATH]
+        if gpu or not bf16:
+            kernels += [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION]
         with torch.autocast(self.device.type, torch.bfloat16, enabled=bf16), sdpa_kernel(kernels):
             yield
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Token loss and weighted position loss at `indices` (B,); in the first `scene_steps` the position
-        loss alone."""
+        """Return token loss plus weighted position loss; in the first `scene_steps` the position loss alone."""
         inputs = self.training.inputs(indices, self.device)
         if self.settings.colour and inputs.images is not None:
             inputs = replace(inputs, images=lit(inputs.images, indices, step, self.settings.colour))
-        scene = self.settings.scene_weight if self.module.cameras else 0.0
         with self.precision():
             places = self.training.places[indices].to(self.device)
-            if scene and step < self.settings.scene_steps:
+            if self.learns_places and step < self.settings.scene_steps:
                 loss = position_loss(self.module.encode_batch(inputs)[1], places)
                 return loss, {"position_loss": float(loss.detach())}
             tokens = self.tokens(self.training, indices)
             logits, positions = self.module.teacher_forced(inputs, tokens)
             loss = token_loss(logits, tokens, self.labels)
             metrics = {"token_loss": float(loss.detach())}
-            if scene:
-                extra = position_loss(positions, places)
-                loss = loss + scene * extra
-                metrics["position_loss"] = float(extra.detach())
+            if self.learns_places:
+                of_places = position_loss(positions, places)
+                loss = loss + self.settings.scene_weight * of_places
+                metrics["position_loss"] = float(of_places.detach())
         return loss, metrics
 
     @torch.no_grad()
     def validate(self, module: nn.Module) -> Metrics:
-        """Teacher-forced metrics on held-out episodes; the score is minus the mean action L1, plus ten times the
-        success where it is measured."""
+        """Return teacher-forced metrics on held-out episodes.
+
+        The score is minus the mean action L1, plus ten times the success if that is measured.
+        """
         assert isinstance(module, CompactTarget)
         chosen = torch.linspace(0, len(self.held_out) - 1, min(VALIDATED, len(self.held_out))).long()
-        hits, close, errors, offsets = [], [], [], []
+        distances, gaps, offsets = [], [], []
         actions = module.actions
         for indices in chosen.split(256):
             inputs = self.held_out.inputs(indices, self.device)
             tokens = self.tokens(self.held_out, indices)
             logits, positions = module.teacher_forced(inputs, tokens)
             guess = logits.argmax(-1)
-            distance = (guess - tokens).abs()
-            hits.append((distance == 0).float().flatten())
-            close.append((distance <= WITHIN).float().flatten())
+            distances.append((guess - tokens).abs().flatten())
             gap = np.abs(actions.values_of(guess.cpu().numpy()) - actions.values_of(tokens.cpu().numpy()))
-            errors.append(gap.reshape(-1, actions.dofs))
+            gaps.append(gap.reshape(-1, actions.dofs))
             offsets.append((positions - self.held_out.places[indices].to(self.device)).norm(dim=-1))
-        error = np.concatenate(errors).mean(0)
+        distance, error = torch.cat(distances), np.concatenate(gaps).mean(0)
         metrics = {
             "score": -float(error.mean()),
-            "token_accuracy": float(torch.cat(hits).mean()),
-            f"within_{WITHIN}": float(torch.cat(close).mean()),
+            "token_accuracy": float((distance == 0).float().mean()),
+            f"within_{WITHIN}": float((distance <= WITHIN).float().mean()),
             "action_l1": float(error.mean()),
             **{f"l1_{name}": float(e) for name, e in zip(actions.names, error, strict=True)},
         }
-        if module.cameras and self.settings.scene_weight:
+        if self.learns_places:
             medians = torch.cat(offsets).median(0).values.tolist()
             names = [place.name.replace(" ", "_") for place in module.observation.places]
             if self.settings.places == "path":
@@ -229,27 +258,22 @@ class Imitation:
         return metrics
 
 
-def position_loss(estimated: Tensor, places: Tensor) -> Tensor:
-    """Smooth L1 of estimated positions (B, K, 3) metres, in units of 2 cm."""
-    return F.smooth_l1_loss(estimated / 0.02, places / 0.02, beta=1.0) * 0.5
-
-
 def new_target(
     settings: TargetSettings, dataset: DemoDataset, samples: Samples, words: WordTokenizer, camera: str, seed: int
 ) -> CompactTarget:
-    """A fresh policy of the dataset's spaces with the samples' action statistics."""
+    """Return a fresh policy of the dataset's spaces, with the samples' action statistics."""
     torch.manual_seed(seed)
     actions = dataset.manifest.actions.fitted(samples.chunks[:, 0].numpy().astype(np.float64))
     return CompactTarget(replace(settings), actions, dataset.manifest.observation, words, camera)
 
 
 def check_init(settings: TargetSettings, camera: str, description: TargetDescription, folder: Path) -> None:
-    """Checks that the target in `folder`, with this description, can be fine-tuned to `settings` and to frames of
-    `camera`. All settings but the chunk length and the norm, on which no weight's shape depends, and `parallel`, whose
-    queries begin fresh, must agree; views may be added behind its own.
+    """Refuse a target in `folder` that cannot be trained on with these settings and frames of `camera`.
+
+    Only the name, the chunk length, the norm and `parallel` may differ, and `camera` may add views.
 
     Raises:
-        UsageError: the first shape that differs.
+        UsageError: The first shape that differs.
     """
     for name, value in asdict(settings).items():
         stored = description.settings.get(name)
@@ -266,9 +290,11 @@ def check_init(settings: TargetSettings, camera: str, description: TargetDescrip
 
 
 def continued_target(settings: TargetSettings, init: CompactTarget, camera: str) -> CompactTarget:
-    """A policy of `settings` that begins with a copy of the weights of `init` and shares its statistics and words. Only
-    the queries of a parallel target are fresh. A further view of `camera` begins with the first one's encoder, and the
-    estimated positions do not depend on it yet."""
+    """Return a policy of `settings` that begins with the weights, statistics and words of `init`.
+
+    Only the queries of a parallel target are fresh. An added view of `camera` begins with the first one's encoder, and
+    the estimated positions do not depend on it yet.
+    """
     target = CompactTarget(replace(settings), init.actions, init.observation, init.words, camera)
     fresh = {k: v for k, v in target.state_dict().items() if k == "queries"}
     weights = {**fresh, **{k: v for k, v in init.state_dict().items() if k in target.state_dict()}}
@@ -285,5 +311,5 @@ def continued_target(settings: TargetSettings, init: CompactTarget, camera: str)
 
 
 def vocabulary(environment: str) -> WordTokenizer:
-    """Word tokenizer over the instructions of all tasks of an environment."""
+    """Return a tokenizer of the words in the instructions of all tasks of an environment."""
     return WordTokenizer.build(t.instruction for t in specs()[environment].tasks.values())

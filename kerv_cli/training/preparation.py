@@ -1,4 +1,4 @@
-"""What a method needs of a target besides the target itself: which artifacts, in which order, made by which command."""
+"""What `kerv prepare` makes for a target: which artifacts, in which order, by which command."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.base.places import RESUME
 from kerv_cli.base.registry import find, parts
 from kerv_cli.catalogue.entries import state_of
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings
+from kerv_cli.lab.runs import command_to_go_on
 from kerv_cli.methods.artifacts import Artifacts, Weights, kind_of, removal
 from kerv_cli.methods.compose import Method
 from kerv_cli.training.demonstrations import demos_for
@@ -25,8 +25,14 @@ THERE, MISSING = "there", "missing"
 
 @dataclass(frozen=True)
 class Step:
-    """An artifact that a target needs. state: `there`, `missing`, `step 300 of 4000`, …. command: words behind `kerv`
-    that make it, without those that every step shares. seconds: of making it, a guess; 0 where it is there."""
+    """An artifact that a target needs.
+
+    Attributes:
+        kind: Kind of the artifact.
+        state: `there`, `missing`, `unfinished`, `step 300 of 4000`, …
+        command: The words after `kerv` that make it, without those that all steps share.
+        seconds: A guess of how long that takes; 0 if it is there.
+    """
 
     kind: str
     state: str
@@ -35,11 +41,11 @@ class Step:
 
 
 def plan(settings: PrepareSettings) -> list[Step]:
-    """The steps in their order, those that are done among them; nothing is loaded or made.
+    """Return all steps in order, also those that are done; nothing is loaded or made.
 
     Raises:
-        UsageError: no such target or method, a target that drafts nothing. CheckpointError: no such demonstrations, or
-            an artifact of another target lies where a new one is to be trained.
+        UsageError: No such target or method, or a target that drafts nothing.
+        CheckpointError: No such demonstrations, or another target's artifact is where one would be trained.
     """
     artifacts = Artifacts(settings.results, settings.policy)
     description = artifacts.description
@@ -50,13 +56,12 @@ def plan(settings: PrepareSettings) -> list[Step]:
     steps: list[Step] = []
     for kind in kinds:
         files = kind_of(kind)
-        command = list(files.command_beside(kinds))
-        if command[0] == "train" and settings.steps:
-            command.append(f"train.steps={settings.steps}")
-        state = _state(artifacts, kind, kinds)
-        seconds = files.seconds
+        command, seconds = list(files.command_beside(kinds)), files.seconds
         if command[0] == "train":
+            if settings.steps:
+                command.append(f"train.steps={settings.steps}")
             seconds = drafter_seconds(kind, compose("train_drafter", command[2:], TrainDrafterSettings).train.steps)
+        state = _state(artifacts, kind, kinds)
         steps.append(Step(kind, state, tuple(command), 0.0 if state == THERE else seconds))
     if any(step.state != THERE and not find("artifact", step.kind).traits.get("study") for step in steps):
         demos_for(settings)
@@ -65,11 +70,16 @@ def plan(settings: PrepareSettings) -> list[Step]:
 
 @functools.cache
 def needs(methods: tuple[str, ...], sees: bool, runnable: bool = True) -> tuple[str, ...]:
-    """Kinds of artifacts that methods need, in the order in which they are made. methods: none: all that the target can
-    have. sees: whether it has cameras. runnable: whether its environment can be run, and is not a recording alone.
+    """Return the kinds of artifacts that methods need, in the order in which they are made.
+
+    Args:
+        methods: Names of methods; empty: all that the target can have.
+        sees: Whether the target has cameras.
+        runnable: Whether its environment can be run; some exist only as a recording.
 
     Raises:
-        UnknownName: no such method. UsageError: one needs what a target without cameras cannot have.
+        UnknownName: No such method.
+        UsageError: One needs what a target without cameras cannot have.
     """
     names = groups()["method"]
     for name in methods:
@@ -97,10 +107,10 @@ def needs(methods: tuple[str, ...], sees: bool, runnable: bool = True) -> tuple[
 
 
 def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
-    """Whether the artifact is there, missing, half trained or of other artifacts.
+    """Return whether the artifact is there, missing, half trained or made from other artifacts.
 
     Raises:
-        CheckpointError: a trained one is of another target.
+        CheckpointError: A trained one is of another target.
     """
     files, path = kind_of(kind), artifacts.path(kind)
     if not files.json(path).is_file():
@@ -116,6 +126,6 @@ def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
     if not files.is_complete(described, kinds):
         return MISSING
     state = state_of(path, kind) if isinstance(files, Weights) else THERE
-    if state == "complete" and (path / RESUME).is_file() and not (path / "curves.png").is_file():
-        return "without curves"  # the disk was full at the training's end
+    if state == "complete" and command_to_go_on(artifacts.results, kind, path):
+        return "unfinished"  # e.g. the disk was full before the last files were written
     return THERE if state == "complete" else state
