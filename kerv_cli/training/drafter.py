@@ -22,7 +22,7 @@ from kerv_cli.training.settings import TrainDrafterSettings
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
-OF_TARGETS = ("init", "freeze", "balance", "closed_loop", "colour", "places")
+OF_TARGETS = ("init", "balance", "closed_loop", "colour", "places")
 """Optimisation settings that only the training of a target has."""
 
 

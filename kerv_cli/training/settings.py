@@ -32,7 +32,6 @@ class TrainSettings:
     clip: float = number(1.0, above=0, most=1e9, help="largest norm of the gradient")
     ema: float = number(0.999, 0, 0.999999, help="moving average of the weights, which is what is kept")
     init: str | None = setting(None, "target that gives the initial weights; its chunk may be shorter or longer")
-    freeze: list[str] = setting([], "modules of the target that keep the weights of `init`")
     label_sigma: float = number(1.0, 0, 1000, help="bins over which a label is spread (Gaussian); 0: one-hot")
     balance: float = number(0.0, 0, 1, help="0: every sample is drawn as often as any other; 1: every task")
     scene_weight: float = number(1.0, 0, 1e6, help="weight of the position loss (vision only)")

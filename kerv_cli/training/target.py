@@ -11,7 +11,7 @@ import numpy as np
 from torch import nn
 
 from kerv_cli.base.durations import about
-from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.places import artifact, find_target
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.views import views_of
@@ -103,10 +103,8 @@ class TargetRun(TrainingRun):
             UsageError: The run would overwrite it, or has other shapes.
             CheckpointError: No such target.
         """
-        name, frozen = self.settings.train.init, self.settings.train.freeze
+        name = self.settings.train.init
         if name is None:
-            if frozen:
-                raise UsageError(f"train.freeze={frozen}: fresh weights would stay as they are; set train.init too")
             return None
         folder = find_target(self.settings.results, name)
         if folder.resolve() == self.folder.resolve():
@@ -145,11 +143,6 @@ class TargetRun(TrainingRun):
             target = new_target(settings.target, self.dataset, samples, words, camera, settings.train.seed)
         else:
             target = continued_target(settings.target, init, camera)
-            modules = dict(target.named_children())
-            for name in settings.train.freeze:
-                if name not in modules:
-                    raise UnknownName("train.freeze", name, modules)
-                modules[name].requires_grad_(False)
         closed_loop = self.closed_loop if settings.train.closed_loop else None
         self.objective = Imitation(target.to(self.device), samples, settings.train, closed_loop)
 
