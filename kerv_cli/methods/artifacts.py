@@ -220,6 +220,7 @@ class Weights(Artifact[W]):
     """Base of kinds that are a network: safetensors and a JSON, `<kind>.json`."""
 
     any_chunk = False  # whether the target's H does not matter
+    step_seconds = 0.05  # a guess of how long a training step takes on one core
 
     def anew(self, path: Path) -> str:
         """The remedy where the one in `path` was made for another target: a training goes on with none but its own."""

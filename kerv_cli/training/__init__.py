@@ -1,0 +1,1 @@
+"""Trainings, datastores and calibrations."""

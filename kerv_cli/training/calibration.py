@@ -203,6 +203,6 @@ class CalibrationRun:
 
 
 def distribution(levels: Sequence[float], least: float) -> Variability:
-    """Return percentiles of pre-sampled levels of K, and their median K_S: at least `least`, because K is divided by it."""
+    """Return percentiles of K and its median K_S; K is divided by K_S, which is therefore at least `least`."""
     low, high, top = np.percentile(levels, [25, 75, 90]).tolist()
     return Variability(max(float(np.median(levels)), least), len(levels), low, high, top)

@@ -86,7 +86,7 @@ class DrafterRun(TrainingRun):
         drafter, train = asdict(self.settings.drafter), self.settings.train
         layers = f"{drafter['layers']}-layer " if "layers" in drafter else ""
         samples = f", greedy decodes of {drafter['samples']} observations" if "samples" in drafter else ""
-        time = about(drafter_seconds(self.artifact.kind, train.steps))
+        time = about(self.artifact.step_seconds * train.steps)
         return (
             f"{self.folder}: {layers}{self.artifact.noun} of {self.target_folder}{samples}, {train.steps} steps of "
             f"{train.batch}, {time}"
@@ -113,8 +113,3 @@ class DrafterRun(TrainingRun):
         """Write the drafter's folder."""
         made_for, stored = MadeFor.of(self.description), self.settings.train.stored
         self.artifact.save(self.folder, module, made_for, provenance, stored, settings=asdict(self.settings.drafter))
-
-
-def drafter_seconds(kind: str, steps: int) -> float:
-    """Guess the seconds that training takes, from nano and small targets on one core."""
-    return steps * {"scout": 0.4}.get(kind, 0.05)

@@ -16,7 +16,6 @@ from kerv_cli.lab.runs import command_to_go_on
 from kerv_cli.methods.artifacts import Artifacts, Weights, kind_of, removal
 from kerv_cli.methods.compose import Method
 from kerv_cli.training.demonstrations import demos_for
-from kerv_cli.training.drafter import drafter_seconds
 from kerv_cli.training.settings import PrepareSettings, TrainDrafterSettings
 from kerv_cli.worlds import specs
 
@@ -57,10 +56,11 @@ def plan(settings: PrepareSettings) -> list[Step]:
     for kind in kinds:
         files = kind_of(kind)
         command, seconds = list(files.command_beside(kinds)), files.seconds
-        if command[0] == "train":
+        if isinstance(files, Weights):
             if settings.steps:
                 command.append(f"train.steps={settings.steps}")
-            seconds = drafter_seconds(kind, compose("train_drafter", command[2:], TrainDrafterSettings).train.steps)
+            train = compose("train_drafter", command[2:], TrainDrafterSettings).train
+            seconds = files.step_seconds * train.steps
         state = _state(artifacts, kind, kinds)
         steps.append(Step(kind, state, tuple(command), 0.0 if state == THERE else seconds))
     if any(step.state != THERE and not find("artifact", step.kind).traits.get("study") for step in steps):

@@ -130,6 +130,7 @@ class ScoutArtifact(Weights[ScoutDescription]):
     kind, noun = "scout", "scout"
     command = ("train", "drafter", "drafter=scout")
     schema = ScoutDescription
+    step_seconds = 0.4
 
     def module(self, description: ScoutDescription, target: ReadableTarget) -> Scout:
         """A fresh scout, which looks through the target's camera.
