@@ -22,10 +22,10 @@ from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.targets.observations import split
 from kerv_cli.training.drafter import DrafterRun
 from kerv_cli.training.early_distillation import EarlyDistillation, EarlySamples, accepted_tokens, measure, teach_early
 from kerv_cli.training.imitation import load_samples
-from kerv_cli.training.observations import split
 from kerv_cli.training.settings import TrainDrafterSettings, TrainSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.recording import DemoConfig, record

@@ -11,7 +11,7 @@ import torch
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.text import WordTokenizer
-from kerv_cli.training.observations import Observations, read_observations
+from kerv_cli.targets.observations import Observations, read_observations
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode, save_episode
 from kerv_cli.worlds.demos.frames import EncodedFrames
 from kerv_cli.worlds.metaworld.spec import SPEC

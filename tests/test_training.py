@@ -27,8 +27,9 @@ from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.targets.losses import soft_labels, token_loss
 from kerv_cli.training import imitation
-from kerv_cli.training.imitation import Imitation, lit, soft_labels, token_loss, vocabulary, waypoints
+from kerv_cli.training.imitation import Imitation, lit, vocabulary, waypoints
 from kerv_cli.training.loop import Loop, Metrics, schedule
 from kerv_cli.training.resume import digest, read_state, write_state
 from kerv_cli.training.run import optimisation_identity

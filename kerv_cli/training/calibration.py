@@ -31,8 +31,8 @@ from kerv_cli.methods.calibration import (
 )
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.heisd.rules import BoundaryRanges
+from kerv_cli.targets.observations import observations_of
 from kerv_cli.training.demonstrations import demos_for
-from kerv_cli.training.observations import observations_of
 from kerv_cli.training.predictor_fit import choose_episodes, fit_filters, prediction_errors, read_windows
 from kerv_cli.training.settings import CalibrateSettings
 from kerv_cli.training.skip_levels import skip_section

@@ -32,8 +32,8 @@ from kerv_cli.methods.heisd.datastore import (
     projected,
     prompt_key,
 )
+from kerv_cli.targets.observations import observations_of, prompts_of, read_chunks, steps_of
 from kerv_cli.training.demonstrations import demos_for
-from kerv_cli.training.observations import observations_of, prompts_of, read_chunks, steps_of
 from kerv_cli.training.settings import BuildDatastoreSettings
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import OnProgress

@@ -24,8 +24,8 @@ from kerv_cli.engine.protocol import ReadableTarget, Target
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterArtifact, DrafterProposer
 from kerv_cli.methods.spec_vla import RelaxedRule
+from kerv_cli.targets.observations import Rows, held_out_every, observations_of, prompts_of, steps_of
 from kerv_cli.training.loop import Metrics
-from kerv_cli.training.observations import Rows, held_out_every, observations_of, prompts_of, steps_of
 from kerv_cli.training.settings import TrainDrafterSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 

@@ -18,9 +18,9 @@ from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter, choose
-from kerv_cli.training.imitation import soft_labels, token_loss
+from kerv_cli.targets.losses import soft_labels, token_loss
+from kerv_cli.targets.observations import Rows, observations_of, prompts_of, split, steps_of
 from kerv_cli.training.loop import Metrics
-from kerv_cli.training.observations import Rows, observations_of, prompts_of, split, steps_of
 from kerv_cli.training.settings import TrainDrafterSettings, TrainSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode

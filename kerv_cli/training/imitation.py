@@ -26,8 +26,9 @@ from kerv_cli.targets.compact.packed_bfloat16 import has_tiles
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.targets.losses import position_loss, soft_labels, token_loss
+from kerv_cli.targets.observations import Observations, read_chunks, read_observations, split
 from kerv_cli.training.loop import Metrics
-from kerv_cli.training.observations import Observations, read_chunks, read_observations, split
 from kerv_cli.training.settings import TrainSettings
 from kerv_cli.worlds import specs
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
@@ -121,24 +122,6 @@ def task_weights(tasks: Tensor, balance: float) -> Tensor | None:
     shares = torch.bincount(tasks).double() / len(tasks)
     weights: Tensor = shares[tasks] ** -balance
     return weights
-
-
-def soft_labels(tokens: int, sigma: float) -> Tensor:
-    """Return (V, V): row v is a discrete Gaussian of `sigma` bins around v; one-hot for sigma 0."""
-    bins = torch.arange(tokens, dtype=torch.float32)
-    if sigma <= 0:
-        return torch.eye(tokens)
-    return torch.softmax(-((bins[:, None] - bins) ** 2) / (2 * sigma**2), -1)
-
-
-def token_loss(logits: Tensor, tokens: Tensor, labels: Tensor) -> Tensor:
-    """Return the mean cross-entropy of logits (B, N, V) with the soft labels of tokens (B, N)."""
-    return -(labels[tokens] * F.log_softmax(logits.float(), -1)).sum(-1).mean()
-
-
-def position_loss(estimated: Tensor, places: Tensor) -> Tensor:
-    """Return the smooth L1 of estimated positions (B, K, 3) metres, in units of 2 cm."""
-    return F.smooth_l1_loss(estimated / 0.02, places / 0.02, beta=1.0) * 0.5
 
 
 def lit(images: Tensor, indices: Tensor, step: int, spread: float) -> Tensor:

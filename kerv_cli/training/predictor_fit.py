@@ -14,8 +14,8 @@ from kerv_cli.base.errors import KervError
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.methods.calibration import Errors
 from kerv_cli.methods.kerv.prediction import FILTERS, PREDICTORS, Noise, build_predictor, kalman_weights
+from kerv_cli.targets.observations import check_tail, held_out_every
 from kerv_cli.training.demonstrations import check_tasks
-from kerv_cli.training.observations import check_tail, held_out_every
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 

@@ -18,10 +18,10 @@ from kerv_cli.methods.early.drafter import EarlyDrafter
 from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.methods.scout.drafter import Scout, ScoutArtifact, check_sees
 from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.targets.losses import position_loss
+from kerv_cli.targets.observations import BATCH, Observations, read_observations, split
 from kerv_cli.training.early_distillation import Decodes, EarlyDistillation, columns_of, evenly, share_of
-from kerv_cli.training.imitation import position_loss
 from kerv_cli.training.loop import Metrics
-from kerv_cli.training.observations import BATCH, Observations, read_observations, split
 from kerv_cli.training.settings import TrainDrafterSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 

@@ -19,8 +19,8 @@ from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.methods.artifacts import Weights, WeightsDescription
 from kerv_cli.methods.context import Context
+from kerv_cli.targets.observations import Rows, split
 from kerv_cli.training.loop import Metrics
-from kerv_cli.training.observations import Rows, split
 from kerv_cli.training.settings import TrainDrafterSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset
 
