@@ -83,12 +83,6 @@ def difference(study: Study, where: np.ndarray) -> Estimate:
     return stats.paired_difference(stats.paired_counts(study.baseline[where], study.method[where]))
 
 
-def length(study: Study, where: np.ndarray) -> Estimate:
-    """Steps per second of the method: a ratio of sums over episodes, as AL is."""
-    seconds = study.step_method / study.tasks.seconds[study.task] * study.steps_method
-    return stats.ratio(seconds[where], study.steps_method[where], study.names(study.task[where]), None)
-
-
 def speedup(study: Study, per_episode: bool, macro: bool) -> Drawn:
     """Ratio of mean times, and its truth."""
     t, everywhere = study.tasks, np.ones(study.task.size, bool)
@@ -111,7 +105,6 @@ def intervals(study: Study) -> dict[str, Drawn]:
     drawn = {
         "success, Wilson": (success(study, everywhere), study.micro(rate)),
         "difference, Newcombe": (difference(study, everywhere), study.micro(gap)),
-        "AL": (length(study, everywhere), 1.0),
         "speedup per step": speedup(study, False, False),
         "speedup per episode": speedup(study, True, False),
     }

@@ -16,10 +16,10 @@ from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 from kerv_cli.lab.execute import RunEpisode
 from kerv_cli.lab.plan import Setting
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.page import verdict as page_verdict
+from kerv_cli.report.decide import verdict_of
 from kerv_cli.report.plots import study_figures
 from kerv_cli.report.report import report
-from kerv_cli.report.stressed import by_kind, is_stressed, summed_table, verdict
+from kerv_cli.report.stressed import by_kind, is_stressed, summed_table
 from kerv_cli.report.tables import StudyData, load_study, rows_of
 from kerv_cli.worlds.settings import StressSettings
 
@@ -89,9 +89,8 @@ def test_the_figure_has_a_panel_per_kind_and_a_line_per_method(table: pd.DataFra
     assert list(figures) == [""]
     panels = [panel for panel in figures[""].axes if panel.get_visible()]
     assert [panel.get_title(loc="left") for panel in panels] == ["push", "light"]
-    named = [line for line in panels[1].lines if line.get_label() in ("ar", "bold")]
-    assert [list(line.get_ydata()) for line in named] == [[100, 100, 100], [100, 100, 50]]
-    assert {text.get_text() for text in figures[""].legends[0].get_texts()} == {"ar", "bold"}
+    drawn = {bars.get_label(): list(bars.lines[0].get_ydata()) for bars in panels[1].containers}
+    assert drawn == {"ar": [100, 100, 100], "bold": [100, 100, 50]}
 
 
 def test_sums_count_every_stressed_world_once(table: pd.DataFrame) -> None:
@@ -123,11 +122,14 @@ def test_the_report_writes_the_sums_and_shows_them(results: Path) -> None:
     assert "Summed over levels" in page.read_text(encoding="utf-8")
 
 
-def test_the_sentence_says_who_falls_behind_where(table: pd.DataFrame) -> None:
-    assert verdict(table).endswith("bold: light 4*.")
-    assert page_verdict(table, 3.0) == (verdict(table), False)
+def test_the_verdict_says_who_falls_behind_where(table: pd.DataFrame) -> None:
+    behind, is_shown = verdict_of(table, 3.0)
+    assert behind.endswith("bold: light 4*.")
+    assert not is_shown
     kept = table[table["stress"] != "light"]
-    assert verdict(kept) == "No method falls 10 points of success or more behind ar under the same stress."
+    assert verdict_of(kept, 3.0)[0] == "no method is 10 points of success or more below ar in the same worlds."
+    unsolved = table.assign(both=0, only_baseline=2)
+    assert "ar does not solve the tasks under no stress, push 1" in verdict_of(unsolved, 3.0)[0]
     assert not is_stressed(table[table["stress"] == "none"])
 
 
@@ -141,10 +143,3 @@ def test_the_shipped_study_has_every_method_under_every_kind_and_level() -> None
     assert len(found) == len(resolved.settings) == len(methods) * 29
     study = compose("sweep", ["study=stress"], SweepSettings).study
     assert study.baseline == "ar"
-
-
-def test_a_level_0_of_a_kind_means_no_stress() -> None:
-    plain, zero = settings_of("ar", 0, 1), settings_of("ar", 0, 1)
-    zero.world.stress = StressSettings("light", 0)
-    first, second = study_of({"ar": plain, "ar, kind=light level=0": zero}, TASKS).settings
-    assert first.work == second.work

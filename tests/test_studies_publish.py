@@ -59,7 +59,7 @@ def test_sides_of_several_runs_or_commits_are_refused(tmp_path: Path, commit: Ca
     commit("d" * 40)
     store, _ = swept(tmp_path, STUDY)
     found = refusals(load_study(store).table)
-    assert "its episodes are of 2 commits" in found
+    assert "its episodes are from 2 commits" in found
     assert any(reason.startswith("not measured in one run with the baseline: naive_sd") for reason in found)
     assert any(reason.startswith("not measured in turn with the baseline") for reason in found)
 
@@ -67,5 +67,5 @@ def test_sides_of_several_runs_or_commits_are_refused(tmp_path: Path, commit: Ca
 def test_several_machines_are_refused() -> None:
     rows = {"label": ["ar", "x"], "baseline": "ar", "pairs": [0, 3], "same_run": True, "same_block": 1.0}
     table = pd.DataFrame(rows | {"git_commit": COMMIT, "host": ["a", "a;b"], "device_name": "chip", "engine": 1})
-    assert refusals(table) == ["its episodes are of 2 machines"]
+    assert refusals(table) == ["its episodes are from 2 machines"]
     assert refusals(table.assign(host="a")) == []

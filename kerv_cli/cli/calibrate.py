@@ -140,7 +140,6 @@ def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json
     if as_json:
         print_json({"certificate": path, "sentence": certificate.sentence(), "candidates": rows})
         return
-    columns = ("setting", "success", "AR", "lost / won", "p", "pairs needed")
     title = f"not more than {settings.margin:g} points below AR? tested in this order, each at {settings.delta:g}"
-    print_table(columns, [[row[column] for column in columns] for row in rows], title)
+    print_table(tuple(rows[0]), [tuple(row.values()) for row in rows], title)
     typer.echo(f"{certificate.sentence()}\n{path}")

@@ -122,13 +122,15 @@ def run_study(resolved: ResolvedStudy, planned: Plan) -> Outcome:
         Interrupted: Ctrl-C. KervError: As `study.run`.
     """
     from kerv_cli.lab.study import looks_of
-    from kerv_cli.report import decide
+    from kerv_cli.report.decide import confidence_of_a_look
+    from kerv_cli.report.decide import judge as judge_by
+    from kerv_cli.report.verdict import stopping_rule
 
     judge = None
     if resolved.sweep.until == "decided":
-        loss = resolved.sweep.loss
-        typer.echo(decide.stopping_rule(loss, len(looks_of(planned.study))), err=True)
-        judge = decide.judge(loss, lambda line: typer.echo(line, err=True))
+        loss, looks = resolved.sweep.loss, len(looks_of(planned.study))
+        typer.echo(stopping_rule(loss, looks, confidence_of_a_look(looks)), err=True)
+        judge = judge_by(loss, lambda line: typer.echo(line, err=True))
     return run_planned(planned, judge)
 
 

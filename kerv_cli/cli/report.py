@@ -84,9 +84,10 @@ def report(
 def _print_choice(settings: ReportSettings, as_json: bool) -> None:
     """Prints the choice of one study, or of every study that has results."""
     from kerv_cli.lab.store import StudyStore
-    from kerv_cli.report.decide import choices, sentence, short_sentence
+    from kerv_cli.report.decide import choices
     from kerv_cli.report.report import names_to_report
     from kerv_cli.report.tables import load_study
+    from kerv_cli.report.verdict import sentence, short_sentence
 
     results, answers = results_dir(settings.results), {}
     for name in names_to_report(results, settings.only):

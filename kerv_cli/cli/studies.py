@@ -35,9 +35,9 @@ def print_study(table: DataFrame, store: StudyStore) -> None:
 
 def print_verdict(table: DataFrame, store: StudyStore, loss: float) -> None:
     """Prints the last three lines of a study: the verdict, the page to open, the recording to watch."""
-    from kerv_cli.report.page import verdict
+    from kerv_cli.report.decide import verdict_of
 
-    typer.echo(f"verdict: {verdict(table, loss)[0]}")
+    typer.echo(f"verdict: {verdict_of(table, loss)[0]}")
     typer.echo(f"page: {store.root / 'report.html'}")
     recordings = store.recordings
     mend = "" if store.kind == "import" else "; the same sweep with record=1 rerun=all does that"

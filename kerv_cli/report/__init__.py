@@ -1,0 +1,1 @@
+"""Tables, figures, pages and recordings from stored episodes."""

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from kerv_cli.base.config import as_words, compose
 from kerv_cli.base.errors import UsageError
@@ -34,12 +35,19 @@ from kerv_cli.worlds import resolve_tasks, spec_of
 
 POINTS = 100.0
 
+_VARIED = ("prefill_draft", "skip")
+"""Kinds of parts in which candidates may differ."""
+_CONDITIONS = ("task", "seed", "episodes", "world", "rollout.clock", "runtime.dtype", "policy.kind", "policy.target")
+"""Settings that all must share, the baseline too."""
+_OF_CANDIDATES = ("chunk", "policy", *(kind for kind in METHOD_KINDS if kind not in _VARIED))
+"""Settings that all candidates must share."""
+
 
 def folder_of(resolved: ResolvedStudy) -> Path:
-    """The certificate's folder, of a study that meets its conditions (`_check_conditions`).
+    """Return the folder of a study's certificate, after checking that the study can give one.
 
     Raises:
-        UsageError: settings that differ in more than how they trust, or seeds that are not for selection; a shipped
+        UsageError: Settings that differ in more than how they trust, seeds that are not for selection, or a shipped
             policy's certificate.
     """
     baseline, *candidates = _settings(resolved)
@@ -49,18 +57,16 @@ def folder_of(resolved: ResolvedStudy) -> Path:
     first, tasks = candidates[0], resolve_tasks(baseline.task)
     seeds = range(first.seed, first.seed + first.episodes)
     spec_of(tasks[0]).seeds.check(seeds, "selection", f"seed={first.seed}")
-    artifacts = artifacts_of(first)
-    folder = artifacts.path(CertificateArtifact.kind)
+    folder = artifacts_of(first).path(CertificateArtifact.kind)
     check_not_shipped(folder, "policy.artifacts.certificate")
     return folder
 
 
 def _check_conditions(resolved: ResolvedStudy) -> None:
-    """Refuses what a certificate does not say: it names one chunk, method, world, policy and number format, of a world
-    that is not stressed and waits, and compares with AR.
+    """Refuse what a certificate does not say.
 
-    Raises:
-        UsageError: names the setting and what to change.
+    A certificate names one chunk, method, policy, number format and world. The world is not stressed and waits for the
+    policy. The comparison is with AR.
     """
     baseline, first = _settings(resolved)[:2]
     for label, other in resolved.settings.items():
@@ -84,17 +90,17 @@ def _check_conditions(resolved: ResolvedStudy) -> None:
 
 
 def deployment_note(resolved: ResolvedStudy) -> str:
-    """One sentence where method=one_pass_certified decodes otherwise than the study's settings, with the words that
-    change that; else empty."""
+    """Return what to add to method=one_pass_certified so that it decodes as the study does; empty if nothing."""
     preset, study = compose("rollout", ["method=one_pass_certified"], RolloutSettings).parts(), _settings(resolved)[1]
     kinds = [kind for kind, part in study.parts().items() if kind not in _VARIED and part != preset[kind]]
-    was = " ".join(word for kind in kinds for word in _difference(kind, preset[kind], getattr(study, kind)))
-    words = " ".join(word for kind in kinds for word in _difference(kind, getattr(study, kind), preset[kind]))
-    return words and f"method=one_pass_certified has {was}, this study {words}: to deploy its certificate add '{words}'"
+    was = " ".join(word for kind in kinds for word in _overrides(kind, preset[kind], getattr(study, kind)))
+    overrides = " ".join(word for kind in kinds for word in _overrides(kind, getattr(study, kind), preset[kind]))
+    note = f"method=one_pass_certified has {was}, this study {overrides}: to deploy its certificate add '{overrides}'"
+    return note if overrides else ""
 
 
-def _difference(kind: str, part: Any, other: Any) -> list[str]:
-    """The words that put a part, by its settings, in the place of another of its kind."""
+def _overrides(kind: str, part: Any, other: Any) -> list[str]:
+    """Return the overrides that replace the part `other` by `part`."""
     chosen = [] if part.kind == other.kind else [f"{kind}={part.kind}"]
     base = dataclasses.asdict(part_of(kind, part.kind).default if chosen else other)
     changed = {f"{kind}.{name}": value for name, value in dataclasses.asdict(part).items() if value != base[name]}
@@ -104,8 +110,11 @@ def _difference(kind: str, part: Any, other: Any) -> list[str]:
 def certify(
     resolved: ResolvedStudy, store: StudyStore, wanted: Sequence[Wanted], margin: float, delta: float
 ) -> Certificate:
-    """Tests the study's settings in their order, each at delta, up to the first that is not shown to lose at most
-    `margin` points (fixed-sequence testing: the probability that any certified one loses more is delta at most)."""
+    """Test the study's settings in their order, each at delta, up to the first that fails.
+
+    By fixed-sequence testing, the probability that any certified setting loses more than `margin` points is at most
+    delta.
+    """
     baseline, first = _settings(resolved)[:2]
     episodes = load_study(store, wanted).episodes
     episodes = episodes[episodes["repeat"] == 0]  # a repeat is another time, not another pair
@@ -113,30 +122,13 @@ def certify(
     candidates: list[Candidate] = []
     chosen, testing = None, True
     for label, settings in resolved.settings.items():
-        if label == resolved.study.baseline:
-            continue
-        pairs = paired(episodes[episodes["label"] == label], ar)
-        both = pairs[["success_baseline", "success_method"]].to_numpy(float)
-        p = p_value(_values(both), _bound(margin), delta) if testing else None
-        candidates.append(
-            Candidate(
-                label=label,
-                skip=dataclasses.asdict(settings.skip),
-                draft=dataclasses.asdict(settings.prefill_draft),
-                pairs=len(pairs),
-                ar=int(both[:, 0].sum()),
-                successes=int(both[:, 1].sum()),
-                lost=int((both[:, 0] > both[:, 1]).sum()),
-                won=int((both[:, 0] < both[:, 1]).sum()),
-                p=p,
-                needed=_needed(both, margin, delta) if p is not None and p > delta else 0,
-            )
-        )
-        testing = p is not None and p <= delta
-        chosen = len(candidates) - 1 if testing else chosen
-    artifacts = artifacts_of(first)
+        if label != resolved.study.baseline:
+            pairs = paired(episodes[episodes["label"] == label], ar)
+            candidates.append(_candidate(label, settings, pairs, margin, delta, testing))
+            testing = candidates[-1].p is not None and candidates[-1].p <= delta
+            chosen = len(candidates) - 1 if testing else chosen
+    artifacts, tasks = artifacts_of(first), resolve_tasks(baseline.task)
     hashes = artifacts.check(need for settings in _settings(resolved)[1:] for need in Method.of(settings).needs)
-    tasks = resolve_tasks(baseline.task)
     return Certificate(
         target=hashes.pop("target"),
         actions=artifacts.description.actions,
@@ -156,66 +148,65 @@ def certify(
     )
 
 
-_VARIED = ("prefill_draft", "skip")
-"""Kinds in which candidates may differ."""
-
-_CONDITIONS = ("task", "seed", "episodes", "world", "rollout.clock", "runtime.dtype", "policy.kind", "policy.target")
-"""What all settings have in common, the baseline too."""
-
-_OF_CANDIDATES = ("chunk", "policy", *(kind for kind in METHOD_KINDS if kind not in _VARIED))
-"""What all candidates have in common."""
+def _candidate(
+    label: str, settings: RolloutSettings, pairs: pd.DataFrame, margin: float, delta: float, testing: bool
+) -> Candidate:
+    """Return one setting's result over its pairs with AR."""
+    ar, own = (pairs[f"success_{side}"].to_numpy(float) for side in ("baseline", "method"))
+    # (n,) values in a random order that has nothing to do with the tasks
+    seed = int.from_bytes(hashlib.sha256(str(len(ar)).encode()).digest()[:4], "big")
+    values, bound = np.random.default_rng(seed).permutation((1 + ar - own) / 2), (1 + margin / POINTS) / 2
+    p = p_value(values, bound, delta) if testing else None
+    needed = more_to_decide(values, bound, delta) if p is not None and p > delta else 0.0
+    return Candidate(
+        label=label,
+        skip=dataclasses.asdict(settings.skip),
+        draft=dataclasses.asdict(settings.prefill_draft),
+        pairs=len(pairs),
+        ar=int(ar.sum()),
+        successes=int(own.sum()),
+        lost=int((ar > own).sum()),
+        won=int((ar < own).sum()),
+        p=p,
+        needed=int(needed) if math.isfinite(needed) else -1,
+    )
 
 
 def write(folder: Path, certificate: Certificate) -> Path:
-    """Writes the certificate -> its file."""
+    """Write the certificate and return its file."""
     path = CertificateArtifact().json(folder)
     write_json(path, {**dataclasses.asdict(certificate), "actions": certificate.actions.as_dict()})
     return path
 
 
 def candidate_rows(certificate: Certificate) -> list[dict[str, str]]:
-    """A row per candidate, as text."""
+    """Return a row per candidate, as text."""
     return [
         {
             "setting": one.label,
             "success": f"{one.successes}/{one.pairs}",
-            "AR": f"{one.ar}/{one.pairs}",
+            "success of AR": f"{one.ar}/{one.pairs}",
             "lost / won": f"{one.lost} / {one.won}",
-            "p": "not tested"
-            if one.p is None
-            else f"{one.p:.3g}" + (" certified" if one.p <= certificate.delta else ""),
-            "pairs needed": _needed_text(one.needed),
+            "p": _p_text(one.p, certificate.delta),
+            "more pairs needed": _needed_text(one.needed),
         }
         for one in certificate.candidates
     ]
 
 
+def _p_text(p: float | None, delta: float) -> str:
+    if p is None:
+        return "not tested"
+    return f"{p:.3g}" + (", certified" if p <= delta else "")
+
+
 def _needed_text(pairs: int) -> str:
-    """`Candidate.needed` in words."""
     if pairs > MOST_PAIRS:
         return f"more than {MOST_PAIRS:,}"
-    return {0: "", -1: "not at these rates"}.get(pairs, f"about {pairs} more")
-
-
-def _bound(margin: float) -> float:
-    return (1 + margin / POINTS) / 2
-
-
-def _values(both: np.ndarray) -> np.ndarray:
-    """(n, 2) success of AR and of the rule -> v (n,) = (1 + AR − rule) / 2, in an order that has nothing to do with the
-    tasks."""
-    values = (1 + both[:, 0] - both[:, 1]) / 2
-    seed = int.from_bytes(hashlib.sha256(str(len(values)).encode()).digest()[:4], "big")
-    return np.random.default_rng(seed).permutation(values)
-
-
-def _needed(both: np.ndarray, margin: float, delta: float) -> int:
-    """Pairs that are missing at these rates; −1: never."""
-    more = more_to_decide(_values(both), _bound(margin), delta)
-    return int(more) if math.isfinite(more) else -1
+    return {0: "", -1: "not at these rates"}.get(pairs, f"about {pairs}")
 
 
 def _settings(resolved: ResolvedStudy) -> list[RolloutSettings]:
-    """The baseline's settings, then the candidates' in their order."""
+    """Return the baseline's settings, then the candidates' in their order."""
     others = [settings for label, settings in resolved.settings.items() if label != resolved.study.baseline]
     return [resolved.settings[resolved.study.baseline], *others]

@@ -1,8 +1,7 @@
-"""Two runs side by side: which settings differ, and by how much their results do."""
+"""Two runs side by side: in which settings they differ, and by how much their results do."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import pandas as pd
@@ -12,17 +11,29 @@ from kerv_cli.catalogue.entries import RunEntry, description_of, find_run, store
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, without
 from kerv_cli.lab.plan import seeds_text
 from kerv_cli.report.measures import MICRO, Row, measure
-from kerv_cli.report.summary import SPEEDS
+from kerv_cli.report.summary import DIFFERENCE, SPEEDS
 from kerv_cli.report.tables import StudyData, flatten, is_number, load_study
 
-_MEASURES = ("AL", "forwards_per_step", "time_per_step_ms", "skip_rate", "unverified_share")
-_STATUS_KEYS = ("host", "device_name", "git_commit", "torch_version", "mujoco_version", "kerv_version")
+_MEASURES = {
+    "AL": "tokens per verification",
+    "forwards_per_step": "forwards per step",
+    "time_per_step_ms": "time per step, ms",
+    "skip_rate": "decodes skipped, share",
+    "unverified_share": "tokens unverified, share",
+}
+_PROVENANCE = ("host", "device_name", "git_commit", "torch_version", "mujoco_version", "kerv_version")
 
 
 @dataclass(frozen=True)
 class Side:
-    """One side of a comparison: a run, and one of its settings unless it is a training. data: of the run's episodes,
-    read by `pairs_to_compare`."""
+    """One side of a comparison.
+
+    Attributes:
+        name: What it is called.
+        run: Its run.
+        label: One of the run's settings; empty for a training.
+        data: The run's episodes, read by `pairs_to_compare`.
+    """
 
     name: str
     run: RunEntry
@@ -32,7 +43,7 @@ class Side:
 
 @dataclass(frozen=True)
 class Difference:
-    """A setting, weight, machine or version in which the two sides differ. `None`: that side lacks it."""
+    """A setting, weight, machine or version in which the two sides differ; None if a side lacks it."""
 
     key: str
     first: object
@@ -41,8 +52,14 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The comparison of two sides. first, second: their names. settings: their differences. results: a row per measure
-    with both values, their difference or ratio, and its 95 % interval where there is one."""
+    """The comparison of two sides.
+
+    Attributes:
+        first: Name of the first side.
+        second: Name of the second side.
+        settings: In what they differ.
+        results: A row per measure: both values, their difference or ratio, and its 95 % interval if it has one.
+    """
 
     first: str
     second: str
@@ -51,10 +68,10 @@ class Comparison:
 
 
 def sides(results: str, name: str) -> list[Side]:
-    """The sides that a name stands for: `ID` is every setting of a run, `ID:LABEL` one of them.
+    """Return the sides that a name stands for: `ID` is every setting of a run, `ID:LABEL` one of them.
 
     Raises:
-        UsageError, UnknownName: no such run or setting.
+        UsageError, UnknownName: No such run or setting.
     """
     identifier, _, label = name.partition(":")
     run = find_run(results, identifier)
@@ -65,18 +82,18 @@ def sides(results: str, name: str) -> list[Side]:
     labels = store_of(run).load().labels
     if label and label not in labels:
         raise UsageError(f"run {run.id} has no setting '{label}': it has {', '.join(labels)}")
-    many = len(labels) > 1
-    settings = [label] if label else labels
-    return [Side(f"{run.id}:{setting}" if many else run.id, run, setting) for setting in settings]
+    return [Side(f"{run.id}:{one}" if len(labels) > 1 else run.id, run, one) for one in ([label] if label else labels)]
 
 
 def pairs_to_compare(results: str, first: str, second: str) -> list[tuple[Side, Side]]:
-    """Pairs of the settings that both runs have; if they share none, the first run's first setting with each of the
-    second run's.
+    """Return pairs of the settings that both runs have.
+
+    If they share fewer than two, they are the first run's first setting with each of the second run's.
 
     Raises:
-        UsageError, UnknownName: no such run or setting. UsageError: a training beside a run with episodes, or a run
-            without episodes. CheckpointError: a damaged one.
+        UsageError, UnknownName: No such run or setting, a training beside a run with episodes, or a run without
+            episodes.
+        CheckpointError: A damaged run.
     """
     ours, theirs = sides(results, first), sides(results, second)
     if ours[0].run.has_episodes != theirs[0].run.has_episodes:
@@ -90,19 +107,20 @@ def pairs_to_compare(results: str, first: str, second: str) -> list[tuple[Side, 
 
 
 def compare(first: Side, second: Side) -> Comparison:
-    """The differences between two sides. Raises UsageError: a setting without episodes."""
-    if first.data is None or second.data is None:
-        rows = _training_results(first.run, second.run)
-    else:
-        rows = _episode_results(first.data, first.label, second.data, second.label)
-    return Comparison(first.name, second.name, differences(first, second), rows)
+    """Return the differences between two sides.
 
-
-def differences(first: Side, second: Side) -> list[Difference]:
-    """Settings, weights, machine and versions in which two sides differ."""
+    Raises:
+        UsageError: A setting without episodes.
+    """
     ours, theirs = _settings_of(first), _settings_of(second)
     keys = dict.fromkeys([*ours, *theirs])
-    return [Difference(k, ours.get(k), theirs.get(k)) for k in keys if ours.get(k) != theirs.get(k)]
+    differing = [Difference(key, ours.get(key), theirs.get(key)) for key in keys if ours.get(key) != theirs.get(key)]
+    if first.data is None or second.data is None:
+        a, b = first.run.figures, second.run.figures
+        rows = [_plain(name, a[name], b[name]) for name in a if name in b]
+    else:
+        rows = _episode_results(_episodes(first.data, first.label), _episodes(second.data, second.label))
+    return Comparison(first.name, second.name, differing, rows)
 
 
 def _settings_of(side: Side) -> Row:
@@ -112,80 +130,52 @@ def _settings_of(side: Side) -> Row:
         settings.update((key, description[key]) for key in ("git_commit", "versions", "demos") if key in description)
         return flatten(settings)
     setting, episodes = side.data.settings[side.label], _episodes(side.data, side.label)
-    settings = flatten(without(setting.settings, NOT_DETERMINING - {"policy", "method"}))
-    weights = {name: value[:12] for name, value in setting.identity.items() if name != OBSERVATION}
-    circumstances = {
-        key: ";".join(sorted({str(value) for value in episodes[key].dropna()}))
-        for key in _STATUS_KEYS
-        if key in episodes and len(episodes)
+    wanted = [one for one in side.data.study.wanted if one.setting.label == side.label]
+    return {
+        **flatten(without(setting.settings, NOT_DETERMINING - {"policy", "method"})),
+        **{name: value[:12] for name, value in setting.identity.items() if name != OBSERVATION},
+        "tasks": ";".join(sorted({one.task for one in wanted})),
+        "seeds": seeds_text(one.seed for one in wanted),
+        **{
+            name: ";".join(sorted({str(v) for v in episodes[name].dropna()}))
+            for name in _PROVENANCE
+            if name in episodes
+        },
     }
-    return {**settings, **weights, **_tasks_and_seeds(side.data, side.label), **circumstances}
-
-
-def _tasks_and_seeds(data: StudyData, label: str) -> Row:
-    wanted = [one for one in data.study.wanted if one.setting.label == label]
-    tasks = ";".join(sorted({one.task for one in wanted}))
-    return {"tasks": tasks, "seeds": seeds_text(one.seed for one in wanted)}
-
-
-def _episode_results(first: StudyData, ours: str, second: StudyData, theirs: str) -> list[Row]:
-    baseline, episodes = _episodes(first, ours), _episodes(second, theirs)
-    if baseline.empty or episodes.empty:
-        raise UsageError("one of the two settings has no episode yet: run it first")
-    a, b = measure(baseline, baseline, MICRO), measure(episodes, baseline, MICRO, apart=True)
-    rows = [
-        _row("success", a["success"], b["success"], b, "difference", "difference"),
-        _row("speed per episode", 1.0, b["episode_speedup"], b, "episode_speedup", "ratio of times per episode"),
-        _row("speedup", 1.0, b["speedup"], b, "speedup", "ratio of times per step"),
-    ]
-    rows += _speedups(first, ours, second, theirs)
-    rows += [
-        {"measure": name, "first": a[name], "second": b[name], "change": b[name] - a[name]}
-        for name in _MEASURES
-        if is_number(a[name]) and is_number(b[name]) and (a[name] or b[name])
-    ]
-    rows.append({"measure": "pairs", "first": len(baseline), "second": len(episodes), "change": b["pairs"]})
-    return rows
 
 
 def _episodes(data: StudyData, label: str) -> pd.DataFrame:
     return data.episodes[data.episodes["label"] == label]
 
 
-def _speedups(first: StudyData, ours: str, second: StudyData, theirs: str) -> Iterator[Row]:
-    """The speedups of both settings against the baselines of their runs, and how far they differ: of two runs of one
-    study, how far these agree."""
-    a, b = (
-        measure(_episodes(data, label), _episodes(data, data.references[label]), MICRO)
-        for data, label in ((first, ours), (second, theirs))
-    )
-    names = list(dict.fromkeys((first.references[ours], second.references[theirs])))
-    for column, unit in SPEEDS.items():
-        if names not in ([ours], [theirs]) and is_number(a[column]) and is_number(b[column]):
-            yield {"measure": f"{unit} against {' and '.join(names)}", "first": a[column], "second": b[column],
-                   "change": b[column] / a[column], "what": "ratio of the speedups"}  # fmt: skip
+def _episode_results(first: pd.DataFrame, second: pd.DataFrame) -> list[Row]:
+    if first.empty or second.empty:
+        raise UsageError("one of the two settings has no episode yet: run it first")
+    a, b = measure(first, first, MICRO), measure(second, first, MICRO, all_pairs=True)
+    rows = [_measured("success", a["success"], b["success"], b, "difference", DIFFERENCE)]
+    rows += [_measured(heading, 1.0, b[name], b, name, "ratio of times") for name, heading in SPEEDS.items()]
+    rows += [
+        _plain(heading, a[name], b[name])
+        for name, heading in _MEASURES.items()
+        if is_number(a[name]) and is_number(b[name]) and (a[name] or b[name])
+    ]
+    return [*rows, {"measure": "pairs", "first": len(first), "second": len(second), "change": b["pairs"]}]
 
 
-def _row(name: str, first: float, second: float, measured: Row, column: str, what: str) -> Row:
-    low, high = measured[f"{column}_low"], measured[f"{column}_high"]
-    return {"measure": name, "first": first, "second": second, "change": measured[column], "low": low, "high": high,
-            "what": what}  # fmt: skip
+def _plain(name: str, first: float, second: float) -> Row:
+    return {"measure": name, "first": first, "second": second, "change": second - first}
 
 
-def _training_results(first: RunEntry, second: RunEntry) -> list[Row]:
-    names = [name for name in first.figures if name in second.figures]
-    return [
-        {"measure": name, "first": first.figures[name], "second": second.figures[name],
-         "change": second.figures[name] - first.figures[name]}
-        for name in names
-    ]  # fmt: skip
+def _measured(name: str, first: float, second: float, values: Row, column: str, what: str) -> Row:
+    ends = {end: values[f"{column}_{end}"] for end in ("low", "high")}
+    return {"measure": name, "first": first, "second": second, "change": values[column], **ends, "what": what}
 
 
 def same_tokens(first: RunEntry, second: RunEntry) -> tuple[int, int]:
-    """(episodes with equal tokens, episodes) of the settings, tasks and seeds that both runs have.
+    """Return in how many episodes the tokens are equal, and how many episodes both runs have.
 
     Raises:
-        UsageError: no episode.
+        UsageError: A run has no episode.
     """
     ours, theirs = _tokens(first), _tokens(second)
     shared = ours.keys() & theirs.keys()
@@ -193,13 +183,14 @@ def same_tokens(first: RunEntry, second: RunEntry) -> tuple[int, int]:
 
 
 def _tokens(run: RunEntry) -> dict[tuple[str, str, int, int], list[list[int]]]:
+    """Return the tokens of every decode by label, task, seed and repeat of the episode."""
     store = store_of(run)
     frame = store.frame()
-    tokens: dict[tuple[str, str, int, int], list[list[int]]] = {}
     if frame.empty:
-        return tokens
+        return {}
     decodes = store.decodes(frame["episode"].tolist(), ["tokens"]).to_pandas()
     keys = list(zip(*(frame[name] for name in ("label", "task", "seed", "repeat")), strict=True))
-    for position, group in decodes.groupby("episode"):
-        tokens[keys[int(str(position))]] = [list(row) for row in group["tokens"]]
-    return tokens
+    return {
+        keys[int(str(position))]: [list(row) for row in group["tokens"]]
+        for position, group in decodes.groupby("episode")
+    }

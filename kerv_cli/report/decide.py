@@ -1,11 +1,9 @@
-"""Judges settings by a bound on the loss of success: which setting of a study to take (`kerv report --choose`), and
-which settings a sweep stops (`until=decided`); docs/methods.md §7.
+"""Which setting to take (`kerv report --choose`), and which settings a sweep stops (`until=decided`).
 
-A choice tests the settings of a finished study in a fixed order, the safest first, each only where all before it
-passed: however many there are, the error is that of one test. A sweep looks after every block of seeds,
-group-sequentially with Pocock's constant boundary (Biometrika 64, 1977): of K planned looks each has the same
-confidence, so high that a setting exactly at the bound is misjudged at any of them with at most 5 %, both sides
-together.
+Both judge by a bound on the loss of success (docs/methods.md §7). A choice tests the settings of a finished study in a
+fixed order, the safest first, up to the first that fails. Its error is that of one test. A sweep looks after every
+block of seeds, with Pocock's constant boundary (Biometrika 64, 1977). A setting exactly at the bound is misjudged at
+any of the planned looks with a probability of at most 5 %.
 """
 
 from __future__ import annotations
@@ -13,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from statistics import NormalDist
 
@@ -25,89 +23,85 @@ from kerv_cli.lab.plan import Wanted
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.lab.study import Judge
 from kerv_cli.report import statistics as stats
+from kerv_cli.report import stressed, verdict
 from kerv_cli.report.measures import MICRO, Row, pair_counts, paired
 from kerv_cli.report.tables import StudyData, is_baseline, is_number, load_study, rows_of
-from kerv_cli.report.text import interval
+from kerv_cli.report.verdict import LARGER, OPEN, SMALLER, Choice, Decision
 
 POINTS = 100.0
 SPEED = "episode_speedup"
 
 
-@dataclass(frozen=True)
-class Choice:
-    """The answer for a suite or a task. front: settings that no other one beats in both speed and success, the fastest
-    first. chosen: the fastest setting whose loss of success is shown to be below the bound; empty if there is none.
-    loss_at_most, episode_speedup: of the chosen one, the first in points of success at 95 % confidence. candidate: the
-    fastest that more pairs would show at the present rates, empty if there is none, and about how many pairs, all in
-    all. faster: how many settings are faster than the baseline, or untimed; no other is ever chosen."""
-
-    where: str
-    pairs: int
-    front: tuple[str, ...]
-    chosen: str
-    loss_at_most: float
-    candidate: str
-    candidate_pairs: float
-    faster: int
-    episode_speedup: float
-    episode_speedup_low: float
-    episode_speedup_high: float
-
-    def as_dict(self) -> Row:
-        """For JSON."""
-        return {**asdict(self), "front": ";".join(self.front)}
+def verdict_of(table: pd.DataFrame, loss: float) -> tuple[str, bool]:
+    """Return a study's answer in one sentence, and whether a setting is shown to be faster at that loss in points."""
+    rows, is_shown = rows_of(table, MICRO), False
+    if stressed.is_stressed(table):
+        text = verdict.under_stress(table, stressed.reference_of(table))
+    elif not any(row["pairs"] and not is_baseline(row) for row in rows):
+        text = verdict.rates(rows)
+    else:
+        choice = _choice("all tasks", rows, loss)
+        text, is_shown = verdict.sentence(choice, loss, str(rows[0]["baseline"])), choice.is_shown
+    return f"{text}.", is_shown
 
 
-def choices(study: pd.DataFrame, per_task: pd.DataFrame | None, loss: float) -> list[Choice]:
-    """The suite's choice, then each task's.
+def choices(table: pd.DataFrame, per_task: pd.DataFrame, loss: float) -> list[Choice]:
+    """Return the choice for all tasks, then the choice for each task.
 
     Args:
-        study, per_task: a study's table, and that by task; None: the suite alone.
-        loss: bound on the loss of success, points.
+        table: A study's table.
+        per_task: A study's table by task.
+        loss: Bound on the loss of success, points.
     """
-    suite = rows_of(study, MICRO)
-    groups = () if per_task is None else per_task.groupby("task", sort=True)
-    tasks = {str(task): rows_of(rows) for task, rows in groups}
-    return [_choice(where, rows, loss) for where, rows in {"all tasks": suite, **tasks}.items()]
+    tasks = {str(task): rows_of(rows) for task, rows in per_task.groupby("task", sort=True)}
+    return [_choice(where, rows, loss) for where, rows in {"all tasks": rows_of(table, MICRO), **tasks}.items()]
 
 
 def _choice(where: str, rows: Sequence[Row], loss: float) -> Choice:
-    order = safest_first(rows)
+    success = next((float(row["success"]) for row in rows if is_baseline(row)), math.nan)
+    order = [] if success < verdict.SOLVED else safest_first(rows)
     best = _fastest(list(itertools.takewhile(lambda row: _loss_at_most(row) < loss, order)))
-    pairs = itertools.accumulate((_pairs_needed(row, loss) for row in order), max)  # what is safer is shown before
+    # a setting is shown only after all safer ones
+    pairs = itertools.accumulate((_pairs_needed(row, loss) for row in order), max)
     reached = {str(row["label"]): least for row, least in zip(order, pairs, strict=True) if math.isfinite(least)}
     candidate = None if best else _fastest([row for row in order if str(row["label"]) in reached])
     label = str(candidate["label"]) if candidate else ""
     return Choice(
         where,
         pairs=max((int(row["pairs"]) for row in rows if not is_baseline(row)), default=0),
+        baseline_success=success,
         front=tuple(str(row["label"]) for row in pareto(rows)),
         chosen=str(best["label"]) if best else "",
         loss_at_most=_loss_at_most(best) if best else math.nan,
         candidate=label,
         candidate_pairs=reached.get(label, math.nan),
-        faster=len(order),
+        tested=len(order),
         **{f"{SPEED}{end}": float(best[f"{SPEED}{end}"]) if best else math.nan for end in ("", "_low", "_high")},
     )
 
 
 def safest_first(rows: Sequence[Row]) -> list[Row]:
-    """The settings in the order in which they are tested. What executes less unverified comes first, then
-    what asks the target more often per step, then the study's order; none of this looks at success. A setting that is
-    not faster than the baseline is no answer and is left out, unless nobody timed it."""
-    paired = [row for row in rows if not is_baseline(row) and row["pairs"]]
-    faster = [row for row in paired if not is_number(row[SPEED]) or row[SPEED] > 1]
-    return sorted(faster, key=lambda row: (_unverified(row), -row["forwards_per_step"]))
+    """Return the settings in the order in which they are tested; none of it looks at success.
+
+    First what executes less unverified (in whole per cent, and settings that decode nothing last), then what asks the
+    target more often per step, then the study's order. Settings that were timed and not faster are left out.
+    """
+    compared = [row for row in rows if not is_baseline(row) and row["pairs"]]
+    tested = [row for row in compared if not is_number(row[SPEED]) or row[SPEED] > 1]
+    return sorted(tested, key=lambda row: (_unverified(row), -row["forwards_per_step"]))
 
 
 def _unverified(row: Row) -> float:
-    """Share of unverified tokens, rounded to a per cent; 1 where nothing decodes."""
     return round(float(row["unverified_share"]), 2) if is_number(row["unverified_share"]) else 1.0
 
 
 def _fastest(rows: Sequence[Row]) -> Row | None:
-    """The fastest of settings, which are in the order of their tests; where none is timed, the last of them."""
-    return max(reversed(rows), key=lambda row: row[SPEED] if is_number(row[SPEED]) else -math.inf, default=None)
+    """Return the fastest setting, those that are shown to be faster first; if none is timed, the last one tested."""
+    return max(
+        reversed(rows),
+        key=lambda row: (row[f"{SPEED}_low"] > 1, row[SPEED]) if is_number(row[SPEED]) else (False, -math.inf),
+        default=None,
+    )
 
 
 def _loss_at_most(row: Row) -> float:
@@ -120,53 +114,19 @@ def _pairs_needed(row: Row, loss: float) -> float:
 
 
 def pareto(rows: Sequence[Row]) -> list[Row]:
-    """Rows that no other one beats in speed per episode and success at once, the fastest first. The baseline's is 1."""
+    """Return the rows that no other one beats in both speed per episode and success, the fastest first."""
 
     def point(row: Row) -> tuple[float, float]:
         return (1.0 if is_baseline(row) else float(row[SPEED]), float(row["success"]))
 
+    def is_beaten(row: Row) -> bool:
+        speed, success = point(row)
+        others = (point(other) for other in timed)
+        return any(other != (speed, success) and other[0] >= speed and other[1] >= success for other in others)
+
     timed = [row for row in rows if is_baseline(row) or is_number(row[SPEED])]
-    front = [row for row in timed if not any(_beats(point(other), point(row)) for other in timed)]
-    return sorted(front, key=point, reverse=True)
+    return sorted((row for row in timed if not is_beaten(row)), key=point, reverse=True)
 
-
-def _beats(a: tuple[float, float], b: tuple[float, float]) -> bool:
-    return a != b and a[0] >= b[0] and a[1] >= b[1]
-
-
-def sentence(choice: Choice, loss: float, baseline: str) -> str:
-    """The choice for the whole suite in words."""
-    bound = f"loses less than {loss:g} points of success against {baseline}, with 95 % confidence"
-    if choice.chosen:
-        times = interval(choice.as_dict(), SPEED)
-        if times == "–":
-            return f"{choice.chosen} {bound} ({choice.pairs} pairs); which setting is the fastest was not timed"
-        speed = f"per episode {times} times as fast as {baseline} on this machine"
-        return f"the fastest setting that {bound}: {choice.chosen}, {speed} ({choice.pairs} pairs)"
-    if not choice.faster:
-        return f"no setting is faster per episode than {baseline} ({choice.pairs} pairs)"
-    return f"{choice.pairs} pairs do not yet show a setting that is faster and {bound}; {_missing(choice)}"
-
-
-def short_sentence(choice: Choice) -> str:
-    """The choice for one task in a few words."""
-    if choice.chosen:
-        return f"{choice.where}: {choice.chosen}"
-    if not choice.faster:
-        return f"{choice.where}: none is faster ({choice.pairs} pairs)"
-    return f"{choice.where}: undecided after {choice.pairs} pairs; {_missing(choice)}"
-
-
-def _missing(choice: Choice) -> str:
-    if not choice.candidate:
-        return "more would not show one"
-    more = max(1, math.ceil(choice.candidate_pairs - choice.pairs))
-    if more > stats.MOST_PAIRS:
-        return f"more than {stats.MOST_PAIRS:,} pairs would be needed to show it for {choice.candidate}"
-    return f"about {more} more would show it for {choice.candidate} at the present rates"
-
-
-SMALLER, LARGER, OPEN = "loss is smaller", "loss is larger", "open"
 
 _CONSTANTS = (1.960, 2.178, 2.289, 2.361, 2.413, 2.453, 2.485, 2.512, 2.535, 2.555, 2.572, 2.588, 2.602, 2.614, 2.626,
               2.637, 2.646, 2.655, 2.663, 2.671)  # fmt: skip
@@ -174,46 +134,29 @@ _CONSTANTS = (1.960, 2.178, 2.289, 2.361, 2.413, 2.453, 2.485, 2.512, 2.535, 2.5
 
 
 def confidence_of_a_look(looks: int) -> float:
-    """Confidence of the interval at each of so many looks.
+    """Return the confidence of the interval at each of several looks.
 
     Raises:
-        UsageError: more looks than the boundary is tabled for.
+        UsageError: More looks than the boundary is tabled for.
     """
     if not 1 <= looks <= len(_CONSTANTS):
-        raise UsageError(f"until=decided with {looks} looks: 1 to {len(_CONSTANTS)}; set study.block higher")
+        raise UsageError(f"until=decided with {looks} looks: at most {len(_CONSTANTS)}; set study.block higher")
     return float(1 - 2 * NormalDist().cdf(-_CONSTANTS[looks - 1]))
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """The answer for a setting at a look. difference: its success minus the baseline's; low, high: the interval at the
-    look's confidence."""
-
-    label: str
-    verdict: str  # SMALLER, LARGER or OPEN
-    pairs: int
-    look: int  # from 1
-    difference: float
-    low: float
-    high: float
-
-
-def verdict_of(label: str, counts: stats.PairedCounts, margin: float, look: int, looks: int) -> Verdict:
-    """Judges a setting. margin: the bound on the loss, a share of episodes."""
+def decision_of(label: str, counts: stats.PairedCounts, margin: float, look: int, looks: int) -> Decision:
+    """Judge a setting by a bound on the loss, given as a share of episodes."""
     difference = stats.paired_difference(counts, confidence_of_a_look(looks))
     answer = SMALLER if difference.low > -margin else LARGER if difference.high < -margin else OPEN
-    return Verdict(label, answer, int(sum(counts)), look, difference.value, difference.low, difference.high)
+    return Decision(label, answer, int(sum(counts)), look, *difference)
 
 
-def verdicts(data: StudyData, labels: Sequence[str], margin: float, look: int, looks: int) -> list[Verdict]:
-    """Judges the settings of these labels by all their pairs with the baseline."""
+def decisions(data: StudyData, labels: Sequence[str], margin: float, look: int, looks: int) -> list[Decision]:
+    """Judge settings by all their pairs with the baseline."""
     episodes = data.episodes[data.episodes["repeat"] == 0]
     baseline = episodes[episodes["label"] == data.study.baseline]
-    answers = []
-    for label in labels:
-        counts = pair_counts(paired(episodes[episodes["label"] == label], baseline))
-        answers.append(verdict_of(label, counts, margin, look, looks))
-    return answers
+    pairs = {label: pair_counts(paired(episodes[episodes["label"] == label], baseline)) for label in labels}
+    return [decision_of(label, counts, margin, look, looks) for label, counts in pairs.items()]
 
 
 def judge(loss: float, tell: Callable[[str], None]) -> Judge:
@@ -223,51 +166,34 @@ def judge(loss: float, tell: Callable[[str], None]) -> Judge:
         loss: The bound, in points.
         tell: Takes a line of progress.
     """
-    latest: dict[str, Verdict] = {}
+    latest: dict[str, Decision] = {}
 
     def ask(store: StudyStore, wanted: Sequence[Wanted], labels: Sequence[str], look: int, looks: int) -> list[str]:
-        answers = verdicts(load_study(store, wanted), labels, loss / POINTS, look, looks)
-        tell(f"look {look} of {looks}: {progress_line(answers)}")
+        answers = decisions(load_study(store, wanted), labels, loss / POINTS, look, looks)
+        tell(f"look {look} of {looks}: {verdict.progress_line(answers)}")
         latest.update({answer.label: answer for answer in answers})
-        write_verdicts(store.root, latest, loss, looks)
+        write_decisions(store.root, latest, loss, looks)
         return [answer.label for answer in answers if answer.verdict == OPEN]
 
     return ask
 
 
-def write_verdicts(folder: Path, answers: Mapping[str, Verdict], loss: float, looks: int) -> None:
-    """Writes decided.json into the study's folder. answers: label -> its verdict at its last look.
+def write_decisions(folder: Path, answers: Mapping[str, Decision], loss: float, looks: int) -> None:
+    """Write decided.json into the study's folder: the last decision on every label.
 
     Raises:
-        StorageError: the disk refused.
+        StorageError: The disk is full or read-only.
     """
-    rows = [{k: None if v != v else v for k, v in asdict(verdict).items()} for verdict in answers.values()]
+    rows = [{k: None if v != v else v for k, v in asdict(answer).items()} for answer in answers.values()]
     head = {"loss_points": loss, "looks": looks, "confidence_of_a_look": confidence_of_a_look(looks)}
     write_json(folder / "decided.json", {**head, "settings": rows})
 
 
-def read_verdicts(folder: Path) -> pd.DataFrame | None:
-    """The last answers of `until=decided` in a study's folder; None where it was swept without.
+def read_decisions(folder: Path) -> list[Row]:
+    """Return the last decisions of `until=decided` in a study's folder; none if it was swept without.
 
     Raises:
-        CheckpointError: the file is damaged.
+        CheckpointError: The file is damaged.
     """
     path = folder / "decided.json"
-    return pd.DataFrame(read_json(path)["settings"]) if path.is_file() else None
-
-
-def stopping_rule(loss: float, looks: int) -> str:
-    """The stopping rule in one sentence."""
-    confidence = 100 * confidence_of_a_look(looks)
-    return (
-        f"until=decided: at most {looks} looks, one per block of seeds over all tasks, each at {confidence:.1f} % "
-        "(Pocock's boundary, 95 % over all looks); a setting stops when its loss of success is shown to be below or "
-        f"above {loss:g} points"
-    )
-
-
-def progress_line(answers: Sequence[Verdict]) -> str:
-    """Verdicts in one line, for progress."""
-    clauses = [f"{v.label}: {v.verdict} after {v.pairs} pairs" for v in answers if v.verdict != OPEN]
-    waiting = sum(v.verdict == OPEN for v in answers)
-    return "; ".join([*clauses, f"{waiting} open"])
+    return list(read_json(path)["settings"]) if path.is_file() else []

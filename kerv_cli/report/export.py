@@ -1,4 +1,4 @@
-"""Runs for other trackers: trackio, Weights & Biases (offline) and MLflow, each an optional package; or CSV."""
+"""Runs for other trackers (trackio, Weights & Biases offline, MLflow: optional packages), or as files."""
 
 from __future__ import annotations
 
@@ -19,18 +19,25 @@ from kerv_cli.episodes.rows import DECODE_SCHEMA
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.curves import read_log
 from kerv_cli.report.measures import MICRO
-from kerv_cli.report.tables import flatten, load_study, rows_of, write_csv
+from kerv_cli.report.tables import flatten, is_number, load_study, rows_of, write_csv
 
 PROJECT = "kerv"
 FILES = ("csv", "parquet", "db")
 """What is written without a tracker."""
-_AT_ONCE = 100
+_AT_ONCE = 100  # episodes in memory
 
 
 @dataclass(frozen=True)
 class Tracked:
-    """What a tracker shows as one run. config: settings. history: (step, numbers), one entry per episode of a sweep or
-    rollout, or per validation of a training. summary: the numbers of the whole run."""
+    """What a tracker shows as one run.
+
+    Attributes:
+        name: Its name.
+        group: What it belongs to.
+        config: Settings.
+        history: (step, numbers), one per episode, or per validation of a training.
+        summary: Numbers of the whole run.
+    """
 
     name: str
     group: str
@@ -40,24 +47,26 @@ class Tracked:
 
 
 def export(run: RunEntry, to: str, folder: Path) -> list[str]:
-    """Hands a run to a tracker, or writes it as CSV -> names of the runs or files. folder: of the tracker's data.
+    """Hand a run to a tracker, or write it into a folder, and return the names of the runs or files.
 
     Raises:
-        UnknownName: no such tracker. UsageError: its package is not installed; the message says how to install it.
+        UnknownName: No such tracker.
+        UsageError: Its package is not installed; the message says how to install it.
     """
     if to not in (*FILES, *TRACKERS):
         raise UnknownName("tracker", to, (*FILES, *TRACKERS))
-    if to in ("db", "parquet"):
-        store = store_of(run)
-        return [str(export_database(store, folder / run.id))] if to == "db" else _to_parquet(store, folder / run.id)
-    if to not in FILES and importlib.util.find_spec(to) is None:
+    if to == "db":
+        return [str(export_database(store_of(run), folder / run.id))]
+    if to == "parquet":
+        return _to_parquet(store_of(run), folder / run.id)
+    if to != "csv" and importlib.util.find_spec(to) is None:
         raise UsageError(f"--to {to} needs the package {to}: pip install 'kerv[{to}]'")
     folder.mkdir(parents=True, exist_ok=True)
     return [TRACKERS[to](tracked, folder) for tracked in tracked_runs(run)]
 
 
 def _to_parquet(store: StudyStore, folder: Path) -> list[str]:
-    """Write episodes.parquet and decodes.parquet; the episodes of a hundred are in memory at once."""
+    """Write episodes.parquet and decodes.parquet."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -72,46 +81,35 @@ def _to_parquet(store: StudyStore, folder: Path) -> list[str]:
         pq.write_table(table, path, compression="zstd")
     schema = pa.schema([*(table.schema.field(key) for key in keys), *DECODE_SCHEMA])
     with atomic_path(decodes) as path, pq.ParquetWriter(path, schema, compression="zstd") as writer:
-        for at in range(0, len(frame), _AT_ONCE):
-            part = frame.iloc[at : at + _AT_ONCE]
+        for start in range(0, len(frame), _AT_ONCE):
+            part = frame.iloc[start : start + _AT_ONCE]
             rows = store.decodes(list(part["episode"]))
-            of = pa.Table.from_pandas(part[keys], preserve_index=False).take(rows["episode"])
-            columns = [*of.columns, *(rows[name] for name in DECODE_SCHEMA.names)]
+            episode_keys = pa.Table.from_pandas(part[keys], preserve_index=False).take(rows["episode"])
+            columns = [*episode_keys.columns, *(rows[name] for name in DECODE_SCHEMA.names)]
             writer.write_table(pa.table(columns, names=schema.names).cast(schema))
     return [str(episodes), str(decodes)]
 
 
 def tracked_runs(run: RunEntry) -> Iterator[Tracked]:
-    """One per setting for a sweep or a rollout, one for any other run."""
+    """Yield one per setting for a sweep or a rollout, one for any other run."""
     if not run.has_episodes:
-        yield _training(run)
+        log = read_log(run.folder) if run.is_training else pd.DataFrame()
+        history = [(int(row.pop("step")), _numbers(row)) for row in rows_of(log)]
+        config = {"kind": run.kind, **flatten(description_of(run).get("settings", {}))}
+        yield Tracked(run.id, run.kind, config, history, dict(run.figures))
         return
     data = load_study(store_of(run))
     for row in rows_of(data.table, MICRO):
-        episodes = data.episodes[data.episodes["label"] == row["label"]]
-        history = []
-        for number, episode in enumerate(rows_of(episodes)):
-            values = {name: float(episode[name]) for name in ("success", "steps", "forwards", "decodes", "seconds")}
-            values["ms_per_step"] = 1000 * values["seconds"] / values["steps"]
-            history.append((number, values))
+        episodes = data.episodes.loc[data.episodes["label"] == row["label"]]
+        columns = episodes[["success", "steps", "forwards", "decodes", "seconds"]].astype(float)
+        columns["ms_per_step"] = 1000 * columns["seconds"] / columns["steps"]
         setting = data.settings[row["label"]]
         config = {"kind": run.kind, "run": run.id, **flatten(setting.settings), **setting.identity}
-        numbers = {name: float(value) for name, value in row.items() if _is_measure(value)}
-        yield Tracked(f"{run.id} {row['label']}", run.id, config, history, numbers)
+        yield Tracked(f"{run.id} {row['label']}", run.id, config, list(enumerate(rows_of(columns))), _numbers(row))
 
 
-def _training(run: RunEntry) -> Tracked:
-    log = read_log(run.folder) if run.is_training else pd.DataFrame()
-    history = [
-        (int(row["step"]), {name: float(value) for name, value in row.items() if name != "step" and _is_measure(value)})
-        for row in rows_of(log)
-    ]
-    settings = description_of(run).get("settings", {})
-    return Tracked(run.id, run.kind, {"kind": run.kind, **flatten(settings)}, history, dict(run.figures))
-
-
-def _is_measure(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+def _numbers(row: Mapping[str, object]) -> dict[str, float]:
+    return {name: float(value) for name, value in row.items() if is_number(value) and math.isfinite(value)}  # type: ignore[arg-type]
 
 
 def _to_csv(tracked: Tracked, folder: Path) -> str:
@@ -164,4 +162,4 @@ TRACKERS: dict[str, Callable[[Tracked, Path], str]] = {
     "wandb": _to_wandb,
     "mlflow": _to_mlflow,
 }
-"""Name, which is also that of its package and of kerv's extra -> what hands a run over."""
+"""Name of a tracker, of its package and of kerv's extra -> the function that hands a run over."""

@@ -1,15 +1,16 @@
-"""A study's decodes at the costs of another machine and target: what each setting would cost there if it decoded the
-same tokens in the same control steps (docs/measuring.md)."""
+"""A study's decodes at the costs of another machine and target.
+
+It is what each setting would cost there if it decoded the same tokens in the same control steps (docs/measuring.md).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 import pyarrow.compute as pc
 
 from kerv_cli.base.errors import CheckpointError, UsageError
@@ -18,9 +19,8 @@ from kerv_cli.engine.cost import READ_PHASES, Profile, Work, prices, read_profil
 from kerv_cli.episodes.identity import batch_of
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MICRO, Row, decodes, measure
-from kerv_cli.report.summary import SPEEDS
+from kerv_cli.report.summary import SPEEDS, intervals
 from kerv_cli.report.tables import StudyData, rows_of
-from kerv_cli.report.text import compared, intervals
 
 ASSUMES = (
     "Speed against the baseline by the cost model: the recorded decodes at a profile's costs, as if the other machine "
@@ -41,17 +41,17 @@ class NamedProfile:
 
     @property
     def title(self) -> str:
-        """Target and device; of a projection, that nobody measured it."""
+        """Target and device, and whether the profile is a projection."""
         about = self.profile.about
         names = [str(about[key]) for key in ("target", "device_name") if about.get(key)]
         return ", ".join(names or [self.name]) + (", projected" if about.get("projected") else "")
 
 
 def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfile]:
-    """The profiles of these names: paths, documents in <results>/bench, or those that kerv ships.
+    """Return the profiles of these names: paths, documents in <results>/bench, or profiles that kerv ships.
 
     Raises:
-        UsageError: no such document, one without a profile, or one of another kerv.
+        UsageError: No such document, a document without a profile, or one of another kerv.
     """
     folders = (Path(results) / "bench", shipped_dir().parent / "bench")
     profiles = []
@@ -61,7 +61,7 @@ def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfil
         if path is None:
             shipped = sorted({p.name.removesuffix(_SHIPPED) for folder in folders for p in folder.glob(f"*{_SHIPPED}")})
             raise UsageError(
-                f"on={name}: no such profile, make one with 'kerv bench target=TARGET'"
+                f"on={name}: no such profile. Make one with 'kerv bench target=TARGET'"
                 + (f", or take one of {', '.join(shipped)}" if shipped else "")
             )
         try:
@@ -72,25 +72,28 @@ def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfil
 
 
 def repriced_table(data: StudyData, store: StudyStore, profiles: Sequence[NamedProfile]) -> pd.DataFrame:
-    """One row per machine and label, pooled over tasks: speeds against the baseline there, per episode and per control
-    step, with their intervals; times; and the speeds as they were measured.
+    """Return one row per machine and label, pooled over tasks.
+
+    A row has the speeds there with their intervals, times, and the speeds as they were measured.
 
     Raises:
-        UsageError: a profile lacks a cost that the study needs, or is of chunks of another length; a setting has no
+        UsageError: A profile lacks a cost that the study needs, or is for chunks of another length; or a setting has no
             times of its own.
     """
     episodes = {str(label): group for label, group in data.episodes.groupby("label", sort=False)}
     labels = [label for label in data.labels if decodes(episodes[label])]
-    works = {label: _label_work(data, label, store) for label in labels}
+    works = {label: _work_of_label(data, label, store) for label in labels}
     rows = []
     for named in profiles:
-        _check(named, works)
+        for label, work in works.items():
+            _check(named, label, work)
         priced = {label: _priced(episodes[label], works[label], named.profile) for label in labels}
         for label in labels:
             reference = data.references[label]
-            baseline = priced[reference] if reference in priced else priced[label].iloc[:0]
-            values = measure(priced[label], baseline, MICRO, apart=True)
-            measured = measure(episodes[label], episodes.get(reference, episodes[label].iloc[:0]), MICRO)
+            values, measured = (
+                measure(times[label], times.get(reference, times[label].iloc[:0]), MICRO, all_pairs)
+                for times, all_pairs in ((priced, True), (episodes, False))
+            )
             rows.append(
                 {
                     "study": data.study.name,
@@ -115,15 +118,21 @@ def _speeds(values: Row, prefix: str) -> dict[str, float]:
 
 
 @dataclass(frozen=True)
-class LabelWork:
-    """The work of a label's decodes. episode: (decodes,) row of the label's episodes that each belongs to. size: N."""
+class _LabelWork:
+    """The work of a label's decodes.
+
+    Attributes:
+        work: What they did.
+        episode: (decodes,) row of the label's episodes that each belongs to.
+        size: N, tokens per chunk.
+    """
 
     work: Work
     episode: np.ndarray
     size: int
 
 
-def _label_work(data: StudyData, label: str, store: StudyStore) -> LabelWork:
+def _work_of_label(data: StudyData, label: str, store: StudyStore) -> _LabelWork:
     """Return the decodes of a label, in the order of its episodes."""
     setting = data.settings[label]
     if (batch := batch_of(setting.settings)) > 1:
@@ -131,57 +140,52 @@ def _label_work(data: StudyData, label: str, store: StudyStore) -> LabelWork:
             f"setting '{label}' ran {batch} episodes at a time, without times: run it with rollout.batch=1"
         )
     episodes = data.episodes.loc[data.episodes["label"] == label, "episode"]
-    whole = store.decodes(episodes.tolist(), _COLUMNS).combine_chunks()
-    proposer = setting.settings.get("proposer", {})
-    drafter = (int(proposer["depth"]), int(proposer["top_k"])) if "top_k" in proposer else None
-    work, size = _work(whole, drafter)
-    return LabelWork(work, whole["episode"].to_numpy(), size)
-
-
-def _work(table: pa.Table, drafter: tuple[int, int] | None) -> tuple[Work, int]:
-    """The work of a table of decodes, and N."""
+    table = store.decodes(episodes.tolist(), _COLUMNS).combine_chunks()
     rounds = table["rounds"].combine_chunks()
     counts = pc.list_value_length(rounds).to_numpy(zero_copy_only=False).astype(np.int64)
-    flat = rounds.flatten()
-    columns = {name: flat.field(name).to_numpy(zero_copy_only=False) for name in (*_ROUND, "committed")}
+    columns = {name: rounds.flatten().field(name).to_numpy(zero_copy_only=False) for name in (*_ROUND, "committed")}
     decode = np.repeat(np.arange(len(counts)), counts)
     size = int(np.bincount(decode, columns.pop("committed")).max())
     phases = {phase: np.nan_to_num(table[f"seconds.{phase}"].to_numpy()) for phase in READ_PHASES}
     looked_up = ~np.isnan(table["similarity"].to_numpy(zero_copy_only=False).astype(float))
-    return work_of(columns, counts, phases, looked_up, size, drafter), size
+    proposer = setting.settings.get("proposer", {})
+    drafter = (int(proposer["depth"]), int(proposer["top_k"])) if "top_k" in proposer else None
+    work = work_of(columns, counts, phases, looked_up, size, drafter)
+    return _LabelWork(work, table["episode"].to_numpy(), size)
 
 
-def _check(named: NamedProfile, works: Mapping[str, LabelWork]) -> None:
-    """Raises UsageError for a profile that cannot price the study."""
+def _check(named: NamedProfile, label: str, work: _LabelWork) -> None:
+    """Refuse a profile that cannot price a setting."""
     target = named.profile.about.get("target", "TARGET")
-    for label, label_work in works.items():
-        if lacks := named.profile.lacks(label_work.work.needs):
-            raise UsageError(
-                f"on={named.name}: no cost of '{lacks[0]}', which setting '{label}' needs: measure it with "
-                f"'kerv bench target={target}'"
-            )
-        if named.profile.tokens < label_work.size:
-            raise UsageError(
-                f"on={named.name}: its costs are of chunks of {named.profile.tokens} tokens, setting '{label}' "
-                f"decodes {label_work.size}: measure them with 'kerv bench target={target} tokens=[{label_work.size}]'"
-            )
+    if lacks := named.profile.lacks(work.work.needs):
+        raise UsageError(
+            f"on={named.name}: no cost of '{lacks[0]}', which setting '{label}' needs. Measure it with 'kerv bench "
+            f"target={target}'"
+        )
+    if named.profile.tokens < work.size:
+        raise UsageError(
+            f"on={named.name}: its costs are for chunks of {named.profile.tokens} tokens, setting '{label}' decodes "
+            f"{work.size}. Measure them with 'kerv bench target={target} tokens=[{work.size}]'"
+        )
 
 
-def _priced(episodes: pd.DataFrame, label_work: LabelWork, profile: Profile) -> pd.DataFrame:
-    """The episodes, with the seconds that their decodes would take there."""
-    seconds = prices(label_work.work, profile)
-    whole = np.bincount(label_work.episode, seconds, len(episodes))
-    order = np.argsort(label_work.episode, kind="stable")
-    stops = np.cumsum(np.bincount(label_work.episode, minlength=len(episodes)))[:-1]
-    return episodes.assign(seconds=whole, decode_seconds=pd.Series(np.split(seconds[order], stops), episodes.index))
+def _priced(episodes: pd.DataFrame, work: _LabelWork, profile: Profile) -> pd.DataFrame:
+    """Return the episodes with the seconds that their decodes would take there."""
+    seconds = prices(work.work, profile)
+    total = np.bincount(work.episode, seconds, len(episodes))
+    order = np.argsort(work.episode, kind="stable")
+    stops = np.cumsum(np.bincount(work.episode, minlength=len(episodes)))[:-1]
+    return episodes.assign(seconds=total, decode_seconds=pd.Series(np.split(seconds[order], stops), episodes.index))
 
 
 def repriced_summary(table: pd.DataFrame) -> pd.DataFrame:
-    """As text: a row per setting, per episode before per control step; as measured, then a column pair per machine."""
+    """Return a row per setting as text: speeds as measured, then a pair of columns per machine."""
     rows: dict[str, dict[str, str]] = {}
     for row in rows_of(table):
         cells = rows.setdefault(row["label"], {"setting": row["label"]})
-        for head, prefix in ((f"measured, {row['measured_on']}", "measured_"), (row["machine"], "")):
-            for name, unit in SPEEDS.items():
-                cells[f"{head}: {unit}"] = compared(intervals(f"{prefix}{name}"), "1")(row)
+        for machine, prefix in ((f"measured, {row['measured_on']}", "measured_"), (row["machine"], "")):
+            for name, heading in SPEEDS.items():
+                cells[f"{machine}: {heading.removeprefix('speed, ')}"] = intervals(f"{prefix}{name}", of_baseline="1")(
+                    row
+                )
     return pd.DataFrame(rows.values())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import math
 from collections.abc import Sequence
 from statistics import NormalDist
@@ -19,8 +20,7 @@ class Estimate(NamedTuple):
 
 
 class PairedCounts(NamedTuple):
-    """Episodes by success of the baseline and of the method from the same initial state; expected ones need not be
-    whole."""
+    """Number of pairs by who succeeded from the same initial state. Expected counts may be fractions."""
 
     both: float
     only_baseline: float
@@ -28,15 +28,16 @@ class PairedCounts(NamedTuple):
     neither: float
 
 
-_Z = NormalDist().inv_cdf(0.975)
 NO_ESTIMATE = Estimate(math.nan, math.nan, math.nan)
 MOST_PAIRS = 10_000
-"""Nobody runs more: what needs more says only that."""
+"""Nobody runs more pairs than this, so messages say only "more than 10,000"."""
 
 
 def wilson(successes: float, episodes: float, confidence: float = 0.95) -> Estimate:
-    """A success rate with its Wilson score interval (Newcombe, Statistics in Medicine 17, 1998, method 3); NaN without
-    episodes. Written out here: scipy.stats alone takes 60 MB."""
+    """Return a success rate with its Wilson score interval; NaN without episodes.
+
+    Newcombe, Statistics in Medicine 17 (1998), method 3. It is written out because `scipy.stats` takes 60 MB of memory.
+    """
     if episodes == 0:
         return NO_ESTIMATE
     rate, z = successes / episodes, NormalDist().inv_cdf(0.5 + confidence / 2)
@@ -48,10 +49,10 @@ def wilson(successes: float, episodes: float, confidence: float = 0.95) -> Estim
 
 
 def mean_of(groups: Sequence[Estimate]) -> Estimate:
-    """The unweighted mean of independent estimates, e.g. of the groups' success rates.
+    """Return the unweighted mean of independent estimates, such as the success rates of groups of tasks.
 
-    A mean of proportions has no Wilson interval of its own; the method of variance estimates recovery (Zou and Donner,
-    2008) combines those of the groups, lopsided as they are, and is the interval of the group where there is one.
+    The interval combines the intervals of the groups by the method of variance estimates recovery (Zou and Donner,
+    Statistics in Medicine 27, 2008). With one group it is the interval of that group.
     """
     if not groups:
         return NO_ESTIMATE
@@ -62,111 +63,60 @@ def mean_of(groups: Sequence[Estimate]) -> Estimate:
 
 
 def paired_counts(baseline: np.ndarray, method: np.ndarray) -> PairedCounts:
-    """Two bool arrays (pairs,) of successes from the same initial states."""
+    """Count the pairs of two bool arrays (pairs,) of successes from the same initial states."""
     a, b = np.asarray(baseline, dtype=bool), np.asarray(method, dtype=bool)
     return PairedCounts(int((a & b).sum()), int((a & ~b).sum()), int((~a & b).sum()), int((~a & ~b).sum()))
 
 
 def paired_difference(counts: PairedCounts, confidence: float = 0.95) -> Estimate:
-    """Success rate of the method minus the baseline's from the same initial states, with its interval.
+    """Return the method's success rate minus the baseline's with its interval; NaN without pairs.
 
-    Newcombe's hybrid score interval for paired proportions (Statistics in Medicine 17, 1998, method 10): the two Wilson
-    intervals, combined with the pairs' correlation. NaN without pairs.
+    Newcombe's hybrid score interval for paired proportions (Statistics in Medicine 17, 1998, method 10). It combines
+    the two Wilson intervals with the correlation of the pairs.
     """
     pairs = sum(counts)
     if not pairs:
         return NO_ESTIMATE
     both, only_baseline, only_method, neither = counts
-    first, second = both + only_method, both + only_baseline  # successes of the method, of the baseline
-    rates = first / pairs, second / pairs
-    bounds = wilson(first, pairs, confidence), wilson(second, pairs, confidence)
-    product = first * (pairs - first) * second * (pairs - second)
+    method, baseline = (wilson(both + won, pairs, confidence) for won in (only_method, only_baseline))
     surplus = float(both * neither - only_method * only_baseline)
     if surplus > 0:
-        surplus = max(surplus - pairs / 2, 0.0)
+        surplus = max(surplus - pairs / 2, 0.0)  # correction for continuity
+    product = math.prod(pairs**2 * rate * (1 - rate) for rate in (method.value, baseline.value))
     phi = surplus / math.sqrt(product) if product else 0.0
 
     def reach(a: float, b: float) -> float:
         return math.sqrt(max(0.0, a**2 - 2 * phi * a * b + b**2))
 
-    difference = rates[0] - rates[1]
-    low = difference - reach(rates[0] - bounds[0].low, bounds[1].high - rates[1])
-    high = difference + reach(bounds[0].high - rates[0], rates[1] - bounds[1].low)
+    difference = method.value - baseline.value
+    low = difference - reach(method.value - method.low, baseline.high - baseline.value)
+    high = difference + reach(method.high - method.value, baseline.value - baseline.low)
     return Estimate(difference, low, high)
 
 
-def _spread(effects: np.ndarray, strata: Sequence[str], clusters: Sequence[str]) -> float:
-    """Half the width of the 95 % interval of a sum of effects (n,) that is 0 at the estimate.
-
-    The clusters of a stratum are independent and what is in one is not: the sum's variance is that of the clusters'
-    sums, stratum by stratum, with Student's t at as many degrees of freedom as clusters less strata. Strata of one
-    cluster have no variance of their own and count as the clusters of one stratum (Cochran, Sampling Techniques,
-    section 5A.12), which adds how much the strata differ. NaN for a single cluster.
-    """
-    from scipy.special import stdtrit
-
-    at, of = _numbers_of(strata), _numbers_of([f"{a}|{b}" for a, b in zip(strata, clusters, strict=True)])
-    sums, stratum = np.bincount(of, effects), np.zeros(int(of.max()) + 1, int)
-    stratum[of] = at
-    stratum = np.where(np.bincount(stratum)[stratum] == 1, -1, stratum)
-    variance, freedom = 0.0, 0
-    for number in np.unique(stratum):
-        parts = sums[stratum == number]
-        # the only stratum of one cluster has nothing to be compared with: the whole sum counts
-        variance += len(parts) * float(parts.var(ddof=1)) if len(parts) > 1 else float(parts[0]) ** 2
-        freedom += len(parts) - 1
-    return float(stdtrit(freedom, 0.975)) * math.sqrt(variance) if freedom else math.nan
-
-
-def ratio(
-    numerators: np.ndarray,
-    denominators: np.ndarray,
-    strata: Sequence[str] | None = None,
-    clusters: Sequence[str] | None = None,
-) -> Estimate:
-    """Sum over sum of two arrays (episodes,), with the 95 % interval of a ratio estimator: clusters are independent,
-    what happens within one is not. An episode with a denominator of 0 says nothing and does not count. NaN bounds for
-    one that counts.
-
-    Args:
-        strata: (episodes,) task of each; without, all are of one.
-        clusters: (episodes,) seed of each, so that repeats count together; without, every episode is one.
-    """
-    a, b = np.asarray(numerators, dtype=np.float64), np.asarray(denominators, dtype=np.float64)
-    counts = b > 0
-    tasks = np.zeros(a.size, int) if strata is None else np.asarray(strata)
-    seeds = np.arange(a.size) if clusters is None else np.asarray(clusters)
-    a, b = a[counts], b[counts]
-    value = float(a.sum() / b.sum())
-    reach = _spread((a - value * b) / b.sum(), tasks[counts].tolist(), seeds[counts].tolist())
-    return Estimate(value, value - reach, value + reach)
-
-
 def pairs_to_settle(counts: PairedCounts, margin: float) -> float:
-    """About how many pairs would show non-inferiority at `margin`, if the four outcomes' rates stayed as they are: the
-    least that bring the lower bound of `paired_difference` above -margin. Infinite where the difference itself lies
-    there or below; NaN without pairs."""
+    """Return about how many pairs would show non-inferiority if the rates of the four outcomes stayed as they are.
+
+    It is the smallest number that brings the lower bound of `paired_difference` above -margin. It is infinite if ten
+    million do not, and NaN without pairs.
+    """
     pairs = sum(counts)
     if not pairs:
         return math.nan
-    if (counts.only_method - counts.only_baseline) / pairs <= -margin:
-        return math.inf
 
-    def shows(number: float) -> bool:
-        more = PairedCounts(*(count * number / pairs for count in counts))
-        return paired_difference(more).low > -margin
+    def shows(number: int) -> bool:
+        return paired_difference(PairedCounts(*(count * number / pairs for count in counts))).low > -margin
 
-    low, high = 0.0, 1.0
-    while not shows(high):
-        low, high = high, 2 * high
-    while high - low > max(0.5, high / 1000):
-        middle = (low + high) / 2
-        low, high = (low, middle) if shows(middle) else (middle, high)
-    return math.ceil(high)
+    numbers = range(1, 10_000_000)
+    found = bisect.bisect_left(numbers, True, key=shows)
+    return numbers[found] if found < len(numbers) else math.inf
 
 
 def mcnemar(counts: PairedCounts) -> float:
-    """Exact two-sided p of McNemar's test, that discordant pairs favour either side equally; 1 without such pairs."""
+    """Return the exact two-sided p of McNemar's test; 1 if no pair is discordant.
+
+    McNemar, Psychometrika 12 (1947). The hypothesis is that discordant pairs favour either side equally.
+    """
     from scipy.special import bdtr
 
     lost, won = int(counts.only_baseline), int(counts.only_method)
@@ -180,42 +130,55 @@ def speedup(
     groups: Sequence[str] | None = None,
     blocks: Sequence[str] | None = None,
 ) -> Estimate:
-    """Ratio of mean times, baseline over method, with the 95 % interval of its logarithm.
+    """Return the ratio of mean times, baseline over method, with the 95 % interval of its logarithm.
 
-    Blocks are the clusters of a task, because the episodes of a block share the machine's state. Where every task has
-    one block, the tasks are the clusters, and the interval contains how much they differ; where there is one block in
-    all, its pairs are, and the interval says nothing of another state of the machine.
+    The interval is that of a linearised ratio in a stratified cluster sample (Cochran, Sampling Techniques, 1977).
+    Blocks are the clusters of a task, because the episodes of a block share the machine's state. If every task has one
+    block, the tasks are the clusters. If there is one block in all, its pairs are the clusters, and the interval says
+    nothing about another state of the machine.
 
     Args:
         baseline: (pairs,) time of the baseline's episodes, any unit.
-        method: (pairs,) the method's, same initial states, same unit.
+        method: (pairs,) time of the method's episodes from the same initial states.
         strata: (pairs,) task of each pair.
-        groups: (pairs,) difficulty group of each pair: the means are then unweighted means over the groups' means.
-        blocks: (pairs,) block of each pair; without, every pair is a block.
+        groups: (pairs,) difficulty group of each pair. With it, each mean is the unweighted mean of the groups' means.
+        blocks: (pairs,) block of each pair. Without it, every pair is a block.
 
     Returns:
-        NaN without pairs; NaN bounds for a single one.
+        NaN without pairs; NaN bounds for a single pair.
     """
     a, b = np.asarray(baseline, dtype=np.float64), np.asarray(method, dtype=np.float64)
     if a.size == 0:
         return NO_ESTIMATE
-    weights = _weights(a.size, groups)
+    weights = np.full(a.size, 1.0 / a.size)
+    if groups is not None:
+        _, members, sizes = np.unique(np.asarray(groups, dtype=str), return_inverse=True, return_counts=True)
+        weights = 1.0 / (sizes[members] * len(sizes))
     mean_a, mean_b = float(weights @ a), float(weights @ b)
-    pairs = [str(number) for number in range(a.size)]
-    clusters = pairs if blocks is None or len(set(zip(strata, blocks, strict=True))) == 1 else blocks
-    reach = math.exp(_spread(weights * (a / mean_a - b / mean_b), strata, clusters))
+    if blocks is None or len(set(zip(strata, blocks, strict=True))) == 1:
+        blocks = [str(number) for number in range(a.size)]
+    reach = math.exp(_spread(weights * (a / mean_a - b / mean_b), strata, blocks))
     return Estimate(mean_a / mean_b, mean_a / mean_b / reach, mean_a / mean_b * reach)
 
 
-def _numbers_of(names: Sequence[str]) -> np.ndarray:
-    """(n,) numbers 0, 1, … of the distinct names."""
-    numbers: np.ndarray = np.unique(np.asarray(names, dtype=object).astype(str), return_inverse=True)[1]
-    return numbers
+def _spread(effects: np.ndarray, strata: Sequence[str], clusters: Sequence[str]) -> float:
+    """Return half the width of the 95 % interval of a sum of effects (n,) that is 0 at the estimate.
 
+    Clusters are independent. The variance of the sum is the variance of the clusters' sums, stratum by stratum, with
+    Student's t; the degrees of freedom are clusters minus strata. Strata of one cluster count together as one stratum
+    (Cochran, Sampling Techniques, section 5A.12). NaN for a single cluster.
+    """
+    from scipy.special import stdtrit
 
-def _weights(pairs: int, groups: Sequence[str] | None) -> np.ndarray:
-    """Weight of every pair in the mean, summing to 1: uniform, or uniform over groups."""
-    if groups is None:
-        return np.full(pairs, 1.0 / pairs)
-    _, members, sizes = np.unique(np.asarray(groups, dtype=object).astype(str), return_inverse=True, return_counts=True)
-    return 1.0 / (sizes[members] * len(sizes))
+    stratum_of_pair = np.unique(np.asarray(strata, dtype=str), return_inverse=True)[1]
+    names = [f"{stratum}|{cluster}" for stratum, cluster in zip(strata, clusters, strict=True)]
+    _, first, cluster_of_pair = np.unique(names, return_index=True, return_inverse=True)
+    sums, stratum = np.bincount(cluster_of_pair, effects), stratum_of_pair[first]
+    stratum = np.where(np.bincount(stratum)[stratum] == 1, -1, stratum)
+    variance, freedom = 0.0, 0
+    for number in np.unique(stratum):
+        parts = sums[stratum == number]
+        # a single one-cluster stratum has nothing to be compared with: its whole sum counts
+        variance += len(parts) * float(parts.var(ddof=1)) if len(parts) > 1 else float(parts[0]) ** 2
+        freedom += len(parts) - 1
+    return float(stdtrit(freedom, 0.975)) * math.sqrt(variance) if freedom else math.nan

@@ -1,12 +1,12 @@
-"""Tables of a study from its stored episodes: per task and aggregated, as data frames and CSV files."""
+"""Tables of a study from its stored episodes: aggregated and per task, as data frames and CSV files."""
 
 from __future__ import annotations
 
 import functools
 import math
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -15,25 +15,13 @@ import pandas as pd
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_text
 from kerv_cli.base.provenance import PACKAGES
-from kerv_cli.episodes.identity import (
-    NOT_DETERMINING,
-    NOT_DETERMINING_RUNTIME,
-    OBSERVATION,
-    Plain,
-    flat,
-    stress_of,
-    without,
-    work_of,
-)
+from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, flat, stress_of, without, work_of
 from kerv_cli.lab.plan import Setting, Study, Wanted, seeds_text
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.methods.settings import MODEL
 from kerv_cli.report.measures import MACRO, MICRO, Row, measure
 from kerv_cli.worlds import specs
 
-_RUNTIME = ("device", "dtype", "threads")
-_MACHINE = ("executor", "workers", "device_name", "host")
-_CODE = ("git_commit", "engine", "code", "run")
 CSV_COLUMNS = (
     "study", "averaging", "label", "method", "stress", "stress_level", "task", "seeds", "episodes", "baseline",
     "successes", "success", "success_low", "success_high", "speedup", "speedup_low", "speedup_high",
@@ -43,17 +31,22 @@ CSV_COLUMNS = (
     "only_method", "mcnemar_p", "difference", "difference_low", "difference_high", "non_inferior", "pairs_to_settle",
     "steps", "decodes", "steps_to_success",
 )  # fmt: skip
-"""Columns of a study's CSV files. The other measures and the settings are in `further_of`, tables/<study>.json."""
-_STATUS_COLUMNS = (*_MACHINE, *(f"{name}_version" for name in PACKAGES), "python_version", *_CODE)
+"""Columns of a study's CSV files. `further_of` holds the rest, in tables/<study>.json."""
+
+_RUNTIME = ("device", "dtype", "threads")
+_PROVENANCE = (
+    "executor", "workers", "device_name", "host", *(f"{name}_version" for name in PACKAGES), "python_version",
+    "git_commit", "engine", "code", "run",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class StudyData:
-    """A study and those of its episodes that are there; its tables are computed once.
+    """A study and its episodes that are there. Its tables are computed once.
 
     Attributes:
-        study: Its settings and what it wants.
-        episodes: A row per label, task, seed and repeat; columns of `StudyStore.frame` and those of `_labelled`.
+        study: Its settings and the episodes that it wants.
+        episodes: A row per label, task, seed and repeat; columns of `StudyStore.frame` and of `_labelled`.
     """
 
     study: Study
@@ -61,64 +54,60 @@ class StudyData:
 
     @functools.cached_property
     def settings(self) -> dict[str, Setting]:
-        """Label -> its setting."""
+        """Settings by label."""
         return {setting.label: setting for setting in self.study.settings}
 
     @functools.cached_property
     def labels(self) -> list[str]:
         """Labels that have episodes, in the study's order."""
-        there = set(self.episodes["label"])
-        return [label for label in self.study.labels if label in there]
+        present = set(self.episodes["label"])
+        return [label for label in self.study.labels if label in present]
 
     @property
     def absent(self) -> list[Wanted]:
-        """Episodes that are wanted and not there."""
+        """Wanted episodes that are missing."""
         names = ("label", "task", "seed", "repeat")
-        there = set(zip(*(self.episodes[name] for name in names), strict=True))
-        return [one for one in self.study.wanted if (one.setting.label, *one.key[1:]) not in there]
+        present = set(zip(*(self.episodes[name] for name in names), strict=True))
+        return [one for one in self.study.wanted if (one.setting.label, *one.key[1:]) not in present]
 
     @functools.cached_property
     def references(self) -> dict[str, str]:
         """Label -> the label that it is compared with.
 
-        It is the baseline's setting under its own stress if the study has it, else the baseline.
+        It is the baseline under the setting's own stress if the study has it, else the baseline.
         """
-        baseline = self.settings.get(self.study.baseline)
-        if baseline is None:
-            return dict.fromkeys(self.settings, self.study.baseline)
-        plain = _unstressed(baseline)
-        same = {_stress(one): label for label, one in self.settings.items() if _unstressed(one) == plain}
-        same[_stress(baseline)] = self.study.baseline
+        same: dict[tuple[str, int], str] = {}
+        if baseline := self.settings.get(self.study.baseline):
+            same = {_stress(one): one.label for one in self._same_but_stress[_unstressed(baseline)]}
+            same[_stress(baseline)] = baseline.label
         return {label: same.get(_stress(one), self.study.baseline) for label, one in self.settings.items()}
 
     @functools.cached_property
     def unstressed(self) -> dict[str, str]:
-        """Label -> what the setting is called in a study of stress, whatever its stress.
+        """Label -> the label of the same setting without stress; without one, the first of its stressed settings."""
+        names: dict[str, str] = {}
+        for group in self._same_but_stress.values():
+            plain = next((one for one in group if not _stress(one)[1]), group[0])
+            names |= {one.label: one.label if not _stress(one)[1] else plain.label for one in group}
+        return names
 
-        It is the label of the same setting without stress. Without one it is the method, or if several such settings
-        share a method the first label.
-        """
+    @functools.cached_property
+    def _same_but_stress(self) -> dict[str, list[Setting]]:
         groups: dict[str, list[Setting]] = {}
         for setting in self.study.settings:
             groups.setdefault(_unstressed(setting), []).append(setting)
-        methods = Counter(str(group[0].settings["method"]) for group in groups.values())
-        names: dict[str, str] = {}
-        for group in groups.values():
-            plain, method = [one for one in group if not _stress(one)[1]], str(group[0].settings["method"])
-            name = plain[0].label if plain else method if methods[method] == 1 else group[0].label
-            names |= {one.label: one.label if one in plain else name for one in group}
-        return names
+        return groups
 
     @functools.cached_property
     def table(self) -> pd.DataFrame:
         """Two rows per label: micro over tasks and macro over difficulty groups."""
-        return _frame([row for averaging in (MICRO, MACRO) for row in _rows(self, self.episodes, averaging)])
+        return pd.DataFrame(row for averaging in (MICRO, MACRO) for row in _rows(self, self.episodes, averaging))
 
     @functools.cached_property
     def per_task(self) -> pd.DataFrame:
         """One row per task and label: tasks by name, labels in the study's order."""
-        by_task = [episodes for _, episodes in self.episodes.groupby("task", sort=True)]
-        return _frame([row for episodes in by_task for row in _rows(self, episodes, "one task")])
+        by_task = self.episodes.groupby("task", sort=True)
+        return pd.DataFrame(row for _, episodes in by_task for row in _rows(self, episodes, "one task"))
 
 
 def _stress(setting: Setting) -> tuple[str, int]:
@@ -150,11 +139,11 @@ def load_study(store: StudyStore, wanted: Sequence[Wanted] | None = None) -> Stu
 
 
 def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
-    """Return the episodes with the columns of their settings that the tables need."""
+    """Return the episodes with difficulty, device, dtype and threads."""
     groups = {task: difficulty_of(task) for task in set(episodes["task"])}
     runtime = {setting.label: setting.settings["runtime"] for setting in study.settings}
     columns = {name: episodes["label"].map({k: v[name] for k, v in runtime.items()}) for name in _RUNTIME}
-    # strings as Python objects: these frames are cut into hundreds of small ones, which arrow's arrays are slow at
+    # strings as Python objects: these frames are cut into hundreds of small ones, and arrow's arrays are slow at that
     texts = {
         name: episodes[name].astype(object) for name in ("label", "task", "block", "started", "device_name", "run")
     }
@@ -164,38 +153,29 @@ def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
 
 
 def difficulty_of(task: str) -> str:
-    """The task's difficulty group; `other` for a task that no environment has."""
+    """Return the task's difficulty group; `other` if no environment has the task."""
     return next((spec.tasks[task].difficulty for spec in specs().values() if task in spec.tasks), "other")
 
 
-Sections = list[Row]
-"""One row of a table as sections of columns. A column that only some settings have stays within its section."""
-
-
-def _frame(rows: Sequence[Sections]) -> pd.DataFrame:
-    """Rows as a table; within each section, columns that only later rows have are appended."""
-    columns = [name for parts in zip(*rows, strict=True) for part in parts for name in part]
-    merged = [{name: value for part in row for name, value in part.items()} for row in rows]
-    return pd.DataFrame(merged, columns=list(dict.fromkeys(columns)))
-
-
-def _rows(data: StudyData, episodes: pd.DataFrame, averaging: str) -> Iterator[Sections]:
-    """One row per label that has episodes here."""
+def _rows(data: StudyData, episodes: pd.DataFrame, averaging: str) -> Iterator[Row]:
+    """Yield one row per label that has episodes here."""
+    by_label = {str(label): group for label, group in episodes.groupby("label", sort=False)}
     for label in data.study.labels:
-        group = episodes[episodes["label"] == label]
-        if len(group):
-            baseline = episodes[episodes["label"] == data.references[label]]
-            yield _row(data, label, group, baseline, averaging)
+        if label in by_label:
+            baseline = by_label.get(data.references[label], episodes.iloc[:0])
+            yield _row(data, label, by_label[label], baseline, averaging)
 
 
-def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> Sections:
-    tasks = sorted(set(episodes["task"]))
-    setting = data.settings[label]
-    head = {
+def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> Row:
+    """Return identity, measures, settings and provenance; values that differ are joined by semicolons."""
+    tasks, setting = sorted(set(episodes["task"])), data.settings[label]
+    stress, hashes = stress_of(setting.settings), without(setting.identity, {OBSERVATION})
+    varied = [f"{key.split('.')[-1]} {value}" for key, value in setting.varies.items() if key != data.study.axis]
+    return {
         "study": data.study.name,
         "averaging": averaging,
         "label": label,
-        "name": setting.name,
+        "series": ", ".join([setting.name.rstrip(", "), *varied]),  # settings that differ only along the study's axis
         "unstressed": data.unstressed[label],
         "method": setting.settings["method"],
         "task": ";".join(tasks),
@@ -205,43 +185,25 @@ def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataF
         "repeats": int(episodes["repeat"].nunique()),
         "episodes": len(episodes),
         "baseline": data.references[label],
-    }
-    measures = measure(episodes, baseline, averaging)
-    return [head, measures, *_origin(setting, episodes)]
-
-
-def _origin(setting: Setting, episodes: pd.DataFrame) -> Sections:
-    """Return settings, weights and provenance of a row; values that differ are joined by semicolons."""
-    settings, policy = setting.settings, setting.settings["policy"]
-    world, runtime, stress = settings["world"], settings["runtime"], stress_of(settings)
-    parts = without(settings, {*NOT_DETERMINING, "world", "runtime"})
-    weights = {
-        "policy.kind": policy.get("kind", MODEL),
-        "target": policy["target"],
-        "artifacts": _joined(f"{kind}={name}" for kind, name in policy.get("artifacts", {}).items() if name),
-        OBSERVATION: setting.identity.get(OBSERVATION, ""),
-        **{f"{name}_sha256": value for name, value in sorted(setting.identity.items()) if name != OBSERVATION},
-    }
-    surroundings = {
-        "horizon": world["horizon"],
-        "camera": world["camera"]["name"],
-        **flatten({"camera": without(world["camera"], {"name"})}),
+        **measure(episodes, baseline, averaging),
+        "overrides": setting.overrides,
+        **flatten(without(setting.settings, NOT_DETERMINING - {"policy"})),
+        "observation": setting.identity.get(OBSERVATION, ""),
+        **{f"{name}_sha256": value for name, value in sorted(hashes.items())},
         "stress": stress["kind"],
         "stress_level": stress["level"],
-        **without(runtime, NOT_DETERMINING_RUNTIME),
-        **{key: _joined(episodes[key].dropna()) if key in episodes else "" for key in _STATUS_COLUMNS},
+        **{key: _joined(episodes[key].dropna()) if key in episodes else "" for key in _PROVENANCE},
     }
-    return [{"overrides": setting.overrides}, flatten(parts), weights, surroundings]
 
 
 def is_autoregressive(settings: Plain) -> bool:
-    """Whether a setting is a model that decodes token by token: nothing drafts, nothing is skipped."""
+    """Return whether a setting is a model that decodes token by token: nothing drafts, nothing is skipped."""
     drafts = any(settings[part]["kind"] != "none" for part in ("prefill_draft", "proposer", "skip"))
     return not drafts and settings["policy"]["kind"] == MODEL
 
 
 def flatten(settings: Plain) -> Row:
-    """Nested settings as dotted keys: {"threshold": {"r": 5}} -> {"threshold.r": 5}; lists joined by semicolons."""
+    """Return nested settings with dotted keys, such as `threshold.r`; lists are joined by semicolons."""
     return {k: _joined(v) if isinstance(v, list | tuple) else v for k, v in flat(settings).items()}
 
 
@@ -250,18 +212,18 @@ def _joined(values: Iterable[object]) -> str:
 
 
 def values_of(table: pd.DataFrame, column: str) -> set[str]:
-    """The values of a column whose rows join several by semicolons."""
+    """Return the values of a column whose rows join several by semicolons."""
     return {value for text in table[column].astype(str) for value in text.split(";")}
 
 
 def further_of(data: StudyData) -> dict[str, Any]:
-    """Return what a study's CSV files leave out, as JSON values, by label.
+    """Return what a study's CSV files leave out, as JSON values by label.
 
     A label has `name` and `varies` (of a grid), `overrides`, `settings`, `identity` (hashes of weights and data),
-    `provenance` of its episodes, and `measures`: averaging, or task, -> the measures that are no column.
+    `provenance`, and `measures`: averaging or task -> the measures that have no CSV column.
     """
     columns = list(data.table.columns)
-    left_out = {*CSV_COLUMNS, "name", "unstressed"}
+    left_out = {*CSV_COLUMNS, "series", "unstressed"}
     measures = [name for name in columns[: columns.index("overrides")] if name not in left_out]
     labels: dict[str, Any] = {}
     for rows, key in ((rows_of(data.table), "averaging"), (rows_of(data.per_task), "task")):
@@ -273,7 +235,8 @@ def further_of(data: StudyData) -> dict[str, Any]:
                 "overrides": setting.overrides,
                 "settings": without(setting.settings, {"results", "task"}),
                 "identity": dict(setting.identity),
-                "provenance": {name: _json(row[name]) for name in (*_RUNTIME, *_STATUS_COLUMNS)},
+                "provenance": {name: setting.settings["runtime"][name] for name in _RUNTIME}
+                | {name: row[name] for name in _PROVENANCE},
                 "measures": {},
             }
             values = {name: _json(row[name]) for name in measures}
@@ -286,31 +249,31 @@ def _json(value: Any) -> Any:
 
 
 def csv_text(table: pd.DataFrame) -> str:
-    """CSV with six significant digits; empty where a value does not exist."""
+    """Return CSV with six significant digits; a cell is empty if its value does not exist."""
     return table.to_csv(index=False, float_format="%.6g", lineterminator="\n")
 
 
 def write_csv(table: pd.DataFrame, path: Path) -> Path:
-    """Writes `csv_text` atomically.
+    """Write `csv_text` atomically and return the path.
 
     Raises:
-        StorageError: the disk refused.
+        StorageError: The disk is full or read-only.
     """
     write_text(path, csv_text(table))
     return path
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value exists: neither None nor NaN."""
-    return value is not None and not math.isnan(value)
+    """Return whether a value is a number: neither text, bool, None nor NaN."""
+    return isinstance(value, Real) and not isinstance(value, bool) and not math.isnan(value)
 
 
 def is_baseline(row: Row) -> bool:
-    """Whether the row of a table is that of the setting which it is compared with."""
+    """Return whether a row's setting is the one that it is compared with."""
     return bool(row["label"] == row["baseline"])
 
 
 def rows_of(table: pd.DataFrame, averaging: str | None = None) -> list[Row]:
-    """The table's rows, or those of one averaging, as dicts by column."""
+    """Return the table's rows, or the rows of one averaging, as dicts by column."""
     rows = table if averaging is None else table[table["averaging"] == averaging]
     return [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]

@@ -1,0 +1,217 @@
+"""Words for what a study shows. No other module of kerv writes such a sentence.
+
+A sentence says *faster*, *slower* or *loses less than* only if a 95 % interval does. If the baseline solves less than
+`SOLVED` of the episodes, nothing is recommended.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import pandas as pd
+
+from kerv_cli.report.measures import MICRO, Row
+from kerv_cli.report.statistics import MOST_PAIRS
+from kerv_cli.report.tables import is_baseline, is_number, rows_of
+
+SOLVED = 0.20
+"""Smallest success rate at which a baseline counts as solving its tasks."""
+BEHIND = 0.10
+"""Loss of success that is worth naming in a study of stress."""
+SMALLER, LARGER, OPEN = "loss is smaller", "loss is larger", "open"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which setting to take, for all tasks together or for one.
+
+    Attributes:
+        where: `all tasks`, or the task.
+        pairs: Largest number of pairs of a setting.
+        baseline_success: Success rate of the baseline.
+        front: Settings that no other one beats in both speed and success, the fastest first.
+        chosen: The fastest setting whose loss of success is shown to be below the bound; empty if there is none.
+        loss_at_most: Upper bound on the loss of the chosen one, points of success, 95 % confidence.
+        candidate: The fastest setting that more pairs would show at the present rates; empty if there is none.
+        candidate_pairs: About how many pairs that takes, all in all.
+        tested: Number of settings whose measured speed is above the baseline's, or that nobody timed.
+        episode_speedup: Speed per episode of the chosen one, with its interval.
+    """
+
+    where: str
+    pairs: int
+    baseline_success: float
+    front: tuple[str, ...]
+    chosen: str
+    loss_at_most: float
+    candidate: str
+    candidate_pairs: float
+    tested: int
+    episode_speedup: float
+    episode_speedup_low: float
+    episode_speedup_high: float
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether a setting is shown to be faster at that loss of success."""
+        return bool(self.chosen) and self.episode_speedup_low > 1
+
+    @property
+    def is_unsolved(self) -> bool:
+        """Whether the baseline does not solve its tasks."""
+        return self.baseline_success < SOLVED
+
+    def as_dict(self) -> Row:
+        """Return the choice for JSON."""
+        return {**asdict(self), "front": ";".join(self.front)}
+
+
+@dataclass(frozen=True)
+class Decision:
+    """The answer for a setting at a look (`until=decided`).
+
+    Attributes:
+        label: The setting.
+        verdict: SMALLER, LARGER or OPEN.
+        pairs: Number of its pairs with the baseline.
+        look: Number of the look, from 1.
+        difference: Success of the setting minus the baseline's; low and high: the interval at the look's confidence.
+    """
+
+    label: str
+    verdict: str
+    pairs: int
+    look: int
+    difference: float
+    low: float
+    high: float
+
+
+def sentence(choice: Choice, loss: float, baseline: str) -> str:
+    """Return the choice for all tasks in one sentence, for a bound on the loss in points of success."""
+    if choice.is_unsolved:
+        return (
+            f"{baseline} does not solve these tasks ({_percent(choice.baseline_success)} of its episodes succeed), so "
+            "no setting is recommended"
+        )
+    bound = f"loses less than {loss:g} points of success against {baseline}"
+    if choice.chosen:
+        return f"{choice.chosen} {bound} (95 % confidence, {choice.pairs} pairs){_speed(choice)}"
+    if not choice.tested:
+        return f"no setting is shown to be faster per episode than {baseline} ({choice.pairs} pairs)"
+    return f"{choice.pairs} pairs do not show a setting that is faster and {bound}; {_missing(choice)}"
+
+
+def short_sentence(choice: Choice) -> str:
+    """Return the choice for one task in a few words."""
+    if choice.is_unsolved:
+        return f"{choice.where}: the baseline does not solve it ({_percent(choice.baseline_success)})"
+    if choice.chosen:
+        return f"{choice.where}: {choice.chosen}" + ("" if choice.is_shown else ", not shown to be faster")
+    if not choice.tested:
+        return f"{choice.where}: no setting is shown to be faster ({choice.pairs} pairs)"
+    return f"{choice.where}: open after {choice.pairs} pairs; {_missing(choice)}"
+
+
+def _speed(choice: Choice) -> str:
+    if not is_number(choice.episode_speedup):
+        return "; its speed was not measured"
+    if is_number(choice.episode_speedup_low):
+        interval = f" ({choice.episode_speedup_low:.2f}–{choice.episode_speedup_high:.2f})"
+    else:
+        interval = ""
+    shown = "and is faster" if choice.is_shown else "but is not shown to be faster"
+    return f" {shown}: {choice.episode_speedup:.2f}{interval} times as fast per episode on this machine"
+
+
+def _missing(choice: Choice) -> str:
+    if not choice.candidate:
+        return "at these rates, more pairs would not show one either"
+    more = max(1, math.ceil(choice.candidate_pairs - choice.pairs))
+    count = f"about {more}" if more <= MOST_PAIRS else f"more than {MOST_PAIRS:,}"
+    return f"at these rates, {count} more pairs would show it for {choice.candidate}"
+
+
+def rates(rows: Sequence[Row]) -> str:
+    """Return the success rates of settings that have no pairs with a baseline."""
+    return "success: " + ", ".join(f"{row['label']} {100 * row['success']:.1f} %" for row in rows)
+
+
+def under_stress(table: pd.DataFrame, reference: str) -> str:
+    """Say under which stress each method succeeds less often than the baseline, in one sentence.
+
+    Args:
+        table: A study's table.
+        reference: Name of the baseline whatever its stress.
+    """
+    rows = [row for row in rows_of(table, MICRO) if row["pairs"] and not is_baseline(row)]
+    solved = [row for row in rows if (row["both"] + row["only_baseline"]) / row["pairs"] >= SOLVED]
+    behind: dict[str, list[str]] = {}
+    for row in solved:
+        if row["difference"] <= -BEHIND:
+            star = "*" if row["difference_high"] < 0 else ""
+            behind.setdefault(str(row["unstressed"]), []).append(f"{_stress(row)}{star}")
+    bound = f"{100 * BEHIND:.0f} points of success or more below {reference} in the same worlds"
+    clauses = [f"{name}: {', '.join(worlds)}" for name, worlds in behind.items()]
+    text = f"{bound} (* shown with 95 % confidence): {'; '.join(clauses)}" if clauses else f"no method is {bound}"
+    if len(solved) < len(rows):
+        worlds = dict.fromkeys(_stress(row) for row in rows if row not in solved)
+        text += f"; {reference} does not solve the tasks under {', '.join(worlds)}, so nothing is compared there"
+    return text
+
+
+def _stress(row: Row) -> str:
+    return f"{row['stress']} {row['stress_level']}" if row["stress_level"] else "no stress"
+
+
+def caution(table: pd.DataFrame) -> str:
+    """Return what to know before reading the numbers, in one line; empty if there is nothing."""
+    rows = rows_of(table, MICRO)
+    privileged = sorted({str(row["policy.target"]) for row in rows if "privileged" in str(row["observation"])})
+    unverified = [
+        str(row["label"]) for row in rows if is_number(row["unverified_share"]) and row["unverified_share"] == 1
+    ]
+    clauses = [f"{', '.join(privileged)}: is given the positions of object and goal"] if privileged else []
+    if unverified:
+        clauses.append(f"{', '.join(unverified)}: nothing is verified")
+    return "; ".join(clauses)
+
+
+def differing_speeds(rows: Sequence[Row]) -> list[str]:
+    """Return a line for every setting whose intervals of speed per episode and per control step do not overlap."""
+    by_label = {row["label"]: row for row in rows}
+    lines = []
+    for row in rows:
+        reference = by_label.get(row["baseline"])
+        low, high = (
+            max(row["episode_speedup_low"], row["speedup_low"]),
+            min(row["episode_speedup_high"], row["speedup_high"]),
+        )
+        if reference is not None and low > high:
+            own, other = (one["steps"] / one["episodes"] for one in (row, reference))
+            lines.append(
+                f"{row['label']}: {row['episode_speedup']:.2f} times as fast per episode, {row['speedup']:.2f} per "
+                f"control step; its episodes take {own:.0f} control steps, those of {reference['label']} {other:.0f}"
+            )
+    return lines
+
+
+def stopping_rule(loss: float, looks: int, confidence: float) -> str:
+    """Return the stopping rule of `until=decided` in one sentence."""
+    return (
+        f"until=decided: at most {looks} looks, one after each block of seeds, each at {100 * confidence:.1f} % "
+        "confidence (Pocock's boundary, 95 % over all looks). A setting stops when its loss of success is shown to be "
+        f"below or above {loss:g} points"
+    )
+
+
+def progress_line(decisions: Sequence[Decision]) -> str:
+    """Return decisions in one line, for progress."""
+    clauses = [f"{one.label}: {one.verdict} after {one.pairs} pairs" for one in decisions if one.verdict != OPEN]
+    return "; ".join([*clauses, f"{sum(one.verdict == OPEN for one in decisions)} open"])
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"
