@@ -17,7 +17,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command, where nump
 import numpy as np
 import pandas as pd
 
-from kerv_cli.base.config import as_words, compose
+from kerv_cli.base.config import as_overrides, compose
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.places import results_dir, store_of_words
 from kerv_cli.catalogue.entries import RunEntry, find_run, find_runs, matching, store_of
@@ -99,7 +99,7 @@ def rollout(*words: str, grid: bool = False, **settings: object) -> Study:
         UsageError: a setting that does not exist or cannot be. CheckpointError: no such policy, or a damaged one.
         Interrupted: Ctrl-C; complete episodes are kept. KervError: an episode failed.
     """
-    with store_of_words(as_words(*words, **settings)) as overrides:
+    with store_of_words(as_overrides(*words, **settings)) as overrides:
         resolved = resolve_rollout(overrides, grid)
         planned = plan_rollout(resolved, ["rollout", *(["-m"] if grid else []), *overrides])
         run(planned, save=save_recording)
@@ -116,7 +116,7 @@ def sweep(study: str | Path, *words: str, **settings: object) -> Study:
     Raises:
         UsageError, CheckpointError, Interrupted: as `rollout`. KervError: episodes failed; the others are kept.
     """
-    with store_of_words(as_words(f"study={study}", *words, **settings)) as overrides:
+    with store_of_words(as_overrides(f"study={study}", *words, **settings)) as overrides:
         resolved = resolve(overrides)
         planned = plan(resolved, ["sweep", *overrides])
         judge = decide.judge(resolved.sweep.loss, print) if resolved.sweep.until == "decided" else None
@@ -211,5 +211,5 @@ def load_policy(
         UsageError: a setting that does not exist or cannot be. CheckpointError: no such policy, or an artifact that the
             method needs is missing or of another policy.
     """
-    typed = as_words(*words, **{"policy.target": target, "method": method, "task_name": task}, **settings)
+    typed = as_overrides(*words, **{"policy.target": target, "method": method, "task_name": task}, **settings)
     return Policy(Served(compose("serve", typed, ServeSettings)))

@@ -20,8 +20,6 @@ import examples.insertion  # noqa: F401 - registers the environment with seven d
 import pytest
 
 from kerv_cli.base import registry
-from kerv_cli.base.config import Composer, conf_dir
-from kerv_cli.base.registry import SETTINGS_GROUPS
 from kerv_cli.lab.database import VARIABLE, Database
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -63,25 +61,6 @@ def registered_environments() -> Iterator[None]:
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(registry._PARTS, "environment", dict(ENVIRONMENTS))
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def compositions() -> Iterator[None]:
-    """Composers of one command keep what they composed for the next one while the registered parts are the same:
-    a composition takes 0.1 s, and the tests ask a thousand times for a few dozen."""
-    kept: dict[Any, Any] = {}
-    create = Composer.__init__
-
-    def created(self: Composer[Any], command: str, schema: type) -> None:
-        create(self, command, schema)
-        parts = tuple(
-            (name, part.settings) for group in SETTINGS_GROUPS for name, part in registry.parts(group).items()
-        )
-        self._composed = kept.setdefault((command, schema, conf_dir(), parts), {})
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Composer, "__init__", created)
         yield
 
 

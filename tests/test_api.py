@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import kerv_cli as kerv
-from kerv_cli.base.config import as_words
+from kerv_cli.base.config import as_overrides
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT: dict[str, Any] = {"task": "reach", "episodes": 1, "record": 0, "world": {"horizon": 6}}
@@ -50,7 +50,9 @@ def test_the_import_loads_nothing_and_names_what_the_stub_names() -> None:
 
 
 def test_settings_are_written_as_they_are_typed() -> None:
-    words = as_words("a=1", task=["reach", "push"], threshold={"r": 5}, world={"camera": {"size": 48}}, on=True, x=None)
+    words = as_overrides(
+        "a=1", task=["reach", "push"], threshold={"r": 5}, world={"camera": {"size": 48}}, on=True, x=None
+    )
     assert words == ["a=1", "task=[reach,push]", "threshold.r=5", "world.camera.size=48", "on=true", "x=null"]
 
 

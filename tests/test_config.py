@@ -10,10 +10,11 @@ import pytest
 import yaml
 
 import kerv_cli.cli.app  # noqa: F401 - registers the commands
-from kerv_cli.base.config import compose, conf_dir, expand, groups, swept_keys, to_yaml
+from kerv_cli.base.config import _composed, compose, conf_dir, expand, groups, swept_keys
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import description
 from kerv_cli.base.registry import PART_GROUPS, part_of, parts
+from kerv_cli.cli.common import settings_yaml
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings
 
@@ -25,7 +26,7 @@ HOMES = {"target": "train_target", "drafter": "train_drafter", "study": "sweep"}
 def test_every_command_composes_and_shows_what_every_setting_is() -> None:
     for command, schema in SCHEMAS.items():
         settings = compose(command, [], schema)
-        shown = to_yaml(settings)
+        shown = settings_yaml(settings)
         assert "results: results" in shown
         assert yaml.safe_load(shown) == asdict(settings)  # the descriptions are comments
 
@@ -69,17 +70,24 @@ def test_every_config_of_a_part_composes(row: int) -> None:
 
 
 def test_grids_expand_in_hydras_grammar() -> None:
-    assert expand("method=ar,spec_vla threshold.r=0,9") == [
+    assert expand(["method=ar,spec_vla", "threshold.r=0,9"]) == [
         ["method=ar", "threshold.r=0"],
         ["method=ar", "threshold.r=9"],
         ["method=spec_vla", "threshold.r=0"],
         ["method=spec_vla", "threshold.r=9"],
     ]
-    assert [p[0] for p in expand("threshold.r=range(0,7,3)")] == ["threshold.r=0", "threshold.r=3", "threshold.r=6"]
-    assert expand("task=[reach-v3,push-v3]") == [["task=[reach-v3,push-v3]"]]
-    assert swept_keys("method=ar threshold.r=0,9") == ["threshold.r"]
+    assert [p[0] for p in expand(["threshold.r=range(0,7,3)"])] == ["threshold.r=0", "threshold.r=3", "threshold.r=6"]
+    assert expand(["task=[reach-v3,push-v3]"]) == [["task=[reach-v3,push-v3]"]]
+    assert swept_keys(["method=ar", "threshold.r=0,9"]) == ["threshold.r"]
 
 
 def test_a_study_refuses_what_it_sets_itself() -> None:
     with pytest.raises(UsageError, match=r"sets threshold\.r itself"):
         resolve(["study=threshold", "threshold.r=3"])
+
+
+def test_a_study_composes_each_choice_of_parts_once() -> None:
+    """145 settings take 1 s; each composition of Hydra takes 0.05 s."""
+    before = _composed.cache_info().misses
+    assert len(resolve(["study=stress"]).settings) == 145
+    assert _composed.cache_info().misses - before <= 10

@@ -21,9 +21,19 @@ def _unpickled(kind: type[KervError], message: str) -> KervError:
 
 
 class UsageError(KervError):
-    """The request itself is wrong: unknown name, wrong key, impossible value."""
+    """The request itself is wrong: unknown name, wrong key, impossible value.
+
+    Args:
+        message: One line.
+        key: The dotted setting that is wrong, if the message is about one.
+    """
 
     exit_code = 2
+    key = ""
+
+    def __init__(self, message: str, key: str = "") -> None:
+        super().__init__(message)
+        self.key = key
 
 
 class UnknownName(UsageError):
@@ -32,7 +42,7 @@ class UnknownName(UsageError):
     def __init__(self, kind: str, name: str, names: Iterable[str]) -> None:
         names = list(names)
         hint = did_you_mean(name, names) or f"known: {', '.join(names)}"
-        super().__init__(f"unknown {kind} '{name}': {hint}")
+        super().__init__(f"unknown {kind} '{name}': {hint}", kind)
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kerv_cli.base.errors import CheckpointError, StorageError
+from kerv_cli.base.errors import CheckpointError, StorageError, UsageError
 from kerv_cli.base.leftovers import clean, temporary_beside
 
 if TYPE_CHECKING:
@@ -247,6 +247,47 @@ def read_yaml(text: str) -> Any:
         return yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     except (yaml.YAMLError, RecursionError) as error:
         raise ValueError(f"not YAML: {error}") from error
+
+
+def read_yaml_lines(path: Path, what: str) -> tuple[dict[str, Any], dict[str, int]]:
+    """Return the mapping in a YAML file, and the line of each dotted key.
+
+    Args:
+        path: The file.
+        what: How errors call it.
+
+    Raises:
+        UsageError: It cannot be read, is no mapping, or gives a key twice.
+    """
+    import yaml
+
+    lines: dict[str, int] = {}
+
+    def note(node: yaml.Node | None, prefix: str) -> None:
+        if isinstance(node, yaml.SequenceNode):
+            for index, child in enumerate(node.value):
+                note(child, f"{prefix}{index}.")
+        elif isinstance(node, yaml.MappingNode):
+            for key, child in node.value:
+                name, line = f"{prefix}{key.value}", key.start_mark.line + 1
+                if name in lines:
+                    raise UsageError(f"{path}:{line}: {name} is given twice, also in line {lines[name]}")
+                lines[name] = line
+                note(child, f"{name}.")
+
+    try:
+        loader = yaml.SafeLoader(read_text(path))
+        node = loader.get_single_node()
+        note(node, "")
+        value = loader.construct_document(node) if node else {}
+    except (OSError, ValueError, RecursionError) as error:
+        raise UsageError(f"{what} cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    except yaml.MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 1
+        raise UsageError(f"{path}:{line}: it is not YAML, {error.problem}") from error
+    if not isinstance(value, dict):
+        raise UsageError(f"{what} holds no keys: write key: value")
+    return value, lines
 
 
 def to_yaml(value: Any, **options: Any) -> str:

@@ -97,9 +97,9 @@ def check_settings(settings: Any, what: str = "") -> None:
         name, value = f"{prefix}{at.name}", getattr(settings, at.name)
         values = list(value.values()) if isinstance(value, dict) else value if isinstance(value, list) else [value]
         if element is not None and not isinstance(value, list | dict):
-            raise UsageError(f"{name}={value}: a list or a mapping is wanted")
+            raise UsageError(f"{name}={value}: a list or a mapping is wanted", name)
         if element is not None and not all(isinstance(x, element) for x in values):
-            raise UsageError(f"{name}={value}: every element must be of type {element.__name__}")
+            raise UsageError(f"{name}={value}: every element must be of type {element.__name__}", name)
         for x in values:
             _check_value(name, x, at.metadata)
         if is_dataclass(value):
@@ -129,7 +129,7 @@ def _check_value(name: str, value: Any, metadata: Any) -> None:
     if "limits" in metadata:
         least, most, above = metadata["limits"]
         if isinstance(value, str) or not (least <= value <= most and value > above):
-            raise UsageError(f"{name}={value}: {_range_text(least, most, above)}")
+            raise UsageError(f"{name}={value}: {_range_text(least, most, above)}", name)
 
 
 def _range_text(least: float, most: float, above: float) -> str:

@@ -68,10 +68,6 @@ class TaskSettings(RunSettings):
     task: list[str] = setting([], "tasks and suites: reach, drawer-open, MT10, …; empty: those that the target knows")
 
 
-DERIVED_FROM = ("policy.kind",)
-"""Keys of settings that others are derived from when a dataclass is made."""
-
-
 def choices_of(schema: type) -> dict[str, str]:
     """The groups that these settings choose from -> the choice without a word, in the order of composition."""
     parts = {at.name: str(at.metadata["group"]) for at in fields(schema) if "group" in at.metadata}

@@ -18,7 +18,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from kerv_cli.base.config import as_words, compose, groups
+from kerv_cli.base.config import as_overrides, compose, groups
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.files import read_mapping, read_text, sha256_of, storage_errors, sync, visible
 from kerv_cli.base.leftovers import clean, temporary_beside
@@ -239,8 +239,8 @@ def command_of(run: RunEntry) -> tuple[str, ...]:
         for value in settings[group].values()
         if value in groups()[group] and value != default
     ]
-    defaults = as_words(**asdict(compose(name.replace(" ", "_"), chosen, schema)))
-    return *run.command, *chosen, *(word for word in as_words(**settings) if word not in defaults)
+    defaults = as_overrides(**asdict(compose(name.replace(" ", "_"), chosen, schema)))
+    return *run.command, *chosen, *(word for word in as_overrides(**settings) if word not in defaults)
 
 
 def _described(folder: Path, kind: str) -> dict[str, Any]:

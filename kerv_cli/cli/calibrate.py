@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.base.config import compose, to_yaml
+from kerv_cli.base.config import compose
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan, print_json, print_plan, print_table, progress_bar
+from kerv_cli.cli.common import AsJson, ShowPlan, print_json, print_plan, print_table, progress_bar, settings_yaml
 from kerv_cli.episodes.settings import SweepSettings
 from kerv_cli.training.settings import CalibrateSettings, CalibrateSuccessSettings
 
@@ -119,7 +119,7 @@ def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json
     settings = compose("calibrate_success", [*of_test, *results], CalibrateSuccessSettings)
     resolved = resolve(of_study)
     if cfg:
-        lines = to_yaml(settings).splitlines()
+        lines = settings_yaml(settings).splitlines()
         typer.echo("\n".join([*(line for line in lines if line.split(":")[0] in OF_TEST), "---"]))
         print_settings(resolved)
         return

@@ -18,13 +18,14 @@ from typing import Annotated, Any, TypeVar
 import typer
 from typer.core import TyperCommand
 
-from kerv_cli.base.config import compose, conf_dir, groups, to_yaml
+from kerv_cli.base.config import compose, conf_dir, groups
 from kerv_cli.base.errors import UnknownName
 from kerv_cli.base.files import read_yaml_file
 from kerv_cli.base.limits import field_of
 from kerv_cli.base.places import check_writable, store_of_words
 from kerv_cli.base.registry import NoSettings, Part, add, find, load, parts
 from kerv_cli.base.settings import CommandSettings, choices_of
+from kerv_cli.cli.common import settings_yaml
 
 F = TypeVar("F", bound=Callable[..., None])
 
@@ -180,7 +181,7 @@ def _settings(part: Part, words: list[str], cfg: bool) -> Any:
     plain = [f"{key}=[{value.strip('[]')}]" if key in lists else key + equals + value for key, equals, value in pairs]
     settings: Any = compose(part.name.replace(" ", "_"), plain, part.settings)
     if cfg:
-        typer.echo(to_yaml(settings), nl=False)
+        typer.echo(settings_yaml(settings), nl=False)
         raise typer.Exit(0)
     if part.traits.get("writes", True) and hasattr(settings, "results"):
         check_writable(settings.results)

@@ -10,12 +10,15 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from kerv_cli.base.durations import left
 from kerv_cli.base.errors import Interrupted, KervError, UsageError
+from kerv_cli.base.files import to_yaml
+from kerv_cli.base.limits import description
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -43,6 +46,22 @@ def _plain(value: object) -> object:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+def settings_yaml(settings: Any, indent: str = "") -> str:
+    """Return a dataclass of settings as YAML, for `--cfg`; a comment says what each setting is."""
+    lines = []
+    for setting in fields(settings):
+        value = getattr(settings, setting.name)
+        if is_dataclass(value):
+            lines += [f"{setting.name}:", *settings_yaml(value, "  ").splitlines()]
+            continue
+        # without a maximum width, so that a string without line breaks is one line
+        text = to_yaml({setting.name: value}, width=2**30, default_flow_style=False, allow_unicode=True)
+        first, *rest = text.splitlines()
+        comment = description(setting) if not rest or not isinstance(value, str) else ""
+        lines += [f"{first}  # {comment}" if comment else first, *rest]
+    return "".join(f"{indent}{line}\n" for line in lines)
 
 
 def print_notes(idle: Mapping[str, str]) -> None:

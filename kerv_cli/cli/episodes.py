@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.base.config import to_yaml
 from kerv_cli.base.durations import about
-from kerv_cli.cli.common import at_work, console, print_json, print_notes, print_table
+from kerv_cli.cli.common import at_work, console, print_json, print_notes, print_table, settings_yaml
 
 if TYPE_CHECKING:
     from kerv_cli.episodes.resolve import ResolvedStudy
@@ -84,9 +83,9 @@ def _few(names: Sequence[str], what: str) -> str:
 
 def print_settings(resolved: ResolvedStudy) -> None:
     """Print the study and each of its settings as YAML, for --cfg."""
-    typer.echo(to_yaml(resolved.study), nl=False)
+    typer.echo(settings_yaml(resolved.study), nl=False)
     for label, settings in resolved.settings.items():
-        typer.echo(f"--- # {label}\n{to_yaml(settings)}", nl=False)
+        typer.echo(f"--- # {label}\n{settings_yaml(settings)}", nl=False)
 
 
 def print_study_plan(planned: Plan, as_json: bool) -> None:

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kerv_cli.base.config import to_yaml
 from kerv_cli.base.durations import about
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import (
@@ -18,6 +17,7 @@ from kerv_cli.cli.common import (
     print_notes,
     print_table,
     results_word,
+    settings_yaml,
 )
 from kerv_cli.cli.episodes import count, planned_rollout, run_study
 from kerv_cli.episodes.settings import RolloutSettings
@@ -49,7 +49,7 @@ def rollout(
 
     resolved = resolve_rollout(words, multirun)
     if cfg:
-        typer.echo("---\n".join(to_yaml(settings) for settings in resolved.settings.values()), nl=False)
+        typer.echo("---\n".join(settings_yaml(settings) for settings in resolved.settings.values()), nl=False)
         return
     for label, settings in resolved.settings.items():
         print_notes(without_effect(settings, resolved.overrides[label].split()))

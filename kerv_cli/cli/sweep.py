@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.base.config import Composer, conf_dir, expand, groups, split_words
+from kerv_cli.base.config import compose, expand, groups, split
 from kerv_cli.base.errors import UsageError
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import (
@@ -62,13 +62,12 @@ def sweep(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: 
 def _list_studies(as_json: bool) -> None:
     """Prints the studies of conf/ and how large each is."""
     from kerv_cli.episodes.policy import tasks_of
-    from kerv_cli.episodes.resolve import study_of_file
 
-    rows, composer = [], Composer("rollout", RolloutSettings)
+    rows = []
     for name in groups()["study"]:
-        study = study_of_file(conf_dir() / "study" / f"{name}.yaml")
-        common = composer.compose(split_words(study.common))
-        settings, tasks = sum(len(expand(text)) for text in study.settings.values()), len(tasks_of(common))
+        study = compose("sweep", [f"study={name}"], SweepSettings).study
+        common = compose("rollout", split(study.common), RolloutSettings)
+        settings, tasks = sum(len(expand(split(text))) for text in study.settings.values()), len(tasks_of(common))
         rows.append((name, settings, tasks, common.episodes, settings * tasks * common.episodes, study.title))
     columns = ("study", "settings", "tasks", "episodes", "in all", "")
     if as_json:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from kerv_cli.base.config import MOST_POINTS, Composer, compose, expand, split_words, swept_keys
-from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.base.files import read_yaml_file
+from kerv_cli.base.config import MOST_POINTS, compose, expand, preset_file, split, swept_keys
+from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.files import read_yaml_lines
 from kerv_cli.base.limits import check_label
-from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import METHOD_KINDS
 from kerv_cli.episodes.identity import without_effect
 from kerv_cli.episodes.policy import tasks_of, trained_tasks
@@ -51,26 +50,27 @@ class ResolvedStudy:
 
 
 def resolve(overrides: Sequence[str]) -> ResolvedStudy:
-    """The chosen study; overrides of `study…` and `results` go to the sweep, all others to each of its settings.
+    """Return the chosen study with its settings composed.
+
+    Args:
+        overrides: Those of the sweep and its `study`; all others, and `results`, go to each setting.
 
     Raises:
-        UsageError: an unknown key or name; a key on the command line that the study itself varies; too many settings.
+        UsageError: An unknown key or name; a key on the command line that the study itself varies; too many settings.
     """
-    file = next((o for o in overrides if o.startswith("study=") and o.endswith((".yaml", ".yml"))), None)
-    of_sweep = [o for o in overrides if o != file and _key(o).split(".")[0] in SweepSettings.__dataclass_fields__]
-    of_settings = [o for o in overrides if o != file and (o not in of_sweep or o.startswith("results="))]
+    of_sweep = [o for o in overrides if _key(o).split(".")[0] in SweepSettings.__dataclass_fields__]
+    of_settings = [o for o in overrides if o not in of_sweep or o.startswith("results=")]
     sweep = compose("sweep", of_sweep, SweepSettings)
-    if file is not None:
-        names = {_key(o).removeprefix("study.") for o in of_sweep} & set(StudySettings.__dataclass_fields__)
-        changes = {name: getattr(sweep.study, name) for name in names}
-        sweep.study = dataclasses.replace(study_of_file(Path(file.split("=", 1)[1]).expanduser()), **changes)
     study = sweep.study
-    study.name = study.name or next(o.split("=", 1)[1] for o in of_sweep if o.startswith("study="))
+    name = next((o.partition("=")[2] for o in of_sweep if _key(o) == "study"), SweepSettings.groups["study"])
+    path = preset_file("study", name)
+    study.name = study.name or path.stem
     keys = {_key(o) for o in of_settings}
-    common = [o for o in split_words(study.common) if _key(o) not in keys] + of_settings
-    points, varies, shared = _points(study)
-    for words in points.values():
-        varied = keys & {_key(word) for word in words}
+    with _line_of(path, keys, "common"):
+        common = _outranked(split(study.common), of_settings)
+    points, varies, shared = _points(study, path)
+    for point in points.values():
+        varied = keys & {_key(override) for override in point}
         if varied:
             raise UsageError(f"study '{study.name}' sets {', '.join(sorted(varied))} itself: leave it out")
     if not points:
@@ -80,12 +80,45 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
             f"study '{study.name}' has no setting '{study.baseline}', the baseline that its others are "
             f"compared with: add it, or name one of these by baseline=: {', '.join(points)}"
         )
-    composer = Composer("rollout", RolloutSettings)
-    settings = {label: composer.compose([*common, *words]) for label, words in points.items()}
+    settings: dict[str, RolloutSettings] = {}
+    for label, point in points.items():
+        with _line_of(path, keys, f"settings.{shared[label]}", {_key(o): "common" for o in common}):
+            settings[label] = compose("rollout", _outranked(common, point), RolloutSettings)
+    if study.axis and not any(_has(setting, study.axis) for setting in settings.values()):
+        with _line_of(path, (), "axis"):
+            raise UnknownName("axis", study.axis, dict.fromkeys(key for values in varies.values() for key in values))
     narrows = any(key.startswith("policy") for key in keys) and "task" not in keys  # to the policy named
     _settle(settings.values(), settings[study.baseline], narrows)
-    texts = {label: " ".join(words) for label, words in points.items()}
+    texts = {label: " ".join(point) for label, point in points.items()}
     return ResolvedStudy(sweep, settings, texts, tuple(of_settings), varies, shared)
+
+
+@contextmanager
+def _line_of(path: Path, typed: Collection[str], place: str, others: Mapping[str, str] = {}) -> Iterator[None]:
+    """Put a study's file and line before the message of a UsageError.
+
+    Args:
+        path: The study's file.
+        typed: Keys on the command line; a mistake in these has no line.
+        place: The key in the file of what is read.
+        others: Key of a setting -> key in the file, for settings that are written elsewhere.
+    """
+    try:
+        yield
+    except UsageError as error:
+        line = read_yaml_lines(path, "study")[1].get(others.get(error.key, place))
+        if line is None or error.key in typed:
+            raise
+        raise UsageError(f"{path}:{line}: {error}", error.key) from error
+
+
+def _has(settings: Any, key: str) -> bool:
+    """Tell whether composed settings have a dotted key."""
+    for name in key.split("."):
+        if not hasattr(settings, name):
+            return False
+        settings = getattr(settings, name)
+    return True
 
 
 def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
@@ -145,40 +178,22 @@ def idle_overrides(resolved: ResolvedStudy) -> dict[str, str]:
     return reasons | {word: why for word, why in common[0].items() if all(word in idle for idle in common)}
 
 
-def study_of_file(path: Path) -> StudySettings:
-    """The study in a file. Raises UsageError: no such file, or it is no study."""
-    value = _read_study(path)
-    for key in value:
-        if key not in StudySettings.__dataclass_fields__:
-            raise UnknownName(f"key in study={path}:", key, StudySettings.__dataclass_fields__)
-    try:
-        return read(StudySettings, {"name": path.stem, **value}, str(path))
-    except CheckpointError as error:
-        raise UsageError(str(error).replace(" is damaged", " is no study")) from error
-
-
-def _read_study(path: Path) -> dict[str, Any]:
-    """The study file's values. Raises UsageError where it cannot be read or is no mapping."""
-    try:
-        value = read_yaml_file(path)
-    except (OSError, ValueError) as error:
-        why = getattr(error, "strerror", None) or "it is not YAML"
-        raise UsageError(f"study={path} cannot be read: {why}") from error
-    if not isinstance(value, dict):
-        raise UsageError(f"study={path} is no study: it needs the key settings, see conf/study/demo.yaml")
-    return value
-
-
 def study_name(study: str) -> str:
-    """The name under which `kerv sweep study=…` stores a study: of a file its `name:`, else its stem.
+    """Return the name under which `kerv sweep study=…` stores a study: for a file its `name:`, else its stem.
 
     Raises:
-        UsageError: a file that is there and is no study.
+        UsageError: A file that is there and is no study.
     """
     path = Path(study).expanduser()
     if path.suffix not in (".yaml", ".yml"):
         return study
-    return str(_read_study(path).get("name", path.stem)) if path.is_file() else path.stem
+    return str(read_yaml_lines(path, f"study={path}")[0].get("name", path.stem)) if path.is_file() else path.stem
+
+
+def _outranked(overrides: Iterable[str], by: Sequence[str]) -> list[str]:
+    """Return `overrides` without the keys that `by` sets, then `by`."""
+    keys = {_key(override) for override in by}
+    return [*(override for override in overrides if _key(override) not in keys), *by]
 
 
 def _key(override: str) -> str:
@@ -196,17 +211,19 @@ def _shown(values: Mapping[str, str]) -> list[str]:
     return [f"{key.rpartition('.')[2]}={value}" for key, value in values.items()]
 
 
-def _points(study: StudySettings) -> tuple[dict[str, list[str]], dict[str, dict[str, str]], dict[str, str]]:
+def _points(study: StudySettings, path: Path) -> tuple[dict[str, list[str]], dict[str, dict[str, str]], dict[str, str]]:
     """Return label -> override words, label -> what varies, label -> name. A label has both: `spec_vla r=3`."""
     points: dict[str, list[str]] = {}
     varies: dict[str, dict[str, str]] = {}
     names: dict[str, str] = {}
     for name, text in study.settings.items():
-        varied = swept_keys(text)
-        for words in expand(text):
-            values = _varied_values(words, varied)
-            label = check_label(" ".join([name, *_shown(values)]))
-            points[label], varies[label], names[label] = words, values, name
+        with _line_of(path, (), f"settings.{name}"):
+            overrides = split(text)
+            varied = swept_keys(overrides)
+            for point in expand(overrides):
+                values = _varied_values(point, varied)
+                label = check_label(" ".join([name, *_shown(values)]))
+                points[label], varies[label], names[label] = point, values, name
         if len(points) > MOST_POINTS:
             raise UsageError(f"study '{study.name}' has more than {MOST_POINTS} settings: leave some out")
     return points, varies, names

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from kerv_cli.base.config import as_words, compose
+from kerv_cli.base.config import as_overrides, compose
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_json
 from kerv_cli.base.places import check_not_shipped
@@ -104,7 +104,7 @@ def _overrides(kind: str, part: Any, other: Any) -> list[str]:
     chosen = [] if part.kind == other.kind else [f"{kind}={part.kind}"]
     base = dataclasses.asdict(part_of(kind, part.kind).default if chosen else other)
     changed = {f"{kind}.{name}": value for name, value in dataclasses.asdict(part).items() if value != base[name]}
-    return as_words(*chosen, **changed)
+    return as_overrides(*chosen, **changed)
 
 
 def certify(

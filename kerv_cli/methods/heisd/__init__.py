@@ -104,7 +104,7 @@ class FusedBoundarySettings:
     kind: str = "fused"
     alpha: float = number(0.5, 0, 1)  # weight of the radius of curvature against the path length
     window: int = number(15, 3, MOST_DECODES)  # newest measured positions
-    f_star: float = number(0.3, -1e9, 1e9)  # fused metric from which retrieval drafts (measured; HeiSD: 0.5)
+    f_star: float = number(0.3, 0, 1)  # fused metric from which retrieval drafts (measured; HeiSD: 0.5)
 
 
 @dataclass
