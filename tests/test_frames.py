@@ -58,7 +58,7 @@ def test_observations_of_several_files_keep_none_of_them_in_memory(
     joined = Observations.joined(parts)
     everything = np.concatenate([e.frames for e in written])
     assert isinstance(joined.frames, EncodedFrames)
-    assert all(isinstance(source, Path) for source in joined.frames.sources)  # neither bytes nor open files
+    assert all(isinstance(file, Path) for file in joined.frames.files)  # neither bytes nor open files
     chosen = torch.tensor([10, 0, 7, 7])
     images = joined.inputs(chosen, torch.device("cpu")).images
     assert images is not None

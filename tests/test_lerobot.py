@@ -13,9 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from examples.tiny_openvla import write_checkpoint
 from test_openvla import imported, kerv
-from typer.testing import CliRunner
 
-from kerv_cli.cli.app import app
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.settings import CameraSettings
@@ -88,9 +86,8 @@ def test_what_was_written_is_read_back(results: Path) -> None:
     assert manifest.actions.names == ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
     assert [group.size for group in manifest.actions.groups] == [3, 3, 1]
     assert (manifest.actions.strict, manifest.actions.control_hz) == (("gripper",), 20.0)
-    assert (
-        manifest.instructions["pick-up-the-peg-and-put-it-into-the-slot"] == "pick up the peg and put it into the slot"
-    )
+    text = "pick up the peg and put it into the slot"
+    assert manifest.instructions[text.replace(" ", "-")] == text
 
 
 @pytest.mark.usefixtures("few_validations")
@@ -128,22 +125,22 @@ def edited(results: Path, tmp_path: Path, **changes: Any) -> Path:
 @pytest.mark.parametrize(
     ("changes", "words", "said"),
     [
-        ({}, [], "source=DIR: name the folder"),
-        ({"codebase_version": "v2.1"}, ["SOURCE"], "is of version v2.1, v3.x is read"),
-        ({"features": {"action": {"dtype": "float32", "shape": [7]}}}, ["SOURCE"], "has no images or no action"),
-        ({}, ["SOURCE", "camera=side"], "unknown camera 'side': known: front"),
-        ({}, ["SOURCE", "strict=[jaw]"], "unknown strict DoF 'jaw'"),
-        ({}, ["SOURCE", "dofs=six"], "unknown dofs 'six': known: own, openvla"),
-        ({}, ["SOURCE", "name=pegs", "RESULTS"], "exists: give the new demonstrations another name"),
+        ({}, ["source="], "source=DIR"),
+        ({"codebase_version": "v2.1"}, [], "v2.1"),
+        ({"features": {"action": {"dtype": "float32", "shape": [7]}}}, [], "no images"),
+        ({}, ["camera=side"], "unknown camera 'side': known: front"),
+        ({}, ["strict=[jaw]"], "unknown strict DoF 'jaw'"),
+        ({}, ["dofs=six"], "unknown dofs 'six'"),
+        ({}, ["name=front"], "another name"),
     ],
 )
 def test_an_import_refuses_in_one_line(
     results: Path, tmp_path: Path, changes: dict[str, Any], words: list[str], said: str
 ) -> None:
     source = edited(results, tmp_path, **changes)
-    where = f"results={results}" if "RESULTS" in words else f"results={tmp_path}"
-    given = [f"source={source}" if word == "SOURCE" else word for word in words if word != "RESULTS"]
-    code, line = kerv("demos", "import", *given, where)
+    (tmp_path / "artifacts/demos/front").mkdir(parents=True)
+    given = words if words == ["source="] else [f"source={source}", *words]
+    code, line = kerv("demos", "import", *given, f"results={tmp_path}")
     assert code in (1, 2)
     assert said in line
 
@@ -153,8 +150,7 @@ def test_a_truncated_table_is_refused(results: Path, tmp_path: Path) -> None:
     data = source / "data/chunk-000/file-000.parquet"
     data.write_bytes(data.read_bytes()[:-2000])
     code, line = kerv("demos", "import", f"source={source}", f"results={tmp_path}")
-    assert code == 1
-    assert "file-000.parquet is missing or damaged" in line
+    assert (code, data.name in line) == (1, True)
 
 
 def test_a_dataset_with_videos_is_read(results: Path, tmp_path: Path) -> None:
@@ -182,8 +178,7 @@ def test_a_dataset_with_videos_is_read(results: Path, tmp_path: Path) -> None:
     pq.write_table(pa.Table.from_pylist(rows), source / "meta/episodes/chunk-000/file-000.parquet")
     data = source / "data/chunk-000/file-000.parquet"
     pq.write_table(pq.read_table(data).drop_columns([key]), data)
-    run = CliRunner().invoke(app, ["demos", "import", f"source={source}", "name=video", f"results={tmp_path}"])
-    assert run.exit_code == 0, run.output
+    assert kerv("demos", "import", f"source={source}", "name=video", f"results={tmp_path}") == (0, "")
     after = DemoDataset.open(tmp_path / "artifacts/demos/video")
     for index in range(4):
         ours, theirs = (np.asarray(dataset.load(index).frames).astype(int) for dataset in (before, after))
@@ -193,5 +188,4 @@ def test_a_dataset_with_videos_is_read(results: Path, tmp_path: Path) -> None:
         assert own < shifted
     path.write_bytes(path.read_bytes()[:1000])
     code, line = kerv("demos", "import", f"source={source}", "name=cut", f"results={tmp_path}")
-    assert code == 1
-    assert "file-000.mp4 is missing or damaged" in line
+    assert (code, path.name in line) == (1, True)

@@ -12,7 +12,7 @@ from typing import Any
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import read_mapping, sha256_of
 from kerv_cli.base.manifests import read
-from kerv_cli.base.registry import Part, register
+from kerv_cli.base.registry import add
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.worlds import stands_for_tasks
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode
@@ -27,18 +27,31 @@ FORMAT = 2
 """Format of manifests."""
 
 SPECS = SimpleNamespace()
-"""The specification of every recorded environment, an attribute of its name."""
+"""Specifications of recorded environments, as attributes."""
 
 
 @dataclass(frozen=True)
 class EpisodeEntry:
-    """One episode's entry in the manifest. steps: control steps up to the success. bytes, sha256: of its file."""
+    """One episode in the manifest.
+
+    Attributes:
+        seed: Seed of the episode.
+        perturbed: Whether its execution was noisy.
+        steps: Control steps up to the success.
+        bytes: Size of its file.
+        sha256: Hash of its file.
+    """
 
     seed: int
     perturbed: bool
     steps: int
     bytes: int
     sha256: str
+
+    @classmethod
+    def of(cls, path: Path, episode: DemoEpisode) -> EpisodeEntry:
+        """Describe an episode that was saved to `path`."""
+        return cls(episode.seed, episode.perturbed, episode.steps, path.stat().st_size, sha256_of(path))
 
 
 @dataclass(frozen=True)
@@ -52,12 +65,21 @@ class TaskEntry:
 
 @dataclass(frozen=True)
 class DemoManifest:
-    """The manifest that `kerv demos` writes.
+    """The manifest of a dataset.
 
-    environment, actions, observation: of the tasks' environment. config: the fields of DemoConfig without the workers.
-    versions: of the packages that the physics and the frames depend on. sha256: over the hashes of all episode files.
-    seeds: the first and the last. missing: how many of the requested episodes failed. instructions: of the tasks of
-    recorded data, which no registered environment has.
+    Attributes:
+        format: Format of the manifest.
+        environment: Name of the tasks' environment.
+        actions: Its action space.
+        observation: Its observation space.
+        config: Fields of `DemoConfig` without the workers.
+        tasks: Episodes of each task.
+        sha256: Hash over the hashes of all episode files.
+        versions: Versions of the packages that physics and frames depend on.
+        seeds: The first and the last seed.
+        episodes: Number of episodes.
+        missing: Number of requested episodes that failed.
+        instructions: Task to instruction, for recorded data whose tasks no registered environment has.
     """
 
     format: int
@@ -77,23 +99,30 @@ class DemoManifest:
 def register_recorded(
     name: str, actions: ActionSpace, observation: ObservationSpace, instructions: Mapping[str, str], camera: str
 ) -> EnvironmentSpec:
-    """Registers the environment of a dataset that exists only as a recording: nothing can be rolled out in it. name: an
-    identifier; instructions: task -> instruction."""
+    """Register the environment of a dataset that exists only as a recording: nothing can be rolled out in it.
+
+    Args:
+        name: An identifier. In capitals it is the suite of all tasks.
+        actions: Action space.
+        observation: Observation space.
+        instructions: Task to instruction.
+        camera: Name of the recorded view.
+    """
     tasks = {task: Task(task, instruction, "recorded") for task, instruction in instructions.items()}
-    suite = {name.upper(): tuple(tasks)}
-    spec = EnvironmentSpec(name, actions, observation, tasks, suite, ("recorded",), 10_000, (camera,))
+    suites = {name.upper(): tuple(tasks)}
+    spec = EnvironmentSpec(name, actions, observation, tasks, suites, ("recorded",), 10_000, (camera,))
     setattr(SPECS, name, spec)
-    register(Part("environment", name, f"{__name__}:SPECS.{name}"))
+    add("environment", name, f"{__name__}:SPECS.{name}")
     return spec
 
 
-def episode_path(out: Path, task: str, seed: int) -> Path:
-    """File of an episode within the dataset's folder `out`."""
-    return Path(out) / "episodes" / task / f"{seed:06d}.safetensors"
+def episode_path(folder: Path, task: str, seed: int) -> Path:
+    """Return the file of an episode within the dataset's folder."""
+    return folder / "episodes" / task / f"{seed:06d}.safetensors"
 
 
 def dataset_hash(tasks: Mapping[str, Any]) -> str:
-    """Hex SHA-256 over the hashes of the episode files; tasks: of a manifest's JSON."""
+    """Return a SHA-256 over the hashes of the episode files. `tasks` is that of a manifest's JSON."""
     digest = hashlib.sha256()
     for task, summary in sorted(tasks.items()):
         for episode in summary["episodes"]:
@@ -101,15 +130,16 @@ def dataset_hash(tasks: Mapping[str, Any]) -> str:
     return digest.hexdigest()
 
 
-def entry_of(path: Path, episode: DemoEpisode) -> EpisodeEntry:
-    """The manifest's entry of an episode that lies in `path`."""
-    return EpisodeEntry(episode.seed, episode.perturbed, episode.steps, path.stat().st_size, sha256_of(path))
-
-
 def totals(
     entries: Mapping[str, Sequence[EpisodeEntry]], failed: Mapping[str, Sequence[int]], missing: int
 ) -> dict[str, Any]:
-    """The manifest's fields that sum up its episodes, as JSON. entries: of each task; failed: task -> seeds."""
+    """Return the manifest's fields that sum up its episodes, as JSON.
+
+    Args:
+        entries: Episodes of each task.
+        failed: Task to the seeds that failed.
+        missing: Number of requested episodes that failed.
+    """
     tasks = {}
     for task, rows in entries.items():
         episodes = [asdict(entry) for entry in sorted(rows, key=lambda entry: entry.seed)]
@@ -138,10 +168,10 @@ class DemoDataset:
     """A complete recording on disk.
 
     Attributes:
-        path: the dataset's folder.
-        manifest: what was recorded.
-        episodes: one entry per episode, by task in the recording's order, then by seed.
-        views: how many of the recorded views are read, from the left; 0: all.
+        path: The dataset's folder.
+        manifest: What was recorded.
+        episodes: One entry per episode, by task in the recording's order, then by seed.
+        views: Number of recorded views to read, from the left. 0 means all.
     """
 
     path: Path
@@ -151,17 +181,16 @@ class DemoDataset:
 
     @property
     def sha256(self) -> str:
-        """Hex hash over the hashes of all episode files: two datasets with the same hash are the same."""
+        """Hash over the hashes of all episode files. Two datasets with the same hash are the same."""
         return self.manifest.sha256
 
     @classmethod
     def open(cls, path: Path) -> DemoDataset:
-        """Opens a dataset and checks that its episode files exist in full size; `load` checks their contents.
+        """Open a dataset. Checks that its files are there in full size; `load` checks their contents.
 
         Raises:
-            CheckpointError: no dataset there, its recording was not finished, or it is damaged.
+            CheckpointError: There is no dataset, its recording was not finished, or it is damaged.
         """
-        path = Path(path)
         file = path / "manifest.json"
         if not file.exists():
             command = f"'kerv demos {'task' if stands_for_tasks(path.name) else 'name'}={path.name}'"
@@ -189,23 +218,24 @@ class DemoDataset:
 
     @classmethod
     def joined(cls, parts: Sequence[DemoDataset]) -> DemoDataset:
-        """All episodes of `parts`, in order. The manifest is the first one's, with the tasks and the hash of all.
+        """Return all episodes of `parts`, in order. The manifest is the first one's, with the tasks and hash of all.
 
         Raises:
-            CheckpointError: they are of different environments or cameras.
+            CheckpointError: They are of different environments or cameras.
         """
         if len(parts) == 1:
             return parts[0]
         first = parts[0].manifest
         for part in parts[1:]:
+            other = part.manifest
             for what, ours, theirs in (
-                ("environment", first.environment, part.manifest.environment),
-                ("action space", first.actions, part.manifest.actions),
-                ("observations", first.observation, part.manifest.observation),
-                ("camera", first.config["camera"], part.manifest.config["camera"]),
+                ("environment", first.environment, other.environment),
+                ("action space", first.actions, other.actions),
+                ("observation space", first.observation, other.observation),
+                ("camera", first.config["camera"], other.config["camera"]),
             ):
                 if ours != theirs:
-                    raise CheckpointError(f"{part.path} has another {what} than {parts[0].path}: they do not add up")
+                    raise CheckpointError(f"{part.path} has another {what} than {parts[0].path}: they cannot be joined")
         combined = hashlib.sha256("\n".join(part.sha256 for part in parts).encode()).hexdigest()
         config = {**first.config, "joined": [part.manifest.config for part in parts[1:]]}
         episodes = [entry for part in parts for entry in part.episodes]
@@ -213,10 +243,10 @@ class DemoDataset:
         return cls(parts[0].path, replace(first, sha256=combined, config=config, tasks=tasks), episodes)
 
     def load(self, index: int) -> DemoEpisode:
-        """Reads the episode of entry `index` of `episodes`.
+        """Read the episode of entry `index` of `episodes`.
 
         Raises:
-            CheckpointError: the file changed since it was recorded.
+            CheckpointError: The file changed since it was recorded.
         """
         entry = self.episodes[index]
         if sha256_of(entry.path) != entry.sha256:

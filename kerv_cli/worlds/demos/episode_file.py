@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,24 +16,33 @@ from kerv_cli.base.files import write_bytes
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.worlds.demos.frames import LENGTH, EncodedFrames, encode_png, header_of
 
-FORMAT = 1
+FORMAT = "1"
 """Format of episode files."""
-_INITIAL_STATE = "rand_vec"  # name of the tensor in format 1, taken from Meta-World
+_ARRAYS = {
+    "frame_steps": "frame_steps",
+    "states": "states",
+    "labels": "labels",
+    "executed": "executed",
+    "initial_state": "rand_vec",  # its name in Meta-World
+}
+"""Attribute of an episode to the name of its tensor."""
 
 
 @dataclass(frozen=True)
 class DemoEpisode:
-    """One successful episode of T control steps (up to and including the first success).
+    """One successful episode of T control steps, up to and including the first success.
 
     Attributes:
-        task, seed: of the episode. perturbed: whether its execution was noisy.
+        task: Full name of the task.
+        seed: Seed of the episode.
+        perturbed: Whether its execution was noisy.
         steps: T.
-        frames: (n, size, size x views, 3) uint8, the frames before the actions of `frame_steps`; encoded where loaded.
+        frames: (n, size, size x views, 3) uint8: the frames before the actions of `frame_steps`.
         frame_steps: (n,) int64.
-        states: (T, s) float32, privileged state before each action; it begins with the proprioception.
-        labels: (T + tail, D) float32, the clean expert's clipped actions; the last `tail` lie beyond the success.
-        executed: (T, D) float32, the actions that moved the robot.
-        initial_state: (n,) float64, of the world's `initial_state`, e.g. object and goal placement.
+        states: (T, s) float32: privileged state before each action. It begins with the proprioception.
+        labels: (T + tail, D) float32: the clean expert's clipped actions. The last `tail` are beyond the success.
+        executed: (T, D) float32: the actions that moved the robot.
+        initial_state: (n,) float64: the world's `initial_state`, e.g. placement of object and goal.
     """
 
     task: str
@@ -51,44 +58,42 @@ class DemoEpisode:
 
     @property
     def end_effector(self) -> NDArray[np.float32]:
-        """(T, 3) float32: position of the end effector before each action, metres."""
+        """Position of the end effector before each action, (T, 3) float32, metres."""
         return self.states[:, :3]
 
 
 def save_episode(path: Path, episode: DemoEpisode) -> None:
-    """Writes one episode, atomically; frames as PNG bytes, end to end, with n + 1 offsets.
+    """Write one episode, atomically. The PNGs of its frames are one tensor, with n + 1 offsets beside it.
 
     Raises:
-        StorageError: writing failed.
+        StorageError: Writing failed.
     """
     pictures = [encode_png(frame) for frame in episode.frames]
     tensors = {
         "png": np.frombuffer(b"".join(pictures), dtype=np.uint8),
         "png_offsets": np.cumsum([0, *map(len, pictures)], dtype=np.int64),
-        "frame_steps": episode.frame_steps,
-        "states": episode.states,
-        "labels": episode.labels,
-        "executed": episode.executed,
-        _INITIAL_STATE: episode.initial_state,
+        **{name: getattr(episode, attribute) for attribute, name in _ARRAYS.items()},
     }
+    height, width = episode.frames.shape[1:3]
     metadata = {
-        "format": str(FORMAT),
+        "format": FORMAT,
         "task": episode.task,
         "seed": str(episode.seed),
         "perturbed": str(episode.perturbed).lower(),
         "steps": str(episode.steps),
-        "frame_size": str(episode.frames.shape[1]),
+        "frame_size": str(height),
+        # square frames need no width, so that their files keep their bytes
+        **({"frame_width": str(width)} if width != height else {}),
     }
-    height, width = episode.frames.shape[1:3]
-    if width != height:  # square frames need no width, so that their files keep their bytes
-        metadata["frame_width"] = str(width)
     # save_file would hide a full disk behind an error type of its own.
     write_bytes(path, _with_sorted_metadata(save(tensors, metadata=metadata)))
 
 
 def _with_sorted_metadata(data: bytes) -> bytes:
-    """Sorts the keys of the metadata in the bytes of a safetensors file. safetensors writes them in random order, so
-    that the files of two recordings of one episode would have different hashes."""
+    """Sort the keys of the metadata in the bytes of a safetensors file.
+
+    safetensors writes them in random order. Two recordings of one episode would have different hashes.
+    """
     header, start = header_of(data)
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
     text = json.dumps(header, separators=(",", ":")).encode()
@@ -97,43 +102,27 @@ def _with_sorted_metadata(data: bytes) -> bytes:
 
 
 def load_episode(path: Path, actions: ActionSpace, observation: ObservationSpace) -> DemoEpisode:
-    """Reads one episode of an environment that has these spaces.
+    """Read one episode of an environment that has these spaces.
 
     Raises:
-        CheckpointError: the file is missing, damaged, of another format or of other spaces.
+        CheckpointError: The file is missing, damaged, of another format or of other spaces.
     """
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
-            if metadata.get("format") != str(FORMAT):
+            if metadata.get("format") != FORMAT:
                 raise CheckpointError(f"{path} is not a demonstration episode of format {FORMAT}")
-            names = [name for name in file.keys() if name != "png"]  # noqa: SIM118 - not a mapping
-            arrays = {name: file.get_tensor(name) for name in names}
-        width = int(metadata.get("frame_width", 0))
-        frames = EncodedFrames.of_file(path, arrays["png_offsets"], int(metadata["frame_size"]), width)
-        return _episode_from(arrays, frames, metadata, actions.dofs, observation.state)
+            arrays = {attribute: file.get_tensor(name) for attribute, name in _ARRAYS.items()}
+            offsets = file.get_tensor("png_offsets")
+        steps = int(metadata["steps"])
+        frames = EncodedFrames.of_file(path, offsets, int(metadata["frame_size"]), int(metadata.get("frame_width", 0)))
+        shapes = arrays["states"].shape, arrays["executed"].shape, arrays["labels"].shape[1:]
+        wanted = (steps, observation.state), (steps, actions.dofs), (actions.dofs,)
+        if shapes != wanted or len(arrays["labels"]) < steps or len(arrays["frame_steps"]) != len(frames):
+            raise ValueError(
+                f"the arrays do not hold {steps} steps of {wanted[0][1]} state numbers and {wanted[2]} DoFs"
+            )
+        perturbed = metadata["perturbed"] == "true"
+        return DemoEpisode(metadata["task"], int(metadata["seed"]), perturbed, steps, frames, **arrays)
     except (OSError, SafetensorError, KeyError, ValueError) as error:
         raise CheckpointError(f"{path} is missing or damaged: {error}") from error
-
-
-def _episode_from(
-    arrays: Mapping[str, NDArray[Any]], frames: EncodedFrames, metadata: Mapping[str, str], dofs: int, state: int
-) -> DemoEpisode:
-    steps = int(metadata["steps"])
-    if arrays["states"].shape != (steps, state) or arrays["executed"].shape != (steps, dofs):
-        raise ValueError(f"the arrays do not hold {steps} steps of {state} state numbers and {dofs} DoFs")
-    labels = arrays["labels"]
-    if len(labels) < steps or labels.shape[1:] != (dofs,) or len(arrays["frame_steps"]) != len(frames):
-        raise ValueError("labels or frames are too few")
-    return DemoEpisode(
-        task=metadata["task"],
-        seed=int(metadata["seed"]),
-        perturbed=metadata["perturbed"] == "true",
-        steps=steps,
-        frames=frames,
-        frame_steps=arrays["frame_steps"],
-        states=arrays["states"],
-        labels=labels,
-        executed=arrays["executed"],
-        initial_state=arrays[_INITIAL_STATE],
-    )

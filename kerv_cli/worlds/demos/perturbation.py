@@ -8,32 +8,30 @@ from numpy.typing import NDArray
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.worlds.vectors import unit_vector
 
-_BURST_STEPS = (3, 8)
-
 
 def is_perturbed(seed: int, fraction: float) -> bool:
-    """Whether the episode of this seed is executed with noise; the `fraction` of such seeds is spread evenly."""
+    """Return whether the episode of this seed is executed with noise. Such seeds are spread evenly."""
     return int((seed + 1) * fraction) > int(seed * fraction)
 
 
 class Perturbation:
-    """One episode's noise: Gaussian, sometimes a burst in one random direction. Strict DoFs, e.g. a gripper, stay
-    clean.
+    """One episode's noise: Gaussian, and bursts of 3 to 8 steps in one random direction. Strict DoFs stay clean.
 
     Attributes:
-        sigma: standard deviation of the Gaussian, drawn once; half of a DoF's range is 1.
+        sigma: Standard deviation of the Gaussian, drawn once. 1 is half of a DoF's range.
     """
 
     def __init__(
         self, task: str, seed: int, space: ActionSpace, noise: tuple[float, float], burst_probability: float
     ) -> None:
-        """The noise is a function of task and seed.
+        """Draw the noise from task and seed.
 
         Args:
-            task, seed: of the episode.
-            space: of the actions that are perturbed.
-            noise: (low, high) range of sigma.
-            burst_probability: chance per step that a burst of 3 to 8 steps starts.
+            task: Full name of the task.
+            seed: Seed of the episode.
+            space: Space of the actions.
+            noise: Lowest and highest `sigma`.
+            burst_probability: Probability per step that a burst begins.
         """
         self._random = np.random.default_rng([seed, *task.encode()])
         self.sigma = float(self._random.uniform(*noise))
@@ -45,11 +43,11 @@ class Perturbation:
         self._direction = np.zeros(len(self._half))  # normalised
 
     def __call__(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The action to execute, (D,) in environment units and within the limits, for the clean `action`."""
+        """Return the action (D,) to execute instead of the clean one, within the limits."""
         dofs = len(self._half)
         noise = self._random.normal(0.0, self.sigma, size=dofs)
         if self._burst_left == 0 and self._random.random() < self._burst_probability:
-            self._burst_left = int(self._random.integers(_BURST_STEPS[0], _BURST_STEPS[1] + 1))
+            self._burst_left = int(self._random.integers(3, 9))
             self._direction = unit_vector(self._random, dofs)
         moved = action[self._noisy] + noise * self._half
         if self._burst_left > 0:

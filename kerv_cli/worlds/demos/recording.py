@@ -1,8 +1,8 @@
-"""Demonstrations: scripted experts, recorded to disk with clean labels, and read back.
+"""Demonstrations: scripted experts, recorded to disk with clean labels.
 
-By default half of the episodes are executed with noise, so that they visit states off the expert's path; their labels
-are still the expert's clean actions at those states. Only successful episodes are kept. An *actor*, e.g. a policy, may
-move the robot instead; the expert then only labels the states (DAgger, Ross et al. 2011), and every episode is kept.
+By default half of the episodes are executed with noise, so that they visit states off the expert's path. Their labels
+are still the expert's clean actions at those states. Only successful episodes are kept. An *actor*, e.g. a policy, can
+move the robot instead. Then the expert only labels the states (DAgger, Ross et al. 2011), and every episode is kept.
 
 On disk: `recording.json` (configuration and versions), `episodes/<task>/<seed:06d>.safetensors`,
 `failed/<task>/<seed:06d>.json` and, when the recording is complete, `manifest.json`.
@@ -14,7 +14,7 @@ import contextlib
 import json
 import os
 import platform
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -30,23 +30,15 @@ from kerv_cli.base.manifests import read
 from kerv_cli.base.processes import begin_worker, check_workers
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.camera import choose_backend
-from kerv_cli.worlds.demos.dataset import (
-    FORMAT,
-    DemoManifest,
-    EpisodeEntry,
-    OnProgress,
-    entry_of,
-    episode_path,
-    totals,
-)
+from kerv_cli.worlds.demos.dataset import FORMAT, DemoManifest, EpisodeEntry, OnProgress, episode_path, totals
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode, save_episode
 from kerv_cli.worlds.demos.perturbation import Perturbation, is_perturbed
 from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import EnvironmentSpec, World
 
 _SEEDS_PER_JOB = 5
-_EXTRA_ATTEMPTS = 20
-"""Seeds tried beyond the requested range: this many, plus one per requested episode."""
+_EXTRA_SEEDS = 20
+"""A task tries this many seeds beyond the requested range, and one more per requested episode."""
 
 
 @dataclass(frozen=True)
@@ -54,20 +46,20 @@ class DemoConfig:
     """The configuration of a recording.
 
     Attributes:
-        tasks: tasks and suites of one environment.
-        episodes: successful episodes per task.
-        first_seed: seeds start here, per task; seeds for selection and evaluation are refused.
-        perturbed: fraction of episodes executed with noise; `is_perturbed` says which.
-        noise_low, noise_high: range of the Gaussian noise's standard deviation on the DoFs that are not strict, drawn
-            once per episode; half of a DoF's range is 1.
-        burst_probability: chance per step that a burst starts: 3 to 8 steps in one random direction.
-        camera: view of the frames; the environment's first camera where none is named.
-        frame_stride: control steps per recorded frame.
-        tail: labels recorded beyond success, so that an action chunk that starts near the end has true labels.
-        workers: processes; the result does not depend on them.
-        horizon: control steps within which the expert must succeed; 0: the environment's.
-        policy: hash of the actor's weights; empty: the expert acts.
-        expert_share: probability that the expert acts for one of the actor's chunks.
+        tasks: Tasks and suites of one environment.
+        episodes: Successful episodes per task.
+        first_seed: First seed of every task. Only training seeds are allowed.
+        perturbed: Share of episodes executed with noise. `is_perturbed` says which.
+        noise_low: Lowest standard deviation of the noise, where 1 is half of a DoF's range. Drawn once per episode.
+        noise_high: Highest standard deviation of the noise.
+        burst_probability: Probability per step that a burst of 3 to 8 steps in one random direction begins.
+        camera: View of the frames, by default the environment's first camera.
+        frame_stride: Control steps per recorded frame.
+        tail: Labels recorded beyond the success, for action chunks that begin near the end.
+        workers: Processes. The result does not depend on them.
+        horizon: Control steps within which the expert must succeed. 0 means the environment's.
+        policy: Hash of the actor's weights. Empty if the expert acts.
+        expert_share: Probability that the expert acts for one of the actor's chunks.
     """
 
     tasks: tuple[str, ...]
@@ -100,45 +92,36 @@ class DemoConfig:
 
 
 class Actor(Protocol):
-    """Moves the robot of a recording in the expert's place."""
+    """Moves the robot of a recording instead of the expert."""
 
     def reset(self, world: World, seed: int) -> None:
-        """Begins an episode in a world that was reset."""
+        """Begin an episode in a world that was reset."""
 
     def act(self, label: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The action (D,) to execute now; label: the expert's."""
+        """Return the action (D,) to execute now. `label` is the expert's."""
 
 
 MakeActor = Callable[[DemoConfig], Actor]
-"""Makes the actor of a recording, in the process that records; must be picklable."""
-
-
-class NoisyExpert:
-    """The expert as its own actor, with noise where the seed says so."""
-
-    def __init__(self, config: DemoConfig) -> None:
-        self.config = config
-        self.perturb: Perturbation | None = None
-
-    def reset(self, world: World, seed: int) -> None:
-        """Begins an episode: draws its noise, or none."""
-        config, noise = self.config, (self.config.noise_low, self.config.noise_high)
-        noisy = is_perturbed(seed, config.perturbed)
-        arguments = (world.task, seed, world.spec.actions, noise, config.burst_probability)
-        self.perturb = Perturbation(*arguments) if noisy else None
-
-    def act(self, label: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The expert's action, with noise in a perturbed episode."""
-        return self.perturb(label) if self.perturb else label
+"""Makes the actor of a recording, in the process that records. It must be picklable."""
 
 
 def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None) -> DemoEpisode | None:
-    """Runs one episode, moved by the expert or an actor. None when the expert did not succeed within the horizon, or so
-    late that the simulator's own horizon leaves no room for the tail; an actor's episode ends there and is kept."""
+    """Run one episode, moved by the expert or an actor.
+
+    Returns:
+        The episode. None if the expert did not succeed within the horizon, or so late that the simulator's horizon
+        leaves no room for the tail. An actor's episode ends there and is kept.
+    """
     expert = world.spec.expert(world.task)
-    mover: Actor = actor or NoisyExpert(config)
     observation = world.reset(seed)
-    mover.reset(world, seed)
+    noisy = is_perturbed(seed, config.perturbed)
+    act: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+    if actor is not None:
+        actor.reset(world, seed)
+        act = actor.act
+    elif noisy:
+        noise = config.noise_low, config.noise_high
+        act = Perturbation(world.task, seed, world.spec.actions, noise, config.burst_probability)
     states, labels, executed, frames, frame_steps = [], [], [], [], []
     last_step = min(config.horizon, world.horizon - config.tail)
     while not world.success:
@@ -149,19 +132,17 @@ def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None)
         if world.steps % config.frame_stride == 0:
             frames.append(world.frame())
             frame_steps.append(world.steps)
-        label = expert(observation)
-        action = mover.act(label)
         states.append(observation.state)
-        labels.append(label)
-        executed.append(action)
-        observation = world.step(action)
+        labels.append(expert(observation))
+        executed.append(act(labels[-1]) if act else labels[-1])
+        observation = world.step(executed[-1])
     for _ in range(config.tail):
         labels.append(expert(observation))
         observation = world.step(labels[-1])
     return DemoEpisode(
         task=world.task,
         seed=seed,
-        perturbed=actor is not None or is_perturbed(seed, config.perturbed),
+        perturbed=actor is not None or noisy,
         steps=len(states),
         frames=np.stack(frames),
         frame_steps=np.array(frame_steps, dtype=np.int64),
@@ -178,31 +159,29 @@ def record(
     on_progress: OnProgress = lambda done, total: None,
     make_actor: MakeActor | None = None,
 ) -> DemoManifest:
-    """Records demonstrations into the folder `out`; an interrupted recording resumes.
+    """Record demonstrations into a folder. An interrupted recording resumes.
 
-    A seed whose expert fails is replaced by the next one beyond the range, up to a limit. Which episodes
-    come out does not depend on the number of workers.
+    A seed whose expert fails is replaced by the next one beyond the range, up to a limit. Which episodes come out does
+    not depend on the number of workers.
 
     Args:
-        config: of the recording.
-        out: the dataset's folder.
-        on_progress: of episodes.
-        make_actor: makes the actor that moves the robot in the expert's place.
+        config: Configuration.
+        out: The dataset's folder.
+        on_progress: Called after every few episodes.
+        make_actor: Makes the actor that moves the robot instead of the expert.
 
     Returns:
-        The manifest, as written to `out/manifest.json`. Where an expert failed too often, its `missing` is the number
-        of requested episodes that could not be recorded.
+        The manifest, as written to `out/manifest.json`.
 
     Raises:
         UsageError: `out` holds demonstrations of another configuration.
-        RenderingUnavailable: no frame can be drawn here.
-        StorageError: writing failed.
-        KervError: a task's expert never succeeded.
+        RenderingUnavailable: No frame can be drawn here.
+        StorageError: Writing failed.
+        KervError: A task's expert never succeeded.
     """
-    out = Path(out)
     choose_backend()
     identity = _identity(config)
-    _claim_folder(out, identity)
+    _check_same_recording(out, identity, config.spec.packages)
     try:
         entries, failed = _collect(config, out, on_progress, make_actor)
     finally:
@@ -219,16 +198,17 @@ def record(
 def _collect(
     config: DemoConfig, out: Path, on_progress: OnProgress, make_actor: MakeActor | None
 ) -> tuple[dict[str, list[EpisodeEntry]], dict[str, list[int]]]:
-    """Records the episodes -> task -> the manifest's entries, and task -> seeds whose expert failed."""
+    """Record the episodes. Return the manifest's entries and the failed seeds of each task."""
     entries: dict[str, list[EpisodeEntry]] = {task: [] for task in config.tasks}
     failed: dict[str, list[int]] = {task: [] for task in config.tasks}
     seeds = {task: range(config.first_seed, config.first_seed + config.episodes) for task in config.tasks}
-    limit = min(config.first_seed + 2 * config.episodes + _EXTRA_ATTEMPTS, config.spec.seeds.training.stop)
+    limit = min(config.first_seed + 2 * config.episodes + _EXTRA_SEEDS, config.spec.seeds.training.stop)
     while any(seeds.values()):
-        starts = [
-            (task, block, first) for task, block in seeds.items() for first in range(0, len(block), _SEEDS_PER_JOB)
+        jobs = [
+            (task, block[first : first + _SEEDS_PER_JOB])
+            for task, block in seeds.items()
+            for first in range(0, len(block), _SEEDS_PER_JOB)
         ]
-        jobs = [(task, block[first : first + _SEEDS_PER_JOB]) for task, block, first in starts]
         for task, outcomes in _run_jobs(config, out, jobs, make_actor):
             entries[task] += [entry for entry in outcomes.values() if entry is not None]
             failed[task] += [seed for seed, entry in outcomes.items() if entry is None]
@@ -240,49 +220,44 @@ def _collect(
 
 
 def _identity(config: DemoConfig) -> dict[str, Any]:
+    """Return the manifest's fields that are known before the recording, as JSON."""
     settings = asdict(config)
     del settings["workers"]
     spec = config.spec
     experts = {task: spec.experts[task] for task in config.tasks if task in spec.experts}
     if experts:
         settings["experts"] = experts
-    versions = {name: version(name) for name in (*spec.packages, "numpy")} | {"python": platform.python_version()}
     identity = {
         "format": FORMAT,
         "environment": spec.name,
         "actions": spec.actions.as_dict(),
         "observation": spec.observation.as_dict(),
         "config": settings,
-        "versions": versions,
+        "versions": {name: version(name) for name in (*spec.packages, "numpy")} | {"python": platform.python_version()},
     }
     return dict(json.loads(json.dumps(identity)))  # lists for tuples, as in the file
 
 
-def _claim_folder(out: Path, identity: dict[str, Any]) -> None:
+def _check_same_recording(out: Path, identity: dict[str, Any], packages: Sequence[str]) -> None:
+    """Write `recording.json`, or refuse a folder whose recording is another one."""
     path = out / "recording.json"
     if not path.exists():
         write_json(path, identity)
-        return
-    stored = read_json(path)
-    packages = spec_of(identity["config"]["tasks"][0]).packages
-    new, old = _comparable(identity, packages), _comparable(stored, packages)
-    if new != old:
-        key = next(key for key in [*new, *old] if new.get(key) != old.get(key))
-        raise UsageError(
-            f"{out} holds demonstrations with {key}={old.get(key)}, not {new.get(key)}: "
-            "give these another name=; demos=A+B joins both"
-        )
+
+    def flat(one: dict[str, Any]) -> dict[str, Any]:
+        # Another Python or numpy may resume a recording. Another simulator version may have other physics.
+        return {**one, **one["config"], **{name: one["versions"].get(name) for name in packages}, "versions": {}}
+
+    new, old = flat(identity), flat(read_json(path))
+    for key in [*new, *old]:
+        if key != "config" and new.get(key) != old.get(key):
+            raise UsageError(
+                f"{out} holds demonstrations with {key}={old.get(key)}, not {new.get(key)}: "
+                "give these another name=; demos=A+B joins both"
+            )
 
 
-def _comparable(identity: Mapping[str, Any], packages: Sequence[str]) -> dict[str, Any]:
-    # Another Python or numpy may resume a recording; another simulator version may have other physics.
-    identity = json.loads(json.dumps(identity))
-    keys = ("environment", "format", "actions", "observation")
-    versions = {name: identity["versions"].get(name) for name in packages}
-    return {**{key: identity[key] for key in keys}, **identity["config"], **versions}
-
-
-_Outcomes = dict[int, EpisodeEntry | None]  # seed -> the manifest's entry, None where the expert failed
+_Outcomes = dict[int, EpisodeEntry | None]  # seed -> the manifest's entry, None if the expert failed
 
 
 def _run_jobs(
@@ -302,7 +277,7 @@ def _run_jobs(
         try:
             yield from Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")(work)
         except BrokenProcessPool as error:
-            raise KervError("a worker process was killed: the same command goes on where it was") from error
+            raise KervError("a worker process was killed: run the same command again to go on") from error
 
 
 _world: World | None = None
@@ -311,7 +286,7 @@ _world: World | None = None
 def _record_seeds(
     config: DemoConfig, out: Path, task: str, seeds: Sequence[int], make_actor: MakeActor | None
 ) -> tuple[str, _Outcomes]:
-    """Runs in a worker: records each seed that has no file yet."""
+    """Record each seed that has no file yet. Runs in a worker."""
     actor = make_actor(config) if make_actor else None
     return task, {seed: _record_seed(config, out, task, seed, actor) for seed in seeds}
 
@@ -321,7 +296,7 @@ def _record_seed(config: DemoConfig, out: Path, task: str, seed: int, actor: Act
     if failure.exists():
         return None
     episode = None
-    with contextlib.suppress(CheckpointError):  # missing or damaged: it is recorded anew
+    with contextlib.suppress(CheckpointError):  # missing or damaged: record it again
         episode = load_episode(path, config.spec.actions, config.spec.observation)
     if episode is None or (episode.task, episode.seed) != (task, seed):
         episode = run_expert(_world_for(task, config), seed, config, actor)
@@ -329,7 +304,7 @@ def _record_seed(config: DemoConfig, out: Path, task: str, seed: int, actor: Act
             write_json(failure, {"task": task, "seed": seed, "perturbed": is_perturbed(seed, config.perturbed)})
             return None
         save_episode(path, episode)
-    return entry_of(path, episode)
+    return EpisodeEntry.of(path, episode)
 
 
 def _world_for(task: str, config: DemoConfig) -> World:

@@ -1,4 +1,4 @@
-"""Names, paths and tables of a LeRobot dataset of version 3."""
+"""Names and paths of a LeRobot dataset of version 3."""
 
 VERSION = "v3.0"
 INFO, STATS, TASKS = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"
@@ -8,6 +8,6 @@ VIDEO = f"videos/{{video_key}}/{CHUNK}.mp4"
 STATE, ENVIRONMENT, ACTION, EXECUTED = "observation.state", "observation.environment_state", "action", "action.executed"
 IMAGES, DONE = "observation.images.", "next.done"
 COUNTERS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-"""Columns that every dataset has; timestamps are seconds since the episode's start."""
-FILE_MB = 100
-"""Size from which on a further data file is written."""
+"""Columns that every dataset has. Timestamps are seconds since the episode's start."""
+EVERY_FRAME, EVERY_PIXEL = 10, 4
+"""Statistics of images are computed from every tenth frame, and from every fourth pixel per side."""

@@ -1,4 +1,4 @@
-"""Converts a LeRobot dataset of version 3, tables with images or videos beside them, to demonstrations."""
+"""Converts a LeRobot dataset of version 3 to demonstrations. Its images are in its tables, or in videos beside them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from kerv_cli.base.files import read_mapping, regular, write_folder, write_json
 from kerv_cli.base.foreign import foreign_table
 from kerv_cli.base.places import as_path
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, action_limits
-from kerv_cli.worlds.demos.dataset import FORMAT, DemoDataset, EpisodeEntry, OnProgress, entry_of, episode_path, totals
+from kerv_cli.worlds.demos.dataset import FORMAT, DemoDataset, EpisodeEntry, OnProgress, episode_path, totals
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, save_episode
 from kerv_cli.worlds.demos.lerobot import layout
 from kerv_cli.worlds.settings import DemosImportSettings
@@ -31,18 +31,33 @@ OPENVLA = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
 
 @dataclass(frozen=True)
 class Source:
-    """A LeRobot folder. info: meta/info.json; episodes: rows of meta/episodes; tasks: instruction by task_index."""
+    """A LeRobot folder.
+
+    Attributes:
+        folder: The folder.
+        info: Contents of meta/info.json.
+        episodes: Rows of meta/episodes.
+        tasks: Instruction by task_index.
+        camera: Camera whose images are read.
+        key: Feature that holds them.
+    """
 
     folder: Path
     info: Row
     episodes: Sequence[Row]
     tasks: Mapping[int, str]
     camera: str
+    key: str
 
     @classmethod
     def open(cls, folder: Path, camera: str) -> Source:
-        """Raises CheckpointError: no dataset of version 3, or a damaged one. UnknownName: no such camera. UsageError: a
-        file."""
+        """Read the description of a dataset. An empty `camera` means its first.
+
+        Raises:
+            UsageError: `folder` is a file.
+            CheckpointError: It holds no dataset of version 3, or a damaged one.
+            UnknownName: The dataset has no such camera.
+        """
         if folder.is_file():
             raise UsageError(f"{folder} is a file: name the folder of a LeRobot dataset, which holds meta/")
         info = read_mapping(folder / layout.INFO)
@@ -52,29 +67,23 @@ class Source:
                 f"{folder / layout.INFO} is of version {version}, v3.x is read: convert it with LeRobot's own "
                 "convert_dataset_v21_to_v30"
             )
-        pictures = [name for name, feature in info["features"].items() if feature["dtype"] in ("image", "video")]
-        cameras = [name.removeprefix(layout.IMAGES) for name in pictures]
-        if not cameras or layout.ACTION not in info["features"]:
+        features = info["features"].items()
+        keys = {n.removeprefix(layout.IMAGES): n for n, feature in features if feature["dtype"] in ("image", "video")}
+        if not keys or layout.ACTION not in info["features"]:
             raise CheckpointError(f"{folder} has no images or no {layout.ACTION}: it cannot be learned from")
-        if camera and camera not in cameras:
-            raise UnknownName("camera", camera, cameras)
-        rows = [
-            row for path in sorted(folder.glob("meta/episodes/[!.]*/[!.]*.parquet")) for row in _table(path).to_pylist()
-        ]
+        if camera and camera not in keys:
+            raise UnknownName("camera", camera, keys)
+        camera = camera or next(iter(keys))
+        tables = [_table(path) for path in sorted(folder.glob("meta/episodes/[!.]*/[!.]*.parquet"))]
+        rows = sorted((row for table in tables for row in table.to_pylist()), key=lambda row: row["episode_index"])
         if not rows:
             raise CheckpointError(f"{folder / 'meta/episodes'} is missing or names no episode: copy the dataset again")
         names = _table(folder / layout.TASKS).to_pylist()
         tasks = {int(row["task_index"]): str(row.get("task", row.get("__index_level_0__"))) for row in names}
-        return cls(folder, info, sorted(rows, key=lambda row: row["episode_index"]), tasks, camera or cameras[0])
-
-    @property
-    def key(self) -> str:
-        """Name of the feature that holds the camera's images."""
-        return self.camera if self.camera in self.info["features"] else f"{layout.IMAGES}{self.camera}"
+        return cls(folder, info, rows, tasks, camera, keys[camera])
 
     def names(self, feature: str, prefix: str) -> list[str]:
-        """Names of a vector's numbers: the dataset's where they are complete and distinct, else `prefix`_0, …; empty
-        without such a feature."""
+        """Return the names of a vector's numbers, empty without it. Incomplete ones are replaced by `prefix`_0, …"""
         entry = self.info["features"].get(feature)
         if entry is None:
             return []
@@ -86,12 +95,12 @@ class Source:
         return [str(name) for name in names]
 
     def path(self, episode: Row, columns: str, form: str) -> Path:
-        """The file of an episode, whose chunk and number stand in the columns that begin with `columns`."""
+        """Return a file of an episode. Its chunk and number are in the columns that begin with `columns`."""
         indices = {f"{x}_index": int(episode[f"{columns}/{x}_index"]) for x in ("chunk", "file")}
         return self.folder / form.format(video_key=self.key, **indices)
 
     def table(self, episode: Row) -> pa.Table:
-        """The rows of one episode, in order."""
+        """Return the rows of one episode, in order."""
         path = self.path(episode, "data", self.info.get("data_path") or layout.DATA)
         table = _table(path, ("episode_index", int(episode["episode_index"])))
         if len(table) != int(episode["length"]):
@@ -99,7 +108,7 @@ class Source:
         return table
 
     def frames(self, episode: Row, table: pa.Table) -> np.ndarray:
-        """(T, h, w, 3) uint8 of one episode."""
+        """Return the frames (T, h, w, 3) uint8 of one episode."""
         if self.info["features"][self.key]["dtype"] == "image":
             return np.stack([_picture(cell, self.folder) for cell in table[self.key].to_pylist()])
         path = self.path(episode, f"videos/{self.key}", self.info.get("video_path") or layout.VIDEO)
@@ -108,11 +117,12 @@ class Source:
 
 
 def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProgress) -> DemoDataset:
-    """Writes the dataset's episodes as demonstrations in `folder` and opens them.
+    """Write the dataset's episodes as demonstrations in `folder` and open them.
 
     Raises:
-        UsageError: no source, or the folder holds other demonstrations. CheckpointError: as `Source.open`, or an
-            episode is damaged. KervError: a video, and no package av.
+        UsageError: There is no source, or the folder holds other demonstrations.
+        CheckpointError: The dataset is damaged or of another version.
+        KervError: It holds videos, and the package av is missing.
     """
     if folder.exists():
         raise UsageError(f"{folder} exists: give the new demonstrations another name")
@@ -127,7 +137,7 @@ def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProg
 
 
 def _import(source: Source, settings: DemosImportSettings, folder: Path, progress: OnProgress) -> None:
-    """Fills a new folder."""
+    """Fill a new folder."""
     chosen = source.episodes[: settings.episodes or None]
     names = _task_names(source.tasks)
     entries: dict[str, list[EpisodeEntry]] = {}
@@ -139,10 +149,30 @@ def _import(source: Source, settings: DemosImportSettings, folder: Path, progres
         state = episode.states.shape[1]
         path = episode_path(folder, episode.task, episode.seed)
         save_episode(path, episode)
-        entries.setdefault(episode.task, []).append(entry_of(path, episode))
+        entries.setdefault(episode.task, []).append(EpisodeEntry.of(path, episode))
         progress(done + 1, len(chosen))
-    manifest = _manifest(source, settings, entries, names, np.concatenate(actions), state)
-    write_json(folder / "recording.json", {k: manifest[k] for k in ("format", "environment", "config")})
+    proprioception = tuple(source.names(layout.STATE, "state")[:state])
+    environment = re.sub(r"\W+", "_", settings.name or source.folder.name).strip("_").lower() or "recorded"
+    recording = {
+        "format": FORMAT,
+        "environment": environment,
+        "config": {
+            "source": str(source.folder.resolve()),
+            "camera": {"name": source.camera},
+            "frame_stride": 1,
+            "tail": settings.tail,
+            "tasks": list(entries),
+        },
+    }
+    manifest = {
+        **recording,
+        "actions": action_space(source, settings, np.concatenate(actions)).as_dict(),
+        "observation": ObservationSpace(proprioception, state, (), (0.0, 0.0, 0.0)).as_dict(),
+        "versions": {"lerobot": str(source.info["codebase_version"])},
+        **totals(entries, {}, missing=0),
+        "instructions": {names[i]: text for i, text in source.tasks.items() if names[i] in entries},
+    }
+    write_json(folder / "recording.json", recording)
     write_json(folder / "manifest.json", manifest)
 
 
@@ -172,41 +202,12 @@ def _episode(source: Source, row: Row, names: Mapping[int, str], tail: int) -> D
     )
 
 
-def _manifest(
-    source: Source,
-    settings: DemosImportSettings,
-    entries: Mapping[str, list[EpisodeEntry]],
-    names: Mapping[int, str],
-    actions: np.ndarray,
-    state: int,
-) -> dict[str, Any]:
-    proprioception = source.names(layout.STATE, "state")
-    observation = ObservationSpace(tuple(proprioception[:state]), state, (), (0.0, 0.0, 0.0))
-    config = {
-        "source": str(source.folder.resolve()),
-        "camera": {"name": source.camera},
-        "frame_stride": 1,
-        "tail": settings.tail,
-        "tasks": list(entries),
-    }
-    return {
-        "format": FORMAT,
-        "environment": re.sub(r"\W+", "_", settings.name or source.folder.name).strip("_").lower() or "recorded",
-        "actions": action_space(source, settings, actions).as_dict(),
-        "observation": observation.as_dict(),
-        "config": config,
-        "versions": {"lerobot": str(source.info["codebase_version"])},
-        **totals(entries, {}, missing=0),
-        "instructions": {names[i]: text for i, text in source.tasks.items() if names[i] in entries},
-    }
-
-
 def action_space(source: Source, settings: DemosImportSettings, actions: np.ndarray) -> ActionSpace:
-    """The recorded actions' space: limits are the smallest and largest that occur. dofs=openvla: seven DoFs under
-    OpenVLA's names.
+    """Return the space of recorded actions (n, D). Its limits are the smallest and largest that occur.
 
     Raises:
-        UsageError: dofs=openvla for another number of DoFs, or an unknown strict one.
+        UsageError: dofs=openvla for another number of DoFs than seven.
+        UnknownName: A strict DoF does not exist.
     """
     names = tuple(source.names(layout.ACTION, "action"))
     if settings.dofs == "openvla":
@@ -214,15 +215,15 @@ def action_space(source: Source, settings: DemosImportSettings, actions: np.ndar
             raise UsageError(f"dofs=openvla: the dataset has {len(names)} DoFs ({', '.join(names)}), OpenVLA has 7")
         names = OPENVLA
     strict = tuple(settings.strict or (name for name in names if "gripper" in name.lower()))
-    unknown = [name for name in strict if name not in names]
-    if unknown:
-        raise UnknownName("strict DoF", unknown[0], names)
+    for name in strict:
+        if name not in names:
+            raise UnknownName("strict DoF", name, names)
     low, high = action_limits(actions.min(0).astype(float), actions.max(0).astype(float))
     return ActionSpace(names, _groups(names, strict), strict, float(source.info["fps"]), low, high)
 
 
 def _groups(names: Sequence[str], strict: Sequence[str]) -> tuple[Group, ...]:
-    """Three of position, three of rotation and a gripper where there are seven; else runs of strict and other DoFs."""
+    """Return position, rotation and gripper for seven DoFs whose last is strict, else runs of strict and other DoFs."""
     if len(names) == 7 and tuple(strict) == tuple(names[-1:]):
         return Group("position", 3), Group("rotation", 3), Group("gripper", 1)
     groups: list[Group] = []
@@ -236,17 +237,12 @@ def _groups(names: Sequence[str], strict: Sequence[str]) -> tuple[Group, ...]:
 
 
 def _task_names(tasks: Mapping[int, str]) -> dict[int, str]:
-    """task_index -> a name that can be a folder's and a setting's, made from the instruction."""
+    """Return task_index to a name made from the instruction, fit for a folder and for a setting."""
     names: dict[int, str] = {}
     for number, text in tasks.items():
         name = re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:60] or f"task-{number}"
         names[number] = name if name not in names.values() else f"{name}-{number}"
     return names
-
-
-def _identifier(name: str) -> str:
-    """A registered environment's name: letters, digits and underscores."""
-    return re.sub(r"\W+", "_", name).strip("_").lower() or "recorded"
 
 
 def _table(path: Path, where: tuple[str, Any] | None = None) -> pa.Table:
@@ -266,7 +262,7 @@ def _picture(cell: Row, folder: Path) -> np.ndarray:
 
 
 def _video_frames(path: Path, start: float, rate: float, count: int) -> Iterator[np.ndarray]:
-    """`count` frames of a video at start, start + 1 / rate, … seconds, each the nearest one."""
+    """Yield `count` frames of a video at start, start + 1 / rate, … seconds, each the nearest one."""
     try:
         import av
     except ImportError as error:
