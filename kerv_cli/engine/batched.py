@@ -28,14 +28,9 @@ class BatchDecoder:
     records have no times.
     """
 
-    def __init__(self, decoder: Decoder, deviation_every: int = 0) -> None:
-        """Build the decoder.
-
-        Args:
-            decoder: Of a method that `Method.check` accepts for a batch.
-            deviation_every: As in RolloutSettings.
-        """
-        self.decoder, self.target, self.deviation_every = decoder, decoder.target, deviation_every
+    def __init__(self, decoder: Decoder) -> None:
+        """Build it from the decoder of a method that `Method.check` accepts for a batch."""
+        self.decoder, self.target = decoder, decoder.target
         self.limits = decoder.acceptance.limits(decoder.threshold.radius())
         self.skip = decoder.parts.skip
         self._caches: dict[int, Cache] = {}
@@ -69,7 +64,7 @@ class BatchDecoder:
         records = [chunk.record(chunk.actions(), math.nan, dict(UNTIMED)) for chunk in chunks]
         for episode in episodes:
             episode.decodes += 1
-        every = self.deviation_every
+        every = self.decoder.deviation_every
         sampled = [i for i, episode in enumerate(episodes) if every and episode.decodes % every == 0]
         autoregressive = [chunks[i].tokens for i in sampled]
         if self.skip is not None:

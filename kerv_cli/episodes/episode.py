@@ -1,4 +1,4 @@
-"""Run one episode: world + decoder -> EpisodeRecord."""
+"""Runs one episode of a world with a decoder."""
 
 from __future__ import annotations
 
@@ -17,41 +17,43 @@ from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import World
 
 OnStep = Callable[[int], object]
-"""Told the number of executed control steps after each of them, outside the timing."""
+"""Called after each control step with the number of those executed. Its time does not count."""
 
 
 class Follower(Protocol):
-    """What an episode tells, whoever decodes its observations."""
+    """Follows an episode: it is told of the beginning, of every executed action and of the end."""
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras whose images decode() reads; no others are drawn for it."""
+        """Names of the cameras whose images it reads. No others are drawn for it."""
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
-        """Begins an episode: clears histories."""
+        """Begin an episode, with the end effector at (3,) metres."""
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
-        """Told after each executed action (D,), in environment units; end_effector (3,) is its position now, metres."""
+        """Note an executed action (D,), environment units, after which the end effector is at (3,) metres."""
 
     def finish(self, success: bool) -> None:
-        """Told at the end of the episode."""
+        """End the episode."""
 
 
 class ActionDecoder(Follower, Protocol):
-    """The interface of a decoder to an episode."""
+    """Follows an episode and decodes its observations."""
 
     def decode(self, observation: Observation) -> DecodeRecord:
-        """The present observation, with the images of `cameras` -> the actions to execute and their record."""
+        """Return the actions to execute, and their record, for an observation with the images of `cameras`."""
 
 
 class _Execution:
-    """Executes actions, one per control step: of the chunk in hand, and where it is used up the last one again; before
-    the first one the robot stands still. Collects actions, end-effector positions, gripper openings, frames and
-    places, step by step."""
+    """Executes one action per control step, and collects what an episode's record needs.
+
+    The actions are those of the current chunk. When it is used up, the last action is executed again. Before the first
+    chunk the robot stands still.
+    """
 
     def __init__(self, world: World, follower: Follower, camera: CameraSettings | None, on_step: OnStep | None) -> None:
         self.world, self.follower, self.camera, self.on_step = world, follower, camera, on_step
-        self.in_hand: deque[np.ndarray] = deque()
+        self.chunk: deque[np.ndarray] = deque()
         self.last = world.spec.standstill(world.gripper)
         self.actions: list[np.ndarray] = []  # (D,) float32, within the limits
         self.path: list[np.ndarray] = []
@@ -70,9 +72,9 @@ class _Execution:
                 self.places.setdefault(place.name, []).append(state[place.first : place.first + 3])
 
     def step(self) -> None:
-        """One control step."""
-        if self.in_hand:
-            self.last = self.in_hand.popleft()
+        """Execute one control step."""
+        if self.chunk:
+            self.last = self.chunk.popleft()
         self.world.step(self.last)
         space = self.world.spec.actions
         self.actions.append(np.clip(self.last, space.low, space.high).astype(np.float32))
@@ -82,16 +84,16 @@ class _Execution:
             self.on_step(len(self.actions))
 
     def until(self, rest: int) -> None:
-        """Executes the chunk in hand until so many of its steps are left, or the episode ends."""
-        while len(self.in_hand) > rest and not self.world.done:
+        """Execute the chunk until `rest` of its steps are left, or the episode ends."""
+        while len(self.chunk) > rest and not self.world.done:
             self.step()
 
     def during(self, delay: Delay) -> Delay:
-        """The world goes on for a decode's delay -> the delay, with what was executed."""
-        before, in_hand = len(self.actions), len(self.in_hand)
+        """Let the world go on for a decode's delay. Return the delay, with what was executed."""
+        before, in_chunk = len(self.actions), len(self.chunk)
         while len(self.actions) < before + delay.steps and not self.world.done:
             self.step()
-        carried = in_hand - len(self.in_hand)
+        carried = in_chunk - len(self.chunk)
         return dataclasses.replace(delay, carried=carried, held=len(self.actions) - before - carried)
 
 
@@ -103,12 +105,17 @@ def run_episode(
     clock: RealClock | None = None,
     on_step: OnStep | None = None,
 ) -> EpisodeRecord:
-    """One closed-loop episode until success or the horizon: decodes a chunk and executes it whole, or, with a clock,
-    as docs/methods.md §8 says.
+    """Run one episode until success or the horizon.
 
-    Simulation and rendering happen outside the decoder and so outside inference time. camera: the view whose frames the
-    record keeps, one per control step; None: none. clock: of a world that goes on during decodes; None: it waits.
-    on_step: shows progress.
+    Simulation and rendering happen outside the decoder and are no part of inference time.
+
+    Args:
+        world: Where the episode runs.
+        decoder: Decodes its observations.
+        seed: Of the initial state.
+        camera: The view whose frames the record keeps, one per control step; None for no frames.
+        clock: Of a world that goes on during decodes (docs/methods.md §8); None if it waits.
+        on_step: Shows progress.
     """
     steps = episode(world, decoder, seed, camera, clock, on_step)
     decode: Any = None
@@ -129,8 +136,10 @@ def episode(
     clock: RealClock | None = None,
     on_step: OnStep | None = None,
 ) -> Generator[Observation, DecodeRecord, EpisodeRecord]:
-    """The episode of `run_episode`, decoded by the caller: yields each observation, is sent its decode and returns the
-    record."""
+    """Run the episode of `run_episode`, but let the caller decode.
+
+    Yields each observation, is sent its decode, and returns the record.
+    """
     began = time.perf_counter()
     world.reset(seed)
     follower.reset(world.task, seed, world.end_effector)
@@ -146,7 +155,7 @@ def episode(
             decode = dataclasses.replace(decode, delay=execution.during(delay))
         decodes.append(decode)
         decode_steps.append(len(execution.actions))
-        execution.in_hand = deque(decode.actions[decode.delay.dropped if decode.delay else 0 :])
+        execution.chunk = deque(decode.actions[decode.delay.dropped if decode.delay else 0 :])
         execution.until(0 if clock is None else clock.expected)
     follower.finish(world.succeeded)
     return EpisodeRecord(

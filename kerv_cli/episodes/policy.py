@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.places import find_target
 from kerv_cli.base.runtime import set_up
-from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.base.views import frame_shape
 from kerv_cli.engine.batched import BatchDecoder
@@ -24,7 +24,7 @@ from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.episodes.settings import DEFAULT_TASKS, WAITS, RolloutSettings
 from kerv_cli.methods.artifacts import Artifacts, Use
 from kerv_cli.methods.compose import Method
-from kerv_cli.methods.settings import EXPERT, MethodSettings, PolicySettings
+from kerv_cli.methods.settings import EXPERT, MethodSettings
 from kerv_cli.targets.checkpoint import TargetDescription, described
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.spec import EnvironmentSpec
@@ -32,30 +32,34 @@ from kerv_cli.worlds.spec import EnvironmentSpec
 PRIVILEGED = "state (privileged)"
 WARM_UP_DECODES = 6
 CALIBRATION_DECODES = 15
-"""Autoregressive decodes whose median is what `rollout.ar_ms` scales."""
+"""Autoregressive decodes whose median `rollout.ar_ms` scales."""
 
 
 def artifacts_of(settings: MethodSettings) -> Artifacts:
-    """The policy's files on its device; all settings of this process share the loaded objects."""
+    """Return the policy's files on its device. All settings of this process share the loaded objects."""
     device, _ = set_up(settings.runtime)
     return Artifacts(settings.results, settings.policy, settings.datastore, device, settings.runtime.dtype)
 
 
 def check(settings: RolloutSettings) -> dict[str, str]:
-    """Refuses settings that cannot run, before anything heavy starts -> the identity of their results: hashes of
-    everything that determines these besides the settings, and what is observed.
+    """Refuse settings that cannot run, before anything heavy starts.
+
+    Returns:
+        The identity of their results: what is observed, and hashes of all that determines the results beside the
+        settings.
 
     Raises:
-        UsageError: a number out of range, training seeds, a camera that the policy was not trained on, parts that do
-            not belong together.
-        CheckpointError: no such policy, a damaged one, an artifact of another target or another action space.
+        UsageError: A number out of range, training seeds, a camera that the policy was not trained on, or parts that do
+            not fit together.
+        CheckpointError: No such policy, a damaged one, or an artifact of another target or action space.
     """
     tasks = tasks_of(settings)
     spec = spec_of(tasks[0])
     _check_seeds(settings, spec)
     spec.check_stress(settings.world.stress)
     if settings.policy.kind == EXPERT:
-        _check_expert(settings, spec)
+        _check_expert(settings)
+        clock.check(settings, spec, None)
         experts = ";".join(f"{task} {spec.experts[task]}" for task in sorted(tasks) if task in spec.experts)
         return {"target": "", **({"expert": experts} if experts else {}), OBSERVATION: PRIVILEGED}
     artifacts = artifacts_of(settings)
@@ -75,20 +79,22 @@ def check(settings: RolloutSettings) -> dict[str, str]:
 
 
 def tasks_of(settings: RolloutSettings) -> tuple[str, ...]:
-    """Full names of a rollout's tasks; of tasks that are not named those that the target was trained on.
+    """Return the full names of a rollout's tasks: by default those that its target was trained on.
 
     Raises:
-        UnknownName: no such task. CheckpointError: the target's description is damaged.
+        UnknownName: No such task.
+        CheckpointError: The target's description is damaged.
     """
     return resolve_tasks(settings.task or list(trained_tasks(settings)) or DEFAULT_TASKS)
 
 
 def trained_tasks(settings: RolloutSettings) -> tuple[str, ...]:
-    """Full names of the tasks that a rollout's target was trained on; none of the expert, and where it does not say or
-    is not there, which `policy.check` refuses.
+    """Return the full names of the tasks that a rollout's target was trained on.
+
+    There are none for the expert, for a target that does not say, and for one that is missing, which `check` refuses.
 
     Raises:
-        CheckpointError: its description is damaged.
+        CheckpointError: The target's description is damaged.
     """
     if settings.policy.kind == EXPERT:
         return ()
@@ -101,7 +107,7 @@ def trained_tasks(settings: RolloutSettings) -> tuple[str, ...]:
 
 
 def unseen_tasks(settings: RolloutSettings, tasks: Iterable[str]) -> list[str]:
-    """Those of the tasks that the policy's target was not trained on; none where its description names no tasks."""
+    """Return those of the tasks that the target was not trained on; none if its description names no tasks."""
     trained = trained_tasks(settings)
     return [task for task in tasks if trained and task not in trained]
 
@@ -115,84 +121,72 @@ def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
     spec.seeds.check(seeds, purpose, f"seed={settings.seed} episodes={settings.episodes}")
 
 
-def _check_expert(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
-    clock.check(settings, spec, None)
-    if settings.rollout.batch > 1:
-        raise UsageError(f"policy=expert with rollout.batch={settings.rollout.batch}: it decodes nothing, leave it out")
-    if settings.deviation_every > 0:
-        raise UsageError(f"deviation_every={settings.deviation_every}: the expert has no AR to differ from")
-    if settings.chunk:
-        raise UsageError(f"policy=expert with chunk={settings.chunk}: the expert decodes nothing, leave it out")
-    for kind, part in settings.parts().items():
-        if part != getattr(RolloutSettings(), kind):
-            raise UsageError(f"policy=expert with {kind}={part.kind}: the expert decodes nothing, leave it out")
+def _check_expert(settings: RolloutSettings) -> None:
+    """Refuse what needs a decoding method."""
+    plain, default = (
+        {"rollout.batch": each.rollout.batch, "deviation_every": each.deviation_every, "chunk": each.chunk}
+        | each.parts()
+        for each in (settings, RolloutSettings())
+    )
+    for key, value in plain.items():
+        if value != default[key]:
+            word = f"{key}={getattr(value, 'kind', value)}"
+            raise UsageError(f"policy=expert with {word}: the expert decodes nothing, leave it out")
 
 
 def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
-    """The decoder of one setting on one task, warmed up.
+    """Return the decoder of one setting on one task, warmed up.
 
     Raises:
-        UsageError, CheckpointError: as `check`.
+        UsageError: As `check`.
+        CheckpointError: As `check`.
     """
     spec = spec_of(task)
-    if settings.policy.kind == EXPERT:
-        decoder: ActionDecoder = ExpertDecoder()
-    else:
-        artifacts = artifacts_of(settings)
-        decoder = of_method = Method.of(settings).decoder(artifacts.target, artifacts.load, task)
-        if settings.deviation_every > 0:
-            of_method.deviation_every = settings.deviation_every
+    expert = settings.policy.kind == EXPERT
+    decoder: ActionDecoder = ExpertDecoder() if expert else _method_decoder(settings, task)
     warm_up(decoder, task, spec.observation, settings.world.camera.size)
     return decoder
 
 
 def batch_decoder_for(settings: RolloutSettings) -> BatchDecoder:
-    """The decoder of one setting for several episodes, of any tasks.
+    """Return the decoder of one setting for several episodes, of any tasks."""
+    return BatchDecoder(_method_decoder(settings))
 
-    Raises:
-        UsageError, CheckpointError: as `check`.
-    """
+
+def _method_decoder(settings: RolloutSettings, task: str = "") -> Decoder:
     artifacts = artifacts_of(settings)
-    return BatchDecoder(Method.of(settings).decoder(artifacts.target, artifacts.load), settings.deviation_every)
+    decoder = Method.of(settings).decoder(artifacts.target, artifacts.load, task)
+    decoder.deviation_every = settings.deviation_every
+    return decoder
 
 
 def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:
-    """The clock of one setting on one task; None where the world waits.
-
-    Raises:
-        UsageError: as `check`.
-    """
+    """Return the clock of one setting on one task; None if the world waits."""
     if settings.rollout.clock == WAITS:
         return None
-    target = None if settings.policy.kind == EXPERT else artifacts_of(settings).description
-    measured = 0.0
-    if clock.calibrates(settings):
-        runtime = settings.runtime
-        measured = _ar_seconds(
-            *(settings.results, settings.policy.target, settings.chunk, task, settings.world.camera.size),
-            *(runtime.device, runtime.dtype, runtime.threads),
-        )
+    target, measured = None, 0.0
+    if settings.policy.kind != EXPERT:
+        artifacts = artifacts_of(settings)
+        target = artifacts.description
+        if clock.calibrates(settings):
+            loaded: Any = artifacts.target
+            pixels, threads = settings.world.camera.size, settings.runtime.threads
+            measured = _ar_seconds(loaded, settings.chunk, task, pixels, threads)
     latency = clock.latency_of(settings, target, measured)
     return RealClock(latency, spec_of(task).actions, settings.rollout.delay_compensation)
 
 
 @functools.cache
-def _ar_seconds(
-    results: str, target: str, chunk: int, task: str, pixels: int, device: str, dtype: str, threads: int
-) -> float:
-    """Median seconds of an autoregressive decode here, after warm-up; measured once per process."""
-    runtime = RuntimeSettings(device=device, dtype=dtype, threads=threads)
-    policy = PolicySettings(target=target)
-    artifacts = artifacts_of(RolloutSettings(results=results, runtime=runtime, policy=policy))
-    decoder = Decoder(artifacts.target, chunk=chunk)
-    space = spec_of(task).observation
+def _ar_seconds(target: Any, chunk: int, task: str, pixels: int, threads: int) -> float:
+    """Return the median seconds of a target's autoregressive decode here, measured once per process."""
+    decoder, space = Decoder(target, chunk=chunk), spec_of(task).observation
     warm_up(decoder, task, space, pixels)
     still = still_observation(decoder, space, pixels)
     return float(np.median([decoder.decode(still).seconds for _ in range(CALIBRATION_DECODES)]))
 
 
 def still_observation(decoder: ActionDecoder, space: ObservationSpace, pixels: int) -> Observation:
-    """Zeros for everything that the decoder reads. pixels: size of the images."""
+    """Return zeros for everything that the decoder reads, images of `pixels` pixels included."""
     images = {name: np.zeros(frame_shape(name, pixels), dtype=np.uint8) for name in decoder.cameras}
     return Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
 
@@ -200,8 +194,10 @@ def still_observation(decoder: ActionDecoder, space: ObservationSpace, pixels: i
 def warm_up(
     decoder: ActionDecoder, task: str, space: ObservationSpace, pixels: int, decodes: int = WARM_UP_DECODES
 ) -> None:
-    """Runs a few decodes before anything is timed: first calls allocate memory and choose kernels. The hand is moved,
-    so that parts that need a history or a path run too. pixels: size of the images."""
+    """Run a few decodes before anything is timed: first calls allocate memory and choose kernels.
+
+    The hand is moved, so that parts that need a history or a path run too.
+    """
     still = still_observation(decoder, space, pixels)
     decoder.reset(task, 0, np.array([0.0, 0.0, 0.1]))
     for i in range(decodes):

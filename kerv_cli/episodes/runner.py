@@ -1,7 +1,7 @@
 """Runs episodes in the worlds of this process: one after the other, or several at once.
 
-Weights, datastores and worlds are shared by all settings of a process. Frames and decoders are not: a setting that got
-its frames from another would decode with warm caches, and a skip's level may follow the episodes of its own block.
+All settings of a process share weights, datastores and worlds. They do not share frames and decoders: a setting with
+the frames of another would decode with warm caches, and a skip's level may follow the episodes of its own block.
 """
 
 from __future__ import annotations
@@ -30,15 +30,17 @@ from kerv_cli.worlds.stress import build as build_stress
 K = TypeVar("K")
 
 TOGETHER = 16
-"""Episodes that a training's validation decodes together. Their worlds take 1.5 GB where they are drawn."""
+"""Episodes that a training's validation decodes together. Their worlds take 1.5 GB if they are drawn."""
 
-_WORLDS = 4  # kept open per process: one that is drawn takes about 90 MB
+_WORLDS = 4  # kept open per process; one that is drawn takes about 90 MB
 _opened: OrderedDict[tuple[str, CameraSettings, int], World] = OrderedDict()  # the most recently used one is last
 
 
 def open_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) -> World:
-    """This process's world for a task, camera and horizon, shared by all settings that agree in them. The worlds used
-    last stay open. stress: the shift of its next episodes."""
+    """Return this process's world for a task, camera and horizon, with the stress of its next episodes.
+
+    The worlds used last stay open.
+    """
     spec = spec_of(task)
     key = task, spec.camera(settings.camera), settings.horizon
     if key not in _opened:
@@ -51,24 +53,22 @@ def open_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) -
 
 
 def new_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) -> World:
-    """A new world for a task, which the caller closes; see `open_world`."""
+    """Return a new world for a task, which the caller closes."""
     world = spec_of(task).open_world(task, settings.camera, settings.horizon)
     world.stress = stress
     return world
 
 
 def close_worlds() -> None:
-    """Closes every open world."""
+    """Close every open world."""
     while _opened:
         _opened.popitem()[1].close()
 
 
 class Runner:
-    """One setting on one task, with its decoder built and warmed up. Episodes may alternate with those of other
-    runners: no state is shared between decoders.
+    """One setting on one task, with its decoder built and warmed up.
 
-    Raises:
-        UsageError, CheckpointError: the setting cannot run; see `policy.check`.
+    Episodes may alternate with those of other runners: decoders share no state.
     """
 
     def __init__(self, settings: RolloutSettings, task: str) -> None:
@@ -79,17 +79,13 @@ class Runner:
         self._recording = dataclasses.replace(settings.world.camera, size=settings.record_size, supersample=1)
 
     def episode(self, seed: int, recorded: bool = False, on_step: OnStep | None = None) -> EpisodeRecord:
-        """Runs the episode of a seed; its record has frames where it is recorded. on_step: see `run_episode`."""
+        """Run the episode of a seed. Its record has frames if `recorded`."""
         world = open_world(self.task, self.settings.world, self.stress)  # another runner may have closed it since
         return run_episode(world, self.decoder, seed, self._recording if recorded else None, self.clock, on_step)
 
 
 def run_batch(settings: RolloutSettings, requests: Iterable[Request[K]]) -> Iterator[EpisodeEnd[K]]:
-    """Runs episodes of one setting on any tasks, `rollout.batch` at a time; see `run_together`. None is recorded.
-
-    Raises:
-        UsageError, CheckpointError: the setting cannot run; see `policy.check`.
-    """
+    """Run episodes of one setting on any tasks, `rollout.batch` at a time. None is recorded."""
     decoder, world = batch_decoder_for(settings), settings.world
     return run_together(
         decoder, requests, settings.rollout.batch, lambda task: new_world(task, world, build_stress(world.stress))
@@ -97,16 +93,18 @@ def run_batch(settings: RolloutSettings, requests: Iterable[Request[K]]) -> Iter
 
 
 def is_recorded(settings: RolloutSettings, seed: int) -> bool:
-    """Whether the episode of a seed keeps its frames: the first `settings.record`, or all for a negative number; none
-    of a batch."""
-    if settings.rollout.batch > 1:
-        return False
-    return settings.record < 0 or seed - settings.seed < settings.record
+    """Return whether the episode of a seed keeps its frames.
+
+    The first `settings.record` do, or all if it is negative; none of a batch does.
+    """
+    return settings.rollout.batch == 1 and (settings.record < 0 or seed - settings.seed < settings.record)
 
 
 def success_of(target: Target, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:
-    """Share in [0, 1] of successful episodes over tasks and seeds, decoded as the target was trained to,
-    autoregressively or in parallel, TOGETHER at a time."""
+    """Return the share in [0, 1] of successful episodes over tasks and seeds.
+
+    The target decodes as it was trained to: autoregressively or in parallel.
+    """
     decoder = BatchDecoder(native_decoder(target))
     requests = [Request(None, task, seed) for task in tasks for seed in seeds]
     outcomes = []

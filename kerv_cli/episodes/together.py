@@ -1,13 +1,13 @@
 """Runs several episodes at once in one process: each in a world of its own, all of them decoded together.
 
-As soon as an episode ends the next one begins in its slot, so that the batch stays full until the last ones.
+When an episode ends the next one takes its place, so that the batch stays full until the last ones.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import time
-from collections import OrderedDict, deque
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Generic, TypeVar
@@ -21,38 +21,41 @@ from kerv_cli.worlds.spec import World
 
 K = TypeVar("K")
 OpenWorld = Callable[[str], World]
-"""Task -> a new world."""
+"""Opens a new world for a task."""
 
 
 @dataclass(frozen=True)
 class Request(Generic[K]):
-    """An episode to run. key: whose it is, for the caller."""
+    """An episode to run."""
 
-    key: K
+    key: K  # tells the caller whose it is
     task: str
     seed: int
 
 
 EpisodeEnd = tuple[Request[K], EpisodeRecord | Exception]
-"""What was requested, and its record or the error that its world raised. The record's wall_seconds are its share of the
-time: that of a decode is divided by the episodes that were decoded together."""
+"""A request, and its record or the error that its world raised.
+
+The record's wall_seconds are its share: a decode's time is divided by the episodes that were decoded together.
+"""
 
 
 def run_together(
     decoder: BatchDecoder, requests: Iterable[Request[K]], batch: int, open_world: OpenWorld
 ) -> Iterator[EpisodeEnd[K]]:
-    """Runs the episodes, at most `batch` at a time, and yields each as it ends.
+    """Run the episodes, at most `batch` at a time, and yield each as it ends.
 
-    A world is opened when an episode needs one and closed when its task has no episode left: the slots of a batch go
-    to different tasks as long as there are enough of them, because a world costs more than a reset.
+    A world is opened when an episode needs one and closed when its task has no episode left. The slots of a batch go to
+    different tasks while there are enough of them, because opening a world costs more than resetting one.
     """
-    queue = _Queue(requests)
-    slots: list[_Slot[K]] = [_Slot(decoder.new_episode(), open_world) for _ in range(min(batch, queue.count))]
+    waiting = list(requests)
+    slots: list[_Slot[K]] = [_Slot(decoder.new_episode(), open_world) for _ in range(min(batch, len(waiting)))]
     try:
         while True:
             for slot in slots:
-                while slot.request is None and queue.count:
-                    yield from slot.begin(queue.take(slot.task))
+                while slot.request is None and waiting:
+                    slot.begin(_take(waiting, slot.task))
+                    yield from slot.advance(None)
                 if slot.request is None:
                     slot.close()
             live = [slot for slot in slots if slot.request is not None]
@@ -63,70 +66,55 @@ def run_together(
             share = (time.perf_counter() - began) / len(live)
             for slot, decode in zip(live, decodes, strict=True):
                 slot.seconds += share
-                yield from slot.go_on(decode)
+                yield from slot.advance(decode)
     finally:
         for slot in slots:
             slot.close()
 
 
-class _Queue(Generic[K]):
-    """Episodes that have not begun, by task."""
-
-    def __init__(self, requests: Iterable[Request[K]]) -> None:
-        self.by_task: OrderedDict[str, deque[Request[K]]] = OrderedDict()
-        for request in requests:
-            self.by_task.setdefault(request.task, deque()).append(request)
-        self.count = sum(map(len, self.by_task.values()))
-
-    def take(self, task: str) -> Request[K]:
-        """The next request of this task; where it has none, of the task with the most."""
-        if not self.by_task.get(task):
-            task = max(self.by_task, key=lambda name: len(self.by_task[name]))
-        self.count -= 1
-        return self.by_task[task].popleft()
+def _take(waiting: list[Request[K]], task: str) -> Request[K]:
+    """Take the next request of a task. If it has none left, take one of the task with the most."""
+    counts = Counter(request.task for request in waiting)
+    wanted = task if counts[task] else counts.most_common(1)[0][0]
+    return waiting.pop(next(i for i, request in enumerate(waiting) if request.task == wanted))
 
 
 class _Slot(Generic[K]):
-    """A slot of the batch: its open world and the episode that runs in it. seconds: time of that episode so far."""
+    """A slot of the batch: its open world and the episode that runs in it."""
 
     def __init__(self, state: EpisodeState, open_world: OpenWorld) -> None:
         self.state, self.open_world = state, open_world
-        self.task, self.seconds = "", 0.0
+        self.task = ""
         self.world: World | None = None
         self.request: Request[K] | None = None
 
-    def begin(self, request: Request[K]) -> Iterator[EpisodeEnd[K]]:
-        """Begins an episode; yields it where it ends at once."""
-        self.request, self.seconds = request, 0.0
-        yield from self.go_on(None)
+    def begin(self, request: Request[K]) -> None:
+        self.request, self.seconds, self.steps = request, 0.0, self._episode(request)
 
-    def go_on(self, decode: DecodeRecord | None) -> Iterator[EpisodeEnd[K]]:
-        """Executes a decode, None at the beginning, up to the next observation; yields the episode where it ends."""
+    def _episode(self, request: Request[K]) -> Generator[Observation, DecodeRecord, EpisodeRecord]:
+        if self.world is None or self.task != request.task:
+            self.close()
+            self.world, self.task = self.open_world(request.task), request.task
+        return (yield from episode(self.world, self.state, request.seed))
+
+    def advance(self, decode: DecodeRecord | None) -> Iterator[EpisodeEnd[K]]:
+        """Execute a decode, None at the beginning, until the next observation. Yield the episode if it ends."""
         began, request = time.perf_counter(), self.request
         assert request is not None
         try:
-            if decode is None:
-                self.steps = self._episode(request)
-            self.observation = next(self.steps) if decode is None else self.steps.send(decode)
+            self.observation = self.steps.send(decode)  # type: ignore[arg-type]
             self.seconds += time.perf_counter() - began
             return
         except StopIteration as end:
-            self.seconds += time.perf_counter() - began
-            result: EpisodeRecord | Exception = dataclasses.replace(end.value, wall_seconds=self.seconds)
+            seconds = self.seconds + time.perf_counter() - began
+            result: EpisodeRecord | Exception = dataclasses.replace(end.value, wall_seconds=seconds)
         except Exception as error:  # noqa: BLE001 - one world's failure of any kind must not end the others
             result = error
             self.close()
         self.request = None
         yield request, result
 
-    def _episode(self, request: Request[K]) -> Generator[Observation, DecodeRecord, EpisodeRecord]:
-        if self.world is None or self.task != request.task:
-            self.close()
-            self.world, self.task = self.open_world(request.task), request.task
-        return episode(self.world, self.state, request.seed)
-
     def close(self) -> None:
-        """Closes the world."""
         if self.world is not None:
             self.world.close()
-        self.world, self.task = None, ""
+        self.task, self.world = "", None
