@@ -9,15 +9,15 @@ from kerv_cli.engine.record import EpisodeRecord
 
 
 def save_recording(record: EpisodeRecord, path: Path, method: str) -> Path:
-    """Writes an episode as a recording that carries its own layout, atomically -> `path`. The first call imports Rerun.
+    """Write an episode atomically as a recording that carries its own layout, and return the path.
 
     Args:
-        record: without frames, the recording has no camera.
-        path: the .rrd file; its folder is created.
-        method: name of the method, for the summary; recordings of one method share their layout in the viewer.
+        record: The episode; without frames, the recording has no camera.
+        path: The .rrd file; its folder is created.
+        method: Name of the method. Recordings of one method share their layout in the viewer.
 
     Raises:
-        StorageError: the disk is full or read-only, or the folder may not be written to.
+        StorageError: The disk is full or read-only, or the folder may not be written to.
     """
     from kerv_cli.report.viewing.rerun_log import encode
 
