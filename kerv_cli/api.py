@@ -119,11 +119,11 @@ def sweep(study: str | Path, *words: str, **settings: object) -> Study:
     with store_of_words(as_overrides(f"study={study}", *words, **settings)) as overrides:
         resolved = resolve(overrides)
         planned = plan(resolved, ["sweep", *overrides])
-        judge = decide.judge(resolved.sweep.loss, print) if resolved.sweep.until == "decided" else None
-        failed = run(planned, save=save_recording, judge=judge).failed
+        analysis = decide.judge(resolved.sweep.loss, print) if resolved.sweep.until == "decided" else None
+        failed = run(planned, save=save_recording, analysis=analysis).failed
     if failed:
-        one, lost = failed[0].wanted[0], sum(len(failure.wanted) for failure in failed)
-        of_all = f"{lost} of {len(planned.study.wanted)} episodes failed"
+        one, lost = failed[0].episodes[0], sum(len(failure.episodes) for failure in failed)
+        of_all = f"{lost} of {len(planned.study.episodes)} episodes failed"
         raise KervError(f"{of_all}, {one.setting.label} on {one.task}: {failed[0].reason}")
     return Study(planned.store)
 

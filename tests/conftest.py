@@ -20,7 +20,8 @@ import examples.insertion  # noqa: F401 - registers the environment with seven d
 import pytest
 
 from kerv_cli.base import registry
-from kerv_cli.lab.database import VARIABLE, Database
+from kerv_cli.base.places import STORE
+from kerv_cli.lab.database import Database
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -162,13 +163,13 @@ def postgresql() -> Iterator[str]:
 @pytest.fixture(params=["sqlite", "postgresql"])
 def database(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Database]:
     """The empty database of the results folder `tmp_path`: in its file, or on a server."""
-    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.delenv(STORE, raising=False)
     if request.param == "sqlite":
         yield Database(tmp_path)
         return
     psycopg = pytest.importorskip("psycopg")
     server, name = request.getfixturevalue("postgresql"), f"kerv_{secrets.token_hex(4)}"
-    monkeypatch.setenv(VARIABLE, f"{server}/{name}")
+    monkeypatch.setenv(STORE, f"{server}/{name}")
     with psycopg.connect(f"{server}/postgres", autocommit=True) as connection:
         connection.execute(f"CREATE DATABASE {name}")
         made = Database(tmp_path)

@@ -20,10 +20,9 @@ from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.events import OnEvent, Outcome
 from kerv_cli.lab.execute import Prepare, RunEpisode, execute
-from kerv_cli.lab.plan import Setting, Study, plain_settings, wanted_of
+from kerv_cli.lab.plan import Setting, Study, all_episodes, plain_settings
 from kerv_cli.lab.runs import Run
-from kerv_cli.lab.store import StudyStore
-from kerv_cli.lab.study import plan_study
+from kerv_cli.lab.store import StudyStore, plan_study
 from kerv_cli.worlds import settled
 from kerv_cli.worlds.metaworld.spec import SPEC
 
@@ -86,7 +85,7 @@ def study_of(
         for label, one in settings.items()
     )
     about = {"baseline": "ar", "title": "Acceptance threshold", "axis": "threshold.r"} | about
-    return Study(name, made, wanted_of(made, tasks, block, repeats), block=block, **about)
+    return Study(name, made, all_episodes(made, tasks, block, repeats), block=block, **about)
 
 
 def threshold_study(
@@ -106,12 +105,12 @@ def swept(
     on_event: OnEvent = lambda event: None,
 ) -> tuple[StudyStore, Outcome]:
     """Runs what the database of a results folder lacks of a study."""
-    runtime = runtime or RuntimeSettings()
-    planned = plan_study(Database(results), study, runtime, ["sweep", f"study={study.name}"], rerun)
+    command = ["sweep", f"study={study.name}"]
+    planned = plan_study(Database(results), study, rerun, runtime=runtime, command=command)
     store = planned.store
-    with Run(store.database, study.kind, study.name, planned.command, alone=False) as record:
-        store.save(planned)
-        return store, execute(planned, prepare or episodes_of, store, record, runtime, on_event)
+    with Run(store.database, study.kind, study.name, command, alone=False) as record:
+        store.save(study, planned.existing)
+        return store, execute(planned, prepare or episodes_of, record, on_event)
 
 
 def generator(*parts: object) -> np.random.Generator:

@@ -34,7 +34,7 @@ from kerv_cli.episodes import policy as policies_of
 from kerv_cli.episodes import runner as run
 from kerv_cli.episodes.together import Request, run_together
 from kerv_cli.lab.execute import RunEpisode
-from kerv_cli.lab.plan import Setting, Study, Wanted, blocks_of
+from kerv_cli.lab.plan import Episode, Setting, Study, blocks_of
 from kerv_cli.lab.study import EpisodeRunner
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
@@ -274,8 +274,8 @@ def batched(study: Study, labels: Sequence[str], batch: int = 4) -> Study:
     for one in study.settings:
         rollout = {**one.settings["rollout"], "batch": batch if one.label in labels else 1}
         settings[one.label] = replace(one, settings={**one.settings, "rollout": rollout})
-    wanted = tuple(replace(one, setting=settings[one.setting.label]) for one in study.wanted)
-    return replace(study, settings=tuple(settings.values()), wanted=wanted)
+    wanted = tuple(replace(one, setting=settings[one.setting.label]) for one in study.episodes)
+    return replace(study, settings=tuple(settings.values()), episodes=wanted)
 
 
 class Prepared:
@@ -287,7 +287,7 @@ class Prepared:
     def __call__(self, setting: Setting, task: str) -> RunEpisode:
         return lambda seed: episode(setting, task, seed)
 
-    def together(self, wanted: Sequence[Wanted]) -> Iterator[tuple[Wanted, EpisodeRecord | Exception]]:
+    def together(self, wanted: Sequence[Episode]) -> Iterator[tuple[Episode, EpisodeRecord | Exception]]:
         self.groups.append(len(wanted))
         if self.broken == "all":
             raise KervError("no such policy")
@@ -304,7 +304,7 @@ TASKS = ["reach-v3", "push-v3", "drawer-open-v3"]
 def ar_study(*tasks: str, episodes: int = 7, batch: int = 4) -> Study:
     study = batched(threshold_study(tasks or TASKS, episodes=episodes), ["ar"], batch)
     return replace(
-        study, settings=study.settings[:1], wanted=tuple(one for one in study.wanted if one.setting.label == "ar")
+        study, settings=study.settings[:1], episodes=tuple(one for one in study.episodes if one.setting.label == "ar")
     )
 
 
@@ -323,27 +323,27 @@ def test_a_batch_is_another_setting_and_has_no_times(tmp_path: Path) -> None:
 
 
 def test_blocks_of_a_batch_hold_many_tasks_and_share_out_over_workers() -> None:
-    wanted, timed = ar_study().wanted, threshold_study(TASKS, episodes=7).wanted
+    wanted, timed = ar_study().episodes, threshold_study(TASKS, episodes=7).episodes
     (block,) = blocks_of(wanted, 5)
-    assert {one.task for one in block.wanted} == set(TASKS)
+    assert {one.task for one in block.episodes} == set(TASKS)
     assert "21 episodes, 4 at a time" in block.title
     assert len(blocks_of(wanted, 5, workers=3)) == 3
-    many = ar_study(episodes=60, batch=2).wanted
-    assert max(len(block.wanted) for block in blocks_of(many, 5)) == 32
+    many = ar_study(episodes=60, batch=2).episodes
+    assert max(len(block.episodes) for block in blocks_of(many, 5)) == 32
     mixed = blocks_of([*wanted, *timed], 5)
     assert {block.batch for block in mixed} == {1, 4}
-    assert all(len({one.setting.settings["rollout"]["batch"] for one in block.wanted}) == 1 for block in mixed)
+    assert all(len({one.setting.settings["rollout"]["batch"] for one in block.episodes}) == 1 for block in mixed)
 
 
 def test_a_failure_in_a_batch_is_of_its_setting_and_what_ran_is_kept(tmp_path: Path) -> None:
     _, outcome = swept(tmp_path, ar_study(), Prepared(broken="all"))
-    assert [(failure.reason, len(failure.wanted)) for failure in outcome.failed] == [("no such policy", 7)] * 3
+    assert [(failure.reason, len(failure.episodes)) for failure in outcome.failed] == [("no such policy", 7)] * 3
     _, outcome = swept(tmp_path, ar_study(), Prepared(broken="push-v3"))
     assert [failure.reason for failure in outcome.failed] == ["it fell"]
-    assert len(outcome.done) + len(outcome.failed[0].wanted) == 21
+    assert len(outcome.done) + len(outcome.failed[0].episodes) == 21
     assert "push-v3" not in {one.task for one in outcome.done}
     _, again = swept(tmp_path, ar_study(), Prepared())
-    assert (len(again.reused), len(again.done)) == (len(outcome.done), len(outcome.failed[0].wanted))
+    assert (len(again.reused), len(again.done)) == (len(outcome.done), len(outcome.failed[0].episodes))
 
 
 @pytest.mark.parametrize("which", ["baseline", "method", "both"])

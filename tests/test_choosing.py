@@ -13,7 +13,7 @@ import pytest
 from studies_synthetic import settings_of, study_of, swept
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.lab.study import looks_of
+from kerv_cli.lab.plan import seed_blocks
 from kerv_cli.report import decide
 from kerv_cli.report.decide import choices, confidence_of_a_look, decision_of, pareto, safest_first
 from kerv_cli.report.measures import MICRO
@@ -155,7 +155,7 @@ def test_verdicts_come_from_the_stored_pairs_and_are_stored(tmp_path: Path) -> N
     settings = {"ar": settings_of("ar", episodes=4), "spec_vla": settings_of("spec_vla", 9, 4)}
     study = study_of(settings, ["reach-v3"], block=2)
     store, _ = swept(tmp_path, study)
-    assert [len(look) for look in looks_of(study)] == [4, 4]
+    assert [len(look) for look in seed_blocks(study)] == [4, 4]
     (found,) = decide.decisions(load_study(store), ["spec_vla"], 0.5, 2, 2)
     assert found.pairs == 4
     decide.write_decisions(store.root, {"spec_vla": found}, 50.0, 2)

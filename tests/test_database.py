@@ -7,6 +7,7 @@ import os
 import resource
 import signal
 import sqlite3
+import time
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,7 @@ from kerv_cli.cli.app import app
 from kerv_cli.engine.record import PHASES, EpisodeRecord
 from kerv_cli.episodes.rows import decodes_table, episode_row
 from kerv_cli.lab import database as module
-from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, FILE, RUNS, STUDIES, Database, insert_or_ignore
+from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, FILE, RUNS, STUDIES, Database
 from kerv_cli.lab.execute import RunEpisode
 from kerv_cli.lab.plan import Setting
 from kerv_cli.lab.runs import Run, run_rows
@@ -36,12 +37,12 @@ def count(database: Database, table: sa.Table) -> int:
 
 BEGUN = """
 import os, signal, sys, time
-from kerv_cli.lab.database import STUDIES, Database, insert_or_ignore
+from kerv_cli.lab.database import STUDIES, Database
 
 def begun(database, name):
     with database.writing() as connection:
-        values = {"name": name, "kind": "sweep", "created": "", "about": {}}
-        connection.execute(insert_or_ignore(connection, STUDIES).values(values))
+        if connection.execute(STUDIES.select().where(STUDIES.c.name == name)).first() is None:
+            connection.execute(STUDIES.insert().values(name=name, kind="sweep", created="", about={}))
 
 database = Database(sys.argv[1])
 """
@@ -50,8 +51,7 @@ database = Database(sys.argv[1])
 def begun(database: Database, name: str) -> None:
     """Write the row of a study."""
     with database.writing() as connection:
-        values = {"name": name, "kind": "sweep", "created": "", "about": {}}
-        connection.execute(insert_or_ignore(connection, STUDIES).values(values))
+        connection.execute(STUDIES.insert().values(name=name, kind="sweep", created="", about={}))
 
 
 def told(error: pytest.ExceptionInfo[KervError]) -> str:
@@ -174,26 +174,18 @@ def test_older_tables_are_migrated_in_one_transaction(database: Database, monkey
 def test_newer_tables_are_refused(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
     begun(database, "a")
     as_version(monkeypatch, 0)
-    with pytest.raises(CheckpointError, match=r"newer kerv \(schema 1, this one reads 0\): update kerv") as error:
+    with pytest.raises(CheckpointError, match="newer kerv") as error:
         studies(Database(database.results))
     assert told(error)
     with pytest.raises(CheckpointError):
         begun(Database(database.results), "b")
 
 
-@pytest.mark.parametrize(
-    ("url", "message"),
-    [
-        ("results/kerv.db", "is no URL: write postgresql://USER@HOST/DB"),
-        ("postgresql://kerv@host:port/kerv", "is no URL"),
-        ("mysql://root@host/kerv", "mysql:// is not supported: use postgresql://"),
-        ("oracle://host", "is not supported"),
-    ],
-)
-def test_a_wrong_url_is_one_line(tmp_path: Path, url: str, message: str) -> None:
-    with pytest.raises(UsageError, match=message) as error:
+@pytest.mark.parametrize("url", ["results/kerv.db", "postgresql://kerv@host:port/kerv", "mysql://root@host/kerv"])
+def test_a_wrong_url_is_one_line(tmp_path: Path, url: str) -> None:
+    with pytest.raises(UsageError) as error:
         studies(Database(tmp_path, url))
-    assert told(error)
+    assert "postgresql://USER@HOST/DB" in told(error)
 
 
 def test_a_server_that_does_not_answer_is_one_line_without_the_password(tmp_path: Path) -> None:
@@ -298,7 +290,9 @@ def test_a_removed_study_leaves_nothing_but_what_others_want(database: Database)
     assert [count(database, table) for table in (EPISODES, DECODES, BLOCKS, STUDIES)] == [0] * 4
 
 
-def test_a_run_has_a_row_from_its_first_second_to_its_end(database: Database) -> None:
+def test_a_run_has_a_row_from_its_first_second_to_its_end(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("kerv_cli.lab.runs.BEAT_SECONDS", 0.05)
+
     def row() -> tuple[str, int, int, str]:
         (row,) = run_rows(database, "target", "mine")
         assert row.command == ("train", "target")
@@ -306,7 +300,11 @@ def test_a_run_has_a_row_from_its_first_second_to_its_end(database: Database) ->
 
     with Run(database, "target", "mine", ["train", "target"], total=9) as record:
         assert row() == ("running", 0, 9, "")
-        record.beat(4, at_once=True)
+        record.beat(4)
+        deadline = time.monotonic() + 10
+        while row()[1] == 0:  # until the next heartbeat
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
         assert row() == ("running", 4, 9, "")
     assert row() == ("complete", 9, 9, "")
     with database.writing() as connection:

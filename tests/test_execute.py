@@ -47,8 +47,8 @@ from kerv_cli.lab.events import BlockStarted, BlockWaits, EpisodeEnd, Event, Set
 from kerv_cli.lab.execute import RunEpisode
 from kerv_cli.lab.executors import check_executor
 from kerv_cli.lab.plan import Setting, Study, blocks_of
-from kerv_cli.lab.store import StudyStore, split_of
-from kerv_cli.lab.study import estimate, plan_study
+from kerv_cli.lab.store import StudyStore, plan_study
+from kerv_cli.lab.study import estimate
 
 STUDY = threshold_study(["reach-v3"])
 TWO = threshold_study(["reach-v3", "push-v3"])
@@ -93,7 +93,7 @@ def test_the_settings_of_a_block_take_turns_in_a_recorded_order(database: Databa
         return run
 
     store, _ = swept(database.results, study, noting)
-    turns = [one for block in blocks_of(study.wanted, study.block) for one in block.turns()]
+    turns = [one for block in blocks_of(study.episodes, study.block) for one in block.turns()]
     assert ran == [(one.setting.label, one.seed) for one in turns]
     table = store.frame().sort_values(["started", "order"])
     assert list(zip(table["label"], table["seed"], strict=True)) == ran
@@ -129,7 +129,7 @@ def test_a_setting_that_raises_is_dropped_from_its_block_alone(database: Databas
     store, outcome = swept(database.results, STUDY, bad, on_event=events.append)
     assert len(outcome.done) == 14
     (failure,) = outcome.failed
-    assert [(one.setting.label, one.seed) for one in failure.wanted] == [("naive_sd", 100_002), ("naive_sd", 100_003)]
+    assert [(one.setting.label, one.seed) for one in failure.episodes] == [("naive_sd", 100_002), ("naive_sd", 100_003)]
     assert re.fullmatch(r"RuntimeError: the gripper fell off \(conftest\.py:\d+\)", failure.reason)
     assert ["fell off" in text for text in errors(database)] == [True, True]
     assert [type(event) for event in events[:2]] == [Started, BlockStarted]
@@ -169,7 +169,7 @@ def test_over_processes_only_the_guilty_settings_fail(tmp_path: Path) -> None:
     for setting in study.settings:
         setting.settings["runtime"]["threads"] = 3  # type: ignore[index]
     store, outcome = swept(tmp_path, study, misbehave, runtime=RuntimeSettings(workers=2))
-    reasons = {failure.wanted[0].setting.label: failure.reason for failure in outcome.failed}
+    reasons = {failure.episodes[0].setting.label: failure.reason for failure in outcome.failed}
     assert len(outcome.failed) == 4
     assert reasons["spec_vla r=1"] == "its worker process was killed by SIGKILL"
     assert reasons["spec_vla r=5"].startswith("Odd: 1 and 2")
@@ -258,7 +258,7 @@ def test_a_sweep_that_begins_in_the_middle_of_another_runs_nothing_twice(databas
         def on_event(event: Event) -> None:
             if isinstance(event, EpisodeEnd) and not outcomes and StudyStore(database, "threshold").counts()[0] == 5:
                 outcomes.append(pool.submit(swept, database.results, STUDY))
-                until(lambda: split_of(database, STUDY).there)
+                until(lambda: plan_study(database, STUDY).existing)
                 time.sleep(0.3)
 
         swept(database.results, STUDY, on_event=on_event)
@@ -288,21 +288,21 @@ def test_episodes_whose_order_counts_run_in_one_process(database: Database) -> N
         swept(database.results, in_order(), raising(KeyboardInterrupt(), "ar", [100_002]))
     store, _ = swept(database.results, in_order())
     assert store.frame().query("label == 'heisd'")["block"].nunique() == 1
-    assert not split_of(database, in_order()).reasons
+    assert not plan_study(database, in_order()).missing
 
 
 def test_episodes_whose_order_counts_run_whole_again_when_their_process_dies(tmp_path: Path) -> None:
     store, outcome = swept(tmp_path, in_order(), killed_at_the_third, runtime=RuntimeSettings(workers=2))
-    assert [one.setting.label for failure in outcome.failed for one in failure.wanted] == ["ar", "ar"]
+    assert [one.setting.label for failure in outcome.failed for one in failure.episodes] == ["ar", "ar"]
     assert len(outcome.done) == 2 + 4
     frame = store.frame().query("label == 'heisd'")
     assert (len(frame), frame["block"].nunique()) == (4, 1)
-    assert {one.setting.label for one in split_of(store.database, in_order()).reasons} == {"ar"}
+    assert {one.setting.label for one in plan_study(store.database, in_order()).missing} == {"ar"}
 
 
 def test_estimates_say_what_they_rest_on(database: Database) -> None:
     def planned(workers: int) -> Any:
-        return plan_study(database, TWO, RuntimeSettings(workers=workers), ["sweep"])
+        return plan_study(database, TWO, runtime=RuntimeSettings(workers=workers))
 
     guess = estimate(planned(1), 10.0)
     assert guess.seconds == 32 * 10.0
@@ -362,7 +362,7 @@ def cluster(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_cluster_loses_only_the_guilty_settings_and_resumes(cluster: RuntimeSettings, tmp_path: Path) -> None:
     study = threshold_study(["reach-v3"], episodes=2, radii=(1, 5))
     store, outcome = swept(tmp_path, study, misbehave, runtime=cluster)
-    reasons = {failure.wanted[0].setting.label: failure.reason for failure in outcome.failed}
+    reasons = {failure.episodes[0].setting.label: failure.reason for failure in outcome.failed}
     assert set(reasons) == {"spec_vla r=1", "spec_vla r=5"}
     assert "its worker process was lost" in reasons["spec_vla r=1"] or "its job" in reasons["spec_vla r=1"]
     assert reasons["spec_vla r=5"].startswith("Odd: 1 and 2")

@@ -105,5 +105,5 @@ def test_a_report_has_the_section_where_the_world_goes_on_alone(results: Path) -
     assert felt.to_list() == pytest.approx([100.0, 100.0])
     assert set(whole["rollout.delay_compensation"]) == {"none", "chunk"}
     store = StudyStore(results, "latency")
-    waiting = [one for one in store.load().wanted if "waits" in one.setting.label]
+    waiting = [one for one in store.load().episodes if "waits" in one.setting.label]
     assert latency_table(load_study(store, waiting)) is None

@@ -22,9 +22,9 @@ from kerv_cli.episodes.code import _meaning, code_hash
 from kerv_cli.episodes.identity import ENGINE, hash_of, work_of
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database
-from kerv_cli.lab.plan import Block, Setting, Split, Study, blocks_of, plain_settings, seeds_text, wanted_of
+from kerv_cli.lab.plan import Block, Setting, Study, all_episodes, blocks_of, plain_settings, seeds_text
 from kerv_cli.lab.runs import interrupted_since
-from kerv_cli.lab.store import StudyStore, split_of
+from kerv_cli.lab.store import Plan, StudyStore, plan_study
 from kerv_cli.report.summary import not_in_turn
 from kerv_cli.report.tables import load_study
 
@@ -47,16 +47,16 @@ def changed(path: str, value: Any) -> RolloutSettings:
     return settings
 
 
-def to_run(split: Split) -> Found:
+def to_run(split: Plan) -> Found:
     """(label, task) -> the seeds to run and why."""
     found: Found = {}
-    for one, why in split.reasons.items():
+    for one, why in split.missing.items():
         found.setdefault((one.setting.label, one.task), ([], why))[0].append(one.seed)
     return found
 
 
-def why(split: Split) -> set[str]:
-    return set(split.reasons.values())
+def why(split: Plan) -> set[str]:
+    return set(split.missing.values())
 
 
 def table_of(store: StudyStore) -> pd.DataFrame:
@@ -64,8 +64,8 @@ def table_of(store: StudyStore) -> pd.DataFrame:
 
 
 def same_wanted(store: StudyStore, study: Study) -> bool:
-    return {(one.setting.label, one.key) for one in store.load().wanted} == {
-        (one.setting.label, one.key) for one in study.wanted
+    return {(one.setting.label, one.key) for one in store.load().episodes} == {
+        (one.setting.label, one.key) for one in study.episodes
     }
 
 
@@ -122,8 +122,8 @@ def test_seeds_as_ranges(seeds: tuple[int, ...], text: str) -> None:
 def test_blocks_go_by_repeat_task_and_seeds() -> None:
     settings = {"ar": settings_of("ar", episodes=7), "b": settings_of("spec_vla", 9, episodes=7)}
     study = study_of(settings, TASKS, block=3, repeats=2)
-    assert len({one.key for one in study.wanted}) == len(study.wanted) == 2 * 2 * 2 * 7
-    blocks = blocks_of(study.wanted, 3)
+    assert len({one.key for one in study.episodes}) == len(study.episodes) == 2 * 2 * 2 * 7
+    blocks = blocks_of(study.episodes, 3)
     assert [(b.task, len(b.seeds)) for b in blocks[:4]] == [*(("reach-v3", n) for n in (3, 3, 1)), ("push-v3", 3)]
     assert [b.seeds[0] for b in blocks[:3]] == [100_000, 100_003, 100_006]
     assert all([setting.label for setting in block.settings] == ["ar", "b"] for block in blocks)
@@ -132,43 +132,43 @@ def test_blocks_go_by_repeat_task_and_seeds() -> None:
 
 
 def test_settings_take_turns_seed_by_seed_in_a_drawn_order() -> None:
-    (block,) = blocks_of(threshold_study(["reach-v3"], episodes=5).wanted, 5)
+    (block,) = blocks_of(threshold_study(["reach-v3"], episodes=5).episodes, 5)
     turns = list(block.turns())
     assert [one.seed for one in turns] == sorted(one.seed for one in turns)
     orders = [tuple(one.setting.label for one in turns[at : at + 4]) for at in range(0, 20, 4)]
     assert {frozenset(order) for order in orders} == {frozenset(threshold_study(["reach-v3"]).labels)}
     assert len(set(orders)) > 1
-    assert list(Block(block.wanted).turns()) == turns
+    assert list(Block(block.episodes).turns()) == turns
 
 
 def test_what_differs_in_threads_cannot_take_turns_in_one_process() -> None:
     study = study_of({"a": settings_of("ar"), "b": changed("runtime.threads", 2)}, ["reach-v3"])
-    assert [len(block.settings) for block in blocks_of(study.wanted, 5)] == [1, 1]
+    assert [len(block.settings) for block in blocks_of(study.episodes, 5)] == [1, 1]
 
 
 def test_a_batch_takes_any_tasks_of_one_setting_in_a_block_per_worker() -> None:
     settings = {"ar": settings_of("ar"), "b": settings_of("spec_vla", 9)}
     for one in settings.values():
         one.rollout.batch = 2
-    blocks = blocks_of(study_of(settings, TASKS).wanted, 5, workers=2)
-    assert [(len(block.wanted), [s.label for s in block.settings]) for block in blocks] == [
+    blocks = blocks_of(study_of(settings, TASKS).episodes, 5, workers=2)
+    assert [(len(block.episodes), [s.label for s in block.settings]) for block in blocks] == [
         (4, [label]) for label in ("ar", "ar", "b", "b")
     ]
-    assert [len(block.wanted) for block in blocks_of(study_of(settings, TASKS).wanted, 5)] == [8, 8]
+    assert [len(block.episodes) for block in blocks_of(study_of(settings, TASKS).episodes, 5)] == [8, 8]
 
 
 def test_a_study_is_counted_before_it_is_planned() -> None:
     setting = study_of({"ar": settings_of("ar", episodes=1)}, ["reach-v3"]).settings[0]
     large = dataclasses.replace(setting, settings={**setting.settings, "episodes": 10**7})
     with pytest.raises(UsageError, match="10000000 episodes: at most 1000000"):
-        wanted_of([large], ["reach-v3"])
+        all_episodes([large], ["reach-v3"])
 
 
 def test_more_episodes_run_only_the_new_seeds_in_turn(database: Database) -> None:
     swept(database.results, threshold_study(TASKS, episodes=3, radii=(3,)))
     study = threshold_study(TASKS, episodes=5, radii=(3,))
     new = {(label, task): ([100_003, 100_004], "new seeds") for label in study.labels for task in TASKS}
-    assert to_run(split_of(database, study)) == new
+    assert to_run(plan_study(database, study)) == new
     store, outcome = swept(database.results, study)
     assert (len(outcome.done), len(outcome.reused)) == (12, 18)
     row = table_of(store).loc["spec_vla r=3"]
@@ -188,7 +188,7 @@ def test_sweeps_over_other_tasks_end_in_one_study(database: Database) -> None:
     assert same_wanted(store, threshold_study(TASKS, episodes=2))
     settings = {label: settings_of("ar", episodes=2) for label in ("ar", "other")}
     store, _ = swept(database.results, study_of(settings, ["push-v3"]))
-    assert {(one.setting.label, one.task) for one in store.load().wanted} == {
+    assert {(one.setting.label, one.task) for one in store.load().episodes} == {
         ("ar", "reach-v3"), ("ar", "push-v3"), ("other", "push-v3")
     }  # fmt: skip
 
@@ -197,14 +197,14 @@ def test_another_study_runs_only_what_it_does_not_share(database: Database) -> N
     store, _ = swept(database.results, threshold_study(["reach-v3"]))
     settings = {"renamed": settings_of("spec_vla", 3), "ar": settings_of("ar"), "new": settings_of("spec_vla", 15)}
     study = study_of(settings, ["reach-v3"], "other")
-    assert to_run(split_of(database, study)) == {("new", "reach-v3"): (list(range(100_000, 100_004)), "new setting")}
+    assert to_run(plan_study(database, study)) == {("new", "reach-v3"): (list(range(100_000, 100_004)), "new setting")}
     other, outcome = swept(database.results, study)
     assert len(outcome.reused) == 8
     store.remove()
-    assert not store.is_there
+    assert not store.exists
     assert other.counts() == (12, 12)
     assert len(table_of(other)) == 3
-    assert len(to_run(split_of(database, threshold_study(["reach-v3"])))) == 2  # only naive_sd and r=9 are gone
+    assert len(to_run(plan_study(database, threshold_study(["reach-v3"])))) == 2  # only naive_sd and r=9 are gone
 
 
 def test_two_labels_of_one_result_run_once(database: Database) -> None:
@@ -220,29 +220,29 @@ def test_times_of_other_blocks_are_no_ratio_until_they_are_taken_in_turn(databas
     store, _ = swept(database.results, study)
     assert not_in_turn(table_of(store).reset_index()) == ["spec_vla r=9"]
     assert table_of(store).loc["spec_vla r=9", "pairs"] == 4  # successes are compared
-    assert why(split_of(database, study, "timed")) == {"times wanted in turn"}
+    assert why(plan_study(database, study, "timed")) == {"times wanted in turn"}
     swept(database.results, study, rerun="timed")
     assert not_in_turn(table_of(store).reset_index()) == []
-    assert not split_of(database, study, "timed").reasons
+    assert not plan_study(database, study, "timed").missing
 
 
 def test_other_code_runs_again_on_request_only(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
     study = threshold_study(["reach-v3"])
     swept(database.results, study)
-    assert not split_of(database, study, "changed").reasons
+    assert not plan_study(database, study, "changed").missing
     monkeypatch.setattr("kerv_cli.episodes.code.code_hash", lambda: "f" * 64)
-    assert not split_of(database, study).reasons
-    assert why(split_of(database, study, "changed")) == {"other code"}
+    assert not plan_study(database, study).missing
+    assert why(plan_study(database, study, "changed")) == {"other code"}
 
 
 def test_a_rerun_keeps_the_older_measurement(database: Database) -> None:
     study = threshold_study(["reach-v3"])
     store, _ = swept(database.results, study)
     first = set(store.frame()["episode"])
-    assert why(split_of(database, study, "all")) == {"rerun=all"}
+    assert why(plan_study(database, study, "all")) == {"rerun=all"}
     swept(database.results, study, rerun="all")
     assert first.isdisjoint(store.frame()["episode"])
-    newest = {row.id for row in split_of(database, study).there.values()}
+    newest = {row.id for row in plan_study(database, study).existing.values()}
     assert newest == set(store.frame()["episode"])
 
 
@@ -259,7 +259,7 @@ def test_an_interrupted_rerun_goes_on(database: Database) -> None:
     since = interrupted_since(database, "sweep", study.name, words)
     assert since
     rest = {(label, "reach-v3"): ([100_002, 100_003], "rerun=all") for label in study.labels}
-    assert to_run(split_of(database, study, "all", since)) == rest
+    assert to_run(plan_study(database, study, "all", since)) == rest
 
 
 def test_reasons_name_what_changed(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -267,8 +267,8 @@ def test_reasons_name_what_changed(database: Database, monkeypatch: pytest.Monke
 
     def reason(settings: RolloutSettings, task: str = "reach-v3", weights: dict[str, str] = IDENTITY) -> str:
         setting = Setting("spec_vla r=3", "", plain_settings(asdict(settings)), weights)
-        split = split_of(database, Study("threshold", (setting,), wanted_of([setting], [task])))
-        return next(iter(split.reasons.values()), "")
+        split = plan_study(database, Study("threshold", (setting,), all_episodes([setting], [task])))
+        return next(iter(split.missing.values()), "")
 
     same = settings_of("spec_vla", 3)
     assert reason(same) == ""
@@ -278,7 +278,7 @@ def test_reasons_name_what_changed(database: Database, monkeypatch: pytest.Monke
     another = dataclasses.replace(same, policy=dataclasses.replace(same.policy, target="mine"))
     assert reason(another, weights={**IDENTITY, "target": "c" * 64}) == "new setting"  # nobody's weights changed
     repeated = study_of({"ar": settings_of("ar")}, ["reach-v3"], repeats=2)
-    assert why(split_of(database, repeated)) == {"new repeat"}
+    assert why(plan_study(database, repeated)) == {"new repeat"}
     idle = settings_of("spec_vla", 3)
     idle.policy.artifacts["datastore"] = "mine"  # not read
     assert reason(idle) == ""
@@ -294,8 +294,8 @@ def test_what_depends_on_the_order_of_episodes_is_reused_whole(database: Databas
         return study_of({"ar": settings_of("ar", episodes=episodes), "heisd": settings}, ["reach-v3"])
 
     swept(database.results, study(2))
-    assert not split_of(database, study(2)).reasons
-    split = split_of(database, study(4))
+    assert not plan_study(database, study(2)).missing
+    split = plan_study(database, study(4))
     assert {key: sorted(seeds) for key, (seeds, _) in to_run(split).items()} == {
         ("ar", "reach-v3"): [100_002, 100_003],
         ("heisd", "reach-v3"): [100_000, 100_001, 100_002, 100_003],
@@ -312,4 +312,4 @@ def test_what_depends_on_the_order_of_episodes_is_reused_whole(database: Databas
 def test_episodes_that_failed_are_planned_again(database: Database, missing: Sequence[int]) -> None:
     study = study_of({"ar": settings_of("ar")}, ["reach-v3"], block=1)
     swept(database.results, study, raising(RuntimeError(), seeds=missing))
-    assert to_run(split_of(database, study)) == {("ar", "reach-v3"): (missing, "new seeds")}
+    assert to_run(plan_study(database, study)) == {("ar", "reach-v3"): (missing, "new seeds")}

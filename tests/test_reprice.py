@@ -59,7 +59,7 @@ def test_an_episode_costs_its_decodes_at_the_profiles_costs(results: Path, data:
     table = repriced_table(data, StudyStore(results, "threshold"), [NamedProfile("there", PROFILE)]).set_index("label")
     seconds: dict[str, list[float]] = {}
     steps: dict[str, list[int]] = {}
-    for one in data.study.wanted:
+    for one in data.study.episodes:
         record = episode(one.setting, one.task, one.seed)
         priced = [predicted(work_of_record(decode), PROFILE) for decode in record.decodes]
         seconds.setdefault(one.setting.label, []).append(sum(priced))

@@ -24,8 +24,9 @@ from typer.testing import CliRunner
 
 from kerv_cli.catalogue.entries import find_runs, matching
 from kerv_cli.cli.app import app
-from kerv_cli.lab.database import EPISODES, INTERRUPTED, RUNS, WANTED, Database
+from kerv_cli.lab.database import EPISODES, RUNS, WANTED, Database
 from kerv_cli.lab.plan import Setting
+from kerv_cli.lab.runs import INTERRUPTED
 from kerv_cli.lab.study import EpisodeRunner
 from kerv_cli.report.export import TRACKERS, export
 

@@ -15,9 +15,10 @@ from test_training import quadratic
 from typer.testing import CliRunner
 
 from kerv_cli.base.errors import CheckpointError, Interrupted, UsageError
+from kerv_cli.base.places import STORE
 from kerv_cli.cli.app import app
 from kerv_cli.engine.cost import read_profile
-from kerv_cli.lab.database import VARIABLE, Database
+from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import Curve, making, run_rows
 from kerv_cli.report.curves import read_log
 from kerv_cli.training.demonstrations import open_demos
@@ -119,12 +120,12 @@ def test_a_curve_has_each_validation_once(tmp_path: Path) -> None:
 def test_a_store_is_used_by_one_command_and_no_password_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.delenv(STORE, raising=False)
     other, where = Database(tmp_path, f"sqlite:///{tmp_path}/other.db"), f"results={tmp_path}"
     kerv("build", "target", f"checkpoint={tmp_path}", f"store={other.url}", where, code=1)
     assert [row.status for row in run_rows(other)] == ["failed"]
     assert run_rows(Database(tmp_path)) == []
-    assert VARIABLE not in os.environ
+    assert STORE not in os.environ
     store = "store=postgresql://me:secret@127.0.0.1:1/kerv"
     assert "store: postgresql://me@127.0.0.1:1/kerv" in kerv("build", "target", store, "--cfg")
     line = kerv("runs", "list", store, where, code=1)

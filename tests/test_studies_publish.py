@@ -11,7 +11,7 @@ import pytest
 from studies_synthetic import swept, threshold_study
 
 from kerv_cli.lab.database import Database
-from kerv_cli.lab.store import StudyStore, split_of
+from kerv_cli.lab.store import StudyStore, plan_study
 from kerv_cli.report.publish import Unpublishable, refusals
 from kerv_cli.report.report import report
 from kerv_cli.report.tables import load_study
@@ -44,8 +44,8 @@ def test_one_run_of_one_commit_is_published_where_it_is_committed(tmp_path: Path
 
 def test_what_is_missing_or_not_committed_is_refused(tmp_path: Path, commit: Callable[[str], None]) -> None:
     commit(f"{COMMIT}+changes")
-    swept(tmp_path, replace(STUDY, wanted=STUDY.wanted[:-1]))
-    StudyStore(tmp_path, "threshold").save(split_of(Database(tmp_path), STUDY))
+    swept(tmp_path, replace(STUDY, episodes=STUDY.episodes[:-1]))
+    StudyStore(tmp_path, "threshold").save(STUDY, plan_study(Database(tmp_path), STUDY).existing)
     with pytest.raises(Unpublishable) as refused:
         report(tmp_path, "threshold", publish=True)
     assert "1 of its episodes are missing" in str(refused.value)
@@ -55,7 +55,7 @@ def test_what_is_missing_or_not_committed_is_refused(tmp_path: Path, commit: Cal
 
 
 def test_sides_of_several_runs_or_commits_are_refused(tmp_path: Path, commit: Callable[[str], None]) -> None:
-    swept(tmp_path, replace(STUDY, wanted=tuple(one for one in STUDY.wanted if one.setting.label == "ar")))
+    swept(tmp_path, replace(STUDY, episodes=tuple(one for one in STUDY.episodes if one.setting.label == "ar")))
     commit("d" * 40)
     store, _ = swept(tmp_path, STUDY)
     found = refusals(load_study(store).table)

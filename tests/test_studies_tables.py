@@ -20,8 +20,8 @@ from studies_synthetic import settings_of, still_episode, study_of, swept, thres
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.execute import RunEpisode
-from kerv_cli.lab.plan import Setting, Study, Wanted
-from kerv_cli.lab.store import StudyStore, split_of
+from kerv_cli.lab.plan import Episode, Setting, Study
+from kerv_cli.lab.store import StudyStore, plan_study
 from kerv_cli.report.measures import MACRO, MICRO
 from kerv_cli.report.report import report
 from kerv_cli.report.statistics import PairedCounts, mean_of, paired_difference, speedup, wilson
@@ -78,8 +78,8 @@ def two_settings(episodes: int = 4, **about: Any) -> Study:
 def hand_study() -> Study:
     """Two episodes of reach and three of push; in every turn both settings."""
     study = two_settings(3)
-    wanted = [Wanted(one.setting, task, one.seed) for task in ("reach-v3", "push-v3") for one in study.wanted]
-    return replace(study, wanted=tuple(one for one in wanted if one.task == "push-v3" or one.seed < 100_002))
+    wanted = [Episode(one.setting, task, one.seed) for task in ("reach-v3", "push-v3") for one in study.episodes]
+    return replace(study, episodes=tuple(one for one in wanted if one.task == "push-v3" or one.seed < 100_002))
 
 
 @pytest.fixture(scope="module")
@@ -230,8 +230,8 @@ def test_other_initial_states_are_no_pair(data: StudyData) -> None:
 def test_pairs_of_one_block_are_told_from_others(tmp_path: Path) -> None:
     """Two blocks of two pairs; of the second, the setting ran alone, later."""
     study = two_settings(block=2)
-    early = [one for one in study.wanted if one.seed < 100_002 or one.setting.label == "ar"]
-    swept(tmp_path, replace(study, wanted=tuple(early)))
+    early = [one for one in study.episodes if one.seed < 100_002 or one.setting.label == "ar"]
+    swept(tmp_path, replace(study, episodes=tuple(early)))
     store, _ = swept(tmp_path, study)
     table = load_study(store).table
     row = row_of(table, label="kerv", averaging=MICRO)
@@ -268,7 +268,7 @@ def test_repeats_are_paired_with_their_own(tmp_path: Path) -> None:
 def test_without_the_baselines_episodes_there_is_a_row_but_no_speedup(data: StudyData) -> None:
     episodes = data.episodes
     data = StudyData(data.study, episodes[episodes["label"] == "kerv"])
-    assert data.absent == [one for one in data.study.wanted if one.setting.label == "ar"]
+    assert data.absent == [one for one in data.study.episodes if one.setting.label == "ar"]
     assert list(data.table["label"]) == ["kerv", "kerv"]
     assert data.table["speedup"].isna().all()
     assert summary_frame(data.table)["speed, per step"].tolist() == ["–"]
@@ -306,8 +306,8 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A threshold study over three tasks, three episodes missing."""
     folder = tmp_path_factory.mktemp("results")
     study = threshold_study(["reach-v3", "push-v3", "door-open-v3"], episodes=3)
-    swept(folder, replace(study, wanted=study.wanted[:-3]))
-    StudyStore(folder, "threshold").save(split_of(Database(folder), study))
+    swept(folder, replace(study, episodes=study.episodes[:-3]))
+    StudyStore(folder, "threshold").save(study, plan_study(Database(folder), study).existing)
     return folder
 
 

@@ -42,9 +42,9 @@ from vla_eval.specs import (
 from websockets.sync.client import connect
 
 from kerv_cli.base.config import compose
-from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.errors import UsageError
 from kerv_cli.catalogue.served import read_served
-from kerv_cli.catalogue.vla_eval import read_evaluations, sides_of
+from kerv_cli.catalogue.vla_eval import by_server, read_evaluations
 from kerv_cli.cli.app import app
 from kerv_cli.episodes.runner import Runner
 from kerv_cli.episodes.settings import RolloutSettings
@@ -407,20 +407,13 @@ def test_evaluations_of_the_same_episodes_are_paired(results: Path, recordings: 
     assert (refused.exit_code, "was imported: run vla-eval again" in refused.output) == (2, True)
 
 
-def test_the_aggregate_and_the_recording_say_the_same(recordings: dict[str, Path]) -> None:
-    (recorded,) = read_evaluations(recordings["naive_sd"])
-    (aggregate,) = read_evaluations(recordings["naive_sd"].parent / "MetaWorld_aggregate.json")
-    assert sorted(recorded.episodes, key=str) == sorted(aggregate.episodes, key=str)
-    assert (recorded.facts, recorded.name, recorded.id) == (aggregate.facts, "naive_sd", aggregate.id)
-
-
 def test_an_import_again_replaces_the_study_and_no_other(results: Path, recordings: dict[str, Path]) -> None:
     for _ in range(2):
         kerv("runs", "import", str(recordings["ar"]), "name=again", "labels=mine", f"results={results}")
     assert "mine" in kerv("runs", "show", "again", f"results={results}")
     swept(results, threshold_study(["reach-v3"], name="own"))
     refused = CliRunner().invoke(app, ["runs", "import", str(recordings["ar"]), "name=own", f"results={results}"])
-    assert "study 'own' is there and was not imported" in refused.output
+    assert "study 'own' exists and was not imported" in refused.output
 
 
 def test_a_killed_shard_leaves_episodes_that_are_missing_until_it_ran_again(results: Path, tmp_path: Path) -> None:
@@ -488,18 +481,11 @@ def test_a_harmed_recording_is_refused_in_one_line(
     assert refused.output.count("\n") == 1
 
 
-def test_an_aggregate_that_is_cut_short_is_refused(recordings: dict[str, Path], tmp_path: Path) -> None:
-    path = tmp_path / "x_aggregate.json"
-    path.write_text((recordings["ar"].parent / "MetaWorld_aggregate.json").read_text()[:-200])
-    with pytest.raises(CheckpointError, match="cannot be read as JSON"):
-        read_evaluations(path)
-
-
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
         ({"config": {"params": {**PARAMS, "horizon": 40, "seed": 5}}}, "params.seed is 100000 and 5"),
-        ({"benchmark": "LIBERO"}, "are of other benchmarks: MetaWorld and LIBERO"),
+        ({"benchmark": "LIBERO"}, "have different benchmarks: MetaWorld and LIBERO"),
         ({"episodes": ()}, "have no episode in common"),
     ],
 )
@@ -509,9 +495,9 @@ def test_evaluations_of_other_episodes_are_refused(
     (first,), (second,) = (read_evaluations(recordings[name]) for name in ("ar", "naive_sd"))
     changes = {**changes, **({"config": {**second.config, **changes["config"]}} if "config" in changes else {})}
     with pytest.raises(UsageError, match=said):
-        sides_of([[first], [replace(second, **changes)]])
-    with pytest.raises(UsageError, match="one for each of the 2 recordings"):
-        sides_of([[first], [second]], ["one"])
+        by_server([[first], [replace(second, **changes)]])
+    with pytest.raises(UsageError, match="each of the 2 recordings"):
+        by_server([[first], [second]], ["one"])
 
 
 # --- LIBERO up to its container (docs/libero.md)

@@ -1,68 +1,69 @@
-"""Evaluations that `lerobot-eval` ran: its `eval_info.json`, which holds successes and no times.
+"""Reads evaluations that `lerobot-eval` ran: its `eval_info.json`, which has successes but no times.
 
-A file of several tasks has `per_task` (task_group, task_id and lists of metrics), one of a single task `per_episode`.
+A file with several tasks has `per_task` (task_group, task_id and lists of metrics), one with a single task
+`per_episode`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import read_mapping
-from kerv_cli.catalogue.vla_eval import Episode, Evaluation
+from kerv_cli.catalogue.vla_eval import Evaluation, RecordedEpisode
 
 FILE = "eval_info.json"
-"""Name that lerobot-eval gives to its results."""
-HARNESS = "lerobot-eval"
+"""Name of lerobot-eval's results."""
 
 
 def read_info(path: Path) -> list[Evaluation]:
     """Return the evaluations of a file, one per group of tasks.
 
-    The file names no policy, so a policy is called like the file's folder. Without a seed in the file an episode's
-    number counts: lerobot-eval gives the episodes of every task the same seeds in order.
+    The file does not name the policy, so its name is that of the file's folder. Without a seed in the file, an
+    episode's number is its seed: lerobot-eval gives the episodes of every task the same seeds in order.
 
     Raises:
-        CheckpointError: It is damaged, or holds no episode.
+        CheckpointError: The file is damaged, or has no episodes.
     """
     value = read_mapping(path)
-    groups: dict[str, list[Episode]] = {}
+    groups: dict[str, list[RecordedEpisode]] = {}
     try:
         overall = value.get("overall") or value.get("aggregated") or {}
         seconds = float(overall.get("eval_ep_s") or 0.0)
         for one in value.get("per_task") or ():
-            successes = one["metrics"]["successes"]
-            task = f"task {one['task_id']}"
-            episodes = [_episode(task, i, i, success, seconds) for i, success in enumerate(successes)]
-            groups.setdefault(str(one["task_group"]), []).extend(episodes)
+            episodes = groups.setdefault(str(one["task_group"]), [])
+            for index, success in enumerate(one["metrics"]["successes"]):
+                episodes.append(_episode(f"task {one['task_id']}", index, index, success, seconds))
         if not groups:
-            groups["lerobot"] = [_of_row(row, number, seconds) for number, row in enumerate(value["per_episode"])]
+            for index, row in enumerate(value["per_episode"]):
+                seed = index if row.get("seed") is None else int(row["seed"])
+                groups.setdefault("lerobot", []).append(_episode("task", index, seed, row["success"], seconds))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         why = " ".join(f"{type(error).__name__} {error}".split())[:120]
         raise CheckpointError(f"{path} is damaged or not of lerobot-eval ({why})") from error
     if not any(groups.values()):
         raise CheckpointError(f"{path} holds no episode: the evaluation ended before its first")
+    figures = {key: value for key, value in overall.items() if isinstance(value, int | float) and math.isfinite(value)}
     name = path.resolve().parent.name
-    return [_evaluation(path, name, group, episodes, overall) for group, episodes in groups.items() if episodes]
+    return [
+        Evaluation(
+            path,
+            f"{name} {group}",
+            group,
+            figures,
+            {"model_server": name},
+            tuple(episodes),
+            len(episodes),
+            "lerobot-eval",
+        )
+        for group, episodes in groups.items()
+        if episodes
+    ]
 
 
-def _of_row(row: Mapping[str, Any], number: int, seconds: float) -> Episode:
-    seed = row.get("seed")
-    return _episode("task", number, number if seed is None else int(seed), row["success"], seconds)
-
-
-def _episode(task: str, index: int, seed: int, success: Any, seconds: float) -> Episode:
+def _episode(task: str, index: int, seed: int, success: Any, seconds: float) -> RecordedEpisode:
     if not isinstance(success, bool | int | float) or math.isnan(success):
         raise ValueError(f"success {success!r} of episode {index}")
-    return Episode(task, index, seed, bool(success), None, seconds, str(index), (float(seed),))
-
-
-def _evaluation(
-    path: Path, name: str, group: str, episodes: Sequence[Episode], overall: Mapping[str, Any]
-) -> Evaluation:
-    figures = {key: value for key, value in overall.items() if isinstance(value, int | float) and math.isfinite(value)}
-    server = {"model_server": name}
-    return Evaluation(path, f"{name} {group}", group, figures, server, tuple(episodes), len(episodes), HARNESS)
+    return RecordedEpisode(task, index, seed, bool(success), None, seconds, str(index), (float(seed),))

@@ -10,8 +10,8 @@ from pathlib import Path
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.foreign import foreign_sqlite
 from kerv_cli.catalogue import lerobot, vla_eval
-from kerv_cli.catalogue.older import import_older, is_older
-from kerv_cli.catalogue.stored import import_database
+from kerv_cli.catalogue.older import import_older, older_studies
+from kerv_cli.catalogue.stored import Imported, import_database
 from kerv_cli.lab.database import ABOUT, FILE, Database
 
 
@@ -19,13 +19,13 @@ def is_results(path: Path) -> bool:
     """Return whether a path is a results folder or a kerv.db.
 
     Raises:
-        UsageError: Nothing is there.
+        UsageError: It does not exist.
     """
     if not path.exists():
         raise UsageError(
             f"{path} does not exist: name a results folder, a kerv.db, or evaluations of vla-eval or lerobot"
         )
-    return _database_of(path) is not None or (path.is_dir() and is_older(path))
+    return _database_of(path) is not None or bool(older_studies(path))
 
 
 def _database_of(path: Path) -> Path | None:
@@ -41,42 +41,56 @@ def _database_of(path: Path) -> Path | None:
     return None
 
 
-def import_results(results: Database, paths: Sequence[Path], name: str = "") -> tuple[list[str], list[str]]:
-    """Copy the studies of results folders and databases -> (their names, lines about what is left out).
+def import_results(results: Database, paths: Sequence[Path], name: str = "") -> Imported:
+    """Copy the studies of results folders and databases.
+
+    Args:
+        results: Where they are copied to.
+        paths: Results folders of this version or 0.1.0, and databases.
+        name: Name of the study here, if there is only one. Empty: as there.
 
     Raises:
-        UsageError: The results folder itself, or a name for several. CheckpointError: A database is damaged.
+        UsageError: A path is the results folder itself, or `name` is set and there are several studies.
+        CheckpointError: A database is damaged.
     """
-    names: list[str] = []
-    notes: list[str] = []
+    imported = Imported()
     for path in paths:
-        found = []
-        if path.is_dir() and is_older(path):
-            found.append(import_older(results, path, name))
-        file = _database_of(path)
-        if file is not None and not (
-            results.file is not None and results.file.exists() and file.samefile(results.file)
-        ):
-            found.append(import_database(results, file, name))
-        elif file is not None and not found:
+        older, file = older_studies(path), _database_of(path)
+        if older:
+            import_older(results, path, name, imported)
+        is_same = (
+            file is not None and results.file is not None and results.file.exists() and file.samefile(results.file)
+        )
+        if file is not None and not is_same:
+            import_database(results, file, name, imported)
+        elif is_same and not older:
             raise UsageError(f"{path} is the results folder that it would be imported into: name another with results=")
-        for studies, lines in found:
-            names += studies
-            notes += lines
-    return names, notes
+    return imported
 
 
 def import_evaluations(
     results: Path, paths: Sequence[Path], name: str, labels: Sequence[str], baseline: str, words: Sequence[str]
 ) -> tuple[str, list[str]]:
-    """Write evaluations of vla-eval and lerobot as one study -> (its name, lines about what is missing).
+    """Write evaluations of vla-eval and lerobot as one study.
+
+    Args:
+        results: The results folder.
+        paths: Recordings, or folders that hold some.
+        name: Name of the study. Empty: that of the benchmarks.
+        labels: A label for each path. Empty: names of the servers.
+        baseline: Label of the baseline. Empty: ar, else the first.
+        words: Words after `kerv` of the command.
+
+    Returns:
+        The name of the study, and lines about missing episodes.
 
     Raises:
-        UsageError: A path holds no evaluation, or they cannot be compared. CheckpointError: A file is damaged.
+        UsageError: A path holds no evaluation, or they cannot be compared.
+        CheckpointError: A file is damaged.
     """
-    sides = vla_eval.sides_of([_evaluations(path) for path in paths], labels)
-    name = name or vla_eval.study_name(sides)
-    return name, vla_eval.write_study(results, name, sides, baseline, words)
+    servers = vla_eval.by_server([_evaluations(path) for path in paths], labels)
+    name = name or vla_eval.study_name(servers)
+    return name, vla_eval.write_study(results, name, servers, baseline, words)
 
 
 def _evaluations(path: Path) -> list[vla_eval.Evaluation]:

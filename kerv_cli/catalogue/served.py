@@ -1,8 +1,7 @@
-"""What a server keeps of an episode whose world ran elsewhere: its decodes and a row like that of an episode here.
+"""Files of the episodes that a server of kerv served: results/served/<evaluation>/<episode>.arrow.
 
-results/served/<evaluation>/<episode>.arrow: the decodes; the columns of the episode and what served it are
-JSON in the file's metadata. Both names are the harness's. Arrow's files are read several times as fast as parquet's,
-and an import reads thousands.
+A file holds the decodes. Its metadata holds the columns of the episode and the server's facts as JSON. Both names come
+from the harness. Arrow files are read several times as fast as Parquet, and an import reads thousands.
 """
 
 from __future__ import annotations
@@ -28,26 +27,35 @@ _NAME = re.compile(r"\w[\w.-]{0,199}")
 
 @dataclass(frozen=True)
 class Served:
-    """An episode as its server saw it. episode: columns of the table `episodes`. by: `Policy.facts` of the server.
-    decodes: with the columns of rows.DECODE_SCHEMA."""
+    """An episode as its server saw it.
+
+    Attributes:
+        episode: Columns of the table `episodes`.
+        decodes: Table with the columns of rows.DECODE_SCHEMA.
+    """
 
     episode: dict[str, Any]
-    by: dict[str, Any]
     decodes: pa.Table
 
 
 def path_of(results: Path, evaluation: str, episode: str) -> Path | None:
-    """The file of an episode; None for names that cannot be those of files."""
+    """Return the file of an episode, or None if the names are not file names."""
     if not _NAME.fullmatch(evaluation) or not _NAME.fullmatch(episode):
         return None
     return results / SERVED / evaluation / f"{episode}.arrow"
 
 
 def write_served(path: Path, record: EpisodeRecord, started: str, by: Mapping[str, Any]) -> None:
-    """Writes an episode. A record whose path is not known has none (n, 3) of length 0.
+    """Write an episode.
+
+    Args:
+        path: The file.
+        record: The episode. Its path has shape (0, 3) if it is unknown.
+        started: Time at which it began (ISO 8601).
+        by: `Policy.facts` of the server.
 
     Raises:
-        StorageError: the disk refused.
+        StorageError: The disk refused.
     """
     row = episode_row(record) | {"task": record.task, "seed": record.seed, "started": started}
     if not len(record.path):
@@ -60,10 +68,10 @@ def write_served(path: Path, record: EpisodeRecord, started: str, by: Mapping[st
 
 
 def read_served(path: Path) -> Served | None:
-    """The episode in a file; None where there is no such file.
+    """Return the episode in a file, or None if there is no file.
 
     Raises:
-        CheckpointError: it is damaged.
+        CheckpointError: The file is damaged.
     """
     try:
         with pa.ipc.open_file(str(path)) as file:
@@ -71,7 +79,7 @@ def read_served(path: Path) -> Served | None:
         facts = json.loads((table.schema.metadata or {})[_KEY])
         table = table.replace_schema_metadata(None)
         decodes = table.select(DECODE_SCHEMA.names).cast(DECODE_SCHEMA)
-        return Served(facts["episode"], facts["by"], decodes)
+        return Served(facts["episode"], decodes)
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pyarrow as pa
@@ -13,7 +14,6 @@ import sqlalchemy as sa
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import write_folder
 from kerv_cli.base.foreign import connect_foreign, foreign_table
-from kerv_cli.base.limits import check_label
 from kerv_cli.episodes.rows import DECODE_SCHEMA
 from kerv_cli.lab.database import (
     ABOUT,
@@ -24,155 +24,126 @@ from kerv_cli.lab.database import (
     MEASURES,
     RUNS,
     SCHEMA,
-    SETTINGS,
     STUDIES,
     WANTED,
     Database,
+    newer,
 )
-from kerv_cli.lab.plan import Setting, Study, Wanted
-from kerv_cli.lab.store import Foreign, StudyStore
+from kerv_cli.lab.plan import Episode, Setting, Study
+from kerv_cli.lab.store import ImportedEpisode, StudyStore, stored_study
 
 _DAMAGE = (sa.exc.SQLAlchemyError, sqlite3.Error, pa.ArrowException, OSError, ValueError, KeyError, TypeError)
 _ROW = (*(column.name for column in MEASURES), "order", "started", "worker_pid")
 
 
 @dataclass
-class StoredStudy:
-    """A study of a database. command: the words after `kerv` that ran it last."""
+class Imported:
+    """Names of the studies that were imported, and lines about what was left out."""
 
-    connection: sa.Connection
-    study: Study
-    settings: dict[int, Setting]  # id in the database -> setting
-    command: tuple[str, ...]
+    names: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
-    def episodes(self) -> Iterator[Foreign]:
-        """Yield its episodes.
-
-        Raises:
-            ValueError: The decodes of one are damaged or too large.
-        """
-        query = (
-            sa.select(
-                WANTED.c.setting_id, WANTED.c.task, WANTED.c.seed, WANTED.c.repeat,
-                *(EPISODES.c[name] for name in _ROW), EPISODES.c.block, BLOCKS.c.run, BLOCKS.c.code, BLOCKS.c.seeds,
-                BLOCKS.c.about, DECODES.c.parquet,
-            )
-            .select_from(WANTED.join(EPISODES).join(BLOCKS).join(DECODES, DECODES.c.episode_id == EPISODES.c.id))
-            .where(WANTED.c.setting_id.in_(self.settings))
-            .order_by(WANTED.c.position)
-        )  # fmt: skip
-        for row in self.connection.execution_options(yield_per=100).execute(query).mappings():
-            wanted = Wanted(self.settings[row["setting_id"]], row["task"], row["seed"], row["repeat"])
-            decodes = foreign_table(row["parquet"]).cast(DECODE_SCHEMA)
-            values = {name: row[name] for name in _ROW}
-            yield Foreign(
-                wanted, values, decodes, row["block"], row["about"], row["run"], row["seeds"], row["code"]
-            )  # fmt: skip
+    def add(self, store: StudyStore, study: Study, episodes: Iterator[ImportedEpisode], command: Sequence[str]) -> bool:
+        """Write a study. If one of its name has episodes, leave it out and return False."""
+        if store.counts()[0]:
+            self.notes.append(f"{store.name} exists and was left out: 'kerv runs rm {store.name}' removes it")
+            return False
+        store.add(study, episodes, command)
+        self.names.append(store.name)
+        return True
 
 
-def studies_in(connection: sa.Connection, name: str | None = None) -> list[StoredStudy]:
-    """Return the studies of a database, or the one of a name, the oldest first."""
-    query = sa.select(STUDIES).order_by(STUDIES.c.id)
-    found = []
-    for row in connection.execute(query if name is None else query.where(STUDIES.c.name == name)).all():
-        of_study = sa.select(SETTINGS).where(SETTINGS.c.study_id == row.id).order_by(SETTINGS.c.position)
-        settings = {
-            one.id: Setting(check_label(one.label), one.overrides, one.settings, one.identity, one.varies, one.name)
-            for one in connection.execute(of_study)
-        }
-        wants = sa.select(WANTED).where(WANTED.c.setting_id.in_(settings)).order_by(WANTED.c.position)
-        wanted = tuple(
-            Wanted(settings[one.setting_id], one.task, one.seed, one.repeat) for one in connection.execute(wants)
-        )
-        study = Study(row.name, tuple(settings.values()), wanted, row.kind, **row.about)
-        newest = sa.select(RUNS.c.command).where(RUNS.c.kind == row.kind, RUNS.c.name == row.name)
-        command = connection.scalar(newest.order_by(RUNS.c.started.desc(), RUNS.c.id.desc()))
-        found.append(StoredStudy(connection, study, settings, tuple(command or ())))
-    return found
-
-
-def import_database(results: Database, path: Path, name: str = "") -> tuple[list[str], list[str]]:
-    """Copy the studies of another database -> (their names, lines about those that are left out).
+def episodes_in(connection: sa.Connection, settings: dict[int, Setting]) -> Iterator[ImportedEpisode]:
+    """Yield the episodes of a database's settings.
 
     Args:
-        results: Where they go.
-        path: The other database's file.
-        name: Of the study here; empty: as there.
+        connection: The database.
+        settings: Settings of a study by their ids.
 
     Raises:
-        UsageError: A name for several studies. CheckpointError: The file is damaged, or of a newer kerv.
+        ValueError: The decodes of an episode are damaged or too large.
+    """
+    of_block = BLOCKS.c.id.label("block"), BLOCKS.c.about, BLOCKS.c.run, BLOCKS.c.seeds, BLOCKS.c.code
+    query = (
+        sa.select(WANTED, *(EPISODES.c[name].label(f"row.{name}") for name in _ROW), *of_block, DECODES.c.parquet)
+        .select_from(WANTED.join(EPISODES).join(BLOCKS).join(DECODES, DECODES.c.episode_id == EPISODES.c.id))
+        .where(WANTED.c.setting_id.in_(settings))
+        .order_by(WANTED.c.position)
+    )
+    for row in connection.execution_options(yield_per=100).execute(query).mappings():
+        episode = Episode(settings[row["setting_id"]], row["task"], row["seed"], row["repeat"])
+        values = {name: row[f"row.{name}"] for name in _ROW}
+        decodes = foreign_table(row["parquet"]).cast(DECODE_SCHEMA)
+        yield ImportedEpisode(episode, values, decodes, **{column.name: row[column.name] for column in of_block})
+
+
+def import_database(results: Database, path: Path, name: str, imported: Imported) -> None:
+    """Copy the studies of another database.
+
+    Args:
+        results: Where they are copied to.
+        path: File of the other database.
+        name: Name of the study here. Empty: as there.
+        imported: Notes what was imported.
+
+    Raises:
+        UsageError: `name` is set and there are several studies.
+        CheckpointError: The file is damaged, or from a newer kerv.
     """
     engine = sa.create_engine(
         "sqlite://", creator=lambda: connect_foreign(path, check_same_thread=False), poolclass=sa.pool.NullPool
     )
-    names, notes = [], []
-    try:
-        with engine.connect() as connection:
-            version = int(connection.scalar(sa.select(ABOUT.c.value).where(ABOUT.c.key == "schema_version")) or 0)
-            if version > SCHEMA:
-                raise CheckpointError(
-                    f"{path} is of a newer kerv (schema {version}, this one reads {SCHEMA}): update kerv"
-                )
-            there = studies_in(connection)
-            if name and len(there) != 1:
-                raise UsageError(f"name={name}: {path} holds {len(there)} studies, a name is for one")
-            for one in there:
-                store = StudyStore(results, name or one.study.name, one.study.kind)
-                if take(store, one.study, _told(path, one.episodes()), one.command or ("runs", "import", str(path))):
-                    names.append(store.name)
-                else:
-                    notes.append(left_out(store))
-    except _DAMAGE as error:
-        raise _damaged(path, error) from error
-    return names, notes
+    with _damage(path), engine.connect() as connection:
+        version = int(connection.scalar(sa.select(ABOUT.c.value).where(ABOUT.c.key == "schema_version")) or 0)
+        if version > SCHEMA:
+            raise newer(path, version)
+        rows = connection.execute(sa.select(STUDIES).order_by(STUDIES.c.id)).all()
+        if name and len(rows) != 1:
+            raise UsageError(f"name={name}: {path} holds {len(rows)} studies, a name is for one")
+        for row in rows:
+            study, settings = stored_study(connection, row)
+            store = StudyStore(results, name or study.name, study.kind)
+            command = _command(connection, study) or ("runs", "import", str(path))
+            imported.add(store, study, _checked(path, episodes_in(connection, settings)), command)
 
 
-def _told(path: Path, episodes: Iterator[Foreign]) -> Iterator[Foreign]:
-    """Yield the episodes; an error of reading them names the file that they are from."""
-    try:
+def _command(connection: sa.Connection, study: Study) -> tuple[str, ...]:
+    """Return the words after `kerv` that ran a study last."""
+    newest = sa.select(RUNS.c.command).where(RUNS.c.kind == study.kind, RUNS.c.name == study.name)
+    return tuple(connection.scalar(newest.order_by(RUNS.c.started.desc(), RUNS.c.id.desc())) or ())
+
+
+def _checked(path: Path, episodes: Iterator[ImportedEpisode]) -> Iterator[ImportedEpisode]:
+    with _damage(path):
         yield from episodes
-    except _DAMAGE as error:
-        raise _damaged(path, error) from error
 
 
-def _damaged(path: Path, error: Exception) -> CheckpointError:
-    why = " ".join(str(getattr(error, "orig", error)).split())[:160]
-    why = "reading it takes too long" if why == "interrupted" else why
-    return CheckpointError(f"{path} is damaged or no kerv.db: {why}")
-
-
-def take(store: StudyStore, study: Study, episodes: Iterator[Foreign], command: tuple[str, ...]) -> bool:
-    """Write a study under the store's name -> False if one of that name has episodes already."""
-    was_there = store.is_there
-    if was_there and store.counts()[0]:
-        return False
+@contextlib.contextmanager
+def _damage(path: Path) -> Iterator[None]:
     try:
-        store.add(study, episodes, command)
-    except BaseException:
-        if not was_there:
-            store.remove()
-        raise
-    return True
-
-
-def left_out(store: StudyStore) -> str:
-    """Return the line about a study that `take` refused."""
-    return f"{store.name} is there already and was left out: 'kerv runs rm {store.name}' removes it"
+        yield
+    except _DAMAGE as error:
+        why = " ".join(str(getattr(error, "orig", error)).split())[:160]
+        why = "reading it takes too long" if why == "interrupted" else why
+        raise CheckpointError(f"{path} is damaged or not a kerv.db: {why}") from error
 
 
 def export_database(store: StudyStore, folder: Path) -> Path:
-    """Write a kerv.db with one study into `folder`, in place of an older one -> its file.
+    """Write a kerv.db with one study into a folder and return its file. An older one is replaced.
 
     Raises:
+        UsageError: The folder holds other files.
         StorageError: The disk refused.
     """
 
     def fill(new: Path) -> None:
-        target = Database(new, f"sqlite:///{new.absolute() / FILE}")
+        copy = Database(new, f"sqlite:///{new.absolute() / FILE}")
         with store.database.reading() as connection:
-            (one,) = studies_in(connection, store.name)
-            StudyStore(target, store.name, one.study.kind).add(one.study, one.episodes(), one.command)
-        target.close()
+            row = connection.execute(sa.select(STUDIES).where(STUDIES.c.name == store.name)).one()
+            study, settings = stored_study(connection, row)
+            episodes = episodes_in(connection, settings)
+            StudyStore(copy, study.name, study.kind).add(study, episodes, _command(connection, study))
+        copy.close()
 
     if folder.is_dir() and any(path.name != FILE for path in folder.iterdir()):
         raise UsageError(f"{folder} holds other files: choose another folder with --dir")

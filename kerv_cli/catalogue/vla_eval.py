@@ -1,7 +1,7 @@
-"""Evaluations that vla-eval ran, as a study: a setting per server, whose episodes reports pair.
+"""Imports evaluations that vla-eval ran, as a study with a setting per model server.
 
-A recording is a SQLite file or the aggregate JSON beside it. What kerv served has kerv's decodes too (served.py); of
-other servers success and steps are known, and nothing of their time.
+A recording is a SQLite file. For servers of kerv the decodes are known too (served.py). For other servers success and
+steps are known, but no times.
 """
 
 from __future__ import annotations
@@ -14,37 +14,42 @@ import math
 import re
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import pyarrow as pa
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
-from kerv_cli.base.files import read_json, visible
+from kerv_cli.base.files import visible
 from kerv_cli.base.foreign import foreign_sqlite
-from kerv_cli.base.spaces import ActionSpace, Group
-from kerv_cli.catalogue.served import Served, path_of, read_served
-from kerv_cli.engine.record import UNTIMED, DecodeRecord, EpisodeRecord
+from kerv_cli.catalogue.served import path_of, read_served
 from kerv_cli.episodes.identity import ENGINE, OBSERVATION
-from kerv_cli.episodes.rows import EPISODE_SCHEMA, decodes_table, episode_row
+from kerv_cli.episodes.rows import DECODE_SCHEMA, EPISODE_SCHEMA, INT
 from kerv_cli.episodes.settings import RolloutSettings, settings_from
-from kerv_cli.lab.plan import Setting, Study, Wanted
-from kerv_cli.lab.store import IMPORT, Foreign, StudyStore
+from kerv_cli.lab.plan import Episode, Setting, Study
+from kerv_cli.lab.store import IMPORT, ImportedEpisode, StudyStore
 
-_ELSEWHERE = "elsewhere"
-"""Mode of the one decode that stands for those of a server which is not kerv."""
-_UNKNOWN = ("path_length", "jerk")
-"""Columns of an episode of another server."""
-_ONE = ActionSpace(("x",), (Group("x", 1),), (), 1.0, (-1.0,), (1.0,))
-_WORLD = {"horizon": "horizon", "stress": "stress.kind", "stress_level": "stress.level", "camera": "camera.name"}
-"""Parameter of kerv's own benchmark -> the setting of the world that it is."""
+_UNKNOWN_DECODE = {"index": 0, "step": 0, "mode": "elsewhere", "forwards": 0, "seconds": math.nan, "tokens": [],
+                   "actions": [], "rounds": [], "compensated": 0, "skipped": False}  # fmt: skip
+"""Stands for all decodes of a server that is not kerv's."""
 
 
 @dataclass(frozen=True)
-class Episode:
-    """One recorded episode. seed: its initial state's where the benchmark names it, else its index. reason: why it
-    ended in an error, empty where it did not."""
+class RecordedEpisode:
+    """One episode of a recording.
+
+    Attributes:
+        task: Name of the task.
+        index: Number of the episode within the task.
+        seed: Seed of its initial state if the benchmark names it, else the index.
+        success: Whether the task was solved.
+        steps: Number of control steps. None: unknown.
+        seconds: Wall time.
+        id: The harness's name for it.
+        start: Initial state.
+        reason: Why it ended in an error. Empty: it did not.
+    """
 
     task: str
     index: int
@@ -59,247 +64,283 @@ class Episode:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """One benchmark of a recording. id: the harness's name of it. config: of the benchmark. server: what the model
-    server said of itself. planned: episodes, as far as the recording tells. harness: the program that ran it."""
+    """One benchmark of a recording.
+
+    Attributes:
+        source: The file.
+        id: The harness's name for it.
+        benchmark: Name of the benchmark.
+        config: Settings of the benchmark.
+        server: What the model server said about itself.
+        episodes: Its episodes.
+        planned: Number of episodes that were planned, as far as the recording says.
+        harness: The program that ran it.
+    """
 
     source: Path
     id: str
     benchmark: str
     config: dict[str, Any]
     server: dict[str, Any]
-    episodes: tuple[Episode, ...]
+    episodes: tuple[RecordedEpisode, ...]
     planned: int
     harness: str = "vla-eval"
 
     @property
     def facts(self) -> dict[str, Any]:
-        """`Policy.facts` of kerv's server; empty where another one served."""
+        """`Policy.facts` of a server of kerv. Empty for other servers."""
         return dict(self.server.get("kerv") or {})
 
     @property
     def name(self) -> str:
-        """Its method where kerv served, else its server."""
+        """Method of a server of kerv, else the name of the server."""
         method = self.facts.get("settings", {}).get("method")
         return str(method or self.server.get("model_server") or "server")
 
 
 def read_evaluations(path: Path) -> list[Evaluation]:
-    """The evaluations in a recording of vla-eval or a file of lerobot-eval, or in all of a folder.
+    """Return the evaluations in a recording of vla-eval, or in all recordings of a folder.
 
     Raises:
-        UsageError: nothing is there. CheckpointError: a recording is damaged or cut short.
+        UsageError: There is no recording, or none has an episode.
+        CheckpointError: A recording is damaged or cut short.
     """
-    files = [path]
-    if path.is_dir():
-        recordings = [file for file in visible(path) if file.suffix in (".sqlite", ".json")]
-        files = [f for f in recordings if f.suffix == ".sqlite"]
-        files = files or [f for f in recordings if f.name.endswith("_aggregate.json")]
+    files = [file for file in visible(path) if file.suffix == ".sqlite"] if path.is_dir() else [path]
     if not files or not all(file.is_file() for file in files):
-        raise UsageError(f"{path}: no recording of vla-eval, recording-….sqlite or …_aggregate.json")
-    evaluations = [one for file in files for one in (_from_json if file.suffix == ".json" else _from_sqlite)(file)]
-    if not any(one.episodes for one in evaluations):
+        raise UsageError(f"{path}: no recording of vla-eval, recording-….sqlite")
+    evaluations = [one for file in files for one in _read(file) if one.episodes]
+    if not evaluations:
         raise UsageError(f"{path}: the recording holds no episode")
-    return [one for one in evaluations if one.episodes]
+    return evaluations
 
 
-def _from_sqlite(path: Path) -> list[Evaluation]:
-    with _damage(path), foreign_sqlite(path) as file:
-        return [_of_row(file, path, *row) for row in file.execute("SELECT eval_id, metadata FROM eval_metadata")]
-
-
-def _of_row(file: sqlite3.Connection, path: Path, name: str, metadata: str) -> Evaluation:
-    about = json.loads(metadata)
-    columns = ("task_name", "episode_id", "metrics", "steps", "elapsed_sec", "eid", "context", "failure_reason")
-    # of an episode that ran again the last result counts
-    rows = file.execute(
-        f"SELECT {', '.join(columns)} FROM episode_results WHERE rowid IN (SELECT MAX(rowid) FROM episode_results "
-        "WHERE eval_id = ? GROUP BY task_name, episode_id) ORDER BY rowid",
-        (name,),
-    )
-    episodes = []
-    for row in rows:
-        one = dict(zip(columns, row, strict=True))
-        episodes.append(_episode(one["task_name"], one | {"metrics": json.loads(one["metrics"] or "{}")}))
-    queued = file.execute("SELECT COUNT(*) FROM work_queue WHERE eval_id = ?", (name,)).fetchone()[0]
-    return _evaluation(path, name, about, episodes, queued)
-
-
-def _from_json(path: Path) -> list[Evaluation]:
-    with _damage(path):
-        about = read_json(path)
-        episodes = [_episode(task["task"], one) for task in about["tasks"] for one in task["episodes"]]
-        return [_evaluation(path, str(about.get("eval_id", path.stem)), about, episodes, 0)]
-
-
-def _evaluation(
-    path: Path, name: str, about: Mapping[str, Any], episodes: Sequence[Episode], queued: int
-) -> Evaluation:
-    config, server = dict(about.get("config") or {}), dict(about.get("server_info") or {})
-    each = int(config.get("episodes_per_task") or 0)
-    planned = queued or each * len({one.task for one in episodes})
-    return Evaluation(path, name, str(about["benchmark"]), config, server, tuple(episodes), planned)
-
-
-def _episode(task: Any, one: Mapping[str, Any]) -> Episode:
-    metrics, index = dict(one.get("metrics") or {}), int(one["episode_id"])
-    return Episode(
-        task=" ".join(str(task or "unknown").split())[:200],
-        index=index,
-        seed=int(metrics.get("seed", index)),
-        success=bool(metrics.get("success")),
-        steps=int(one.get("steps") or 0),
-        seconds=float(one.get("elapsed_sec") or 0.0),
-        id=str(one.get("eid", "")),
-        start=tuple(float(x) for x in metrics.get("initial_state") or (index,)),
-        reason=str(one.get("failure_reason") or ""),
-    )
-
-
-@contextlib.contextmanager
-def _damage(path: Path) -> Iterator[None]:
+def _read(path: Path) -> list[Evaluation]:
     try:
-        yield
+        with foreign_sqlite(path) as file:
+            return [
+                _evaluation(file, path, *row) for row in file.execute("SELECT eval_id, metadata FROM eval_metadata")
+            ]
     except (sqlite3.Error, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         why = " ".join(f"{type(error).__name__} {error}".split())[:120]
         raise CheckpointError(f"{path} is damaged, cut short or no recording of vla-eval ({why})") from error
 
 
+def _evaluation(file: sqlite3.Connection, path: Path, name: str, metadata: str) -> Evaluation:
+    about = json.loads(metadata)
+    config, server = dict(about.get("config") or {}), dict(about.get("server_info") or {})
+    # the last result of an episode that ran again counts
+    rows = file.execute(
+        "SELECT task_name, episode_id, metrics, steps, elapsed_sec, eid, failure_reason FROM episode_results "
+        "WHERE rowid IN (SELECT MAX(rowid) FROM episode_results WHERE eval_id = ? GROUP BY task_name, episode_id) "
+        "ORDER BY rowid",
+        (name,),
+    )
+    episodes = tuple(_episode(*row) for row in rows)
+    (queued,) = file.execute("SELECT COUNT(*) FROM work_queue WHERE eval_id = ?", (name,)).fetchone()
+    each = int(config.get("episodes_per_task") or 0)
+    planned = queued or each * len({one.task for one in episodes})
+    return Evaluation(path, name, str(about["benchmark"]), config, server, episodes, planned)
+
+
+def _episode(
+    task: Any, episode_id: Any, metrics: Any, steps: Any, seconds: Any, eid: Any, reason: Any
+) -> RecordedEpisode:
+    measured, index = dict(json.loads(metrics or "{}")), int(episode_id)
+    return RecordedEpisode(
+        task=" ".join(str(task or "unknown").split())[:200],
+        index=index,
+        seed=int(measured.get("seed", index)),
+        success=bool(measured.get("success")),
+        steps=int(steps or 0),
+        seconds=float(seconds or 0.0),
+        id=str(eid or ""),
+        start=tuple(float(x) for x in measured.get("initial_state") or (index,)),
+        reason=str(reason or ""),
+    )
+
+
 @dataclass
-class Side:
-    """A setting of the study: the evaluations of one server."""
+class Server:
+    """The evaluations of one model server, which are one setting of the study."""
 
     label: str
-    evaluations: list[Evaluation] = field(default_factory=list)
+    evaluations: list[Evaluation]
 
-    def takes(self, one: Evaluation) -> bool:
-        """Whether an evaluation of another benchmark is of the same server."""
-        servers = [(each.name, each.facts, each.server.get("action_spec")) for each in (self.evaluations[0], one)]
-        return servers[0] == servers[1] and one.benchmark not in {other.benchmark for other in self.evaluations}
+    def ran(self, one: Evaluation) -> bool:
+        """Return whether the same server ran this evaluation of another benchmark."""
+        first = self.evaluations[0]
+        is_same = all(getattr(first, name) == getattr(one, name) for name in ("name", "facts")) and first.server.get(
+            "action_spec"
+        ) == one.server.get("action_spec")
+        return is_same and one.benchmark not in {other.benchmark for other in self.evaluations}
 
 
-def sides_of(recordings: Sequence[Sequence[Evaluation]], labels: Sequence[str] = ()) -> list[Side]:
-    """A side per server. recordings: the evaluations of each that was named. labels: of each recording.
+def by_server(recordings: Sequence[Sequence[Evaluation]], labels: Sequence[str] = ()) -> list[Server]:
+    """Group evaluations by their model server.
+
+    Args:
+        recordings: The evaluations of each recording.
+        labels: A label for each recording. Empty: names of the servers.
 
     Raises:
-        UsageError: another number of labels, or evaluations of other episodes.
+        UsageError: The number of labels is wrong, or the evaluations have different episodes.
     """
     if labels and (len(labels) != len(recordings) or len(set(labels)) < len(labels)):
-        raise UsageError(f"labels={','.join(labels)}: one for each of the {len(recordings)} recordings is wanted")
-    sides: list[Side] = []
+        raise UsageError(
+            f"labels={','.join(labels)}: write a different one for each of the {len(recordings)} recordings"
+        )
+    servers: list[Server] = []
     for number, evaluations in enumerate(recordings):
         for one in evaluations:
             name = labels[number] if labels else one.name
-            side = next((s for s in sides if (s.label == name if labels else s.takes(one))), None)
-            if side is None:
-                taken = {other.label for other in sides}
-                free = (label for label in (name, *(f"{name}-{n}" for n in range(2, 10_000))) if label not in taken)
-                sides.append(side := Side(next(free)))
-            side.evaluations.append(one)
-    for side in sides[1:]:
-        _check_same_episodes(sides[0], side)
-    return sides
+            server = next((s for s in servers if (s.label == name if labels else s.ran(one))), None)
+            if server is None:
+                taken = {other.label for other in servers}
+                label = next(n for n in (name, *(f"{name}-{i}" for i in range(2, 10_000))) if n not in taken)
+                servers.append(Server(label, [one]))
+            else:
+                server.evaluations.append(one)
+    for server in servers[1:]:
+        _check_same_episodes(servers[0], server)
+    return servers
 
 
-def _check_same_episodes(first: Side, other: Side) -> None:
-    by_name = {one.benchmark: one for one in first.evaluations}
-    shared = [(by_name[one.benchmark], one) for one in other.evaluations if one.benchmark in by_name]
-    if not shared:
-        names = (", ".join(one.benchmark for one in side.evaluations) for side in (first, other))
-        raise UsageError(f"{first.label} and {other.label} are of other benchmarks: {' and '.join(names)}")
-    for a, b in shared:
+def _check_same_episodes(first: Server, other: Server) -> None:
+    pairs = [(a, b) for a in first.evaluations for b in other.evaluations if a.benchmark == b.benchmark]
+    if not pairs:
+        names = (", ".join(one.benchmark for one in server.evaluations) for server in (first, other))
+        raise UsageError(f"{first.label} and {other.label} have different benchmarks: {' and '.join(names)}")
+    for a, b in pairs:
         left, right = _conditions(a.config), _conditions(b.config)
         for key in sorted(left.keys() | right.keys()):
             if left.get(key) != right.get(key):
                 raise UsageError(
-                    f"{first.label} and {other.label} are of other episodes of {a.benchmark}: {key} is "
+                    f"{first.label} and {other.label} have different episodes of {a.benchmark}: {key} is "
                     f"{left.get(key)} and {right.get(key)}"
                 )
-    episodes = [{(a.benchmark, one.task, one.seed) for one in a.episodes} for a, _ in shared]
-    if not set().union(*episodes) & {(b.benchmark, one.task, one.seed) for _, b in shared for one in b.episodes}:
+    if not any(
+        {(one.task, one.seed) for one in a.episodes} & {(one.task, one.seed) for one in b.episodes} for a, b in pairs
+    ):
         raise UsageError(f"{first.label} and {other.label} have no episode in common: neither task nor seed agree")
 
 
 def _conditions(config: Mapping[str, Any]) -> dict[str, Any]:
-    """What decides which world an evaluation ran in."""
+    """Return the settings of a benchmark that determine its world."""
     params = {f"params.{key}": value for key, value in dict(config.get("params") or {}).items()}
     return {key: config.get(key) for key in ("benchmark", "mode", "max_steps")} | params
 
 
-def write_study(results: Path, name: str, sides: Sequence[Side], baseline: str, words: Sequence[str]) -> list[str]:
-    """Write the study of these sides -> lines about what is missing.
+def write_study(results: Path, name: str, servers: Sequence[Server], baseline: str, words: Sequence[str]) -> list[str]:
+    """Write the evaluations of these servers as a study.
 
     Args:
         results: The results folder.
-        name: Of the study.
-        sides: A setting each.
-        baseline: Its label; empty: ar, else the first.
-        words: The command, after `kerv`.
+        name: Name of the study.
+        servers: A setting each.
+        baseline: Label of the baseline. Empty: ar, else the first.
+        words: Words after `kerv` of the command.
+
+    Returns:
+        Lines about missing episodes.
 
     Raises:
-        UsageError: A study of that name is there that was not imported, or no such label. StorageError: The disk
-            refused. CheckpointError: A served episode is damaged.
+        UsageError: Another study has the name, or there is no such label.
+        StorageError: The disk refused.
+        CheckpointError: A served episode is damaged.
     """
     store = StudyStore(results, name)
-    if store.is_there and store.kind != IMPORT:
-        raise UsageError(f"study '{name}' is there and was not imported: choose another with name=")
-    labels = [side.label for side in sides]
+    if store.exists and store.kind != IMPORT:
+        raise UsageError(f"study '{name}' exists and was not imported: choose another with name=")
+    labels = [server.label for server in servers]
     baseline = baseline or ("ar" if "ar" in labels else labels[0])
     if baseline not in labels:
         raise UsageError(f"baseline={baseline}: the recordings are of {', '.join(labels)}")
-    benchmarks = list(dict.fromkeys(one.benchmark for side in sides for one in side.evaluations))
-    settings = {side.label: Setting(side.label, "", _settings(side), _identity(side)) for side in sides}
-    planned = [one for side in sides for one in _planned(side, settings[side.label], len(benchmarks) > 1)]
-    notes = [line for side in sides for one in side.evaluations for line in _notes(side.label, one)]
-    harnesses = dict.fromkeys(one.harness for side in sides for one in side.evaluations)
-    title = f"{', '.join(harnesses)}: {', '.join(benchmarks)}"
-    wanted = tuple(one for one, _, _ in planned)
-    study = Study(name, tuple(settings.values()), wanted, IMPORT, title, baseline, note="; ".join(notes))
-    foreign = (
-        _foreign(want, one, episode, _served(results, one, episode))
-        for want, one, episode in planned
-        if episode is not None
+    evaluations = [(server, one) for server in servers for one in server.evaluations]
+    benchmarks = list(dict.fromkeys(one.benchmark for _, one in evaluations))
+    settings = {server.label: Setting(server.label, "", _settings(server), _identity(server)) for server in servers}
+    episodes = {
+        episode: (one, recorded)
+        for server, one in evaluations
+        for episode, recorded in _episodes(settings[server.label], one, len(benchmarks) > 1)
+    }
+    notes = [line for server, one in evaluations for line in _notes(server.label, one)]
+    title = f"{', '.join(dict.fromkeys(one.harness for _, one in evaluations))}: {', '.join(benchmarks)}"
+    study = Study(name, tuple(settings.values()), tuple(episodes), IMPORT, title, baseline, note="; ".join(notes))
+    existing = (
+        _imported(results, episode, one, recorded)
+        for episode, (one, recorded) in episodes.items()
+        if recorded is not None
     )
-    StudyStore(results, name, IMPORT).add(study, foreign, words)
+    StudyStore(results, name, IMPORT).add(study, existing, words)
     return notes
 
 
-def _planned(side: Side, setting: Setting, several: bool) -> Iterator[tuple[Wanted, Evaluation, Episode | None]]:
-    """Yield what the side wants, each with its episode; without one, it is missing.
-
-    several: the study is of several benchmarks.
-    """
-    for one in side.evaluations:
-        tasks: dict[str, list[Episode]] = {}
-        for episode in one.episodes:
-            tasks.setdefault(episode.task, []).append(episode)
-        each = int(one.config.get("episodes_per_task") or 0)
-        for task, episodes in tasks.items():
-            good = {e.seed: e for e in sorted(episodes, key=lambda e: e.seed) if not e.reason}
-            offset = episodes[0].seed - episodes[0].index if not episodes[0].reason else 0
-            name = f"{one.benchmark}: {task}" if several else task
-            for seed in dict.fromkeys([*good, *(i + offset for i in range(each))]):
-                yield Wanted(setting, name, seed), one, good.get(seed)
+def _episodes(
+    setting: Setting, one: Evaluation, names_benchmark: bool
+) -> Iterator[tuple[Episode, RecordedEpisode | None]]:
+    """Yield the episodes of an evaluation. None: it is missing or ended in an error."""
+    each = int(one.config.get("episodes_per_task") or 0)
+    for task in dict.fromkeys(episode.task for episode in one.episodes):
+        episodes = [episode for episode in one.episodes if episode.task == task]
+        good = {e.seed: e for e in sorted(episodes, key=lambda e: e.seed) if not e.reason}
+        offset = episodes[0].seed - episodes[0].index if not episodes[0].reason else 0
+        name = f"{one.benchmark}: {task}" if names_benchmark else task
+        for seed in dict.fromkeys([*good, *(i + offset for i in range(each))]):
+            yield Episode(setting, name, seed), good.get(seed)
 
 
 def _notes(label: str, one: Evaluation) -> Iterator[str]:
-    """Lines about episodes that failed or are missing."""
-    failed = [episode for episode in one.episodes if episode.reason]
-    if failed:
-        reasons = ", ".join(sorted({episode.reason for episode in failed}))
-        yield f"{label}: {len(failed)} episodes ended in an error ({reasons}) and are left out"
-    lost = one.planned - len(one.episodes)
-    if lost > 0:
-        yield f"{label}: {lost} of {one.planned} episodes of {one.benchmark} are missing"
+    reasons = [episode.reason for episode in one.episodes if episode.reason]
+    if reasons:
+        why = ", ".join(sorted(set(reasons)))
+        yield f"{label}: {len(reasons)} episodes ended in an error ({why}) and are left out"
+    missing = one.planned - len(one.episodes)
+    if missing > 0:
+        yield f"{label}: {missing} of {one.planned} episodes of {one.benchmark} are missing"
 
 
-def _served(results: Path, one: Evaluation, episode: Episode) -> Served | None:
-    path = path_of(results, one.id, episode.id) if one.facts else None
-    return read_served(path) if path is not None else None
+def _settings(server: Server) -> dict[str, Any]:
+    """Return RolloutSettings that say what ran: those of a server of kerv, else defaults with the server's name."""
+    first = server.evaluations[0]
+    stored = first.facts.get("settings")
+    plain = dataclasses.asdict(RolloutSettings()) | {"method": first.name}
+    if isinstance(stored, dict):
+        plain |= stored
+        with contextlib.suppress(KervError):  # a part that is not registered here
+            plain = dataclasses.asdict(settings_from(stored))
+    if str(first.config.get("benchmark", "")).startswith("kerv_cli."):
+        params, world = dict(first.config.get("params") or {}), plain["world"]
+        world["horizon"] = params.get("horizon", world["horizon"])
+        world["stress"]["kind"] = params.get("stress", world["stress"]["kind"])
+        world["stress"]["level"] = params.get("stress_level", world["stress"]["level"])
+        world["camera"]["name"] = params.get("camera", world["camera"]["name"])
+    return plain
 
 
-def _about(one: Evaluation) -> dict[str, Any]:
-    """Return the provenance of an evaluation's episodes."""
-    return {
+def _identity(server: Server) -> dict[str, str]:
+    """Return hashes of the weights, and of what was recorded: a rollout never reuses an imported episode."""
+    recorded = [[one.id, [dataclasses.astuple(e) for e in one.episodes]] for one in server.evaluations]
+    digest = hashlib.sha256(json.dumps(recorded, sort_keys=True).encode()).hexdigest()
+    hashes = {str(k): str(v) for k, v in dict(server.evaluations[0].facts.get("identity") or {}).items()}
+    return {"target": "", **hashes, "evaluation": digest, OBSERVATION: "of the benchmark"}
+
+
+def _imported(results: Path, episode: Episode, one: Evaluation, recorded: RecordedEpisode) -> ImportedEpisode:
+    """Return an episode for the database, with its decodes if kerv served it.
+
+    The evaluations did not take turns, so each is a block of its own.
+    """
+    path = path_of(results, one.id, recorded.id) if one.facts else None
+    served = read_served(path) if path is not None else None
+    row: dict[str, Any] = {"success": recorded.success, "steps": recorded.steps}
+    row |= {"initial_state": list(recorded.start), "wall_seconds": recorded.seconds}
+    if served is not None:
+        row = {name: served.episode.get(name) for name in (*EPISODE_SCHEMA.names, "started")} | row
+        decodes = served.decodes
+    else:
+        row = {column.name: 0 for column in EPISODE_SCHEMA if column.type == INT} | {"decodes": 1} | row
+        decodes = pa.Table.from_pylist([_UNKNOWN_DECODE], schema=DECODE_SCHEMA)
+    about = {
         "device_name": "",
         **dict(one.facts.get("machine") or {}),
         "workers": 1,
@@ -309,63 +350,10 @@ def _about(one: Evaluation) -> dict[str, Any]:
         "harness_version": one.server.get("harness_version", ""),
         "imported": {"source": one.source.name, "evaluation": one.id, "config": one.config},
     }
+    return ImportedEpisode(episode, row, decodes, f"{one.id} {episode.setting.label}", about)
 
 
-def _settings(side: Side) -> dict[str, Any]:
-    """Plain settings of a rollout that say what ran: those of kerv's server, else defaults with the server's name."""
-    first = side.evaluations[0]
-    stored = first.facts.get("settings")
-    plain = dataclasses.asdict(RolloutSettings()) | {"method": first.name}
-    if isinstance(stored, dict):
-        try:
-            plain = dataclasses.asdict(settings_from(stored))
-        except KervError:  # a part that is not registered here
-            plain |= stored
-    if str(first.config.get("benchmark", "")).startswith("kerv_cli."):
-        params = dict(first.config.get("params") or {})
-        for name, key in _WORLD.items():
-            at, last = plain["world"], key.split(".")
-            for part in last[:-1]:
-                at = at[part]
-            at[last[-1]] = params.get(name, at[last[-1]])
-    return dict(plain)
-
-
-def _identity(side: Side) -> dict[str, str]:
-    """Hashes of the weights where kerv served, and of what was recorded: no rollout means the same."""
-    recorded = [[one.id, [dataclasses.astuple(e) for e in one.episodes]] for one in side.evaluations]
-    digest = hashlib.sha256(json.dumps(recorded, sort_keys=True).encode()).hexdigest()
-    hashes = {str(k): str(v) for k, v in dict(side.evaluations[0].facts.get("identity") or {}).items()}
-    return {"target": "", **hashes, "evaluation": digest, OBSERVATION: "of the benchmark"}
-
-
-def _foreign(wanted: Wanted, one: Evaluation, episode: Episode, served: Served | None) -> Foreign:
-    """Return an episode for the database.
-
-    Success and steps are the harness's. Its evaluations did not take turns, so each is a block of its own.
-    """
-    if served is None:
-        record = _bare(wanted, episode)
-        row, decodes = episode_row(record) | dict.fromkeys(_UNKNOWN), decodes_table(record)
-    else:
-        names = (*EPISODE_SCHEMA.names, "started")
-        row, decodes = {name: served.episode.get(name) for name in names}, served.decodes
-    here: dict[str, Any] = {"success": episode.success, "steps": episode.steps}
-    here |= {"initial_state": list(episode.start), "wall_seconds": episode.seconds}
-    return Foreign(wanted, row | here, decodes, f"{one.id} {wanted.setting.label}", _about(one))
-
-
-def _bare(wanted: Wanted, episode: Episode) -> EpisodeRecord:
-    """An episode of which no decode is known."""
-    decode = DecodeRecord((), np.zeros((0, 1), np.float32), 0, (), _ELSEWHERE, math.nan, dict(UNTIMED))
-    nothing = np.zeros((0, 1), np.float32)
-    return EpisodeRecord(
-        *("none", _ONE, wanted.task, "", episode.seed, episode.success, episode.steps or 0, (decode,), (0,)),
-        *(nothing, np.zeros((1, 3), np.float32), np.ones(1, np.float32), np.zeros(0)),
-    )
-
-
-def study_name(sides: Sequence[Side]) -> str:
-    """The study's name where none is given: that of the benchmarks."""
-    names = dict.fromkeys(one.benchmark for side in sides for one in side.evaluations)
+def study_name(servers: Sequence[Server]) -> str:
+    """Return a name for the study: that of its benchmarks."""
+    names = dict.fromkeys(one.benchmark for server in servers for one in server.evaluations)
     return re.sub(r"\W+", "_", "-".join(names))[:80].strip("_") or "imported"

@@ -134,7 +134,7 @@ def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json
     with making(settings.results, "certificate", folder):
         if run_study(resolved, planned).failed:
             raise typer.Exit(1)
-        certificate = certify(resolved, planned.store, planned.study.wanted, settings.margin, settings.delta)
+        certificate = certify(resolved, planned.store, planned.study.episodes, settings.margin, settings.delta)
         path = write(folder, certificate)
     rows = candidate_rows(certificate)
     if as_json:

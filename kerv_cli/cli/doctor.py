@@ -178,7 +178,7 @@ def _database(settings: DoctorSettings) -> str:
     database = Database(settings.results)
     rows = len(run_rows(database))
     what = "PostgreSQL" if database.file is None else "SQLite"
-    says = f"{rows} commands in it" if database.is_there else "made by the first command that needs it"
+    says = f"{rows} commands in it" if database.exists else "made by the first command that needs it"
     return f"{what}, {database.shown}: {says}"
 
 

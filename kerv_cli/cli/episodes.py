@@ -13,8 +13,9 @@ from kerv_cli.cli.common import at_work, console, print_json, print_notes, print
 if TYPE_CHECKING:
     from kerv_cli.episodes.resolve import ResolvedStudy
     from kerv_cli.lab.events import Outcome
-    from kerv_cli.lab.plan import Wanted
-    from kerv_cli.lab.study import Judge, Plan
+    from kerv_cli.lab.plan import Episode
+    from kerv_cli.lab.store import Plan
+    from kerv_cli.lab.study import InterimAnalysis
 
 SECONDS_PER_EPISODE = 1.0
 """Before anything was measured; MT10 on one core takes 0.5 to 1.5."""
@@ -51,8 +52,8 @@ def planned_rollout(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
 
         planned = plan_rollout(resolved, command)
     _warn_of_unseen(resolved)
-    if planned.there:
-        there, wanted = len(planned.there), len(planned.study.wanted)
+    if planned.existing:
+        there, wanted = len(planned.existing), len(planned.study.episodes)
         typer.echo(f"resuming {planned.store.name}: {there} of {wanted} episodes are there", err=True)
     return planned
 
@@ -93,18 +94,23 @@ def print_study_plan(planned: Plan, as_json: bool) -> None:
     from kerv_cli.lab.plan import seeds_text
     from kerv_cli.lab.study import estimate
 
-    by_label: dict[str, list[Wanted]] = {label: [] for label in planned.study.labels}
-    for one in planned.study.wanted:
+    by_label: dict[str, list[Episode]] = {label: [] for label in planned.study.labels}
+    for one in planned.study.episodes:
         by_label[one.setting.label].append(one)
     columns = ("setting", "to run", "reused", "tasks", "seeds", "repeats", "why")
     rows = []
     for label, wanted in by_label.items():
-        to_run = [one for one in wanted if one in planned.reasons]
+        to_run = [one for one in wanted if one in planned.missing]
         tasks, repeats = len({one.task for one in wanted}), len({one.repeat for one in wanted})
-        why = "; ".join(dict.fromkeys(planned.reasons[one] for one in to_run))
+        why = "; ".join(dict.fromkeys(planned.missing[one] for one in to_run))
         seeds = seeds_text(one.seed for one in wanted)
         rows.append((label, len(to_run), len(wanted) - len(to_run), tasks, seeds, repeats, why))
-    store, time, to_run, reused = planned.store, estimate(planned, SECONDS_PER_EPISODE), planned.to_run, planned.there
+    store, time, to_run, reused = (
+        planned.store,
+        estimate(planned, SECONDS_PER_EPISODE),
+        planned.to_run,
+        planned.existing,
+    )
     if as_json:
         settings = [dict(zip(columns, row, strict=True)) for row in rows]
         print_json({"study": store.name, "folder": store.root, "settings": settings, "to run": len(to_run),
@@ -120,24 +126,23 @@ def run_study(resolved: ResolvedStudy, planned: Plan) -> Outcome:
     Raises:
         Interrupted: Ctrl-C. KervError: As `study.run`.
     """
-    from kerv_cli.lab.study import looks_of
-    from kerv_cli.report.decide import confidence_of_a_look
-    from kerv_cli.report.decide import judge as judge_by
+    from kerv_cli.lab.plan import seed_blocks
+    from kerv_cli.report.decide import confidence_of_a_look, judge
     from kerv_cli.report.verdict import stopping_rule
 
-    judge = None
+    analysis = None
     if resolved.sweep.until == "decided":
-        loss, looks = resolved.sweep.loss, len(looks_of(planned.study))
+        loss, looks = resolved.sweep.loss, len(seed_blocks(planned.study))
         typer.echo(stopping_rule(loss, looks, confidence_of_a_look(looks)), err=True)
-        judge = judge_by(loss, lambda line: typer.echo(line, err=True))
-    return run_planned(planned, judge)
+        analysis = judge(loss, lambda line: typer.echo(line, err=True))
+    return run_planned(planned, analysis)
 
 
-def run_planned(planned: Plan, judge: Judge | None = None) -> Outcome:
+def run_planned(planned: Plan, analysis: InterimAnalysis | None = None) -> Outcome:
     """Run what a plan lacks, with progress; see `study.run`."""
     from kerv_cli.cli.progress import ProgressDisplay
     from kerv_cli.lab.study import run
     from kerv_cli.report.viewing import save_recording
 
     with ProgressDisplay(console(stderr=True)) as display:
-        return run(planned, display, save=save_recording, on_step=display.on_step, judge=judge)
+        return run(planned, display, save=save_recording, on_step=display.on_step, analysis=analysis)

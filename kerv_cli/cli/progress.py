@@ -59,8 +59,8 @@ class ProgressDisplay:
         elif isinstance(event, BlockWaits):
             self._print(f"{event.block.name}: another sweep computes it")
         elif isinstance(event, SettingFailed):
-            one = event.wanted[0]
-            self._ended += len(event.wanted)
+            one = event.episodes[0]
+            self._ended += len(event.episodes)
             self._print(f"{escape(one.setting.label)} on {one.task}: [red]failed[/red]: {escape(event.reason)}")
         else:
             self._finish(event)
@@ -75,7 +75,7 @@ class ProgressDisplay:
 
     def _finish(self, end: EpisodeEnd) -> None:
         self._ended, self._part = self._ended + 1, 0.0
-        one = end.wanted
+        one = end.episode
         what = f"{escape(one.setting.label)} on {one.task}, seed {one.seed}"
         if end.elsewhere:
             self._print(f"{what}: run by another sweep")

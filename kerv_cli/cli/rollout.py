@@ -56,7 +56,7 @@ def rollout(
     planned = planned_rollout(resolved, ["rollout", *(["-m"] if multirun else []), *words])
     if plan:
         names = ", ".join(f"{label}{_stressed(asdict(settings))}" for label, settings in resolved.settings.items())
-        total, tasks = len(planned.study.wanted), resolved.tasks
+        total, tasks = len(planned.study.episodes), resolved.tasks
         if as_json:
             print_json({"settings": list(resolved.settings), "tasks": tasks, "episodes": total, "seconds": 3 * total})
         else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -97,14 +97,14 @@ def _entry_row(run: RunEntry) -> dict[str, object]:
 @_command_on_runs("show", "kerv runs show last", "kerv runs show main --json")
 def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Show one run, ID or ID:SETTING: its command and figures, what it was made from, where it lies."""
-    from kerv_cli.catalogue.entries import command_of, disk_bytes, find_runs, parents, store_of
+    from kerv_cli.catalogue.entries import disk_bytes, find_runs, parents, store_of
     from kerv_cli.report.compare import sides
     from kerv_cli.report.summary import SummaryTable
     from kerv_cli.report.tables import load_study, rows_of
 
     results, (name,) = settings.results, _run_names(names)
     chosen = sides(results, name)
-    run = replace(chosen[0].run, command=command_of(chosen[0].run))
+    run = chosen[0].run
     table = load_study(store_of(run)).table if run.has_episodes and run.episodes else None
     if table is not None:
         table = table[table["label"].isin([side.label for side in chosen])]
@@ -249,7 +249,7 @@ def export(
 @command(
     "runs import",
     ImportSettings,
-    names="NAME: a results folder of kerv 0.1.0, a kerv.db, vla-eval's recording-….sqlite or …_aggregate.json, "
+    names="NAME: a results folder of kerv 0.1.0, a kerv.db, vla-eval's recording-….sqlite, "
     "lerobot's eval_info.json, or folders that hold one.",
     keys="name baseline labels results",
     examples=(
@@ -274,11 +274,11 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
     if folders:
         if len(folders) < len(paths):
             raise UsageError("import results folders and evaluations one after the other")
-        studies, notes = import_results(Database(results), folders, settings.name)
+        imported = import_results(Database(results), folders, settings.name)
         if as_json:
-            print_json({"studies": studies, "notes": notes})
+            print_json({"studies": imported.names, "notes": imported.notes})
             return
-        for line in [*notes, f"imported {', '.join(studies) or 'nothing'}: kerv runs list"]:
+        for line in [*imported.notes, f"imported {', '.join(imported.names) or 'nothing'}: kerv runs list"]:
             typer.echo(line)
         return
     words = ["runs", "import", *names]

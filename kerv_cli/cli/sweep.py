@@ -23,7 +23,7 @@ from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 if TYPE_CHECKING:
     from kerv_cli.episodes.resolve import ResolvedStudy
     from kerv_cli.lab.events import Outcome
-    from kerv_cli.lab.study import Plan
+    from kerv_cli.lab.store import Plan
 
 
 @command(
@@ -82,7 +82,7 @@ def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, planned: Plan, as_
 
     store, there = planned.store, [*outcome.done, *outcome.reused]
     data = load_study(store, there) if there else None
-    failed = [one for failure in outcome.failed for one in failure.wanted]
+    failed = [one for failure in outcome.failed for one in failure.episodes]
     counts = {"run": len(outcome.done), "reused": len(outcome.reused), "failed": len(failed)}
     if as_json:
         rows = [] if data is None else rows_of(data.table)
@@ -101,9 +101,9 @@ def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, planned: Plan, as_
                 from kerv_cli.report.report import write_study
 
                 # the study may hold tasks of other sweeps
-                is_whole = store.counts()[1] == len(data.study.wanted)
+                is_whole = store.counts()[1] == len(data.study.episodes)
                 write_study(store, data if is_whole else load_study(store), resolved.sweep.loss)
             print_verdict(data.table, store, resolved.sweep.loss)
     for failure in outcome.failed:
-        one = failure.wanted[0]
+        one = failure.episodes[0]
         typer.echo(f"kerv: {one.setting.label} on {one.task}: {failure.reason}", err=True)

@@ -1,7 +1,7 @@
-"""The database of a results folder: runs, studies, episodes and curves as rows (docs/formats.md).
+"""The database of a results folder: tables of runs, studies, episodes and curves (docs/formats.md).
 
-By default it is SQLite in `<results>/kerv.db`. `store=postgresql://USER@HOST/DB`, or the variable KERV_STORE, puts the
-same tables on a server. The process that starts a command writes; its workers hand their episodes back to it.
+The default is SQLite in `<results>/kerv.db`. `store=postgresql://USER@HOST/DB` or the variable KERV_STORE puts the same
+tables on a server. Only the process of a command writes. Its workers send their episodes to it.
 """
 
 from __future__ import annotations
@@ -10,8 +10,6 @@ import contextlib
 import functools
 import os
 import secrets
-import socket
-import time
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,23 +19,15 @@ import sqlalchemy as sa
 
 from kerv_cli.base.errors import CheckpointError, KervError, StorageError, UsageError
 from kerv_cli.base.files import storage_errors
-from kerv_cli.base.leftovers import is_alive
 from kerv_cli.base.places import STORE, results_dir
 
-VARIABLE = STORE
 FILE = "kerv.db"
 SCHEMA = 1
-"""Version of the tables. A change of them raises it and adds the statements to MIGRATIONS."""
+"""Version of the tables. Raise it with every change of them, and add the statements to MIGRATIONS."""
 MIGRATIONS: dict[int, Sequence[str]] = {}
-"""Version -> statements that turn its tables into those of the next one."""
-STALE_SECONDS = 900.0
-"""A process of another machine counts as dead after this many seconds without a heartbeat."""
+"""Version -> statements that turn its tables into those of the next version."""
 LOCK_SECONDS = 60
-"""A process waits at most this long for another one's transaction."""
-BEAT_SECONDS = 5.0
-"""At least this many seconds pass between two heartbeats of a run."""
-
-RUNNING, COMPLETE, FAILED, INTERRUPTED = "running", "complete", "failed", "interrupted"
+"""Longest time to wait for another process's transaction."""
 
 _META = sa.MetaData()
 _JSON = sa.JSON(none_as_null=True)
@@ -48,7 +38,7 @@ def _table(name: str, *columns: sa.schema.SchemaItem) -> sa.Table:
 
 
 def _to(name: str, column: str, **options: Any) -> sa.Column[Any]:
-    """Return a column with a foreign key that goes with its row."""
+    """Return a column that refers to another row, and is deleted with it."""
     return sa.Column(name, sa.ForeignKey(column, ondelete="CASCADE"), **options)
 
 
@@ -58,7 +48,7 @@ RUNS = _table(
     sa.Column("id", sa.Text, primary_key=True),
     sa.Column("kind", sa.Text, nullable=False),  # sweep, rollout, import, or a kind of artifact
     sa.Column("name", sa.Text, nullable=False),  # of the study or the artifact
-    sa.Column("command", _JSON, nullable=False),  # the words after `kerv`
+    sa.Column("command", _JSON, nullable=False),  # words after `kerv`
     sa.Column("status", sa.Text, nullable=False),
     sa.Column("done", sa.Integer, nullable=False, default=0),
     sa.Column("total", sa.Integer, nullable=False, default=0),
@@ -80,14 +70,14 @@ STUDIES = _table(
     sa.Column("about", _JSON, nullable=False),  # title, baseline, axis, note, block
 )
 SETTINGS = _table(
-    "settings",  # what a study compares
+    "settings",  # a row of a study's table
     sa.Column("id", sa.Integer, primary_key=True),
     _to("study_id", "studies.id", nullable=False, index=True),
     sa.Column("position", sa.Integer, nullable=False),
     sa.Column("label", sa.Text, nullable=False),
-    sa.Column("name", sa.Text, nullable=False),  # what the settings of a grid share
+    sa.Column("name", sa.Text, nullable=False),  # shared by the settings of a grid
     sa.Column("method", sa.Text, nullable=False),
-    sa.Column("varies", _JSON, nullable=False),  # key -> value of a grid
+    sa.Column("varies", _JSON, nullable=False),  # key -> value in a grid
     sa.Column("overrides", sa.Text, nullable=False),
     sa.Column("work", sa.Text, nullable=False, index=True),  # hash of what determines a result
     sa.Column("settings", _JSON, nullable=False),
@@ -98,10 +88,10 @@ BLOCKS = _table(
     "blocks",  # one attempt to run some episodes in one process, in which settings take turns
     sa.Column("id", sa.Text, primary_key=True),
     sa.Column("run", sa.Text, nullable=False),
-    sa.Column("claim", sa.Text),  # JSON: the study and its episodes; null once it has ended
+    sa.Column("claim", sa.Text),  # JSON: the episodes of the study that it runs; null when it has ended
     sa.Column("seeds", sa.Text, nullable=False),
     sa.Column("started", sa.Text, nullable=False),
-    sa.Column("code", sa.Text, nullable=False),  # hash of the source; decides nothing
+    sa.Column("code", sa.Text, nullable=False),  # hash of the source code
     sa.Column("about", _JSON, nullable=False),  # machine, versions, commit, executor, workers
 )
 _CLAIMED = BLOCKS.c.claim.is_not(None)
@@ -124,26 +114,26 @@ EPISODES = _table(
     sa.Column("seed", sa.BigInteger, nullable=False),
     sa.Column("repeat", sa.Integer, nullable=False),
     sa.Column("block", sa.ForeignKey("blocks.id"), nullable=False),
-    sa.Column("order", sa.Integer, nullable=False),  # episodes that the block ran before it
+    sa.Column("order", sa.Integer, nullable=False),  # number of episodes that the block ran before it
     sa.Column("started", sa.Text, nullable=False),
     sa.Column("worker_pid", sa.Integer),
     *MEASURES,
     sa.Column("decode_seconds", sa.LargeBinary, nullable=False),  # (decodes,) little-endian float64
-    # One meaning can be measured again: with other settings in turn, or by other code. Times belong to a block.
+    # an episode can run again in another block, in turn with other settings or with other code
     sa.UniqueConstraint("work", "task", "seed", "repeat", "block"),
 )
 DECODES = _table(
     "decodes", _to("episode_id", "episodes.id", primary_key=True), sa.Column("parquet", sa.LargeBinary, nullable=False)
 )
 WANTED = _table(
-    "wanted",  # the episodes of a study's settings; without an episode: still to run
+    "wanted",  # the episodes of a study; those without episode_id are missing
     _to("setting_id", "settings.id", primary_key=True),
     sa.Column("task", sa.Text, primary_key=True),
     sa.Column("seed", sa.BigInteger, primary_key=True),
     sa.Column("repeat", sa.Integer, primary_key=True),
     sa.Column("position", sa.Integer, nullable=False),
     sa.Column("episode_id", sa.ForeignKey("episodes.id", ondelete="SET NULL"), index=True),
-    sa.Column("error", sa.Text),  # traceback of the last attempt, until one succeeds
+    sa.Column("error", sa.Text),  # traceback of the last attempt if it failed
 )
 METRICS = _table(
     "metrics",  # curves of trainings
@@ -161,27 +151,28 @@ def now() -> str:
 
 
 def new_id() -> str:
-    """Return an id for a run that begins now: `20260301T142530Z-0f1e2d`."""
+    """Return an id for a run that begins now, e.g. `20260301T142530Z-0f1e2d`."""
     return f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
 
 
 def url_of(results: str | Path) -> str:
     """Return the URL of the results folder's database."""
-    return os.environ.get(VARIABLE) or f"sqlite:///{results_dir(str(results)).absolute() / FILE}"
+    return os.environ.get(STORE) or f"sqlite:///{results_dir(str(results)).absolute() / FILE}"
 
 
 class Database:
     """The tables of one results folder.
 
-    Nothing is created before the first write: reading where there is no database finds no rows.
+    The first write creates the database. Before, reading finds no rows.
 
     Args:
         results: The results folder.
-        url: Where the tables are; by default `url_of(results)`.
+        url: URL of the tables. Default: `url_of(results)`.
 
     Raises:
-        UsageError: The URL cannot be used. StorageError: The server does not answer, or the disk refuses.
-        CheckpointError: The file is damaged, or of a newer kerv.
+        UsageError: The URL cannot be used.
+        StorageError: The server does not answer, or the disk refuses.
+        CheckpointError: The file is damaged, or from a newer kerv.
     """
 
     def __init__(self, results: str | Path, url: str = "") -> None:
@@ -190,7 +181,7 @@ class Database:
         try:
             parsed = sa.make_url(self.url)
         except (sa.exc.ArgumentError, ValueError) as error:
-            raise UsageError(f"store={self.url} is no URL: write postgresql://USER@HOST/DB") from error
+            raise UsageError(f"store={self.url} is not a URL: write postgresql://USER@HOST/DB") from error
         self.file = Path(parsed.database or "") if parsed.drivername == "sqlite" else None
         if self.file is None and parsed.drivername not in ("postgresql", "postgresql+psycopg"):
             raise UsageError(f"store={parsed.drivername}:// is not supported: use postgresql://USER@HOST/DB")
@@ -199,8 +190,8 @@ class Database:
         self._engine: sa.Engine | None = None
 
     @property
-    def is_there(self) -> bool:
-        """Whether tables can be there: always on a server, else whether the file is."""
+    def exists(self) -> bool:
+        """Whether the file exists. True for a server."""
         return self.file is None or self.file.exists()
 
     def close(self) -> None:
@@ -211,9 +202,9 @@ class Database:
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[sa.Connection]:
-        """Yield a connection for SELECTs; without a database, one to empty tables in memory."""
+        """Yield a connection that reads. Without a database it reads empty tables in memory."""
         with self._errors():
-            if self._engine is None and not self.is_there:
+            if self._engine is None and not self.exists:
                 engine = sa.create_engine("sqlite://", poolclass=sa.pool.NullPool)
                 with engine.connect() as connection:
                     _META.create_all(connection)
@@ -224,7 +215,7 @@ class Database:
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[sa.Connection]:
-        """Yield a connection in a transaction, which is committed at the end of the block."""
+        """Yield a connection in a transaction, which is committed when the block ends."""
         with self._errors():
             engine = self._opened(create=True).execution_options(kerv_writes=True)
             with engine.begin() as connection:
@@ -235,45 +226,17 @@ class Database:
             if self.file is not None and create:
                 with storage_errors(self.file):
                     self.file.parent.mkdir(parents=True, exist_ok=True)
-            self._engine = self._connected()
-            self._check_schema()
-        return self._engine
-
-    def _connected(self) -> sa.Engine:
-        if self.file is None:
-            return _server(self._url)
-        # a reader may look into a folder that it cannot write to, where SQLite cannot make its log
-        frozen = self.file.exists() and not os.access(self.file.parent, os.W_OK)
-        where = f"file:{self.file}?mode=ro&immutable=1&uri=true" if frozen else str(self.file)
-        waiting = {"timeout": LOCK_SECONDS}
-        engine = sa.create_engine(f"sqlite:///{where}", poolclass=sa.pool.NullPool, connect_args=waiting)
-        sa.event.listen(engine, "connect", _configure)
-        sa.event.listen(engine, "begin", _begin)
-        return engine
-
-    def _check_schema(self) -> None:
-        """Create the tables, or bring those of an older kerv up to date."""
-        assert self._engine is not None
-        with self._engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
-            version = _version(connection)
-        if version is None or version < SCHEMA:
-            with self._engine.execution_options(kerv_writes=True).begin() as connection:
+            engine = _server(self._url) if self.file is None else _file(self.file)
+            with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
                 version = _version(connection)
-                if version is None:
-                    _META.create_all(connection)
-                    version = SCHEMA
-                    connection.execute(sa.insert(ABOUT).values(key="schema_version", value=str(SCHEMA)))
-                for step in range(version, SCHEMA):
-                    for statement in MIGRATIONS[step]:
-                        connection.execute(sa.text(statement))
-                connection.execute(
-                    sa.update(ABOUT).where(ABOUT.c.key == "schema_version").values(value=str(max(version, SCHEMA)))
-                )
-        if version > SCHEMA:
-            self.close()
-            raise CheckpointError(
-                f"{self.shown} is of a newer kerv (schema {version}, this one reads {SCHEMA}): update kerv"
-            )
+            if version is None or version < SCHEMA:
+                with engine.execution_options(kerv_writes=True).begin() as connection:
+                    version = _migrated(connection)
+            if version > SCHEMA:
+                engine.dispose()
+                raise newer(self.shown, version)
+            self._engine = engine
+        return self._engine
 
     @contextlib.contextmanager
     def _errors(self) -> Iterator[None]:
@@ -312,16 +275,26 @@ def _server(url: sa.URL) -> sa.Engine:
     return engine
 
 
+def _file(path: Path) -> sa.Engine:
+    # SQLite cannot write its log in a read-only folder
+    is_frozen = path.exists() and not os.access(path.parent, os.W_OK)
+    name = f"file:{path}?mode=ro&immutable=1&uri=true" if is_frozen else str(path)
+    engine = sa.create_engine(f"sqlite:///{name}", poolclass=sa.pool.NullPool, connect_args={"timeout": LOCK_SECONDS})
+    sa.event.listen(engine, "connect", _configure)
+    sa.event.listen(engine, "begin", _begin)
+    return engine
+
+
 def _configure(connection: Any, record: object) -> None:
     """Set up a new SQLite connection."""
-    connection.isolation_level = None  # transactions begin where `_begin` says so
+    connection.isolation_level = None  # `_begin` begins the transactions
     for pragma in ("journal_mode=WAL", "foreign_keys=ON", f"busy_timeout={LOCK_SECONDS * 1000}"):
-        with contextlib.suppress(Exception):  # a folder that cannot be written to refuses the first
+        with contextlib.suppress(Exception):  # a read-only folder refuses the first
             connection.execute(f"PRAGMA {pragma}")
 
 
 def _begin(connection: sa.Connection) -> None:
-    """Let one process write at a time: what it reads in its transaction stays true until it commits."""
+    """Let one process write at a time. What it reads stays true until it commits."""
     if connection.get_execution_options().get("kerv_writes"):
         postgresql = connection.dialect.name == "postgresql"
         connection.exec_driver_sql("SELECT pg_advisory_xact_lock(5271009)" if postgresql else "BEGIN IMMEDIATE")
@@ -334,17 +307,20 @@ def _version(connection: sa.Connection) -> int | None:
     return None if row is None else int(row.value)
 
 
-def insert_or_ignore(connection: sa.Connection, table: sa.Table) -> Any:
-    """Return an INSERT that leaves a row alone that is there already."""
-    if connection.dialect.name == "postgresql":
-        from sqlalchemy.dialects.postgresql import insert
-    else:
-        from sqlalchemy.dialects.sqlite import insert  # type: ignore[assignment]
-    return insert(table).on_conflict_do_nothing()
+def _migrated(connection: sa.Connection) -> int:
+    """Create the tables, or update those of an older kerv. Return their version."""
+    version = _version(connection)  # another process may have done so in the meantime
+    if version is None:
+        _META.create_all(connection)
+        connection.execute(sa.insert(ABOUT).values(key="schema_version", value=str(SCHEMA)))
+        return SCHEMA
+    for step in range(version, SCHEMA):
+        for statement in MIGRATIONS[step]:
+            connection.execute(sa.text(statement))
+    connection.execute(sa.update(ABOUT).where(ABOUT.c.key == "schema_version").values(value=str(max(version, SCHEMA))))
+    return max(version, SCHEMA)
 
 
-def is_live(host: str, pid: int, heartbeat: float) -> bool:
-    """Return whether the process that wrote a row may still be at work."""
-    if host == socket.gethostname():
-        return is_alive(pid)
-    return time.time() - heartbeat < STALE_SECONDS
+def newer(name: str | Path, version: int) -> CheckpointError:
+    """Return the error for tables of a newer kerv."""
+    return CheckpointError(f"{name} is from a newer kerv (schema {version}, this one reads {SCHEMA}): update kerv")

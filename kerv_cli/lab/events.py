@@ -6,56 +6,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from kerv_cli.base.errors import KervError
-from kerv_cli.lab.plan import Block, Wanted
-
-
-@dataclass(frozen=True)
-class EpisodeEnd:
-    """The end of an episode.
-
-    Attributes:
-        wanted: What it means.
-        success: Whether the task was solved.
-        seconds: Wall time.
-        elsewhere: Another sweep ran it while this one ran.
-    """
-
-    wanted: Wanted
-    success: bool = False
-    seconds: float = 0.0
-    elsewhere: bool = False
-
-
-@dataclass(frozen=True)
-class SettingFailed:
-    """A setting failed on a block of seeds; the block's other settings go on.
-
-    Attributes:
-        wanted: The episodes that it leaves out, the one that failed first.
-        reason: The error in one line.
-        trace: Its traceback.
-        error: The error, if it is one of kerv's own.
-    """
-
-    wanted: tuple[Wanted, ...]
-    reason: str
-    trace: str = ""
-    error: KervError | None = None
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The result of `execute`. Every wanted episode is in exactly one of the three."""
-
-    done: list[Wanted] = field(default_factory=list)  # run now
-    reused: list[Wanted] = field(default_factory=list)  # there before, or run by another sweep
-    failed: list[SettingFailed] = field(default_factory=list)
-    seconds: float = 0.0
+from kerv_cli.lab.plan import Block, Episode
 
 
 @dataclass(frozen=True)
 class Started:
-    """The run begins. to_run, reused: numbers of episodes."""
+    """The run begins.
+
+    Attributes:
+        to_run: Number of episodes to run.
+        reused: Number of episodes that exist.
+    """
 
     to_run: int
     reused: int
@@ -63,7 +24,7 @@ class Started:
 
 @dataclass(frozen=True)
 class BlockStarted:
-    """A block was handed to the executor."""
+    """A block was given to the executor."""
 
     block: Block
 
@@ -77,9 +38,67 @@ class BlockEnded:
 
 @dataclass(frozen=True)
 class BlockWaits:
-    """Another sweep computes the block; `execute` looks at it again later."""
+    """Another sweep runs the block. `execute` looks at it again later."""
 
     block: Block
+
+
+@dataclass(frozen=True)
+class EpisodeEnd:
+    """The end of an episode.
+
+    Attributes:
+        episode: The episode.
+        success: Whether the task was solved.
+        seconds: Wall time.
+        elsewhere: Whether another sweep ran it in the meantime.
+    """
+
+    episode: Episode
+    success: bool = False
+    seconds: float = 0.0
+    elsewhere: bool = False
+
+
+@dataclass(frozen=True)
+class SettingFailed:
+    """A setting failed in a block; the other settings of the block go on.
+
+    Attributes:
+        episodes: The episodes that do not run. The one that failed is the first.
+        reason: The error in one line.
+        trace: Its traceback.
+        error: The error, if kerv raised it deliberately.
+    """
+
+    episodes: tuple[Episode, ...]
+    reason: str
+    trace: str = ""
+    error: KervError | None = None
+
+
+@dataclass
+class Outcome:
+    """The result of `execute`. Each episode of the study is in exactly one of the three lists.
+
+    Attributes:
+        done: Episodes that ran.
+        reused: Episodes that existed, or that another sweep ran.
+        failed: Settings that failed, with their episodes.
+        seconds: Wall time.
+    """
+
+    done: list[Episode] = field(default_factory=list)
+    reused: list[Episode] = field(default_factory=list)
+    failed: list[SettingFailed] = field(default_factory=list)
+    seconds: float = 0.0
+
+    def add(self, other: Outcome) -> None:
+        """Add the result of another part of the study."""
+        self.done += other.done
+        self.reused += other.reused
+        self.failed += other.failed
+        self.seconds += other.seconds
 
 
 Event = Started | BlockStarted | BlockEnded | BlockWaits | EpisodeEnd | SettingFailed

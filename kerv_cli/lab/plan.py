@@ -1,14 +1,13 @@
-"""What a study wants, what the database has of it, and what is left to run, with the reason."""
+"""Episodes of a study: which the database has, which are missing and why, and the blocks in which they run."""
 
 from __future__ import annotations
 
 import functools
 import hashlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import groupby
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -27,12 +26,16 @@ from kerv_cli.episodes.identity import (
 )
 
 MOST_EPISODES = 1_000_000
-"""Episodes of a study; more are refused before they are planned."""
+"""Largest number of episodes in a study."""
 FULL_BATCHES = 16
-"""A block of a batch has at most this many times as many episodes as run at once."""
+"""Largest number of batches in a block."""
 
 NEVER, TIMED, CHANGED, ALL = "never", "timed", "changed", "all"
-"""What `rerun=` runs again: nothing; what was not timed in turn; what other code computed; everything."""
+"""Values of `rerun=`. Run again: nothing, what was not timed in turn, what other code computed, everything."""
+
+Key = tuple[str, str, int, int]
+"""Work, task, seed and repeat. Equal keys are the same episode in any study."""
+K = TypeVar("K")
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +45,10 @@ class Setting:
     Attributes:
         label: Its name in the study.
         overrides: The overrides that make it, as the user wrote them.
-        settings: Plain RolloutSettings, without the task.
+        settings: RolloutSettings as plain values, without the task.
         identity: Hashes of the weights and data that it reads.
-        varies: Key -> value of those overrides in which the settings of a grid differ.
-        name: What the settings of a grid share; by default the label.
+        varies: Overrides of a grid in which its settings differ, key -> value.
+        name: Name that the settings of a grid share. Default: the label.
     """
 
     label: str
@@ -60,17 +63,22 @@ class Setting:
 
     @functools.cached_property
     def work(self) -> str:
-        """Hash of everything that determines a result, apart from task, seed and repeat."""
+        """Hash of everything that determines a result, except task, seed and repeat."""
         return work_of(self.settings, self.identity)
 
+    @functools.cached_property
+    def depends_on_order(self) -> bool:
+        """Whether the result of an episode depends on the episodes before it."""
+        return depends_on_order(self.settings)
+
     def on(self, task: str) -> dict[str, Any]:
-        """Return plain RolloutSettings for one task."""
+        """Return its RolloutSettings for one task, as plain values."""
         return {**self.settings, "task": [task]}
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """One episode that a study wants."""
+class Episode:
+    """One episode of a study."""
 
     setting: Setting
     task: str
@@ -78,27 +86,30 @@ class Wanted:
     repeat: int = 0
 
     @property
-    def key(self) -> tuple[str, str, int, int]:
-        """What the episode means: equal keys are the same episode in any study."""
+    def key(self) -> Key:
+        """Work, task, seed and repeat."""
         return self.setting.work, self.task, self.seed, self.repeat
 
 
 @dataclass(frozen=True)
 class Study:
-    """A study and the episodes that it wants, in the order in which they run.
+    """Settings to compare, and the episodes that compare them.
 
     Attributes:
         name: Its name in the database.
+        settings: What it compares.
+        episodes: All its episodes, in the order in which they run.
         kind: sweep, rollout or import.
+        title: Title of its report.
         baseline: Label of the setting that the others are compared with.
-        axis: Config key of the plots' x axis; empty: none.
-        note: A sentence that says what to see.
-        block: Seeds for which the settings take turns in one process.
+        axis: Config key of the x axis of its plots. Empty: no plot.
+        note: A sentence for its report.
+        block: Number of seeds for which the settings take turns in one process.
     """
 
     name: str
     settings: tuple[Setting, ...]
-    wanted: tuple[Wanted, ...]
+    episodes: tuple[Episode, ...]
     kind: str = "sweep"
     title: str = ""
     baseline: str = ""
@@ -114,29 +125,29 @@ class Study:
     @property
     def tasks(self) -> list[str]:
         """Names of the tasks, in order."""
-        return list(dict.fromkeys(one.task for one in self.wanted))
+        return list(dict.fromkeys(one.task for one in self.episodes))
 
     def setting(self, label: str) -> Setting:
-        """Return the setting of a label."""
+        """Return the setting with this label."""
         return next(setting for setting in self.settings if setting.label == label)
 
 
-def wanted_of(
+def all_episodes(
     settings: Sequence[Setting], tasks: Iterable[str], block: int = 5, repeats: int = 1
-) -> tuple[Wanted, ...]:
-    """Return every episode of these settings: repeat by repeat, task by task, block of seeds by block of seeds.
+) -> tuple[Episode, ...]:
+    """Return every episode of these settings, ordered by repeat, task and block of seeds.
 
     Raises:
-        UsageError: More than MOST_EPISODES.
+        UsageError: There are more than MOST_EPISODES.
     """
     tasks = list(dict.fromkeys(tasks))
-    count = len(tasks) * repeats * sum(setting.settings["episodes"] for setting in settings)
-    if count > MOST_EPISODES:
-        raise UsageError(f"the study has {count} episodes: at most {MOST_EPISODES}, plan fewer")
+    total = len(tasks) * repeats * sum(setting.settings["episodes"] for setting in settings)
+    if total > MOST_EPISODES:
+        raise UsageError(f"the study has {total} episodes: at most {MOST_EPISODES}, plan fewer")
     seeds = {s.label: range(s.settings["seed"], s.settings["seed"] + s.settings["episodes"]) for s in settings}
     longest = max((len(one) for one in seeds.values()), default=0)
     return tuple(
-        Wanted(setting, task, seed, repeat)
+        Episode(setting, task, seed, repeat)
         for repeat in range(repeats)
         for task in tasks
         for first in range(0, longest, block)
@@ -146,49 +157,57 @@ def wanted_of(
 
 
 @dataclass(frozen=True)
-class Measured:
-    """An episode in the database, by what decides whether a study can use it."""
+class StoredEpisode:
+    """A row of the database that a study may use.
+
+    Attributes:
+        id: Number of the row.
+        block: Id of the block in which it ran.
+        started: Time at which that block began.
+        code: Hash of the code that ran it.
+        seeds: Seeds of the block, as `seeds_text` writes them.
+    """
 
     id: int
     block: str
-    started: str  # of its block
+    started: str
     code: str
-    seeds: str  # of its block
+    seeds: str
 
 
 @dataclass(frozen=True)
 class Block:
-    """Episodes that one process runs: of one task and one repeat, whose settings take turns seed by seed.
+    """Episodes that one process runs: one task and one repeat, with settings that take turns seed by seed.
 
-    A block of a batch has one setting instead, and any tasks and seeds.
+    A block that runs as a batch has one setting instead, and any tasks and seeds.
     """
 
-    wanted: tuple[Wanted, ...]  # at least one
+    episodes: tuple[Episode, ...]
 
     @property
     def task(self) -> str:
         """Task of its first episode."""
-        return self.wanted[0].task
+        return self.episodes[0].task
 
     @functools.cached_property
     def settings(self) -> tuple[Setting, ...]:
         """Its settings, each once."""
-        return tuple({one.setting.work: one.setting for one in self.wanted}.values())
+        return tuple({one.setting.work: one.setting for one in self.episodes}.values())
 
     @property
     def seeds(self) -> list[int]:
         """Its seeds, each once, ascending."""
-        return sorted({one.seed for one in self.wanted})
+        return sorted({one.seed for one in self.episodes})
 
     @property
     def batch(self) -> int:
-        """Episodes that run at the same time."""
-        return batch_of(self.wanted[0].setting.settings)
+        """Number of episodes that run at the same time."""
+        return batch_of(self.episodes[0].setting.settings)
 
     @property
     def name(self) -> str:
         """Task and seeds, e.g. `reach-v3 100000-100004`."""
-        repeat = self.wanted[0].repeat
+        repeat = self.episodes[0].repeat
         return f"{self.task} {seeds_text(self.seeds)}" + (f" repeat {repeat}" if repeat else "")
 
     @property
@@ -196,215 +215,166 @@ class Block:
         """Name and size, for a display."""
         if self.batch == 1:
             return f"{self.name}: {count(len(self.settings), 'setting')} in turn"
-        label = self.wanted[0].setting.label
-        return f"{label} from {self.name} on: {count(len(self.wanted), 'episode')}, {self.batch} at a time"
+        label = self.episodes[0].setting.label
+        return f"{label} from {self.name} on: {count(len(self.episodes), 'episode')}, {self.batch} at a time"
 
-    def turns(self) -> Iterator[Wanted]:
-        """Yield its episodes seed by seed; the order of the settings is drawn from task, seed and repeat."""
+    def turns(self) -> Iterator[Episode]:
+        """Yield its episodes seed by seed, with the settings in an order drawn from task, seed and repeat."""
         for seed in self.seeds:
-            turn = [one for one in self.wanted if one.seed == seed]
+            turn = [one for one in self.episodes if one.seed == seed]
             digest = hashlib.sha256(f"{self.task} {seed} {turn[0].repeat}".encode()).digest()
             for index in np.random.default_rng(list(digest)).permutation(len(turn)):
                 yield turn[int(index)]
 
 
-@dataclass
-class Split:
-    """A study, split into the episodes that the database has and those to run.
-
-    Attributes:
-        study: What is wanted.
-        there: Wanted episode -> its row.
-        reasons: Wanted episode to run -> why, in a few words.
-        newest: Id of the newest row that was looked at. Later ones are of sweeps that run at the same time.
-    """
-
-    study: Study
-    there: dict[Wanted, Measured] = field(default_factory=dict)
-    reasons: dict[Wanted, str] = field(default_factory=dict)
-    newest: int = 0
-
-    @property
-    def to_run(self) -> list[Wanted]:
-        """The episodes to run; one that two labels share runs once."""
-        return list({one.key: one for one in self.reasons}.values())
-
-    def blocks(self, workers: int = 1) -> list[Block]:
-        """Return the episodes to run as blocks, in the order of their first episodes."""
-        return blocks_of(self.to_run, self.study.block, workers)
-
-
 def split(
-    study: Study, stock: Mapping[tuple[str, str, int, int], Sequence[Measured]], rerun: str = NEVER, since: str = ""
-) -> Split:
-    """Return the plan of a study: wanted episodes minus those of the database.
+    study: Study,
+    stored: Mapping[Key, Sequence[StoredEpisode]],
+    rerun: str = NEVER,
+    since: str = "",
+    earlier: Mapping[str, tuple[Setting, str]] | None = None,
+) -> tuple[dict[Episode, StoredEpisode], dict[Episode, str]]:
+    """Return the episodes of a study that exist, and those that are missing with the reason.
 
     Args:
-        study: What is wanted.
-        stock: Meaning of an episode -> its rows in the database.
-        rerun: One of NEVER, TIMED, CHANGED, ALL.
-        since: With ALL, rows of blocks that began then or later count (ISO 8601): of the same command, interrupted.
+        study: The study.
+        stored: Rows of the database by key.
+        rerun: NEVER, TIMED, CHANGED or ALL.
+        since: With ALL, rows of blocks that began at this time or later exist (ISO 8601). They belong to the same
+            command, which was interrupted.
+        earlier: Newest stored setting of a label, and its work. Explains what changed.
     """
     from kerv_cli.episodes.code import code_hash
 
-    def accepted(row: Measured) -> bool:
+    def is_usable(row: StoredEpisode) -> bool:
         if rerun == ALL:
             return bool(since) and row.started >= since
         return rerun != CHANGED or row.code == code_hash()
 
-    plan = Split(study, newest=max((row.id for rows in stock.values() for row in rows), default=0))
-    known = {work: True for work, *_ in stock}
-    tasks = {(work, task) for work, task, *_ in stock}
-    usable = {one: [row for row in stock.get(one.key, ()) if accepted(row)] for one in study.wanted}
-    _only_whole_orders(usable, study.block)
-    for turn in _turns(study.wanted).values():
-        rows = {one: usable[one] for one in turn}
-        of_block = Counter(row.block for found in rows.values() for row in found)
-        chosen = {one: max(found, key=lambda row: (of_block[row.block], row.started, row.id), default=None)
-                  for one, found in rows.items()}  # fmt: skip
-        if rerun == TIMED and len({row and row.block for row in chosen.values()}) > 1:
-            chosen = dict.fromkeys(chosen)
-        for one, row in chosen.items():
-            if row is not None:
-                plan.there[one] = row
-            else:
-                plan.reasons[one] = _reason(one, stock, known, tasks, rerun)
-    _whole_orders(plan)
-    return plan
+    usable = {one: [row for row in stored.get(one.key, ()) if is_usable(row)] for one in study.episodes}
+    _keep_whole_orders(usable, study.block)
+    existing: dict[Episode, StoredEpisode] = {}
+    for turn in _turns(study.episodes).values():
+        in_block = Counter(row.block for one in turn for row in usable[one])
+        found = {}
+        for one in turn:
+            if usable[one]:
+                found[one] = max(usable[one], key=lambda row: (in_block[row.block], row.started, row.id))
+        if rerun != TIMED or (len(found) == len(turn) and len({row.block for row in found.values()}) == 1):
+            existing |= found
+    for part in _ordered_parts(study.episodes, study.block):
+        if any(one not in existing for one in part):
+            for one in part:
+                existing.pop(one, None)
+    works, tasks = {work for work, *_ in stored}, {(work, task) for work, task, *_ in stored}
+
+    @functools.cache
+    def change(setting: Setting) -> str:
+        return differences(setting, *(earlier or {}).get(setting.label, ()))
+
+    def reason(one: Episode) -> str:
+        if stored.get(one.key):
+            why = {TIMED: "times wanted in turn", CHANGED: "other code", ALL: "rerun=all"}
+            return why.get(rerun, "order of episodes")
+        if (one.setting.work, one.task) in tasks:
+            return "new repeat" if one.repeat else "new seeds"
+        return "new task" if one.setting.work in works else change(one.setting)
+
+    return existing, {one: reason(one) for one in study.episodes if one not in existing}
 
 
-def _turns(wanted: Iterable[Wanted]) -> dict[tuple[str, int, int], list[Wanted]]:
-    """(task, seed, repeat) -> its episodes, which take turns."""
-    turns: dict[tuple[str, int, int], list[Wanted]] = {}
-    for one in wanted:
-        turns.setdefault((one.task, one.seed, one.repeat), []).append(one)
-    return turns
+def _grouped(episodes: Iterable[Episode], key: Callable[[Episode], K]) -> dict[K, list[Episode]]:
+    groups: dict[K, list[Episode]] = {}
+    for one in episodes:
+        groups.setdefault(key(one), []).append(one)
+    return groups
 
 
-def _only_whole_orders(usable: dict[Wanted, list[Measured]], block: int) -> None:
-    """Leave episodes that depend on those before them the rows of one block that ran all their seeds, or none."""
+def _turns(episodes: Iterable[Episode]) -> dict[tuple[str, int, int], list[Episode]]:
+    """Group the episodes that take turns, by task, seed and repeat."""
+    return _grouped(episodes, lambda one: (one.task, one.seed, one.repeat))
+
+
+def _ordered_parts(episodes: Iterable[Episode], block: int) -> list[list[Episode]]:
+    """Group episodes whose results depend on their order, by setting, task, repeat and block of seeds."""
+
+    def key(one: Episode) -> tuple[str, str, int, int]:
+        return one.setting.work, one.task, one.repeat, (one.seed - one.setting.settings["seed"]) // block
+
+    return list(_grouped((one for one in episodes if one.setting.depends_on_order), key).values())
+
+
+def _keep_whole_orders(usable: dict[Episode, list[StoredEpisode]], block: int) -> None:
+    """Keep rows of episodes that depend on their order only if one block ran exactly these seeds."""
     sizes = Counter(row.block for rows in usable.values() for row in rows)
-    for seeds in _ordered_chunks(usable, block):
-        text = seeds_text(one.seed for one in seeds)
-        whole = [row for row in usable[seeds[0]] if row.seeds == text]
-        whole = [row for row in whole if all(any(row.block == other.block for other in usable[one]) for one in seeds)]
+    for part in _ordered_parts(usable, block):
+        seeds = seeds_text(one.seed for one in part)
+        whole = [row for row in usable[part[0]] if row.seeds == seeds]
+        whole = [row for row in whole if all(any(row.block == other.block for other in usable[one]) for one in part)]
         best = max(whole, key=lambda row: (sizes[row.block], row.started, row.id), default=None)
-        for one in seeds:
+        for one in part:
             usable[one] = [row for row in usable[one] if best is not None and row.block == best.block]
 
 
-def _whole_orders(plan: Split) -> None:
-    """Run a block of seeds whole if an episode's result depends on the episodes before it."""
-    for seeds in _ordered_chunks(plan.study.wanted, plan.study.block):
-        if any(one in plan.reasons for one in seeds):
-            for one in seeds:
-                plan.there.pop(one, None)
-                plan.reasons.setdefault(one, "order of episodes")
+def blocks_of(episodes: Iterable[Episode], block: int, workers: int = 1) -> list[Block]:
+    """Group episodes into blocks.
 
+    Seeds stay in one block if the study keeps them together and the same settings lack them. If a setting depends on
+    the order of episodes, all its seeds stay together. All episodes of a block use the same number of threads.
+    Episodes that run as a batch are grouped by setting, into at least as many blocks as there are workers.
 
-def _ordered_chunks(wanted: Iterable[Wanted], block: int) -> Iterator[list[Wanted]]:
-    """Yield the episodes of each setting, task and repeat that depend on their order, by blocks of seeds."""
-
-    def key(one: Wanted) -> tuple[str, str, int, int]:
-        return one.setting.work, one.task, one.repeat, (one.seed - one.setting.settings["seed"]) // block
-
-    groups: dict[tuple[str, str, int, int], list[Wanted]] = {}
-    ordered: dict[str, bool] = {}
-    for one in wanted:
-        work = one.setting.work
-        if work not in ordered:
-            ordered[work] = depends_on_order(one.setting.settings)
-        if ordered[work]:
-            groups.setdefault(key(one), []).append(one)
-    yield from groups.values()
-
-
-def blocks_of(wanted: Iterable[Wanted], block: int, workers: int = 1) -> list[Block]:
-    """Return episodes grouped into blocks.
-
-    Seeds stay together that the study runs together and that the same settings miss, or all of them if a setting
-    depends on the order of episodes. A process has one number of threads. Episodes of a batch are grouped by setting,
-    into at least as many blocks as there are workers.
+    Args:
+        episodes: What to run.
+        block: Number of seeds in a block.
+        workers: Number of processes.
     """
-    batches: dict[tuple[str, int], list[Wanted]] = {}
-    in_turn: list[Wanted] = []
-    for one in wanted:
-        if batch_of(one.setting.settings) > 1:
-            batches.setdefault((one.setting.work, one.repeat), []).append(one)
-        else:
-            in_turn.append(one)
-    groups: dict[tuple[object, ...], list[Wanted]] = {}
-    for (task, seed, repeat), turn in _turns(in_turn).items():
-        for threads, some in groupby(sorted(turn, key=_threads), key=_threads):
-            part = list(some)
-            first = min(one.setting.settings["seed"] for one in part)
-            missing = sorted(one.setting.work for one in part)
-            ordered = sorted(one.setting.work for one in part if depends_on_order(one.setting.settings))
-            groups.setdefault((task, repeat, threads, (seed - first) // block, *(ordered or missing)), []).extend(part)
+    by_way = _grouped(episodes, lambda one: batch_of(one.setting.settings) > 1)
+    groups: dict[tuple[object, ...], list[Episode]] = {}
+    for (task, seed, repeat), turn in _turns(by_way.get(False, ())).items():
+        for threads, part in _grouped(turn, lambda one: one.setting.settings["runtime"]["threads"]).items():
+            index = (seed - min(one.setting.settings["seed"] for one in part)) // block
+            ordered = sorted(one.setting.work for one in part if one.setting.depends_on_order)
+            same = ordered or sorted(one.setting.work for one in part)
+            groups.setdefault((task, repeat, threads, index, *same), []).extend(part)
     blocks = [Block(tuple(group)) for group in groups.values()]
-    for group in batches.values():
+    for group in _grouped(by_way.get(True, ()), lambda one: (one.setting.work, one.repeat)).values():
         size = min(FULL_BATCHES * batch_of(group[0].setting.settings), -(-len(group) // workers))
-        blocks += [Block(tuple(group[at : at + size])) for at in range(0, len(group), size)]
+        blocks += [Block(tuple(group[first : first + size])) for first in range(0, len(group), size)]
     return blocks
 
 
-def _threads(one: Wanted) -> int:
-    return int(one.setting.settings["runtime"]["threads"])
+def seed_blocks(study: Study) -> list[list[Episode]]:
+    """Return a study's episodes grouped by block of seeds, in the order of the seeds."""
+    first = min(one.seed for one in study.episodes)
+    return [part for _, part in sorted(_grouped(study.episodes, lambda one: (one.seed - first) // study.block).items())]
 
 
-def _reason(
-    one: Wanted,
-    stock: Mapping[Any, Sequence[Measured]],
-    known: Mapping[str, bool],
-    tasks: set[tuple[str, str]],
-    rerun: str,
-) -> str:
-    """Return why an episode is to run, in a few words."""
-    if stock.get(one.key):
-        return {TIMED: "times wanted in turn", CHANGED: "other code", ALL: "rerun=all"}.get(rerun, "order of episodes")
-    if (one.setting.work, one.task) in tasks:
-        return "new repeat" if one.repeat else "new seeds"
-    return "new task" if one.setting.work in known else NEW_SETTING
+def differences(new: Setting, old: Setting | None = None, work: str = "") -> str:
+    """Return in a few words how a setting differs from a stored one of the same label.
 
-
-NEW_SETTING = "new setting"
-
-
-def differences(old: Setting, work: str, new: Setting) -> str:
-    """Return what changed from a stored setting with this `work` to the one of the same label, in a few words."""
+    Args:
+        new: The setting.
+        old: The stored setting.
+        work: The hash with which `old` was stored.
+    """
+    target = new.settings["policy"]["target"]
+    if old is None or old.settings["policy"]["target"] != target:
+        return "new setting"
     engine = next((one for one in range(ENGINE, 0, -1) if work_of(old.settings, old.identity, one) == work), ENGINE)
     changes = [f"engine {engine} → {ENGINE}"] if engine != ENGINE else []
-    names = {"target": f"weights of {new.settings['policy']['target']}"}
     changes += [
-        f"{names.get(kind, kind)} changed"
+        f"weights of {target} changed" if kind == "target" else f"{kind} changed"
         for kind in dict.fromkeys([*new.identity, *old.identity])
         if kind != OBSERVATION and new.identity.get(kind) != old.identity.get(kind)
     ]
     before, after = flat(effective(old.settings)), flat(effective(new.settings))
     keys = [key for key in dict.fromkeys([*after, *before]) if before.get(key) != after.get(key)]
     changes += [f"{key} {before.get(key)} → {after.get(key)}" for key in keys]
-    return ", ".join(changes[:3]) or NEW_SETTING
-
-
-def explain(plan: Split, earlier: Mapping[str, tuple[Setting, str]]) -> Split:
-    """Return the plan with `new setting` replaced by what changed since a setting of the same label and target ran.
-
-    earlier: Label -> the stored setting, and the `work` that it had.
-    """
-    texts = {
-        setting.label: differences(*earlier[setting.label], setting)
-        for setting in plan.study.settings
-        if setting.label in earlier
-        and earlier[setting.label][0].settings["policy"]["target"] == setting.settings["policy"]["target"]
-    }
-    reasons = {
-        one: texts.get(one.setting.label, why) if why == NEW_SETTING else why for one, why in plan.reasons.items()
-    }
-    return replace(plan, reasons=reasons)
+    return ", ".join(changes[:3]) or "new setting"
 
 
 def plain_settings(settings: Plain) -> dict[str, Any]:
-    """Return plain RolloutSettings without the task, as a Setting holds them."""
+    """Return RolloutSettings without the task, as a Setting holds them."""
     return without(settings, {"task"})
 
 

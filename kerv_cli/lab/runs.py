@@ -1,10 +1,11 @@
-"""Every begun command as a row: who runs it, how far it is, how it ended."""
+"""Rows of the commands that were begun: who runs each, how far it is, how it ended."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import socket
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,29 +16,25 @@ from typing import Any
 import sqlalchemy as sa
 
 from kerv_cli.base.errors import Interrupted, StorageError, UsageError
+from kerv_cli.base.leftovers import is_alive
 from kerv_cli.base.places import results_dir
 from kerv_cli.base.provenance import git_commit
-from kerv_cli.lab.database import (
-    BEAT_SECONDS,
-    COMPLETE,
-    FAILED,
-    INTERRUPTED,
-    METRICS,
-    RUNNING,
-    RUNS,
-    Database,
-    is_live,
-    new_id,
-    now,
-)
+from kerv_cli.lab.database import METRICS, RUNS, Database, new_id, now
+
+RUNNING, COMPLETE, FAILED, INTERRUPTED = "running", "complete", "failed", "interrupted"
+
+BEAT_SECONDS = 5.0
+"""Time between two heartbeats of a run."""
+STALE_SECONDS = 900.0
+"""A run on another machine counts as dead after this time without a heartbeat."""
 
 _command: list[str] = []
 _open: set[str] = set()
-"""Ids of the runs of this process that have not ended: a full disk can refuse to write the end of one."""
+"""Ids of this process's runs that have not ended. A full disk can refuse to write the end of one."""
 
 
 def set_command(words: Sequence[str]) -> list[str]:
-    """Note the words after `kerv` of the command that this process runs, and return those noted before."""
+    """Set the words after `kerv` of this process's command, and return those set before."""
     before = list(_command)
     _command[:] = words
     return before
@@ -45,7 +42,7 @@ def set_command(words: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class RunRow:
-    """A row of the table `runs`. status: running, complete, failed or interrupted; of a dead process interrupted."""
+    """A row of the table `runs`; `status` is `interrupted` if its process is dead."""
 
     id: str
     kind: str
@@ -55,33 +52,37 @@ class RunRow:
     done: int
     total: int
     message: str
+    host: str
+    pid: int
     started: str
-    finished: str
+    finished: str | None
+    heartbeat: float
     git_commit: str
 
 
-def _is_at_work(row: Any) -> bool:
-    mine = (row.host, row.pid) == (socket.gethostname(), os.getpid())
-    live = row.id in _open if mine else is_live(row.host, row.pid, row.heartbeat)
-    return live and row.status == RUNNING
+def _row_of(row: Any) -> RunRow:
+    if row.host != socket.gethostname():
+        is_live = time.time() - row.heartbeat < STALE_SECONDS
+    else:
+        is_live = row.id in _open if row.pid == os.getpid() else is_alive(row.pid)
+    status = INTERRUPTED if row.status == RUNNING and not is_live else row.status
+    return RunRow(**{**row._mapping, "command": tuple(row.command), "status": status})
 
 
 def is_running(connection: sa.Connection, run: str) -> bool:
-    """Return whether the run of this id may still be at work."""
+    """Return whether the run with this id may still be at work."""
     row = connection.execute(sa.select(RUNS).where(RUNS.c.id == run)).first()
-    return row is not None and _is_at_work(row)
-
-
-def _row_of(row: Any) -> RunRow:
-    dead = row.status == RUNNING and not _is_at_work(row)
-    return RunRow(
-        row.id, row.kind, row.name, tuple(row.command), INTERRUPTED if dead else row.status, row.done, row.total,
-        row.message, row.started, row.finished or "", row.git_commit,
-    )  # fmt: skip
+    return row is not None and _row_of(row).status == RUNNING
 
 
 def run_rows(database: Database, kind: str | None = None, name: str | None = None) -> list[RunRow]:
-    """Return the begun commands, the newest first; those of a kind and name if these are given."""
+    """Return the begun commands, the newest first.
+
+    Args:
+        database: Where they are.
+        kind: Only those of this kind.
+        name: Only those of this study or artifact.
+    """
     query = sa.select(RUNS).order_by(RUNS.c.started.desc(), RUNS.c.heartbeat.desc(), RUNS.c.id.desc())
     query = query if kind is None else query.where(RUNS.c.kind == kind)
     query = query if name is None else query.where(RUNS.c.name == name)
@@ -90,20 +91,21 @@ def run_rows(database: Database, kind: str | None = None, name: str | None = Non
 
 
 class Run:
-    """The row of a command from its first second to its end; a context manager.
+    """The row of a command from its first second to its end, with a heartbeat of its own thread.
 
-    A command that ends with a UsageError leaves no row.
+    A context manager. A command that ends with a UsageError leaves no row.
 
     Args:
         database: Where the row is written.
         kind: sweep, rollout, import, or the kind of artifact that is made.
-        name: Of the study or the artifact.
-        command: Words after `kerv` that go on with it; by default those of `set_command`.
-        total: Steps or episodes, for the progress.
+        name: Name of the study or the artifact.
+        command: Words after `kerv` that go on with it. Default: those of `set_command`.
+        total: Number of steps or episodes.
         alone: Refuse to begin while another process makes the same.
 
     Raises:
-        UsageError: Another process makes it. StorageError: The disk refused.
+        UsageError: Another process makes the same.
+        StorageError: The disk refused.
     """
 
     def __init__(
@@ -118,15 +120,17 @@ class Run:
         self.database, self.kind, self.name, self.alone = database, kind, name, alone
         self.command = list(command or _command)
         self.id, self.total, self.done = new_id(), total, 0
-        self._beaten = 0.0
+        self._ended = threading.Event()
+        self._heart = threading.Thread(target=self._keep_beating, daemon=True)
 
     def __enter__(self) -> Run:
+        host, pid = socket.gethostname(), os.getpid()
         same = sa.and_(RUNS.c.kind == self.kind, RUNS.c.name == self.name, RUNS.c.status == RUNNING)
         with self.database.writing() as connection:
-            for row in connection.execute(sa.select(RUNS).where(same)).all():
-                if not _is_at_work(row):
-                    connection.execute(sa.update(RUNS).where(RUNS.c.id == row.id).values(status=INTERRUPTED))
-                elif self.alone and (row.host, row.pid) != (socket.gethostname(), os.getpid()):
+            for row in map(_row_of, connection.execute(sa.select(RUNS).where(same)).all()):
+                if row.status != RUNNING:
+                    connection.execute(sa.update(RUNS).where(RUNS.c.id == row.id).values(status=row.status))
+                elif self.alone and (row.host, row.pid) != (host, pid):
                     raise UsageError(
                         f"{self.kind} {self.name} is being made by process {row.pid} on {row.host} since "
                         f"{row.started[:16]}: wait for it, or choose another name"
@@ -134,47 +138,50 @@ class Run:
             connection.execute(
                 sa.insert(RUNS).values(
                     id=self.id, kind=self.kind, name=self.name, command=self.command, status=RUNNING, done=0,
-                    total=self.total, message="", host=socket.gethostname(), pid=os.getpid(), started=now(),
-                    heartbeat=time.time(), git_commit=git_commit(),
+                    total=self.total, message="", host=host, pid=pid, started=now(), heartbeat=time.time(),
+                    git_commit=git_commit(),
                 )
             )  # fmt: skip
         _open.add(self.id)
+        self._heart.start()
         return self
 
-    def beat(self, done: int | None = None, total: int | None = None, at_once: bool = False) -> None:
-        """Note progress and that the process lives, at most every BEAT_SECONDS."""
-        at_once |= total not in (None, self.total)  # another part of the work began
-        self.done = self.done if done is None else done
-        self.total = self.total if total is None else total
-        if time.monotonic() - self._beaten < BEAT_SECONDS and not at_once:
-            return
-        self._beaten = time.monotonic()
-        self._update(done=self.done, total=self.total, heartbeat=time.time())
+    def beat(self, done: int, total: int | None = None) -> None:
+        """Note progress. The next heartbeat writes it; a new total is written at once."""
+        is_new = total not in (None, self.total)
+        self.done, self.total = done, self.total if total is None else total
+        if is_new:
+            self._update()
+
+    def _keep_beating(self) -> None:
+        while not self._ended.wait(BEAT_SECONDS):
+            with contextlib.suppress(StorageError):  # the command itself meets the same error and shows it
+                self._update()
+
+    def _update(self, **values: Any) -> None:
+        values |= {"done": self.done, "total": self.total, "heartbeat": time.time()}
+        with self.database.writing() as connection:
+            connection.execute(sa.update(RUNS).where(RUNS.c.id == self.id).values(**values))
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._ended.set()
+        self._heart.join()
         _open.discard(self.id)
-        if isinstance(error, UsageError):  # nothing was begun: an earlier command is still the one that goes on
-            with contextlib.suppress(StorageError), self.database.writing() as connection:
-                connection.execute(sa.delete(RUNS).where(RUNS.c.id == self.id))
-            return
-        if error is None:
-            status, done = COMPLETE, self.total or self.done
-        else:
-            status, done = INTERRUPTED if isinstance(error, Interrupted | KeyboardInterrupt) else FAILED, self.done
-        message = "" if error is None else " ".join(str(error).split())[:500]
         try:
-            self._update(
-                status=status, done=done, total=self.total, message=message, finished=now(), heartbeat=time.time()
-            )
+            if isinstance(error, UsageError):  # nothing was begun: an earlier command is still the one that goes on
+                with self.database.writing() as connection:
+                    connection.execute(sa.delete(RUNS).where(RUNS.c.id == self.id))
+            elif error is None:
+                self.done = self.total or self.done
+                self._update(status=COMPLETE, finished=now())
+            else:
+                status = INTERRUPTED if isinstance(error, Interrupted | KeyboardInterrupt) else FAILED
+                self._update(status=status, message=" ".join(str(error).split())[:500], finished=now())
         except StorageError:
-            if error is None:  # else that one is to be shown
+            if error is None:  # otherwise show the first error
                 raise
-
-    def _update(self, **values: Any) -> None:
-        with self.database.writing() as connection:
-            connection.execute(sa.update(RUNS).where(RUNS.c.id == self.id).values(**values))
 
 
 def name_in(results: str | Path, kind: str, folder: Path) -> str:
@@ -183,19 +190,19 @@ def name_in(results: str | Path, kind: str, folder: Path) -> str:
 
 
 def making(results: str | Path, kind: str, folder: Path, command: Sequence[str] = ()) -> Run:
-    """Return the row of a command that makes an artifact in a folder; see `Run`."""
+    """Return the run of a command that makes an artifact in a folder; see `Run`."""
     return Run(Database(results), kind, name_in(results, kind, folder), command)
 
 
 def command_to_go_on(results: str | Path, kind: str, folder: Path) -> tuple[str, ...]:
-    """Return the words after `kerv` that go on with an unfinished artifact; none if no row has them."""
+    """Return the words after `kerv` that go on with an unfinished artifact; empty if no row has them."""
     rows = run_rows(Database(results), kind, name_in(results, kind, folder))
     return rows[0].command if rows and rows[0].status != COMPLETE else ()
 
 
 @dataclass(frozen=True)
 class Curve:
-    """The validations of a training as rows."""
+    """The validations of a training as rows of the database."""
 
     database: Database
     kind: str
@@ -203,12 +210,17 @@ class Curve:
 
     @staticmethod
     def of(folder: Path, results: str | Path | None = None) -> Curve:
-        """Return the curve of a training's folder. results: by default the folder above its `artifacts`."""
+        """Return the curve of the training in a folder.
+
+        Args:
+            folder: Folder of the artifact.
+            results: The results folder. Default: the folder that holds its `artifacts`.
+        """
         results, kind = results or folder.parents[2], folder.parent.name
         return Curve(Database(results), kind, name_in(results, kind, folder))
 
     def write(self, history: Sequence[Mapping[str, float]]) -> None:
-        """Replace the rows by these validations; each has its `step` among the metrics."""
+        """Replace all rows by these validations. Each maps metrics to values, with its `step`."""
         rows = [
             {"kind": self.kind, "name": self.name, "step": int(one["step"]), "metric": metric, "value": float(value)}
             for one in history
@@ -231,14 +243,17 @@ class Curve:
 
 
 def forget(database: Database, kind: str, name: str) -> None:
-    """Delete the rows of all commands that made this, and its curve."""
+    """Delete the rows of all commands that made this study or artifact, and its curve."""
     with database.writing() as connection:
         for table in (RUNS, METRICS):
             connection.execute(sa.delete(table).where(table.c.kind == kind, table.c.name == name))
 
 
 def interrupted_since(database: Database, kind: str, name: str, command: Sequence[str]) -> str:
-    """Return when the command was begun that this one goes on with: the same words, never complete; empty: none."""
+    """Return when the interrupted command began that this one goes on with (ISO 8601); empty if there is none.
+
+    It has the same words and was never complete.
+    """
     since = ""
     for row in run_rows(database, kind, name):
         if row.command != tuple(command) or row.status == COMPLETE:

@@ -1,46 +1,46 @@
-"""The two calls behind every command that runs episodes: `plan`, which computes nothing, and `run`."""
+"""The two calls of every command that runs episodes: `plan` finds what is missing, `run` runs it."""
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import re
 import secrets
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+
+import sqlalchemy as sa
 
 from kerv_cli.base.errors import Interrupted, KervError
 from kerv_cli.base.places import check_writable
 from kerv_cli.base.runtime import set_up
-from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.resolve import ResolvedStudy
 from kerv_cli.episodes.runner import Runner, close_worlds, is_recorded, run_batch
 from kerv_cli.episodes.settings import settings_from
 from kerv_cli.episodes.together import Request
-from kerv_cli.lab.database import COMPLETE, Database
+from kerv_cli.lab.database import EPISODES, Database
 from kerv_cli.lab.events import Event, OnEvent, Outcome, SettingFailed
 from kerv_cli.lab.execute import execute
 from kerv_cli.lab.executors import check_executor
-from kerv_cli.lab.plan import ALL, NEVER, Block, Setting, Split, Study, Wanted, plain_settings, wanted_of
-from kerv_cli.lab.runs import Run, interrupted_since, run_rows
-from kerv_cli.lab.store import ROLLOUT, SWEEP, StudyStore, split_of, studies
+from kerv_cli.lab.plan import ALL, Episode, Setting, Study, all_episodes, plain_settings, seed_blocks
+from kerv_cli.lab.runs import COMPLETE, Run, interrupted_since, run_rows
+from kerv_cli.lab.store import ROLLOUT, SWEEP, Plan, StudyStore, plan_study, studies
 
-_MOST_NAME = 32  # letters of the methods in a rollout's name
+InterimAnalysis = Callable[[StudyStore, Sequence[Episode], Sequence[str], int, int], list[str]]
+"""Called after a block of seeds. It returns the labels of the settings that go on.
 
-Judge = Callable[[StudyStore, Sequence[Wanted], Sequence[str], int, int], list[str]]
-"""Told the store, the episodes so far, the labels that are open, the look and the number of looks -> the labels that
-stay open."""
-
+Its arguments are the store, the episodes so far, the labels that are undecided, the number of this analysis from 1, and
+how many there are at most.
+"""
 
 OnEpisodeStep = Callable[[Setting, str, int, int], None]
-"""Told the setting, the task, the seed and the number of control steps executed, after each of them."""
+"""Called after each control step with setting, task, seed and number of steps."""
 
 Save = Callable[[EpisodeRecord, Path, str], object]
-"""Writes a recording: the record of the episode, the .rrd file and the label of the setting."""
+"""Writes an episode to a .rrd file; the last argument is the label of the setting."""
 
 
 @dataclass(frozen=True)
@@ -58,37 +58,37 @@ class EpisodeRunner:
     on_step: OnEpisodeStep | None = None
 
     def __call__(self, setting: Setting, task: str) -> Callable[[int], EpisodeRecord]:
-        """Build the setting's decoder -> the function that runs the episode of a seed."""
+        """Build the setting's decoder. Return the function that runs the episode of a seed."""
         runner = Runner(settings_from(setting.on(task)), task)
 
-        def episode(seed: int) -> EpisodeRecord:
+        def run_episode(seed: int) -> EpisodeRecord:
             on_step = functools.partial(self.on_step, setting, task, seed) if self.on_step is not None else None
             record = runner.episode(seed, is_recorded(runner.settings, seed), on_step)
             if record.frames:
                 label = setting.label.replace(" ", "_").replace("=", "")
                 path = self.rollouts / f"{label}-{record.task}-{seed}-{setting.work[:6]}.rrd"
                 self.save(record, path, setting.label)
-            return dataclasses.replace(record, frames={}, places={})
+            return replace(record, frames={}, places={})
 
-        return episode
+        return run_episode
 
-    def together(self, wanted: Sequence[Wanted]) -> Iterator[tuple[Wanted, EpisodeRecord | Exception]]:
-        """Run episodes of one setting, `rollout.batch` at a time; yield each as it ends: its record, or the error that
-        its world raised."""
-        setting = wanted[0].setting
-        settings = settings_from(setting.on(wanted[0].task))
-        requests = [Request(one, one.task, one.seed) for one in wanted]
+    def together(self, episodes: Sequence[Episode]) -> Iterator[tuple[Episode, EpisodeRecord | Exception]]:
+        """Run episodes of one setting, `rollout.batch` at a time. Yield each with its record or its world's error."""
+        setting = episodes[0].setting
+        settings = settings_from(setting.on(episodes[0].task))
+        requests = [Request(one, one.task, one.seed) for one in episodes]
         for request, result in run_batch(settings, requests):
             if self.on_step is not None:
                 self.on_step(setting, request.task, request.seed, settings.world.horizon)
             yield request.key, result
 
 
-def study_of(resolved: ResolvedStudy, kind: str = "sweep") -> Study:
-    """Return what a study wants, on the devices of this machine.
+def study_of(resolved: ResolvedStudy, kind: str = SWEEP) -> Study:
+    """Return a resolved study with its episodes, on the devices of this machine.
 
     Raises:
-        UsageError, CheckpointError: As `check` of each setting. UsageError: Too many episodes.
+        UsageError: A setting cannot run, or there are too many episodes.
+        CheckpointError: A setting's weights or data cannot be read.
     """
     about = resolved.study
     identities = {label: check(one) for label, one in resolved.settings.items()}
@@ -98,7 +98,7 @@ def study_of(resolved: ResolvedStudy, kind: str = "sweep") -> Study:
         Setting(
             label,
             resolved.overrides[label],
-            plain_settings(dataclasses.asdict(one)),
+            plain_settings(asdict(one)),
             identities[label],
             resolved.varies.get(label, {}),
             resolved.names.get(label, ""),
@@ -106,212 +106,163 @@ def study_of(resolved: ResolvedStudy, kind: str = "sweep") -> Study:
         for label, one in resolved.settings.items()
     ]
     settings.sort(key=lambda setting: setting.label != about.baseline)
-    wanted = wanted_of(settings, resolved.tasks, about.block, about.repeats)
+    episodes = all_episodes(settings, resolved.tasks, about.block, about.repeats)
     return Study(
-        about.name, tuple(settings), wanted, kind, about.title, about.baseline, about.axis, about.note, about.block
+        about.name, tuple(settings), episodes, kind, about.title, about.baseline, about.axis, about.note, about.block
     )
 
 
-@dataclass
-class Plan(Split):
-    """A study split into what is there and what is to run, and where and how it runs.
-
-    Attributes:
-        store: The study in the database.
-        runtime: Executor, workers, device.
-        command: Words after `kerv` that go on with it.
-    """
-
-    store: StudyStore = field(kw_only=True)
-    runtime: RuntimeSettings = field(kw_only=True)
-    command: tuple[str, ...] = field(kw_only=True)
-
-
 def plan(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
-    """Plan a sweep: the episodes of a study that the database lacks.
+    """Plan a sweep: find the episodes of a study that the database lacks.
+
+    Args:
+        resolved: The study.
+        command: Words after `kerv` that go on with it.
 
     Raises:
-        UsageError, CheckpointError: A setting that cannot run. StorageError: The results folder cannot be written.
+        UsageError: A setting cannot run.
+        CheckpointError: A setting's weights or data cannot be read.
+        StorageError: The results folder cannot be written.
     """
-    first = resolved.first
-    check_executor(first.runtime)
-    check_writable(first.results)
-    study, database = study_of(resolved), Database(first.results)
-    since = interrupted_since(database, SWEEP, study.name, command) if resolved.sweep.rerun == ALL else ""
-    return plan_study(database, study, first.runtime, command, resolved.sweep.rerun, since)
+    runtime, results, rerun = resolved.first.runtime, resolved.first.results, resolved.sweep.rerun
+    check_executor(runtime)
+    check_writable(results)
+    study, database = study_of(resolved), Database(results)
+    since = interrupted_since(database, SWEEP, study.name, command) if rerun == ALL else ""
+    return plan_study(database, study, rerun, since, runtime, command)
 
 
 def plan_rollout(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
-    """Plan a rollout: a new one, or the rest of the newest that the same command left unfinished.
-
-    A complete rollout is not reused, because who types a rollout wants it run. Raises as `plan`.
-    """
-    first = resolved.first
-    check_writable(first.results)
-    study, database = study_of(resolved, ROLLOUT), Database(first.results)
-    runtime = dataclasses.replace(first.runtime, workers=1, executor="local")
+    """Plan a new rollout, or the rest of the newest one that the same command left unfinished. See `plan`."""
+    check_writable(resolved.first.results)
+    study, database = study_of(resolved, ROLLOUT), Database(resolved.first.results)
+    runtime = replace(resolved.first.runtime, workers=1, executor="local")
     for row in run_rows(database, ROLLOUT):
         if row.command == tuple(command) and row.status != COMPLETE:
-            made = plan_study(database, dataclasses.replace(study, name=row.name), runtime, command, ALL, row.started)
-            if made.store.is_there and made.there and made.reasons:
-                return made
-    return plan_study(database, dataclasses.replace(study, name=new_name(database, study)), runtime, command, ALL)
+            rest = plan_study(database, replace(study, name=row.name), ALL, row.started, runtime, command)
+            if rest.store.exists and rest.existing and rest.missing:
+                return rest
+    return plan_study(database, replace(study, name=new_name(database, study)), ALL, "", runtime, command)
 
 
 def plan_again(database: Database, study: Study, name: str, command: Sequence[str]) -> Plan:
-    """Plan to measure a stored study again under another name: the one that an interrupted repetition has, else `name`,
-    `name2`, ….
+    """Plan to run a stored study again under another name.
+
+    The name is that of an interrupted repetition if there is one, else the first that is free of `name`, `name2`, ….
     """
-    words = tuple(command)
-    row = next((row for row in run_rows(database, study.kind) if row.command == words and row.status != COMPLETE), None)
+    rows = run_rows(database, study.kind)
+    row = next((row for row in rows if row.command == tuple(command) and row.status != COMPLETE), None)
     taken = {store.name for store in studies(database)}
     free = next(one for one in (name, *(f"{name}{number}" for number in range(2, 10_000))) if one not in taken)
-    study = dataclasses.replace(study, name=row.name if row else free)
-    return plan_study(database, study, RuntimeSettings(), command, ALL, row.started if row else "")
-
-
-def plan_study(
-    database: Database,
-    study: Study,
-    runtime: RuntimeSettings,
-    command: Sequence[str],
-    rerun: str = NEVER,
-    since: str = "",
-) -> Plan:
-    """Plan a study whose settings are resolved; see `plan.split`."""
-    made = split_of(database, study, rerun, since)
-    store = StudyStore(database, study.name, study.kind)
-    return Plan(study, made.there, made.reasons, made.newest, store=store, runtime=runtime, command=tuple(command))
+    study = replace(study, name=row.name if row else free)
+    return plan_study(database, study, ALL, row.started if row else "", command=command)
 
 
 def new_name(database: Database, study: Study) -> str:
-    """Return a rollout's name by date, time and methods: `20260301-142530-ar-spec_vla`."""
+    """Return a name with date, time and methods for a rollout: `20260301-142530-ar-spec_vla`."""
     methods = "-".join(dict.fromkeys(str(setting.settings["method"]) for setting in study.settings))
-    name = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{re.sub(r'[^A-Za-z0-9_.-]', '_', methods)[:_MOST_NAME]}"
-    return f"{name}-{secrets.token_hex(2)}" if StudyStore(database, name, ROLLOUT).is_there else name
+    name = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{re.sub(r'[^A-Za-z0-9_.-]', '_', methods)[:32]}"
+    return f"{name}-{secrets.token_hex(2)}" if StudyStore(database, name).exists else name
 
 
 def run(
     planned: Plan,
     on_event: OnEvent = lambda event: None,
     *,
-    save: Save | None = None,
+    save: Save = lambda *_: None,
     on_step: OnEpisodeStep | None = None,
-    judge: Judge | None = None,
+    analysis: InterimAnalysis | None = None,
 ) -> Outcome:
-    """Run what a plan lacks. Each episode is in the database as soon as it ends.
+    """Run the missing episodes of a plan. Each is in the database as soon as it ends.
 
     Args:
         planned: What to run.
         on_event: Shows progress.
-        save: Writes recordings; None: nothing is recorded.
-        on_step: Shows progress within an episode, with one local worker.
-        judge: Decides after each block of seeds which settings go on; None: all do.
+        save: Writes recordings. Default: nothing is recorded.
+        on_step: Shows progress within an episode, if there is one local worker.
+        analysis: Decides after each block of seeds which settings go on. Default: all do.
 
     Raises:
-        Interrupted: Ctrl-C. KervError: An episode of a rollout failed. StorageError: The disk refused.
+        Interrupted: Ctrl-C.
+        KervError: An episode of a rollout failed.
+        StorageError: The disk refused.
     """
     store, single = planned.store, planned.runtime.executor == "local" and planned.runtime.workers == 1
-    rollout = planned.study.kind == ROLLOUT
+    is_rollout = planned.study.kind == ROLLOUT
 
-    def heard(event: Event) -> None:
-        if isinstance(event, SettingFailed) and rollout:
+    def forward(event: Event) -> None:
+        if isinstance(event, SettingFailed) and is_rollout:
             raise event.error or KervError(event.reason)
         on_event(event)
 
-    runner = EpisodeRunner(store.rollouts, save or _unsaved, on_step if single else None)
-    with Run(store.database, planned.study.kind, store.name, planned.command, alone=rollout) as record:
+    runner = EpisodeRunner(store.rollouts, save, on_step if single else None)
+    with Run(store.database, planned.study.kind, store.name, planned.command, alone=is_rollout) as record:
         try:
-            if judge is None:
-                store.save(planned)
-                return execute(planned, runner, store, record, planned.runtime, heard)
-            return _until_decided(planned, runner, record, heard, judge)
+            if analysis is not None:
+                return _run_until_decided(planned, runner, record, forward, analysis)
+            store.save(planned.study, planned.existing)
+            return execute(planned, runner, record, forward)
         except KeyboardInterrupt:
-            there, wanted = store.counts()
+            existing, total = store.counts()
             raise Interrupted(
-                f"interrupted: {there} of {wanted} episodes of {store.name} are kept, the same command goes on there"
+                f"interrupted: {existing} of {total} episodes of {store.name} are kept, the same command goes on there"
             ) from None
         finally:
             close_worlds()
 
 
-def _unsaved(*args: object) -> None:
-    """Write no recording."""
-
-
-def _until_decided(planned: Plan, runner: EpisodeRunner, record: Run, on_event: OnEvent, judge: Judge) -> Outcome:
-    """Run block after block of seeds, and leave out the settings that are decided. The study wants what ran."""
-    study, store, total = planned.study, planned.store, Outcome()
-    open_labels = [setting.label for setting in study.settings if setting.label != study.baseline]
-    looks = looks_of(study)
-    so_far: list[Wanted] = []
-    for look, wanted in enumerate(looks, 1):
-        part = [one for one in wanted if one.setting.label in (study.baseline, *open_labels)]
-        so_far += part
+def _run_until_decided(
+    planned: Plan, runner: EpisodeRunner, record: Run, on_event: OnEvent, analysis: InterimAnalysis
+) -> Outcome:
+    """Run block after block of seeds, and leave out the settings that are decided. The study keeps what ran."""
+    study, total = planned.study, Outcome()
+    undecided = [label for label in study.labels if label != study.baseline]
+    blocks = seed_blocks(study)
+    so_far: list[Episode] = []
+    for number, block in enumerate(blocks, 1):
+        chosen = [one for one in block if one.setting.label in (study.baseline, *undecided)]
+        so_far += chosen
         settings = tuple({one.setting.label: one.setting for one in so_far}.values())
-        chosen = set(part)
-        now = Split(
-            dataclasses.replace(study, settings=settings, wanted=tuple(part)),
-            {one: row for one, row in planned.there.items() if one in chosen},
-            {one: why for one, why in planned.reasons.items() if one in chosen},
-            planned.newest,
+        part = replace(
+            planned,
+            study=replace(study, settings=settings, episodes=tuple(chosen)),
+            existing={one: planned.existing[one] for one in chosen if one in planned.existing},
+            missing={one: planned.missing[one] for one in chosen if one in planned.missing},
         )
-        store.save(now, whole=look == 1)
-        outcome = execute(now, runner, store, record, planned.runtime, on_event)
-        total = Outcome(
-            total.done + outcome.done,
-            total.reused + outcome.reused,
-            total.failed + outcome.failed,
-            total.seconds + outcome.seconds,
-        )
-        if outcome.failed:
-            return total
-        open_labels = judge(store, so_far, open_labels, look, len(looks))
-        if not open_labels:
+        planned.store.save(part.study, part.existing, whole=number == 1)
+        total.add(execute(part, runner, record, on_event))
+        if total.failed:
+            break
+        undecided = analysis(planned.store, so_far, undecided, number, len(blocks))
+        if not undecided:
             break
     return total
 
 
-def looks_of(study: Study) -> list[list[Wanted]]:
-    """Return a study's episodes by block of seeds: one look each."""
-    first = min(one.seed for one in study.wanted)
-    looks: dict[int, list[Wanted]] = {}
-    for one in study.wanted:
-        looks.setdefault((one.seed - first) // study.block, []).append(one)
-    return [looks[number] for number in sorted(looks)]
-
-
 @dataclass(frozen=True)
 class TimeEstimate:
-    """Time for the episodes that a plan lacks. source: of the figure, in words."""
+    """Wall time for the missing episodes of a plan, and in words where the number comes from."""
 
     seconds: float
     source: str
 
 
-def estimate(planned: Plan, prior_seconds: float) -> TimeEstimate:
-    """Estimate wall time from the mean wall seconds per episode of the plan's other episodes.
+def estimate(planned: Plan, guess: float) -> TimeEstimate:
+    """Estimate wall time from the mean wall seconds per episode of each setting.
 
-    A setting with such episodes uses its own mean, others the mean over all; `prior_seconds` per episode is the guess
-    without any. Workers are taken to scale perfectly, up to one per block.
+    A setting without stored episodes gets the mean of the others. Workers are taken to scale perfectly, up to one per
+    block.
+
+    Args:
+        planned: What is to run.
+        guess: Seconds per episode if no setting has stored episodes.
     """
-    means, count = store_means(planned)
-    prior = sum(means.values()) / len(means) if means else prior_seconds
-    total = sum(means.get(one.setting.work, prior) for one in planned.to_run)
-    source = f"measured on {count} stored episodes" if count else f"a guess of {prior_seconds:g} s per episode"
-    blocks: list[Block] = planned.blocks(planned.runtime.workers)
-    return TimeEstimate(total / max(1, min(planned.runtime.workers, len(blocks))), source)
-
-
-def store_means(planned: Plan) -> tuple[dict[str, float], int]:
-    """Return the mean wall seconds of stored episodes by setting, and how many there are."""
-    import sqlalchemy as sa
-
-    from kerv_cli.lab.database import EPISODES
-
-    settings: list[Setting] = list(planned.study.settings)
     columns = EPISODES.c.work, sa.func.avg(EPISODES.c.wall_seconds), sa.func.count()
-    query = sa.select(*columns).where(EPISODES.c.work.in_([s.work for s in settings])).group_by(EPISODES.c.work)
+    query = sa.select(*columns).where(EPISODES.c.work.in_([setting.work for setting in planned.study.settings]))
     with planned.store.database.reading() as connection:
-        rows = connection.execute(query).all()
-    return {work: float(mean) for work, mean, _ in rows if mean is not None}, sum(row[2] for row in rows)
+        rows = connection.execute(query.group_by(EPISODES.c.work)).all()
+    means, stored = {row[0]: float(row[1]) for row in rows if row[1] is not None}, sum(row[2] for row in rows)
+    mean = sum(means.values()) / len(means) if means else guess
+    seconds = sum(means.get(one.setting.work, mean) for one in planned.to_run)
+    source = f"measured on {stored} stored episodes" if stored else f"a guess of {guess:g} s per episode"
+    return TimeEstimate(seconds / max(1, min(planned.runtime.workers, len(planned.blocks()))), source)

@@ -23,7 +23,7 @@ from kerv_cli.episodes.identity import ENGINE
 from kerv_cli.episodes.policy import artifacts_of
 from kerv_cli.episodes.resolve import ResolvedStudy
 from kerv_cli.episodes.settings import WAITS, RolloutSettings
-from kerv_cli.lab.plan import Wanted, seeds_text
+from kerv_cli.lab.plan import Episode, seeds_text
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.methods.certified.betting import more_to_decide, p_value
 from kerv_cli.methods.certified.certificate import Candidate, Certificate, CertificateArtifact
@@ -108,7 +108,7 @@ def _overrides(kind: str, part: Any, other: Any) -> list[str]:
 
 
 def certify(
-    resolved: ResolvedStudy, store: StudyStore, wanted: Sequence[Wanted], margin: float, delta: float
+    resolved: ResolvedStudy, store: StudyStore, wanted: Sequence[Episode], margin: float, delta: float
 ) -> Certificate:
     """Test the study's settings in their order, each at delta, up to the first that fails.
 

@@ -130,7 +130,7 @@ def _settings_of(side: Side) -> Row:
         settings.update((key, description[key]) for key in ("git_commit", "versions", "demos") if key in description)
         return flatten(settings)
     setting, episodes = side.data.settings[side.label], _episodes(side.data, side.label)
-    wanted = [one for one in side.data.study.wanted if one.setting.label == side.label]
+    wanted = [one for one in side.data.study.episodes if one.setting.label == side.label]
     return {
         **flatten(without(setting.settings, NOT_DETERMINING - {"policy", "method"})),
         **{name: value[:12] for name, value in setting.identity.items() if name != OBSERVATION},

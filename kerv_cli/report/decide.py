@@ -19,9 +19,9 @@ import pandas as pd
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import read_json, write_json
-from kerv_cli.lab.plan import Wanted
+from kerv_cli.lab.plan import Episode
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.lab.study import Judge
+from kerv_cli.lab.study import InterimAnalysis
 from kerv_cli.report import statistics as stats
 from kerv_cli.report import stressed, verdict
 from kerv_cli.report.measures import MICRO, Row, pair_counts, paired
@@ -159,8 +159,8 @@ def decisions(data: StudyData, labels: Sequence[str], margin: float, look: int, 
     return [decision_of(label, counts, margin, look, looks) for label, counts in pairs.items()]
 
 
-def judge(loss: float, tell: Callable[[str], None]) -> Judge:
-    """Return the `judge` of `study.run` for a bound on the loss of success.
+def judge(loss: float, tell: Callable[[str], None]) -> InterimAnalysis:
+    """Return the `analysis` of `study.run` for a bound on the loss of success.
 
     Args:
         loss: The bound, in points.
@@ -168,7 +168,7 @@ def judge(loss: float, tell: Callable[[str], None]) -> Judge:
     """
     latest: dict[str, Decision] = {}
 
-    def ask(store: StudyStore, wanted: Sequence[Wanted], labels: Sequence[str], look: int, looks: int) -> list[str]:
+    def ask(store: StudyStore, wanted: Sequence[Episode], labels: Sequence[str], look: int, looks: int) -> list[str]:
         answers = decisions(load_study(store, wanted), labels, loss / POINTS, look, looks)
         tell(f"look {look} of {looks}: {verdict.progress_line(answers)}")
         latest.update({answer.label: answer for answer in answers})

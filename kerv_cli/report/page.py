@@ -66,7 +66,7 @@ def render(
         baseline=data.study.baseline,
         absent=list(dict.fromkeys(f"{one.setting.label} on {one.task}" for one in data.absent)),
         missing=len(data.absent),
-        planned=len(data.study.wanted),
+        planned=len(data.study.episodes),
         how_to_run=_how_to_run(store),
         suite=_suite(data.table),
         speeds=differing_speeds(rows_of(data.table, MICRO)),

@@ -16,7 +16,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_text
 from kerv_cli.base.provenance import PACKAGES
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, flat, stress_of, without, work_of
-from kerv_cli.lab.plan import Setting, Study, Wanted, seeds_text
+from kerv_cli.lab.plan import Episode, Setting, Study, seeds_text
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.methods.settings import MODEL
 from kerv_cli.report.measures import MACRO, MICRO, Row, measure
@@ -64,11 +64,11 @@ class StudyData:
         return [label for label in self.study.labels if label in present]
 
     @property
-    def absent(self) -> list[Wanted]:
-        """Wanted episodes that are missing."""
+    def absent(self) -> list[Episode]:
+        """Episode episodes that are missing."""
         names = ("label", "task", "seed", "repeat")
         present = set(zip(*(self.episodes[name] for name in names), strict=True))
-        return [one for one in self.study.wanted if (one.setting.label, *one.key[1:]) not in present]
+        return [one for one in self.study.episodes if (one.setting.label, *one.key[1:]) not in present]
 
     @functools.cached_property
     def references(self) -> dict[str, str]:
@@ -121,7 +121,7 @@ def _unstressed(setting: Setting) -> str:
     return work_of(plain, setting.identity)
 
 
-def load_study(store: StudyStore, wanted: Sequence[Wanted] | None = None) -> StudyData:
+def load_study(store: StudyStore, wanted: Sequence[Episode] | None = None) -> StudyData:
     """Return a study and its episodes; with `wanted`, a study of only those.
 
     Raises:
@@ -131,7 +131,7 @@ def load_study(store: StudyStore, wanted: Sequence[Wanted] | None = None) -> Stu
     if wanted is not None:
         labels = {one.setting.label for one in wanted}
         settings = tuple(setting for setting in study.settings if setting.label in labels)
-        study = replace(study, settings=settings, wanted=tuple(wanted))
+        study = replace(study, settings=settings, episodes=tuple(wanted))
     frame = store.frame(wanted)
     if frame.empty:
         raise UsageError(f"study '{store.name}' has no episode yet: {store.how_to_run()}")

@@ -10,8 +10,8 @@ from kerv_cli.base.manifests import read
 from kerv_cli.base.settings import read_settings
 from kerv_cli.catalogue.again import again_words
 from kerv_cli.catalogue.entries import RunEntry, description_of
-from kerv_cli.lab.database import COMPLETE, Database
-from kerv_cli.lab.runs import run_rows
+from kerv_cli.lab.database import Database
+from kerv_cli.lab.runs import COMPLETE, run_rows
 from kerv_cli.methods.settings import with_artifacts
 from kerv_cli.training.drafter import DrafterRun
 from kerv_cli.training.run import TrainingRun
