@@ -168,9 +168,9 @@ class Policy:
     """
 
     def __init__(self, served: Served) -> None:
-        self.info: dict[str, Any] = metadata(served.interface, served.chunk)
+        self.info: dict[str, Any] = metadata(served)
         self.last: dict[str, Any] = {}
-        self._client = OpenPi(served, served.new_session())
+        self._client = OpenPi(served)
         self._begins = True
 
     def reset(self) -> None:

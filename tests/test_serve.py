@@ -36,7 +36,6 @@ from kerv_cli.serve.guard import Finite
 from kerv_cli.serve.openpi import OpenPi, observation_of
 from kerv_cli.serve.policy import Policy
 from kerv_cli.serve.server import PolicyServer
-from kerv_cli.serve.session import Session
 from kerv_cli.serve.settings import ServeSettings
 from kerv_cli.serve.wire import packed, unpacked
 
@@ -230,7 +229,8 @@ class Watching(Decoder):
 
 def test_the_decoder_is_told_what_was_executed(policy: Policy) -> None:
     decoder = Watching(policy.artifacts.target)
-    client = OpenPi(policy, Session(lambda task: decoder))
+    client = OpenPi(policy)
+    client.decoder = decoder
     first = unpacked(client.answer(packed(seen(0))).frame)["actions"]
     client.answer(packed(seen(1, executed=2)))
     assert len(decoder.told) == 2

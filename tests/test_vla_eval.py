@@ -43,6 +43,7 @@ from websockets.sync.client import connect
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.spaces import Observation
 from kerv_cli.catalogue.served import read_served
 from kerv_cli.catalogue.vla_eval import by_server, read_evaluations
 from kerv_cli.cli.app import app
@@ -50,7 +51,7 @@ from kerv_cli.episodes.runner import Runner
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.serve.policy import Policy
 from kerv_cli.serve.settings import ServeSettings
-from kerv_cli.serve.vla_eval import dim_specs
+from kerv_cli.serve.vla_eval import VlaEval, dim_specs
 from kerv_cli.worlds.vla_eval import MetaWorld
 
 HORIZON = 10
@@ -279,29 +280,24 @@ def test_clients_of_a_batch_get_the_actions_that_each_would_alone(results: Path)
 
 def test_one_bad_observation_of_a_batch_is_no_others_fault(results: Path) -> None:
     policy = policy_of(results, "nano-state", "batch=2")
-    with policy.session() as one, policy.session() as two:
-        good = {"images": {}, "task_description": "reach", "state": np.zeros(39)}
-        outcomes: list[Any] = [None, None]
+    outcomes: dict[str, Any] = {}
 
-        def ask(i: int, session: Any, words: str) -> None:
-            from kerv_cli.base.spaces import Observation
+    def ask(instruction: str) -> None:
+        client = VlaEval(policy)
+        client.begin("reach-v3", 0, np.zeros(3))
+        try:
+            outcomes[instruction] = client.decode(Observation(np.zeros(4), np.zeros(39), instruction)).actions.shape
+        except UsageError as error:
+            outcomes[instruction] = str(error)
 
-            session.begin("reach-v3", 0, np.zeros(3))
-            try:
-                outcomes[i] = session.decode(Observation(np.zeros(4), good["state"], words)).actions.shape
-            except UsageError as error:
-                outcomes[i] = str(error)
-
-        threads = [
-            threading.Thread(target=ask, args=(0, one, "reach")),
-            threading.Thread(target=ask, args=(1, two, "word " * 40)),
-        ]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-    assert outcomes[0] == (4, 4)
-    assert "40 words" in outcomes[1]
+    long = "word " * 40
+    threads = [threading.Thread(target=ask, args=(instruction,)) for instruction in ("reach", long)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert outcomes["reach"] == (4, 4)
+    assert "40 words" in outcomes[long]
 
 
 # --- Meta-World as a benchmark

@@ -1,5 +1,4 @@
-"""What a served policy refuses to act on: states far from those that it was trained on, and numbers that are not
-finite."""
+"""What a served policy refuses to act on: states unlike its demonstrations', and numbers that are not finite."""
 
 from __future__ import annotations
 
@@ -14,35 +13,41 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.protocol import Target
 
 REFUSE, HOLD = "refuse", "hold"
-"""Of `outside`: answer with an error; execute the last action once more."""
+"""Answers to a state out of range: an error, or the last action once more."""
 LEAST_WIDTH = 1.0
-"""Of a number that hardly moved in the demonstrations, in its own unit."""
+"""Width of the range of a number that hardly moved in the demonstrations, in its own unit."""
 
 
 class StateRange:
-    """The range of the numbers that a policy may act on. low, high: the least and the largest of its demonstrations
-    (p,). margin: widths of that range which are added on either side."""
+    """The range of the states on which a policy may act.
+
+    Args:
+        low: (p,) lowest numbers of the demonstrations.
+        high: (p,) highest numbers.
+        names: Names of the first numbers.
+        margin: How many widths of the range are added on each side.
+    """
 
     def __init__(self, low: np.ndarray, high: np.ndarray, names: tuple[str, ...], margin: float) -> None:
-        more = margin * np.where(high - low < LEAST_WIDTH / 100, LEAST_WIDTH, high - low)
-        self.low, self.high, self.names = low - more, high + more, names
+        added = margin * np.where(high - low < LEAST_WIDTH / 100, LEAST_WIDTH, high - low)
+        self.low, self.high, self.names = low - added, high + added, names
 
     def outside(self, observation: Observation) -> str:
-        """Which number of an observation is out of range, in words; empty where none is."""
+        """Say which number is out of range; empty if none is."""
         numbers = observation.state[: len(self.low)]
         beyond = np.flatnonzero((numbers < self.low) | (numbers > self.high))
         if not len(beyond):
             return ""
-        at = int(beyond[0])
-        name = self.names[at] if at < len(self.names) else f"number {at}"
+        first = int(beyond[0])
+        name = self.names[first] if first < len(self.names) else f"number {first}"
         return (
-            f"the state is out of range: {name} is {numbers[at]:.4g}, the policy was trained on "
-            f"{self.low[at]:.4g} to {self.high[at]:.4g}, margin included"
+            f"the state is out of range: {name} is {numbers[first]:.4g}, the policy was trained on "
+            f"{self.low[first]:.4g} to {self.high[first]:.4g}, margin included"
         )
 
 
 class Finite:
-    """A target, and a check that its prompts and logits are finite."""
+    """A target that notes whether its prompts and logits are finite."""
 
     def __init__(self, target: Target) -> None:
         self._target = target
@@ -52,11 +57,11 @@ class Finite:
         return getattr(self._target, name)
 
     def encode(self, observation: Observation) -> Tensor:
-        """The target's prompt."""
+        """Return the target's prompt."""
         return self._noted(self._target.encode(observation))
 
     def head(self, hidden: Tensor) -> Tensor:
-        """The target's logits."""
+        """Return the target's logits."""
         return self._noted(self._target.head(hidden))
 
     def _noted(self, numbers: Tensor) -> Tensor:
@@ -64,7 +69,7 @@ class Finite:
         return numbers
 
     def check(self) -> None:
-        """Raises KervError: the decode computed numbers that are not finite."""
+        """Raise KervError if the decode computed numbers that are not finite."""
         fine, self._fine = self._fine, []
         if fine and not bool(torch.stack(fine).all()):
             raise KervError("the policy computed numbers that are not finite: no action is sent")

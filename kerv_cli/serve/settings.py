@@ -15,19 +15,17 @@ class ServeSettings(MethodSettings):
 
     groups: ClassVar = {"policy": "vision", "runtime": "cpu", "method": "ar"}
 
-    protocol: str = choice(
-        "openpi", "openpi", "vla_eval", help="what clients speak: robots openpi, benchmarks vla_eval"
-    )
+    protocol: str = choice("openpi", "openpi", "vla_eval", help="openpi for robots, vla_eval for benchmarks")
     host: str = setting("127.0.0.1", "address to listen on; there is no password")
     port: int = number(8000, 0, 65_535, help="port to listen on; 0: a free one")
-    log_every: int = number(100, 0, 10**9, help="answers between two lines of latencies; 0: at a connection's end only")
+    log_every: int = number(100, 0, 10**9, help="answers between two lines of latencies; 0: only when a client leaves")
     gripper: str = choice(
         "as_is", "as_is", "signed", "signed_inverted", help="how strict DoFs (0 closed to 1 open) are sent"
     )
-    task_name: str = setting("", "the task, for parts whose levels differ between tasks; empty: vla_eval's clients say")
-    batch: int = number(1, 1, 1024, help="clients that are decoded together; above 1: without times")
-    origins: list[str] = setting([], "web pages that may connect; programs, which name no origin, always may")
+    task_name: str = setting("", "the task, for parts whose levels differ between tasks; vla_eval's clients name it")
+    batch: int = number(1, 1, 1024, help="clients that are decoded together; above 1 nothing is timed")
+    origins: list[str] = setting([], "web pages that may connect; programs always may")
     outside: str = choice(
-        "refuse", "refuse", "hold", help="a state that the policy was not trained on: an error, or the last action"
+        "refuse", "refuse", "hold", help="answer to a state out of range: an error, or the last action again"
     )
-    margin: float = number(1.0, 0, 1e6, help="by how many widths a state may exceed the demonstrations' range")
+    margin: float = number(1.0, 0, 1e6, help="how many widths of the demonstrations' range a state may be outside it")
