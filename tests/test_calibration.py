@@ -120,6 +120,8 @@ def quiet(title: str) -> AbstractContextManager[Callable[[int, int], object]]:
 
 def settings(results: Path, *overrides: str, target: str = "nano-state") -> CalibrateSettings:
     words = ["task=reach,drawer-close", "demos=few", "held_out=0.4", "decodes=4", f"policy.target={target}"]
+    given = {override.split("=")[0] for override in overrides}
+    words = [word for word in words if word.split("=")[0] not in given]
     return compose("calibrate", [*words, f"results={results}", *overrides], CalibrateSettings)
 
 
@@ -326,7 +328,7 @@ def test_a_missing_calibration_names_the_command(tmp_path: Path) -> None:
 )
 def test_wrong_requests_get_one_line(results: Path, override: str, kind: type[KervError], says: str) -> None:
     with pytest.raises(kind, match=says) as caught:
-        CalibrationRun(settings(results, override, "decodes=1")).run(quiet)
+        CalibrationRun(settings(results, override)).run(quiet)
     assert "\n" not in str(caught.value)
 
 

@@ -63,6 +63,8 @@ def save_old(results: Path, seed: int) -> None:
 def settings(results: Path, *overrides: str) -> TrainTargetSettings:
     common = ["name=new", "target=nano", "target.observation=state", "target.chunk=8", "task=drawer-open"]
     common += ["train.init=old", "train.batch=4", "train.steps=4", "train.validate_every=2", f"results={results}"]
+    given = {override.split("=")[0] for override in overrides}
+    common = [override for override in common if override.split("=")[0] not in given]
     return compose("train_target", [*common, *overrides], TrainTargetSettings)
 
 
