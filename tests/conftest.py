@@ -12,7 +12,6 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from functools import partialmethod
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +71,7 @@ def write_policy(results: Path, name: str, observation: str, seed: int = 0) -> N
     from kerv_cli.base.config import compose
     from kerv_cli.methods.artifacts import MadeFor
     from kerv_cli.methods.eagle import DrafterSettings
-    from kerv_cli.methods.eagle.drafter import Drafter, DrafterArtifact
+    from kerv_cli.methods.eagle.drafter import EagleDrafter
     from kerv_cli.targets.compact.folder import save_target
     from kerv_cli.targets.compact.target import CompactTarget
     from kerv_cli.training.imitation import vocabulary
@@ -85,9 +84,9 @@ def write_policy(results: Path, name: str, observation: str, seed: int = 0) -> N
     target = CompactTarget(settings.target, SPEC.actions, SPEC.observation, vocabulary(SPEC.name), camera)
     provenance = {"parameters": sum(p.numel() for p in target.parameters())}
     digest = save_target(results / "artifacts" / "target" / name, target, "metaworld", provenance)
-    drafter = Drafter.beside(DrafterSettings(), target)
+    drafter = EagleDrafter().network(DrafterSettings(), target)
     folder, made_for = results / "artifacts" / "drafter" / name, MadeFor(digest, target.actions)
-    DrafterArtifact().save(folder, drafter, made_for, provenance, settings=asdict(drafter.settings))
+    EagleDrafter().save(folder, drafter, made_for, provenance, settings=asdict(drafter.settings))
 
 
 @pytest.fixture(scope="session")
@@ -102,9 +101,9 @@ def policies(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def few_validations(monkeypatch: pytest.MonkeyPatch) -> None:
     """A drafter in training is validated on 4 observations, not on 60 of which each is decoded twice."""
-    from kerv_cli.training.distillation import Distillation
+    from kerv_cli.methods.eagle import drafter
 
-    monkeypatch.setattr(Distillation, "validate", partialmethod(Distillation.validate, observations=4))
+    monkeypatch.setattr(drafter, "VALIDATED", 4)
 
 
 @contextlib.contextmanager

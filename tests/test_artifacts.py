@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -19,9 +20,9 @@ from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.episodes.policy import check, decoder_for, unseen_tasks
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
-from kerv_cli.methods.eagle.drafter import Drafter
+from kerv_cli.methods.eagle.drafter import EagleDrafter
 from kerv_cli.methods.early import EarlySettings
-from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter
+from kerv_cli.methods.early.drafter import EarlyDrafter
 from kerv_cli.methods.heisd.datastore import Datastore
 from kerv_cli.methods.settings import PolicySettings, with_artifacts
 from kerv_cli.targets import checkpoint
@@ -52,13 +53,8 @@ def whole(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     DatastoreBuild(BuildDatastoreSettings(policy=policy, demos="few", task=list(TASKS), results=str(results))).build()
     words = ["task=reach,drawer-close", "demos=few", "held_out=0.4", "decodes=4", "policy.target=nano-state"]
     run = CalibrationRun(compose("calibrate", [*words, f"results={results}"], CalibrateSettings))
-    run.load(quiet)
-    run.finish(run.presample(quiet), run.boundary(quiet), run.skip(quiet))
+    run.run(lambda text: contextlib.nullcontext(lambda done, total: None))
     return results
-
-
-def quiet(done: int, total: int) -> None:
-    """No progress."""
 
 
 @pytest.fixture
@@ -87,7 +83,7 @@ def test_a_study_loads_and_hashes_everything_once(results: Path, monkeypatch: py
     hashed: Counter[str] = Counter()
     counted(monkeypatch, checkpoint, "load_target", loaded, lambda folder, *rest: f"target {folder}")
     counted(monkeypatch, Datastore, "open", loaded, lambda folder, *rest: f"datastore {folder}")
-    counted(monkeypatch, Drafter, "beside", loaded, lambda *rest: "drafter")
+    counted(monkeypatch, EagleDrafter, "network", loaded, lambda *rest: "drafter")
     counted(monkeypatch, hashlib, "file_digest", hashed, lambda file, algorithm: os.path.relpath(file.name, results))
     study = [settings_of(results, overrides) for overrides in STUDY]
     decoders = []
@@ -180,9 +176,9 @@ def complete(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """As `whole`, with an early drafter."""
     results = Path(shutil.copytree(whole, tmp_path_factory.mktemp("complete") / "results"))
     target, described = checkpoint.load_target(results / "artifacts/target/nano-state")
-    drafter = EarlyDrafter.beside(EarlySettings(width=16, layers=1), target)
+    drafter = EarlyDrafter().network(EarlySettings(width=16, layers=1), target)
     made_for, own = MadeFor.of(described), {"settings": asdict(drafter.settings)}
-    EarlyArtifact().save(results / "artifacts/early/nano-state", drafter, made_for, {}, **own)
+    EarlyDrafter().save(results / "artifacts/early/nano-state", drafter, made_for, {}, **own)
     return results
 
 
@@ -207,7 +203,7 @@ def test_what_was_made_from_another_artifact_is_refused_beside_this_one(
     complete: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     files = Artifacts(str(complete), PolicySettings(target="nano-state"))
-    monkeypatch.setattr(EarlyArtifact, "sources", lambda self, description: {"datastore": OTHER})
+    monkeypatch.setattr(EarlyDrafter, "sources", lambda self, description: {"datastore": OTHER})
     with pytest.raises(CheckpointError, match=MESSAGE) as refused:
         files.check(FILES)
     assert "\n" not in str(refused.value)

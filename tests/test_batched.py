@@ -118,7 +118,7 @@ def test_parallel_passes_of_a_batch_are_those_of_its_rows() -> None:
 def test_early_drafts_of_a_batch_follow_each_episodes_own_history(radius: int, history: int) -> None:
     policy = target()
     torch.manual_seed(3)
-    drafter = EarlyDrafter.beside(EarlySettings(layers=1, width=32), policy).eval()
+    drafter = EarlyDrafter().network(EarlySettings(layers=1, width=32), policy).eval()
     torch.nn.init.normal_(drafter.head.weight, std=1.0)
     draft = EarlyProposer(drafter, policy)
     parts = Parts(prefill_draft=draft, skip=AlwaysSkip(draft), threshold=Fixed(radius))

@@ -16,8 +16,8 @@ from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.places import shipped_dir
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
 from kerv_cli.methods.artifacts import Request
-from kerv_cli.methods.eagle.drafter import DrafterArtifact
-from kerv_cli.methods.early.drafter import EarlyArtifact
+from kerv_cli.methods.eagle.drafter import EagleDrafter
+from kerv_cli.methods.early.drafter import EarlyDrafter
 from kerv_cli.targets.attention import attention_mask
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.captured import CapturedCache, bucket
@@ -95,8 +95,8 @@ def test_the_shipped_targets_load_with_metaworlds_spaces(name: str) -> None:
     assert target.cameras == (("corner4",) if name == "mt10-vision" else ())
     assert target.max_prompt == (31 if name == "mt10-vision" else 15)
     request = Request(description, target)
-    drafter = DrafterArtifact().load(shipped_dir() / name / "drafter", request)
-    early = EarlyArtifact().load(shipped_dir() / name / "early", request)
+    drafter = EagleDrafter().load(shipped_dir() / name / "drafter", request)
+    early = EarlyDrafter().load(shipped_dir() / name / "early", request)
     assert (drafter.width, early.tokens) == (target.width, target.chunk * 4)
 
 

@@ -21,7 +21,7 @@ from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
+from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter, EagleNetwork
 from kerv_cli.methods.jacobi import JacobiProposer
 from kerv_cli.targets.checkpoint import load_target, save_module, target_fields
 from kerv_cli.targets.compact.packed import pack
@@ -152,7 +152,7 @@ def test_strict_decoding_with_a_drafter_equals_ar(
     seed: int, chunk: int, depth: int, top_k: int, nodes: int, layers: int, fixed: bool
 ) -> None:
     target = random_target(seed, 2, 2, chunk, fixed)
-    drafter = Drafter.beside(DrafterSettings(layers=layers), target).eval().requires_grad_(False)
+    drafter = EagleDrafter().network(DrafterSettings(layers=layers), target).eval().requires_grad_(False)
     if fixed:
         drafter.new_cache = functools.partial(drafter.new_cache, fixed=True)  # type: ignore[method-assign]
     proposer = DrafterProposer(drafter, target, depth, top_k, nodes)
@@ -215,7 +215,7 @@ def test_drafts_verified_inside_the_prefill_are_lossless(
     truth = plain_greedy(target, prompt)
     proposer = None
     if drafting:
-        drafter = Drafter.beside(DrafterSettings(), target).eval().requires_grad_(False)
+        drafter = EagleDrafter().network(DrafterSettings(), target).eval().requires_grad_(False)
         proposer = DrafterProposer(drafter, target, 4, 2, 6)
     parts = Parts(prefill_draft=RandomTrees(truth, seed, nodes), proposer=proposer)
     result = Decoder(target, parts).decode_prompt(prompt)
@@ -240,11 +240,11 @@ def test_a_perfect_draft_in_the_prefill_takes_one_forward() -> None:
 
 def test_a_drafter_drafts_the_same_tree_from_a_cache_of_fixed_shapes() -> None:
     target = random_target(2, 2, 2, 4)
-    drafter = Drafter.beside(DrafterSettings(), target).eval().requires_grad_(False)
+    drafter = EagleDrafter().network(DrafterSettings(), target).eval().requires_grad_(False)
     prompt = random_prompt(target, 2)
     drafted = []
     for fixed in (False, True):
-        drafter.new_cache = functools.partial(Drafter.new_cache, drafter, fixed=fixed)  # type: ignore[method-assign]
+        drafter.new_cache = functools.partial(EagleNetwork.new_cache, drafter, fixed=fixed)  # type: ignore[method-assign]
         proposer = DrafterProposer(drafter, target, 5, 4, 20)
         drafted.append([r.drafted for r in decode(target, proposer, prompt).rounds])
     assert drafted[0] == drafted[1]

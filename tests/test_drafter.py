@@ -8,14 +8,14 @@ from test_decoding_lossless import random_prompt, random_target
 
 from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
+from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.targets.compact.target import CompactTarget
 
 
 def drafted(seed: int, depth: int, top_k: int, nodes: int) -> tuple[DrafterProposer, CompactTarget, TokenTree]:
     target = random_target(seed, 2, 2, 4)
     torch.manual_seed(seed)
-    drafter = Drafter.beside(DrafterSettings(), target).eval().requires_grad_(False)
+    drafter = EagleDrafter().network(DrafterSettings(), target).eval().requires_grad_(False)
     for parameter in drafter.parameters():
         if parameter.dim() == 2:
             torch.nn.init.normal_(parameter, std=0.3)

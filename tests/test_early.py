@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -15,8 +16,17 @@ from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.cli.app import app
 from kerv_cli.methods.artifacts import MadeFor, Request
+from kerv_cli.methods.drafters import Lesson
 from kerv_cli.methods.early import EarlySettings
-from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter, choose, choose_with_odds
+from kerv_cli.methods.early.drafter import (
+    EarlyDrafter,
+    EarlyExamples,
+    EarlyNetwork,
+    accepted_tokens,
+    choose,
+    choose_with_odds,
+    measure,
+)
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.settings import TargetSettings
@@ -24,7 +34,6 @@ from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.observations import split
 from kerv_cli.training.drafter import DrafterRun
-from kerv_cli.training.early_distillation import EarlyDistillation, EarlySamples, accepted_tokens, measure, teach_early
 from kerv_cli.training.imitation import load_samples
 from kerv_cli.training.settings import TrainDrafterSettings, TrainSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset
@@ -46,9 +55,9 @@ def shaped(settings: TargetSettings = SHAPE) -> CompactTarget:
 FEATURES = shaped().pooled_width
 
 
-def drafter(settings: EarlySettings = SMALL, target: CompactTarget | None = None) -> EarlyDrafter:
+def drafter(settings: EarlySettings = SMALL, target: CompactTarget | None = None) -> EarlyNetwork:
     torch.manual_seed(0)
-    early = EarlyDrafter.beside(settings, target or shaped()).eval()
+    early = EarlyDrafter().network(settings, target or shaped()).eval()
     for parameter in early.parameters():
         if parameter.dim() == 2:
             torch.nn.init.normal_(parameter, std=0.3)
@@ -67,7 +76,7 @@ def test_pooling_takes_every_part_of_the_prompt_once() -> None:
     assert state.pooled_width == 4 * 16
 
 
-def tokens_of(early: EarlyDrafter, features: torch.Tensor, radius: int) -> list[int]:
+def tokens_of(early: EarlyNetwork, features: torch.Tensor, radius: int) -> list[int]:
     """The drafted tokens of one observation."""
     return early.draft(features, radius)[0, :-1].long().tolist()
 
@@ -173,7 +182,7 @@ def test_plain_and_perturbed_episodes_count_alike() -> None:
     """Three perturbed samples that fail at once and one plain sample that is drafted whole: half, not a quarter."""
     tokens = torch.full((4, 8), 50)
     perturbed = torch.tensor([True, True, True, False])
-    samples = EarlySamples(tokens, torch.arange(4), perturbed, torch.zeros(4, 1))
+    samples = EarlyExamples(tokens, torch.arange(4), perturbed, torch.zeros(4, 1))
     drafts = tokens.clone()
     drafts[:3, 0] += 20
     logits = 20.0 * torch.nn.functional.one_hot(drafts, 255)
@@ -190,10 +199,11 @@ def test_the_network_learns_what_the_teacher_says() -> None:
     features = torch.randn(256, FEATURES, generator=generator).sign()
     tokens = torch.where(features[:, 1] > 0, 200, 40)[:, None].repeat(1, 8)
     tokens[:, 1] = torch.where(features[:, 0] > 0, 90, 170)
-    samples = EarlySamples(tokens, torch.arange(256), torch.arange(256) % 2 == 0, features)
+    samples = EarlyExamples(tokens, torch.arange(256), torch.arange(256) % 2 == 0, features)
     torch.manual_seed(0)
-    early = EarlyDrafter(SMALL, ACTIONS, 2, FEATURES)
-    run = EarlyDistillation(early, samples, samples, TrainSettings(label_sigma=1.0))
+    early = EarlyNetwork(SMALL, ACTIONS, 2, FEATURES)
+    settings = TrainDrafterSettings(train=TrainSettings(label_sigma=1.0))
+    run = Lesson(EarlyDrafter(), early, shaped(), samples, samples, settings)
     before = run.validate(early)["score"]
     optimiser = torch.optim.AdamW(early.parameters(), lr=5e-3)
     for step in range(350):
@@ -219,6 +229,13 @@ def results(tmp_path_factory: pytest.TempPathFactory, policies: Path) -> Path:
     return folder
 
 
+def examples_of(
+    target: CompactTarget, dataset: DemoDataset, settings: EarlySettings
+) -> tuple[EarlyExamples, EarlyExamples]:
+    made: Any = EarlyDrafter().examples(target, dataset, settings, 0.34, lambda done, total: None)
+    return made
+
+
 @pytest.mark.bits
 @pytest.mark.parametrize("name", ["nano-vision", "nano-state"])
 def test_the_teachers_tokens_are_the_targets_own_decodes(results: Path, name: str) -> None:
@@ -227,8 +244,9 @@ def test_the_teachers_tokens_are_the_targets_own_decodes(results: Path, name: st
 
     target = load_target(results / "artifacts/target" / name)[0]
     dataset = DemoDataset.open(results / "artifacts/demos/few")
-    taught = teach_early(target, dataset, SMALL)
-    samples = load_samples(dataset, target.settings, target.words, ("drawer-close-v3",))
+    taught, held = examples_of(target, dataset, SMALL)
+    every = load_samples(dataset, target.settings, target.words, ("drawer-close-v3",))
+    samples, unseen = split(every, 0.34)
     assert torch.equal(taught.episodes, samples.episodes)
     assert [bool(x) for x in taught.perturbed] == [dataset.episodes[e].perturbed for e in taught.episodes]
     decoder = Decoder(target)
@@ -236,15 +254,14 @@ def test_the_teachers_tokens_are_the_targets_own_decodes(results: Path, name: st
         prompt, _ = target.encode_batch(samples.inputs(torch.tensor([i]), target.device))
         assert taught.tokens[i].tolist() == decoder.decode_prompt(prompt).tokens
         assert torch.allclose(taught.features[i].float(), target.pooled(prompt)[0], atol=1e-2)
-    held = split(taught, 0.34)[1]
-    assert torch.equal(held.episodes, split(samples, 0.34)[1].episodes)
-    few = teach_early(target, dataset, dataclasses.replace(SMALL, samples=12))
-    assert 12 <= len(few) <= 18
+    assert torch.equal(held.episodes, unseen.episodes)
+    few = examples_of(target, dataset, dataclasses.replace(SMALL, samples=12))
+    assert 12 <= sum(map(len, few)) <= 18
 
 
 def test_a_single_episode_cannot_be_held_out() -> None:
     zeros = torch.zeros(4, dtype=torch.long)
-    one = EarlySamples(zeros[:, None], zeros, zeros.bool(), torch.zeros(4, 1))
+    one = EarlyExamples(zeros[:, None], zeros, zeros.bool(), torch.zeros(4, 1))
     with pytest.raises(CheckpointError, match="at least two"):
         split(one, 0.1)
 
@@ -263,7 +280,7 @@ def test_it_trains_from_the_command_line_and_drafts_for_its_target_alone(results
     assert done.exit_code == 0, done.output
     assert "accepted_r9" in done.stdout
     target, description = load_target(results / "artifacts/target/nano-vision")
-    files, folder = EarlyArtifact(), results / "artifacts/early/whole"
+    files, folder = EarlyDrafter(), results / "artifacts/early/whole"
     own, early = files.checked(folder, description), files.load(folder, Request(description, target))
     assert own.target == description.sha256
     assert own.chunk == target.chunk
@@ -284,15 +301,15 @@ def test_a_saved_drafter_drafts_the_same_and_a_missing_one_says_what_to_run(tmp_
     early = drafter(SMALL, target)
     early.standardise(torch.randn(20, target.pooled_width))
     with pytest.raises(CheckpointError, match="kerv train drafter drafter=early"):
-        EarlyArtifact().load(tmp_path, Request(description, target))
-    EarlyArtifact().save(tmp_path, early, MadeFor.of(description), {}, settings=dataclasses.asdict(early.settings))
-    loaded = EarlyArtifact().load(tmp_path, Request(description, target))
+        EarlyDrafter().load(tmp_path, Request(description, target))
+    EarlyDrafter().save(tmp_path, early, MadeFor.of(description), {}, settings=dataclasses.asdict(early.settings))
+    loaded = EarlyDrafter().load(tmp_path, Request(description, target))
     features = torch.randn(1, target.pooled_width)
     assert tokens_of(loaded, features, 0) == tokens_of(early, features, 0)
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:-1] + b"x")
     with pytest.raises(CheckpointError, match="does not match"):
-        EarlyArtifact().load(tmp_path, Request(description, target))
+        EarlyDrafter().load(tmp_path, Request(description, target))
 
 
 def test_the_config_brings_its_own_optimisation_and_yields_to_the_command_line() -> None:

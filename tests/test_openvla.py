@@ -27,7 +27,7 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
+from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.jacobi import JacobiProposer
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.openvla.config import TOWERS, Language, Shape, Statistics, action_space, read_shape
@@ -364,7 +364,7 @@ def test_strict_decoding_equals_ar(
 @pytest.mark.bits
 def test_the_methods_run_on_it(target: OpenVLATarget) -> None:
     torch.manual_seed(0)
-    drafter = Drafter.beside(DrafterSettings(), target).eval().requires_grad_(False)
+    drafter = EagleDrafter().network(DrafterSettings(), target).eval().requires_grad_(False)
     for seed in range(3):
         with torch.inference_mode():
             prompt = target.encode(shown(seed))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from examples.own_proposer_table import FollowArtifact, FollowProposer, FollowTable
+from examples.own_proposer_table import FollowDrafter, FollowProposer, FollowTable
 from examples.own_target import SEVEN, MockTarget
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -53,7 +53,7 @@ def results(policies: Path, tmp_path: Path) -> Path:
     random = np.random.default_rng(0)
     table = FollowTable.fit([random.integers(0, 255, (400, 4))], SPEC.actions)
     description = files_of(settings_of(copied)).description
-    FollowArtifact().save(copied / "artifacts/follow/mine", table, MadeFor.of(description), {})
+    FollowDrafter().save(copied / "artifacts/follow/mine", table, MadeFor.of(description), {})
     return copied
 
 

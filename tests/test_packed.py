@@ -16,7 +16,7 @@ from kerv_cli.base.spaces import Observation, ObservationSpace, Place
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.drafter import Drafter
+from kerv_cli.methods.eagle.drafter import EagleDrafter
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
@@ -182,7 +182,7 @@ def test_batches_and_teacher_forcing_agree(observation: str) -> None:
 
 def test_the_drafter_is_packed_too() -> None:
     target, _ = both_targets("state", 1)
-    plain = shaken(Drafter.beside(DrafterSettings(), target), 1)
+    plain = shaken(EagleDrafter().network(DrafterSettings(), target), 1)
     packed = copy.deepcopy(plain)
     pack(packed)
     assert packed.packed is not None

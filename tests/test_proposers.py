@@ -16,7 +16,7 @@ from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
+from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.early.drafter import EarlyProposer
 from kerv_cli.methods.heisd import SimilaritySkipSettings
 from kerv_cli.methods.heisd.datastore import Datastore, Manifest, prompt_key
@@ -77,7 +77,7 @@ def proposers(target: CompactTarget, prompt: torch.Tensor, truth: list[int], see
     wrong = np.array([truth] * 4)
     wrong[random.random(wrong.shape) < 0.2] = random.integers(255)
     retrieval = RetrievalProposer(stored(target, prompt, wrong), target, 3, 40)
-    drafter = Drafter.beside(DrafterSettings(), target).eval().requires_grad_(False)
+    drafter = EagleDrafter().network(DrafterSettings(), target).eval().requires_grad_(False)
     drafting = DrafterProposer(drafter, target, depth=4, top_k=2, nodes=6)
     hold = PredictionProposer(Hold(HELD, minimum=1, horizon=horizon))
     early = EarlyProposer(KnownDraft(truth, random), target)  # type: ignore[arg-type]
@@ -224,7 +224,7 @@ def test_s_min_rises_after_a_failure_and_falls_after_a_success_within_bounds() -
 def test_nothing_is_skipped_on_the_drafters_side() -> None:
     decoder, prompt, _ = skipping()
     retrieval = decoder.parts.proposer
-    drafter = Drafter.beside(DrafterSettings(), decoder.target).eval().requires_grad_(False)
+    drafter = EagleDrafter().network(DrafterSettings(), decoder.target).eval().requires_grad_(False)
     drafting = DrafterProposer(drafter, decoder.target, depth=4, top_k=1, nodes=4)
     for p, forwards in ((0.0, True), (1.0, False)):
         parts = Parts(proposer=HybridProposer(drafting, retrieval), boundary=Random(p), skip=decoder.parts.skip)  # type: ignore[arg-type]

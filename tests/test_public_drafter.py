@@ -16,7 +16,7 @@ from test_openvla import imported, kerv, loaded, shown
 from torch import Tensor
 
 from kerv_cli.methods.artifacts import Request
-from kerv_cli.methods.eagle.drafter import DrafterArtifact, DrafterProposer
+from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.eagle.public import Convention, PublicDrafter, PublicShape
 from kerv_cli.targets.checkpoint import read_target
 from kerv_cli.targets.openvla.config import Language
@@ -119,7 +119,7 @@ def test_it_is_imported_beside_its_target(
     description = json.loads((results / "artifacts/drafter/openvla/drafter.json").read_text())
     assert description["public"]["convention"] == {"positions": "text", "mask": "causal"}
     described = read_target(results / "artifacts/target/openvla")
-    own: Any = DrafterArtifact().load(results / "artifacts/drafter/openvla", Request(described, target))
+    own: Any = EagleDrafter().load(results / "artifacts/drafter/openvla", Request(described, target))
     assert (own.draft_position(40), drafter.draft_position(40)) == (24, 40)
     for name, tensor in own.state_dict().items():
         torch.testing.assert_close(tensor, drafter.state_dict()[name])

@@ -57,7 +57,7 @@ def test_a_name_belongs_to_one_piece_of_code(shelf: dict[str, dict[str, Part]]) 
     assert "\n" not in str(refused.value)
     with pytest.raises(UsageError, match="proposer 'drafter' is registered twice"):
         register(Part("proposer", "drafter", "elsewhere:build", traits={"when": STATES}))
-    assert find("proposer", "drafter").build == "kerv_cli.methods.eagle.drafter:DrafterProposer.build"
+    assert find("proposer", "drafter").build == "kerv_cli.methods.eagle.drafter:EagleDrafter.proposer"
     register(Part("threshold", "mine", "two:build"))  # another kind: another name
     assert list(parts("proposer"))[-1] == "mine"  # in the order of registration
 
@@ -124,7 +124,7 @@ def test_a_plugins_proposer_is_a_choice_like_any_other(tmp_path: Path) -> None:
         ("not_there", "kerv: plugin not_there cannot be imported (No module named 'not_there')"),
         (
             "collides",
-            "kerv: proposer 'drafter' is registered twice: kerv_cli.methods.eagle.drafter:DrafterProposer.build and "
+            "kerv: proposer 'drafter' is registered twice: kerv_cli.methods.eagle.drafter:EagleDrafter.proposer and "
             "collides:build",
         ),
     ],

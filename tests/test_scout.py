@@ -25,7 +25,7 @@ from kerv_cli.methods.certified.certificate import Candidate, Certificate, certi
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.merged import MergedProposerSettings
 from kerv_cli.methods.scout import ScoutSettings
-from kerv_cli.methods.scout.drafter import Scout, ScoutArtifact, ScoutProposer, check_sees
+from kerv_cli.methods.scout.drafter import ScoutDrafter, ScoutNetwork, ScoutProposer, check_sees
 from kerv_cli.methods.streak import StreakSkip, StreakSkipSettings
 from kerv_cli.methods.unverified import AlwaysSkip
 from kerv_cli.report.certificate import folder_of
@@ -56,9 +56,9 @@ def target(policies: Path) -> CompactTarget:
 
 
 @pytest.fixture
-def scout(target: CompactTarget) -> Scout:
+def scout(target: CompactTarget) -> ScoutNetwork:
     torch.manual_seed(0)
-    scout = Scout.beside(SMALL, target).eval().requires_grad_(False)
+    scout = ScoutDrafter().network(SMALL, target).eval().requires_grad_(False)
     for parameter in scout.parameters():
         parameter.data += 0.05 * torch.randn_like(parameter)
     return scout
@@ -79,7 +79,7 @@ def decoder(target: CompactTarget, proposer: ScoutProposer, **parts: Any) -> Dec
 
 
 def test_an_unverified_decode_never_runs_the_targets_encoder(
-    target: CompactTarget, scout: Scout, monkeypatch: pytest.MonkeyPatch
+    target: CompactTarget, scout: ScoutNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     proposer = ScoutProposer(scout, target)
     unverified = decoder(target, proposer, skip=AlwaysSkip(proposer))
@@ -96,7 +96,7 @@ def test_an_unverified_decode_never_runs_the_targets_encoder(
         assert (one.actions == together.actions).all()
 
 
-def test_verified_strictly_its_drafts_change_no_token(target: CompactTarget, scout: Scout) -> None:
+def test_verified_strictly_its_drafts_change_no_token(target: CompactTarget, scout: ScoutNetwork) -> None:
     plain, drafted = Decoder(target), decoder(target, ScoutProposer(scout, target))
     plain.reset(TASK, 1, np.zeros(3))
     for seed in range(4):
@@ -107,12 +107,12 @@ def test_verified_strictly_its_drafts_change_no_token(target: CompactTarget, sco
 
 
 @pytest.mark.parametrize("views", [1, 2])
-def test_packed_weights_give_the_same_draft(target: CompactTarget, scout: Scout, views: int) -> None:
+def test_packed_weights_give_the_same_draft(target: CompactTarget, scout: ScoutNetwork, views: int) -> None:
     inputs = target.inputs(observed(target, 0))
     assert inputs.images is not None
     inputs = dataclasses.replace(inputs, images=torch.cat([inputs.images, 255 - inputs.images][:views], -1))
     shape = target.actions, target.observation, target.chunk, views, target.settings.image_size, target.words.size
-    made = Scout(scout.settings, *shape).eval().requires_grad_(False)
+    made = ScoutNetwork(scout.settings, *shape).eval().requires_grad_(False)
     with torch.no_grad():
         for part in made.modules():
             if isinstance(part, (torch.nn.Linear, torch.nn.RMSNorm, torch.nn.GroupNorm)):
@@ -142,7 +142,7 @@ def test_it_is_trained_from_the_command_line_for_its_target_alone(results: Path)
     assert done.exit_code == 0, done.output
     assert "object_error_cm" in done.stdout
     target, description = load_target(results / "artifacts/target/nano-vision")
-    files, folder = ScoutArtifact(), results / "artifacts/scout/mine"
+    files, folder = ScoutDrafter(), results / "artifacts/scout/mine"
     assert files.load(folder, Request(description, target)).settings.width == 24
     state = load_target(results / "artifacts/target/nano-state")[0]
     with pytest.raises(CheckpointError, match="looks through the camera"):
@@ -190,7 +190,7 @@ def context(target: CompactTarget, artifacts: dict[str, Any], task: str, **metho
     return Context(target, artifacts.__getitem__, task, {}, settings, 0)
 
 
-def test_a_certified_task_gets_its_rule_and_any_other_a_streak(target: CompactTarget, scout: Scout) -> None:
+def test_a_certified_task_gets_its_rule_and_any_other_a_streak(target: CompactTarget, scout: ScoutNetwork) -> None:
     artifacts: dict[str, Any] = {"certificate": certificate(target, 1), "scout": scout}
     drafts = ScopedSettings(outside="hold")
     for task, source, rule in ((TASK, "scout", AlwaysSkip), ("reach-v3", "hold", StreakSkip)):

@@ -14,7 +14,7 @@ from test_proposers import HELD, D, situation, stored
 
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
+from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter, EagleNetwork
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.methods.heisd.rules import HybridProposer, Random, RetrievalProposer
@@ -32,8 +32,8 @@ def parts_of(family: str, target: Any, prompt: torch.Tensor, truth: list[int]) -
     wrong[:, 3:] = (wrong[:, 3:] + [[1], [2], [0]]) % 255
     retrieval = RetrievalProposer(stored(target, prompt, wrong), target, 3, 24)
     torch.manual_seed(1)
-    drafter = Drafter.beside(DrafterSettings(), target).eval().requires_grad_(False)
-    network = EarlyDrafter.beside(EarlySettings(width=16, layers=1, rank=4), target).eval()
+    drafter = EagleDrafter().network(DrafterSettings(), target).eval().requires_grad_(False)
+    network = EarlyDrafter().network(EarlySettings(width=16, layers=1, rank=4), target).eval()
     chain, tree = (DrafterProposer(drafter, target, *sizes) for sizes in ((5, 1, 5), (3, 4, 9)))
     early = EarlyProposer(network.requires_grad_(False), target)
     hold = PredictionProposer(Hold(HELD, minimum=1, horizon=CHUNK))
@@ -91,7 +91,7 @@ def test_a_round_waits_once(family: str, captured: bool, monkeypatch: pytest.Mon
     if captured:
         monkeypatch.setattr(LayerStack, "captures", lambda self, x, cache: cache is not None and cache.fixed)
     parts = parts_of(family, target, prompt, truth)
-    monkeypatch.setattr(Drafter, "new_cache", functools.partialmethod(LayerStack.new_cache, fixed=captured))
+    monkeypatch.setattr(EagleNetwork, "new_cache", functools.partialmethod(LayerStack.new_cache, fixed=captured))
     target.new_cache = functools.partial(target.new_cache, fixed=captured)  # type: ignore[method-assign]
     for module in (target, *modules(parts)):
         move(module)

@@ -146,6 +146,33 @@ def add(
     register(Part(kind, name, build, settings, needs if callable(needs) else lambda _: needs, check, colour, traits))
 
 
+def add_drafter(
+    kind: str,
+    build: str,
+    settings: type,
+    proposer: type = NoSettings,
+    name: str = "",
+    sees: bool = False,
+    colour: int | None = None,
+    **traits: Any,
+) -> None:
+    """Register a drafter with weights: its artifact, its training and its proposer.
+
+    Args:
+        kind: Name of the artifact and of the proposer.
+        build: `module:Class` of a `TrainableDrafter` (`kerv_cli/methods/drafters.py`).
+        settings: Dataclass of its shapes and training.
+        proposer: Dataclass of the settings of its proposer.
+        name: What `kerv train drafter drafter=NAME` calls it; empty: `kind`.
+        sees: Whether it needs a target with cameras.
+        colour: 0xRRGGBB of its rows, lines and timeline.
+        traits: Those of the proposer.
+    """
+    add("artifact", kind, build, sees=sees)
+    add("drafter", name or kind, build, settings)
+    add("proposer", kind, f"{build}.proposer", proposer, (kind,), colour=colour, **traits)
+
+
 def load(name: str) -> Any:
     """Imports the object that `module:attribute` or `module:attribute.attribute` names.
 

@@ -23,7 +23,7 @@ from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.episodes.policy import still_observation
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.drafter import Drafter
+from kerv_cli.methods.eagle.drafter import EagleDrafter, EagleNetwork
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
@@ -78,7 +78,7 @@ class Model:
 
     name: str
     target: Any
-    drafter: Drafter
+    drafter: EagleNetwork
     observation: Observation
     is_shape: bool
 
@@ -199,8 +199,8 @@ def shape_of(name: str, tokens: int) -> TargetSettings:
     return replace(shape, chunk=-(-tokens // SPEC.actions.dofs))
 
 
-def _drafter(target: ReadableTarget) -> Drafter:
-    drafter = Drafter.beside(DrafterSettings(), target).to(device=target.device, dtype=target.dtype)
+def _drafter(target: ReadableTarget) -> EagleNetwork:
+    drafter = EagleDrafter().network(DrafterSettings(), target).to(device=target.device, dtype=target.dtype)
     drafter.eval().requires_grad_(False)
     pack(drafter)
     return drafter

@@ -71,7 +71,7 @@ def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
     """Check a drafter in the public EAGLE or Spec-VLA layout and copy it beside its target."""
     from kerv_cli.lab.runs import making
     from kerv_cli.methods.artifacts import Artifacts
-    from kerv_cli.training.public_drafter import import_drafter
+    from kerv_cli.methods.eagle.drafter import import_drafter
 
     folder = Artifacts(settings.results, settings.policy).path("drafter")
     with making(settings.results, "drafter", folder):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Any, Protocol
+from typing import Any
 
 from torch import nn
 
@@ -12,38 +12,17 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.places import check_not_shipped, find_target
 from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import set_up
-from kerv_cli.engine.protocol import ReadableTarget
-from kerv_cli.methods.artifacts import Artifacts, MadeFor, Weights
+from kerv_cli.methods.artifacts import Artifacts, MadeFor
+from kerv_cli.methods.drafters import TrainableDrafter
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.training.demonstrations import demos_for, subset
-from kerv_cli.training.loop import Objective
 from kerv_cli.training.run import TrainingRun, refuse_unused
 from kerv_cli.training.settings import TrainDrafterSettings
 from kerv_cli.worlds import resolve_tasks
-from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
+from kerv_cli.worlds.demos.dataset import OnProgress
 
 OF_TARGETS = ("init", "balance", "closed_loop", "colour", "places")
 """Optimisation settings that only the training of a target has."""
-
-
-class TrainableDrafter(Protocol):
-    """What a part of kind `drafter` builds: how one kind of drafter is trained."""
-
-    @property
-    def artifact(self) -> Weights[Any]:
-        """The kind of artifact that the weights become."""
-
-    def objective(
-        self, target: ReadableTarget, dataset: DemoDataset, settings: TrainDrafterSettings, progress: OnProgress
-    ) -> Objective:
-        """Read the demonstrations through the target; return a fresh module, its samples and its loss.
-
-        Args:
-            target: The loaded target, on the device to train on.
-            dataset: The demonstrations.
-            settings: Those of the command; `settings.drafter` has the class that the part names.
-            progress: Called with (done, total).
-        """
 
 
 class DrafterRun(TrainingRun):
@@ -63,8 +42,7 @@ class DrafterRun(TrainingRun):
         if not isinstance(settings.drafter, part.settings):
             raise UsageError(f"drafter.kind={part.name}: choose drafter={part.name}, each has settings of its own")
         refuse_unused(settings.train, OF_TARGETS, ": only the training of a target has this setting")
-        self.drafter: TrainableDrafter = part.built()
-        self.artifact = self.drafter.artifact
+        self.artifact: TrainableDrafter = part.built()
         self.target_folder = find_target(settings.results, settings.policy.target)
         self.folder = Artifacts(settings.results, settings.policy).path(self.artifact.kind)
         check_not_shipped(self.folder, f"policy.artifacts.{self.artifact.kind}")
@@ -101,7 +79,7 @@ class DrafterRun(TrainingRun):
         """
         self.device, _ = set_up(self.settings.runtime)
         target: Any = load_target(self.target_folder, self.device)[0]
-        self.objective = self.drafter.objective(target, self.dataset, self.settings, progress)
+        self.objective = self.artifact.objective(target, self.dataset, self.settings, progress)
 
     def identity(self) -> dict[str, Any]:
         """Return the shapes, the target's weights and the tasks."""

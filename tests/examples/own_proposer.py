@@ -1,9 +1,9 @@
-"""Example: a proposer of your own, with weights of its own and their training, in two files.
+"""Example: a drafter of your own with weights: one registration here, one class in `own_proposer_table.py`.
 
-This one is light: it says what there is, so that `--cfg`, completion and wrong overrides are answered before torch is
-imported. `KERV_PLUGINS=examples.own_proposer` registers it; then `kerv train drafter drafter=follow` trains it, and
+This file imports nothing heavy, so that `--cfg`, completion and wrong overrides are answered before torch is imported.
+`KERV_PLUGINS=examples.own_proposer` registers it. Then `kerv train drafter drafter=follow` trains it, and
 `kerv rollout proposer=follow`, `prefill_draft=follow` and `prefill_draft=merged prefill_draft.sources=[follow]` draft
-with it; `policy.artifacts.follow=NAME` names its weights where they do not lie beside the target.
+with it. `policy.artifacts.follow=NAME` names its weights if they are not beside the target.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kerv_cli.base.limits import number
-from kerv_cli.base.registry import PREFILL, Part, register
+from kerv_cli.base.registry import PREFILL, add_drafter
 
 
 @dataclass
@@ -30,16 +30,12 @@ class FollowDrafterSettings:
     share: float = number(1.0, above=0, most=1)  # of every episode, from its beginning, is learned from
 
 
-register(Part("artifact", "follow", "examples.own_proposer_table:FollowArtifact"))
-register(Part("drafter", "follow", "examples.own_proposer_table:FollowTraining", FollowDrafterSettings))
-register(
-    Part(
-        "proposer",
-        "follow",
-        "examples.own_proposer_table:build",
-        FollowSettings,
-        lambda settings: ("follow",),
-        colour=0x7A9E2F,
-        traits={"when": PREFILL, "chains": True},
-    )
+add_drafter(
+    "follow",
+    "examples.own_proposer_table:FollowDrafter",
+    FollowDrafterSettings,
+    FollowSettings,
+    colour=0x7A9E2F,
+    when=PREFILL,
+    chains=True,
 )

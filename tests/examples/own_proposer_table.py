@@ -1,28 +1,26 @@
-"""The weights of `own_proposer`, as safetensors and JSON, their training, and the proposer that drafts with them."""
+"""The class that `own_proposer` registers, with its network and what drafts with it."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from examples.own_proposer import FollowSettings
+from examples.own_proposer import FollowDrafterSettings, FollowSettings
 from torch import Tensor, nn
 
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.proposer import ChainProposer
-from kerv_cli.methods.artifacts import Weights, WeightsDescription
 from kerv_cli.methods.context import Context
+from kerv_cli.methods.drafters import Lesson, Metrics, TrainableDrafter
 from kerv_cli.targets.observations import Rows, split
-from kerv_cli.training.loop import Metrics
-from kerv_cli.training.settings import TrainDrafterSettings
-from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
 
 class FollowTable(nn.Module):
@@ -53,63 +51,6 @@ class FollowTable(nn.Module):
         return self.logits[torch.arange(self.dofs), before]
 
 
-class FollowArtifact(Weights[WeightsDescription]):
-    """The table's files: its weights, and the JSON that all weights have."""
-
-    kind, noun = "follow", "table"
-    command = ("train", "drafter", "drafter=follow")
-    schema = WeightsDescription
-    any_chunk = True
-
-    def module(self, description: WeightsDescription, target: Any) -> FollowTable:
-        return FollowTable(description.actions.dofs, description.actions.tokens)
-
-
-@dataclass(frozen=True)
-class Pairs(Rows):
-    """n control steps of demonstrations."""
-
-    before: Tensor  # (n, D) tokens
-    after: Tensor  # (n, D) tokens, one control step later
-    episodes: Tensor  # (n,)
-
-
-class FollowObjective:
-    """What follows what in the demonstrations."""
-
-    def __init__(self, module: FollowTable, training: Pairs, held_out: Pairs) -> None:
-        self.module, self.training, self.held_out = module, training, held_out
-
-    def __len__(self) -> int:
-        return len(self.training)
-
-    def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        logits = self.module(self.training.before[indices])
-        return F.cross_entropy(logits.flatten(0, 1), self.training.after[indices].flatten()), {}
-
-    @torch.no_grad()
-    def validate(self, module: nn.Module) -> Metrics:
-        return {"score": float((module(self.held_out.before).argmax(-1) == self.held_out.after).float().mean())}
-
-
-class FollowTraining:
-    """`kerv train drafter drafter=follow`."""
-
-    artifact = FollowArtifact()
-
-    def objective(
-        self, target: Any, dataset: DemoDataset, settings: TrainDrafterSettings, progress: Callable[[int, int], None]
-    ) -> FollowObjective:
-        space, count, pairs = target.actions, len(dataset.episodes), []
-        for index in range(count):
-            labels = dataset.load(index).labels
-            tokens = torch.from_numpy(space.encode(labels[: math.ceil(len(labels) * settings.drafter.share)]))
-            pairs.append(Pairs(tokens[:-1], tokens[1:], torch.full((len(tokens) - 1,), index)))
-            progress(index + 1, count)
-        table = FollowTable(space.dofs, space.tokens).to(target.device)
-        return FollowObjective(table, *split(Pairs.joined(pairs), settings.train.held_out))
-
-
 class FollowProposer(ChainProposer):
     """Goes on from the action before, step by step. Nothing is drafted before an action was executed."""
 
@@ -128,6 +69,44 @@ class FollowProposer(ChainProposer):
         return [known[chunk.dofs + first :][: min(depth, self.depth or depth)]]
 
 
-def build(settings: FollowSettings, context: Context) -> Any:
-    """proposer=follow."""
-    return FollowProposer(context.artifact("follow"), settings.depth)
+@dataclass(frozen=True)
+class Pairs(Rows):
+    """n control steps of demonstrations."""
+
+    before: Tensor  # (n, D) tokens
+    after: Tensor  # (n, D) tokens, one control step later
+    episodes: Tensor  # (n,)
+
+
+class FollowDrafter(TrainableDrafter):
+    """Trains, saves, loads and proposes."""
+
+    kind, noun = "follow", "table"
+    settings = FollowDrafterSettings
+    any_chunk = True  # it drafts for any H
+
+    def network(self, settings: FollowDrafterSettings, target: Any) -> FollowTable:
+        return FollowTable(target.actions.dofs, target.actions.tokens)
+
+    def examples(
+        self, target: Any, dataset: DemoDataset, settings: FollowDrafterSettings, held_out: float, progress: OnProgress
+    ) -> tuple[Pairs, Pairs]:
+        space, count, pairs = target.actions, len(dataset.episodes), []
+        for index in range(count):
+            labels = dataset.load(index).labels
+            tokens = torch.from_numpy(space.encode(labels[: math.ceil(len(labels) * settings.share)]))
+            pairs.append(Pairs(tokens[:-1], tokens[1:], torch.full((len(tokens) - 1,), index)))
+            progress(index + 1, count)
+        return split(Pairs.joined(pairs), held_out)
+
+    def loss(self, lesson: Lesson, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
+        logits = lesson.module(lesson.examples.before[indices])
+        return F.cross_entropy(logits.flatten(0, 1), lesson.examples.after[indices].flatten()), {}
+
+    def validate(self, lesson: Lesson, module: FollowTable) -> Metrics:
+        right = module(lesson.held_out.before).argmax(-1) == lesson.held_out.after
+        return {"score": float(right.float().mean())}
+
+    @classmethod
+    def proposer(cls, settings: FollowSettings, context: Context) -> FollowProposer:
+        return FollowProposer(context.artifact(cls.kind), settings.depth)

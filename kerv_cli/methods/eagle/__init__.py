@@ -5,9 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kerv_cli.base.limits import MOST_TOKENS, number
-from kerv_cli.base.registry import DRAFTING, STATES, add
-
-_DRAFTER = "kerv_cli.methods.eagle.drafter:"
+from kerv_cli.base.registry import DRAFTING, STATES, add_drafter
 
 
 @dataclass
@@ -33,7 +31,13 @@ class DrafterProposerSettings:
     nodes: int = number(15, 1, MOST_TOKENS)  # tree nodes kept after reranking
 
 
-add("artifact", "drafter", _DRAFTER + "DrafterArtifact")
-add("drafter", "eagle", "kerv_cli.training.distillation:EagleTraining", DrafterSettings)
-_build = (_DRAFTER + "DrafterProposer.build", DrafterProposerSettings)
-add("proposer", "drafter", *_build, needs=("drafter",), colour=0x56B4E9, when=STATES, cost=DRAFTING)
+add_drafter(
+    "drafter",
+    "kerv_cli.methods.eagle.drafter:EagleDrafter",
+    DrafterSettings,
+    DrafterProposerSettings,
+    name="eagle",
+    colour=0x56B4E9,
+    when=STATES,
+    cost=DRAFTING,
+)

@@ -9,40 +9,48 @@ beginning, in training and at inference.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.provenance import provenance_of
+from kerv_cli.base.runtime import set_up
 from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import HOST, Draft
+from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import ReadableTarget, Target
 from kerv_cli.engine.transfer import upload
 from kerv_cli.engine.tree import ROOT
-from kerv_cli.methods.artifacts import Request, Weights, WeightsDescription
+from kerv_cli.methods.artifacts import Artifacts, MadeFor, Request
 from kerv_cli.methods.context import Context
+from kerv_cli.methods.drafters import DrafterDescription, Lesson, Metrics, TrainableDrafter
 from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.public import PublicDrafter, PublicShape, load_public
+from kerv_cli.methods.eagle.examples import StatesByLength, TeacherStates, decode_demonstrations
+from kerv_cli.methods.eagle.public import Convention, PublicDrafter, PublicShape, load_public, read_public
+from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.compact.trunk import LayerStack
+from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
+
+VALIDATED = 60
+"""Held-out observations that a validation decodes."""
 
 
-class Drafter(LayerStack):
+class EagleNetwork(LayerStack):
     """One decoder layer (or a few) of the target's shape; the head and the token embeddings are the target's own."""
 
     def __init__(self, settings: DrafterSettings, width: int, heads: int, feed_forward: int) -> None:
         super().__init__(width, settings.layers, heads, feed_forward)
         self.settings = settings
         self.fuse = nn.Linear(2 * width, width)
-
-    @classmethod
-    def beside(cls, settings: DrafterSettings, target: ReadableTarget) -> Drafter:
-        """A fresh drafter of the target's width, heads and feed-forward width."""
-        return cls(settings, target.width, target.heads, target.feed_forward)
 
     def draft_position(self, index: int) -> int:
         """Rotary position of the drafted token at `index` of the sequence: `index` itself."""
@@ -72,17 +80,14 @@ class DrafterProposer(Proposer):
     name = "drafter"
     needs_states = True
 
-    def __init__(self, drafter: Drafter | PublicDrafter, target: Target, depth: int, top_k: int, nodes: int) -> None:
+    def __init__(
+        self, drafter: EagleNetwork | PublicDrafter, target: Target, depth: int, top_k: int, nodes: int
+    ) -> None:
         """depth: tokens; top_k: children expanded per level; nodes: kept after reranking."""
         self.drafter, self.target = drafter, target
         self.depth, self.top_k, self.nodes = depth, top_k, nodes
         capacity = target.max_prompt + target.chunk * target.actions.dofs + top_k * depth
         self.cache, self.hidden = drafter.new_cache(1, capacity), torch.empty(0)
-
-    @classmethod
-    def build(cls, settings: Any, context: Context) -> DrafterProposer:
-        """proposer=drafter, and the drafter's side of hybrid: settings of either have depth, top_k and nodes."""
-        return cls(context.artifact("drafter"), context.target, settings.depth, settings.top_k, settings.nodes)
 
     def begin(self, chunk: Chunk) -> None:
         """Feeds the drafter the prompt's states and embeddings."""
@@ -164,28 +169,128 @@ def _best(tokens: Tensor, parents: Tensor, scores: Tensor, nodes: int, depth: in
 
 
 @dataclass(frozen=True, kw_only=True)
-class DrafterDescription(WeightsDescription):
-    """A drafter's JSON. public: shape and convention of one in the public layout."""
+class EagleDescription(DrafterDescription):
+    """The JSON of an EAGLE-style drafter; `public` is the shape of one in the public layout."""
 
-    settings: DrafterSettings
     public: PublicShape | None = None
 
 
-class DrafterArtifact(Weights[DrafterDescription]):
-    """The drafter's files; it drafts for a target with chunks of any length."""
+class EagleDrafter(TrainableDrafter):
+    """The EAGLE-style drafter. It drafts for a target with chunks of any length."""
 
     kind = noun = "drafter"
     command = ("train", "drafter")
-    schema = DrafterDescription
+    schema = EagleDescription
+    settings = DrafterSettings
     any_chunk = True
 
-    def module(self, description: DrafterDescription, target: ReadableTarget) -> Drafter:
-        """A fresh drafter."""
-        return Drafter.beside(description.settings, target)
+    def network(self, settings: DrafterSettings, target: ReadableTarget) -> EagleNetwork:
+        """Return a fresh network of the target's width, heads and feed-forward width."""
+        return EagleNetwork(settings, target.width, target.heads, target.feed_forward)
 
-    def load(self, path: Path, request: Request) -> Drafter | PublicDrafter:
-        """The drafter, ready for inference, of whichever layout."""
-        public = self.checked(path, request.description).public
-        if public is not None:
-            return load_public(path, public, request.target)
-        return super().load(path, request)
+    def load(self, path: Path, request: Request) -> EagleNetwork | PublicDrafter:
+        """Return the network, ready for inference, of whichever layout."""
+        description: Any = self.checked(path, request.description)
+        if description.public is not None:
+            return load_public(path, description.public, request.target)
+        network: EagleNetwork = super().load(path, request)
+        return network
+
+    @classmethod
+    def proposer(cls, settings: Any, context: Context) -> DrafterProposer:
+        """proposer=drafter, and the drafter's side of hybrid: settings of either have depth, top_k and nodes."""
+        return DrafterProposer(
+            context.artifact(cls.kind), context.target, settings.depth, settings.top_k, settings.nodes
+        )
+
+    def examples(
+        self,
+        target: Target,
+        dataset: DemoDataset,
+        settings: DrafterSettings,
+        held_out: float,
+        progress: OnProgress,
+    ) -> tuple[StatesByLength, StatesByLength]:
+        """Return the target's states and tokens, for training and validation."""
+        return decode_demonstrations(target, dataset, settings.samples, held_out, progress)
+
+    def loss(self, lesson: Lesson, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
+        """Return the mean loss over the unrolled passes, and the token loss of each pass."""
+        losses: list[Tensor] = []
+        metrics: Metrics = {}
+        for states in lesson.examples.parts(indices):
+            loss, measured = self.unrolled(lesson, states)
+            losses.append(loss * len(states) / len(indices))
+            metrics |= measured
+        return torch.stack(losses).sum(), metrics
+
+    def unrolled(self, lesson: Lesson, states: TeacherStates) -> tuple[Tensor, Metrics]:
+        """Return the loss of states of one prompt length."""
+        settings, device = lesson.settings.drafter, lesson.target.device
+        prompt, hidden = states.prompt.to(device).float(), states.hidden.to(device).float()
+        tokens, start = states.tokens.to(device), prompt.shape[1]
+        following = torch.cat([prompt[:, 1:], lesson.target.embed(tokens[:, :-1])], 1)
+        positions = torch.arange(hidden.shape[1] - 1, device=device)
+        total, metrics = hidden.new_zeros(()), {}
+        inputs = hidden[:, :-1]
+        for number in range(settings.unroll):
+            predicted = lesson.module(following, inputs, positions)
+            state_loss, token_loss = self.compare(lesson, predicted[:, start - 1 :], hidden[:, start:])
+            total = total + settings.state_weight * state_loss + settings.token_weight * token_loss
+            metrics[f"token_loss_{number}"] = float(token_loss.detach())
+            # after the first drafted position the next pass sees its own predictions, as in drafting
+            inputs = torch.cat([inputs[:, :start], predicted[:, start - 1 : -1]], 1)
+        return total / settings.unroll, metrics
+
+    def compare(self, lesson: Lesson, predicted: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the smooth L1 loss of states (B, N − 1, E) and the soft cross-entropy of their tokens 1 … N − 1."""
+        teacher = lesson.target.head(hidden).softmax(-1)
+        cross_entropy = -(teacher * F.log_softmax(lesson.target.head(predicted), -1)).sum(-1).mean()
+        return F.smooth_l1_loss(predicted, hidden), cross_entropy
+
+    def validate(self, lesson: Lesson, module: EagleNetwork) -> Metrics:
+        """Decode held-out observations: tokens committed per verification, strict and at r = 9."""
+        target = lesson.target
+        prompts = [prompt.to(target.device).float() for prompt in lesson.held_out.prompts(VALIDATED)]
+        strict, relaxed = (acceptance_length(target, module, prompts, r) for r in (0, 9))
+        return {"score": relaxed + strict, "acceptance_length_strict": strict, "acceptance_length_r9": relaxed}
+
+
+def acceptance_length(target: Target, network: EagleNetwork, prompts: list[Tensor], r: int) -> float:
+    """Return AL (docs/methods.md §7) of decoding `prompts` with chains of up to 5 drafts at radius r."""
+    proposer = DrafterProposer(network, target, depth=5, top_k=1, nodes=5)
+    decoder = Decoder(target, Parts(RelaxedRule(target.actions), Fixed(r), proposer=proposer))
+    chunks = [decoder.decode_prompt(prompt) for prompt in prompts]
+    rounds = [one for chunk in chunks for one in chunk.rounds if one.tree_size]
+    return sum(one.committed for one in rounds) / max(1, len(rounds))
+
+
+def import_drafter(settings: Any) -> tuple[Path, dict[str, Any]]:
+    """Run `kerv build drafter`: check a drafter of the public layout against a target and copy it beside the target.
+
+    Args:
+        settings: `BuildDrafterSettings`.
+
+    Returns:
+        The drafter's folder, and figures for the user.
+
+    Raises:
+        UsageError: No checkpoint is named.
+        CheckpointError: No such target, or an incomplete, damaged or pickled drafter, or one of another width.
+    """
+    if not settings.checkpoint:
+        raise UsageError("checkpoint=DIR: name the folder of a drafter (config.json, model.safetensors)")
+    convention = Convention(settings.positions, settings.mask)
+    device, _ = set_up(settings.runtime)
+    artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
+    target: Any = artifacts.target
+    shape, tensors = read_public(Path(settings.checkpoint).expanduser(), target, convention)
+    folder, layers = artifacts.path(EagleDrafter.kind), shape.language.num_hidden_layers
+    network = PublicDrafter(shape)
+    network.load_state_dict(tensors, assign=True)  # stored in their own number format
+    figures = {"parameters": sum(tensor.numel() for tensor in tensors.values())}
+    provenance = provenance_of("kerv build drafter", settings, device, **figures)
+    shapes = asdict(DrafterSettings(kind="public", layers=layers))
+    made_for = MadeFor.of(artifacts.description)
+    EagleDrafter().save(folder, network, made_for, provenance, settings=shapes, public=asdict(shape))
+    return folder, {**figures, "layers": layers, **asdict(convention)}

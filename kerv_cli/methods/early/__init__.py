@@ -6,9 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kerv_cli.base.limits import number
-from kerv_cli.base.registry import PREFILL, add
-
-_DRAFTER = "kerv_cli.methods.early.drafter:"
+from kerv_cli.base.registry import PREFILL, add_drafter
 
 
 @dataclass
@@ -22,13 +20,10 @@ class EarlySettings:
     samples: int = number(100_000, 1, 10**8)  # observations whose greedy decodes it is trained on, at most
 
 
-add("artifact", "early", _DRAFTER + "EarlyArtifact")
-add("drafter", "early", "kerv_cli.training.early_distillation:EarlyTraining", EarlySettings)
-add(
-    "proposer",
+add_drafter(
     "early",
-    _DRAFTER + "EarlyProposer.build",
-    needs=("early",),
+    "kerv_cli.methods.early.drafter:EarlyDrafter",
+    EarlySettings,
     colour=0xD4A6C8,
     when=PREFILL,
     chains=True,

@@ -7,10 +7,11 @@ features, and one head turns features into bins. Nothing is autoregressive, so a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -18,16 +19,21 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kerv_cli.base.registry import NoSettings
-from kerv_cli.base.spaces import ActionSpace
+from kerv_cli.base.spaces import ActionSpace, Observation
+from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.engine.transfer import read
-from kerv_cli.methods.artifacts import Weights, WeightsDescription
 from kerv_cli.methods.context import Context
+from kerv_cli.methods.drafters import Lesson, Metrics, TrainableDrafter
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.targets.compact.packable import Packable
+from kerv_cli.targets.losses import soft_labels, token_loss
+from kerv_cli.targets.observations import Rows, observations_of, prompts_of, split, steps_of
+from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
+from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 if TYPE_CHECKING:
     from kerv_cli.methods.early.packed import PackedEarly
@@ -52,7 +58,7 @@ class Block(nn.Module):
         return x + self.down(F.silu(gate) * up)
 
 
-class EarlyDrafter(Packable):
+class EarlyNetwork(Packable):
     """A residual network from the pooled prompt (F,) to the logits (N, V) of all tokens.
 
     actions: the action space of its tokens; chunk: H; features: F.
@@ -76,11 +82,6 @@ class EarlyDrafter(Packable):
         self.norm = nn.RMSNorm(settings.width, eps=1e-5)
         self.spread = nn.Linear(settings.width, self.tokens * settings.rank)
         self.head = nn.Linear(settings.rank, actions.tokens)
-
-    @classmethod
-    def beside(cls, settings: EarlySettings, target: ReadableTarget) -> EarlyDrafter:
-        """A fresh early drafter for the target's action space, H and F."""
-        return cls(settings, target.actions, target.chunk, target.pooled_width)
 
     def pack_weights(self) -> PackedEarly | None:
         """The packed weights of a float32 drafter; None in other number formats."""
@@ -158,15 +159,10 @@ class EarlyProposer(ChainProposer):
 
     name = "early"
 
-    def __init__(self, early: EarlyDrafter, target: ReadableTarget) -> None:
+    def __init__(self, early: EarlyNetwork, target: ReadableTarget) -> None:
         self.early, self.target = early, target
         self.waits = target.device.type == "cpu"
         self._drafted: tuple[Chunk, list[int], float] | None = None  # the chunk, its draft and the odds
-
-    @classmethod
-    def build(cls, settings: NoSettings, context: Context) -> EarlyProposer:
-        """proposer=early."""
-        return cls(context.artifact("early"), context.target)
 
     def drafted(self, chunk: Chunk) -> tuple[list[int], float]:
         """The draft of the chunk's N tokens, and the odds that all are accepted."""
@@ -176,7 +172,7 @@ class EarlyProposer(ChainProposer):
         return self._drafted[1:]
 
     def _rows(self, chunks: Sequence[Chunk]) -> Tensor:
-        """The drafts of B chunks whose limits are equal, (B, N + 1) as `EarlyDrafter.draft`."""
+        """The drafts of B chunks whose limits are equal, (B, N + 1) as `EarlyNetwork.draft`."""
         features = torch.cat([self.target.pooled(chunk.prompt) for chunk in chunks])
         return self.early.draft(features, radius_of(chunks))
 
@@ -211,20 +207,155 @@ class EarlyProposer(ChainProposer):
         return self.drafted(chunk)[1] >= SURE
 
 
-@dataclass(frozen=True, kw_only=True)
-class EarlyDescription(WeightsDescription):
-    """An early drafter's JSON."""
+@dataclass(frozen=True)
+class Decodes(Rows):
+    """The target's greedy decodes of n observations, in the order of episodes."""
 
-    settings: EarlySettings
+    tokens: Tensor  # (n, N) int64
+    episodes: Tensor  # (n,) int64
+    perturbed: Tensor  # (n,) bool, the observation's episode was executed with noise
 
 
-class EarlyArtifact(Weights[EarlyDescription]):
-    """The early drafter's files."""
+@dataclass(frozen=True)
+class EarlyExamples(Decodes):
+    """What an early drafter learns from."""
+
+    features: Tensor  # (n, F) float16, pooled prompts
+
+
+class EarlyDrafter(TrainableDrafter):
+    """The early drafter. It learns the target's greedy decodes; neighbouring bins share probability."""
 
     kind, noun = "early", "early drafter"
-    command = ("train", "drafter", "drafter=early")
-    schema = EarlyDescription
+    settings: type[Any] = EarlySettings
 
-    def module(self, description: EarlyDescription, target: ReadableTarget) -> EarlyDrafter:
-        """A fresh early drafter."""
-        return EarlyDrafter.beside(description.settings, target)
+    def network(self, settings: Any, target: Any) -> nn.Module:
+        """Return a fresh network for the target's action space, H and F."""
+        return EarlyNetwork(settings, target.actions, target.chunk, target.pooled_width)
+
+    @classmethod
+    def proposer(cls, settings: NoSettings, context: Context) -> EarlyProposer:
+        """proposer=early."""
+        return EarlyProposer(context.artifact(cls.kind), context.target)
+
+    @torch.inference_mode()
+    def examples(
+        self, target: Any, dataset: DemoDataset, settings: Any, held_out: float, progress: OnProgress
+    ) -> tuple[Decodes, Decodes]:
+        """Return the target's decodes of about `settings.samples` observations, spread evenly over all episodes.
+
+        Prompts are pooled right after encoding, so that neither frames nor prompts stay in memory.
+
+        Raises:
+            CheckpointError: The frames are not of the size that the target takes.
+        """
+        sees = bool(target.cameras)
+        share, columns = share_of(dataset, settings.samples, sees), list[dict[str, Tensor]]()
+
+        def observations() -> Iterator[Observation]:
+            for index in range(len(dataset.episodes)):
+                episode = dataset.load(index)
+                steps = evenly(steps_of(episode, sees), share)
+                columns.append(columns_of(episode, index, len(steps)))
+                yield from observations_of(target, episode, steps, dataset.manifest.observation)
+                progress(index + 1, len(dataset.episodes))
+
+        features, tokens = [], []
+        for prompt in prompts_of(target, observations()):
+            features.append(target.pooled(prompt).half().cpu())
+            tokens.append(greedy(target, prompt)[0].cpu())
+        joined = {name: torch.cat([column[name] for column in columns]) for name in columns[0]}
+        return split(EarlyExamples(features=torch.cat(features), tokens=torch.cat(tokens), **joined), held_out)
+
+    def prepare(self, network: Any, examples: Any) -> None:
+        """Take mean and spread of the features."""
+        network.standardise(examples.features)
+
+    def outputs(self, lesson: Lesson, module: Any, examples: Any, indices: Tensor) -> tuple[Tensor, ...]:
+        """Return the module's outputs for the examples `indices` (B,): first of all its logits (B, N, V)."""
+        return (module(examples.features[indices].to(lesson.target.device).float()),)
+
+    def token_loss(self, lesson: Lesson, logits: Tensor, indices: Tensor) -> Tensor:
+        """Return the cross-entropy of logits (B, N, V) with the target's softened tokens."""
+        device = lesson.target.device
+        labels = _labels(lesson.target.actions.tokens, lesson.settings.train.label_sigma, device)
+        return token_loss(logits, lesson.examples.tokens[indices].to(device), labels)
+
+    def loss(self, lesson: Lesson, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
+        """Return the token loss."""
+        logits = self.outputs(lesson, lesson.module, lesson.examples, indices)[0]
+        loss = self.token_loss(lesson, logits, indices)
+        return loss, {"token_loss": float(loss.detach())}
+
+    def validate(self, lesson: Lesson, module: Any) -> Metrics:
+        """Compare drafts of held-out observations with the target; plain and perturbed episodes count alike."""
+        held_out, actions = lesson.held_out, lesson.target.actions
+        batches = (self.outputs(lesson, module, held_out, i) for i in torch.arange(len(held_out)).split(256))
+        logits, *rest = (torch.cat(parts).cpu() for parts in zip(*batches, strict=True))
+        metrics = measure(logits, held_out, torch.from_numpy(actions.strict_tokens(logits.shape[1])))
+        score = metrics["accepted_r9"] + metrics["accepted_strict"]
+        return {"score": score, **metrics, **self.further_metrics(lesson, *rest)}
+
+    def further_metrics(self, lesson: Lesson, *outputs: Tensor) -> Metrics:
+        """Return metrics of the outputs after the logits."""
+        return {}
+
+
+@functools.lru_cache(maxsize=1)
+def _labels(tokens: int, sigma: float, device: torch.device) -> Tensor:
+    return soft_labels(tokens, sigma).to(device)
+
+
+def share_of(dataset: DemoDataset, samples: int, sees: bool) -> float:
+    """Return the share of the observations that makes about `samples`. A target that sees needs those with a frame."""
+    stride = int(dataset.manifest.config["frame_stride"]) if sees else 1
+    return min(1.0, samples * stride / sum(e.steps for e in dataset.episodes))
+
+
+def evenly(steps: np.ndarray, share: float) -> np.ndarray:
+    """Return an evenly spread share of the steps (n,); the first is always one of them."""
+    order = np.arange(len(steps))
+    return steps[np.ceil((order + 1) * share - 1e-9) > np.ceil(order * share - 1e-9)]
+
+
+def columns_of(episode: DemoEpisode, index: int, count: int) -> dict[str, Tensor]:
+    """Return the fields of `Decodes` that need no target, for `count` control steps of one episode."""
+    return {"episodes": torch.full((count,), index), "perturbed": torch.full((count,), episode.perturbed)}
+
+
+def accepted_tokens(drafts: Tensor, teacher: Tensor, r: int, strict: Tensor) -> Tensor:
+    """Return the lengths (n,) of the longest prefixes within r bins of the teacher.
+
+    Approximates relaxed acceptance, in which later target tokens depend on the accepted draft.
+
+    Args:
+        drafts: (n, N) tokens.
+        teacher: (n, N) tokens of the target.
+        r: Radius in bins.
+        strict: (N,) bool, tokens that must be equal.
+    """
+    limit = torch.where(strict, 0, r)
+    return ((drafts - teacher).abs() <= limit).long().cumprod(1).sum(1)
+
+
+def measure(logits: Tensor, examples: Decodes, strict: Tensor) -> Metrics:
+    """Return accepted tokens and the share of whole chunks at every radius, and the token accuracy.
+
+    Args:
+        logits: (n, N, V) of the drafter.
+        examples: n decodes of the target.
+        strict: (N,) bool, tokens that must be equal.
+    """
+    kinds = [mask for mask in (examples.perturbed, ~examples.perturbed) if mask.any()]
+
+    def balanced(values: Tensor) -> float:
+        return float(torch.stack([values.float()[mask].mean() for mask in kinds]).mean())
+
+    metrics: Metrics = {}
+    for name, r in {"strict": 0, "r3": 3, "r9": 9}.items():
+        drafts = choose(logits, r, strict)
+        accepted = accepted_tokens(drafts, examples.tokens, r, strict)
+        metrics[f"accepted_{name}"] = balanced(accepted)
+        metrics[f"whole_{name}"] = balanced(accepted == logits.shape[1])
+    metrics["token_accuracy"] = balanced((logits.argmax(-1) == examples.tokens).float().mean(1))
+    return metrics

@@ -31,7 +31,7 @@ from kerv_cli.engine.record import path_length
 from kerv_cli.engine.transfer import read
 from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.eagle.drafter import DrafterProposer
+from kerv_cli.methods.eagle.drafter import EagleDrafter
 from kerv_cli.methods.heisd import (
     FusedBoundarySettings,
     HybridAcceptanceSettings,
@@ -201,7 +201,7 @@ class HybridProposer(Proposer):
     @classmethod
     def build(cls, settings: HybridProposerSettings, context: Context) -> HybridProposer:
         """proposer=hybrid."""
-        return cls(DrafterProposer.build(settings, context), RetrievalProposer.build(settings, context))
+        return cls(EagleDrafter.proposer(settings, context), RetrievalProposer.build(settings, context))
 
     def prepare(self, chunk: Chunk) -> None:
         """Takes the side that the boundary chose for this chunk."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kerv_cli.base.limits import number
-from kerv_cli.base.registry import PREFILL, add
+from kerv_cli.base.registry import PREFILL, add_drafter
 from kerv_cli.methods.early import EarlySettings
 
 
@@ -22,13 +22,11 @@ class ScoutSettings(EarlySettings):
     word_width: int = number(32, 1, 4096, help="numbers of a word")
 
 
-add("artifact", "scout", "kerv_cli.methods.scout.drafter:ScoutArtifact", sees=True)
-add("drafter", "scout", "kerv_cli.training.scout_distillation:ScoutTraining", ScoutSettings)
-add(
-    "proposer",
+add_drafter(
     "scout",
-    "kerv_cli.methods.scout.drafter:ScoutProposer.build",
-    needs=("scout",),
+    "kerv_cli.methods.scout.drafter:ScoutDrafter",
+    ScoutSettings,
+    sees=True,
     colour=0x7BC8A4,
     when=PREFILL,
     chains=True,

@@ -9,30 +9,43 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
+from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.chunk import Chunk
-from kerv_cli.engine.protocol import ReadableTarget
-from kerv_cli.methods.artifacts import Weights, WeightsDescription
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer, radius_of
+from kerv_cli.methods.drafters import Lesson, Metrics
+from kerv_cli.methods.early.drafter import (
+    Decodes,
+    EarlyDrafter,
+    EarlyNetwork,
+    EarlyProposer,
+    columns_of,
+    evenly,
+    radius_of,
+    share_of,
+)
 from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.targets.compact.features import hand_features, mlp, scene_features, scene_width
 from kerv_cli.targets.compact.packable import Packable
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.vision import VisionEncoder
+from kerv_cli.targets.losses import position_loss
+from kerv_cli.targets.observations import BATCH, Observations, read_observations, split
+from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
 if TYPE_CHECKING:
     from kerv_cli.methods.scout.packed import PackedScout
 
 
-class Scout(Packable):
+class ScoutNetwork(Packable):
     """From one observation to the logits (N, V) of a chunk. Shapes: B batch, p proprioception, K places, W words."""
 
     centre: Tensor
@@ -61,13 +74,7 @@ class Scout(Packable):
         p, places = len(observation.proprioception), len(observation.places)
         self.locate = mlp(2 * s.keypoints * views + p + s.word_width, 128, 64, 3 * places)
         of_views = (s.cell_width + s.grid**2 * s.cell_features) * views
-        self.drafter = EarlyDrafter(s, actions, chunk, of_views + s.word_width + scene_width(observation))
-
-    @classmethod
-    def beside(cls, settings: ScoutSettings, target: CompactTarget) -> Scout:
-        """A fresh scout for the target's spaces, H, camera and vocabulary."""
-        shape = len(target.encoders), target.settings.image_size, target.words.size
-        return cls(settings, target.actions, target.observation, target.chunk, *shape)
+        self.drafter = EarlyNetwork(s, actions, chunk, of_views + s.word_width + scene_width(observation))
 
     def see(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
         """What the drafter's network reads (B, F), and the estimated positions of the places (B, K, 3), metres."""
@@ -100,14 +107,9 @@ class ScoutProposer(EarlyProposer):
 
     name = "scout"
 
-    def __init__(self, scout: Scout, target: CompactTarget) -> None:
+    def __init__(self, scout: ScoutNetwork, target: CompactTarget) -> None:
         super().__init__(scout.drafter, target)
         self.scout, self.inputs = scout, target.inputs
-
-    @classmethod
-    def build(cls, settings: NoSettings, context: Context) -> ScoutProposer:
-        """proposer=scout."""
-        return cls(context.artifact("scout"), context.target)
 
     @torch.inference_mode()
     def _rows(self, chunks: Sequence[Chunk]) -> Tensor:
@@ -117,28 +119,85 @@ class ScoutProposer(EarlyProposer):
         return self.early.chosen(logits, radius_of(chunks))
 
 
-@dataclass(frozen=True, kw_only=True)
-class ScoutDescription(WeightsDescription):
-    """A scout's JSON."""
+@dataclass(frozen=True)
+class ScoutExamples(Observations, Decodes):
+    """What a scout learns from: observations, and what the target says of them. Nothing privileged."""
 
-    settings: ScoutSettings
+    places: Tensor  # (n, K, 3) float32, positions that the target estimates, metres
 
 
-class ScoutArtifact(Weights[ScoutDescription]):
-    """The scout's files."""
+class ScoutDrafter(EarlyDrafter):
+    """The scout, for a target that sees. The first `train.scene_steps` train the stem and its positions alone."""
 
-    kind, noun = "scout", "scout"
-    command = ("train", "drafter", "drafter=scout")
-    schema = ScoutDescription
+    kind = noun = "scout"
+    settings = ScoutSettings
     step_seconds = 0.4
 
-    def module(self, description: ScoutDescription, target: ReadableTarget) -> Scout:
-        """A fresh scout, which looks through the target's camera.
+    def network(self, settings: ScoutSettings, target: Any) -> ScoutNetwork:
+        """Return a fresh network that looks through the target's camera.
 
         Raises:
-            CheckpointError: as `check_sees`.
+            CheckpointError: The target does not see.
         """
-        return Scout.beside(description.settings, check_sees(target))
+        target = check_sees(target)
+        shape = len(target.encoders), target.settings.image_size, target.words.size
+        return ScoutNetwork(settings, target.actions, target.observation, target.chunk, *shape)
+
+    @classmethod
+    def proposer(cls, settings: NoSettings, context: Context) -> ScoutProposer:
+        """proposer=scout."""
+        return ScoutProposer(context.artifact(cls.kind), context.target)
+
+    @torch.inference_mode()
+    def examples(
+        self, target: Any, dataset: DemoDataset, settings: ScoutSettings, held_out: float, progress: OnProgress
+    ) -> tuple[ScoutExamples, ScoutExamples]:
+        """Return the target's decodes and positions for about `settings.samples` observations, evenly spread.
+
+        Raises:
+            CheckpointError: The target does not see, or the frames are not of the size that it takes.
+        """
+        check_sees(target)
+        share = share_of(dataset, settings.samples, sees=True)
+        parts: list[ScoutExamples] = []
+        for index in range(len(dataset.episodes)):
+            episode = dataset.load(index)
+            chosen = evenly(np.arange(len(episode.frame_steps)), share)
+            rows = read_observations(episode, target.settings, target.observation, target.words, chosen)
+            columns = columns_of(episode, index, len(rows))
+            tokens, places = [], []
+            for indices in torch.arange(len(rows)).split(BATCH):
+                prompt, located = target.encode_batch(rows.inputs(indices, target.device))
+                tokens.append(greedy(target, prompt)[0].cpu())
+                places.append(located.float().cpu())
+            parts.append(ScoutExamples(**(vars(rows) | columns), tokens=torch.cat(tokens), places=torch.cat(places)))
+            progress(index + 1, len(dataset.episodes))
+        return split(ScoutExamples.joined(parts), held_out)
+
+    def prepare(self, network: Any, examples: Any) -> None:
+        """Nothing: what the stem sees is not known before it is trained."""
+
+    def outputs(self, lesson: Lesson, module: Any, examples: Any, indices: Tensor) -> tuple[Tensor, ...]:
+        """Return logits (B, N, V) and positions (B, K, 3)."""
+        return module(examples.inputs(indices, lesson.target.device))
+
+    def loss(self, lesson: Lesson, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
+        """Return the token loss plus the weighted position loss."""
+        train, device = lesson.settings.train, lesson.target.device
+        labels = lesson.examples.places[indices].to(device)
+        if step < train.scene_steps:
+            loss = position_loss(lesson.module.see(lesson.examples.inputs(indices, device))[1], labels)
+            return loss, {"position_loss": float(loss.detach())}
+        logits, places = self.outputs(lesson, lesson.module, lesson.examples, indices)
+        token, position = self.token_loss(lesson, logits, indices), position_loss(places, labels)
+        metrics = {"token_loss": float(token.detach()), "position_loss": float(position.detach())}
+        return token + train.scene_weight * position, metrics
+
+    def further_metrics(self, lesson: Lesson, *outputs: Tensor) -> Metrics:
+        """Return the median errors of the positions."""
+        error = (outputs[0] - lesson.held_out.places).norm(dim=-1).median(0).values
+        names = [place.name.replace(" ", "_") for place in lesson.target.observation.places]
+        return {f"{name}_error_cm": 100 * float(e) for name, e in zip(names, error, strict=True)}
 
 
 def check_sees(target: object) -> CompactTarget:
