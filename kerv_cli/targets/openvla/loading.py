@@ -1,6 +1,6 @@
-"""Opens the safetensors shards of a folder, checks names and shapes against the layout, and fills the modules.
+"""Opens the safetensors files of a folder, checks names and shapes against the modules, and fills them.
 
-Shards stay memory-mapped: on a CPU, in the number format of the file, weights are never copied. Nothing is unpickled.
+Files stay memory-mapped: on a CPU, in the number format of the file, weights are never copied. Nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,20 +19,26 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import read_mapping, regular, sha256_of
+from kerv_cli.base.files import regular, sha256_of, visible
 from kerv_cli.targets.openvla.config import CONFIG, Shape
 from kerv_cli.targets.openvla.trunk import LanguageModel, quantise
-from kerv_cli.targets.openvla.vision import Block, PoolingHead, Projector, VisionBackbone
+from kerv_cli.targets.openvla.vision import Projector, VisionBackbone
 
 Sizes = tuple[int, ...]
-INDEX, SINGLE = "model.safetensors.index.json", "model.safetensors"
-PICKLED = ("*.bin", "*.pt", "*.pth", "*.ckpt")
+SINGLE = "model.safetensors"
+PICKLED = (".bin", ".pt", ".pth", ".ckpt")
 LISTED = 3  # names of each kind in a message
 
 
 @dataclass(frozen=True)
 class Shards:
-    """The safetensors files of a folder. tensors: name -> file; shapes: name -> shape, from the files' headers."""
+    """The safetensors files of a folder.
+
+    Attributes:
+        folder: The folder.
+        tensors: Tensor name to file name.
+        shapes: Tensor name to shape, from the files' headers.
+    """
 
     folder: Path
     tensors: Mapping[str, str]
@@ -43,15 +50,15 @@ class Shards:
         return tuple(sorted(set(self.tensors.values())))
 
     def sizes(self) -> dict[str, int]:
-        """File -> bytes."""
+        """Return the bytes of each file."""
         return {name: (self.folder / name).stat().st_size for name in self.files}
 
     def hashes(self) -> dict[str, str]:
-        """File -> SHA-256."""
+        """Return the SHA-256 of each file."""
         return {name: sha256_of(self.folder / name) for name in self.files}
 
     def items(self) -> Iterator[tuple[str, Tensor]]:
-        """Every tensor, backed by the file's memory map."""
+        """Yield every tensor, backed by the file's memory map."""
         for file in self.files:
             with _open_tensors(self.folder / file) as handle:
                 for name in handle.keys():  # noqa: SIM118 - not a mapping
@@ -68,53 +75,40 @@ def _open_tensors(path: Path) -> Iterator[Any]:
 
 
 def open_shards(folder: Path) -> Shards:
-    """The shards of `folder`; reads their headers only.
+    """Return the shards of a folder. Reads their headers only.
 
     Raises:
-        CheckpointError: none, pickled ones, a missing or truncated shard, an index that does not match them.
+        CheckpointError: There are none, only pickled ones, or one is cut short.
     """
-    index = folder / INDEX
-    if index.is_file():
-        named = read_mapping(index).get("weight_map")
-        if not isinstance(named, dict) or not all(isinstance(x, str) and "/" not in x for x in named.values()):
-            raise CheckpointError(f"{index} has no weight_map of file names: download it again")
-        files = sorted(set(named.values()))
-    elif (folder / SINGLE).is_file():
-        named, files = None, [SINGLE]
-    else:
-        raise CheckpointError(_no_weights(folder))
+    files = [path for path in visible(folder) if path.suffix == ".safetensors"]
+    if not files:
+        pickled = [path.name for path in visible(folder) if path.suffix in PICKLED]
+        if pickled:
+            raise CheckpointError(
+                f"{folder} holds pickled weights ({pickled[0]}), which can run code when they are opened, and no "
+                "safetensors: convert them to safetensors where you trust them"
+            )
+        raise CheckpointError(f"no safetensors in {folder}: name the folder of a Hugging Face checkpoint")
     tensors, shapes = {}, {}
     for file in files:
-        with _open_tensors(folder / file) as handle:
+        with _open_tensors(file) as handle:
             for name in handle.keys():  # noqa: SIM118 - not a mapping
-                tensors[name], shapes[name] = file, tuple(handle.get_slice(name).get_shape())
-    if named is not None and named != tensors:
-        wrong = sorted(name for name in {*named, *tensors} if named.get(name) != tensors.get(name))
-        raise CheckpointError(f"{index} and its shards disagree about {_listed(wrong)}: download the folder again")
+                tensors[name], shapes[name] = file.name, tuple(handle.get_slice(name).get_shape())
     return Shards(folder, tensors, shapes)
 
 
-def _no_weights(folder: Path) -> str:
-    pickled = sorted(path.name for pattern in PICKLED for path in folder.glob(pattern))
-    if not pickled:
-        return f"no safetensors in {folder}: name the folder of a Hugging Face OpenVLA checkpoint"
-    return (
-        f"{folder} holds pickled weights ({pickled[0]}), which can run code when they are opened, and no safetensors: "
-        "convert them to safetensors where you trust them"
-    )
-
-
 def check_layout(shapes: Mapping[str, Sizes], expected: Mapping[str, Sizes], where: Path) -> None:
-    """Compares the names and shapes of a folder with those that its config asks for.
+    """Compare the names and shapes of a folder with those that its config asks for.
 
     Raises:
-        CheckpointError: tensors are missing, too many, or of another shape; the line lists the first of each.
+        CheckpointError: Tensors are missing, unknown or of another shape. The message lists the first of each.
     """
-    missing = [name for name in expected if name not in shapes]
-    extra = [name for name in shapes if name not in expected]
-    both = [name for name in expected if name in shapes and tuple(shapes[name]) != tuple(expected[name])]
-    misshapen = [f"{name} {_text(shapes[name])}, not {_text(expected[name])}" for name in both]
-    kinds = {"missing": missing, "unknown": extra, "of another shape": misshapen}
+    both = [name for name in expected if name in shapes and shapes[name] != expected[name]]
+    kinds = {
+        "missing": [name for name in expected if name not in shapes],
+        "unknown": [name for name in shapes if name not in expected],
+        "of another shape": [f"{name} {_text(shapes[name])}, not {_text(expected[name])}" for name in both],
+    }
     wrong = [f"{len(names)} {kind}: {_listed(names)}" for kind, names in kinds.items() if names]
     if wrong:
         raise CheckpointError(f"the weights in {where} are not those of its {CONFIG}: {'; '.join(wrong)}")
@@ -140,32 +134,41 @@ class OpenVLAModel(nn.Module):
 
 
 def layout(shape: Shape) -> dict[str, Sizes]:
-    """Name -> shape of every tensor of a checkpoint: those of the modules, and of each tower what nothing reads, its
-    last block, the norm behind it and SigLIP's pooling head."""
+    """Return name and shape of every tensor that is read of a checkpoint."""
     with torch.device("meta"):
-        tensors = sizes_of(OpenVLAModel(shape))
-        for name, tower in zip(("featurizer", "fused_featurizer"), shape.towers, strict=True):
-            unread = {f"blocks.{tower.depth - 1}": Block(tower), "norm": nn.LayerNorm(tower.width)}
-            if tower.pooled:
-                unread["attn_pool"] = PoolingHead(tower)
-            for part, module in unread.items():
-                tensors |= sizes_of(module, f"vision_backbone.{name}.{part}.")
-    return tensors
+        return sizes_of(OpenVLAModel(shape))
 
 
-def sizes_of(module: nn.Module, prefix: str = "") -> dict[str, Sizes]:
-    """Name -> shape of a module's tensors."""
-    return {f"{prefix}{name}": tuple(tensor.shape) for name, tensor in module.state_dict().items()}
+def is_unread(name: str, shape: Shape) -> bool:
+    """Return whether a checkpoint's tensor has no effect: a tower's last block, its norm and its pooling head."""
+    first, second = (tower.depth - 1 for tower in shape.towers)
+    parts = rf"(featurizer\.blocks\.{first}|fused_featurizer\.blocks\.{second}|\w+\.norm|\w+\.attn_pool)\."
+    return re.match(rf"vision_backbone\.{parts}", name) is not None
+
+
+def sizes_of(module: nn.Module) -> dict[str, Sizes]:
+    """Return name and shape of a module's tensors."""
+    return {name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
+
+
+def open_checked(folder: Path, shape: Shape) -> Shards:
+    """Return the shards of a folder if they hold the tensors of this shape; errors as `open_shards`, `check_layout`."""
+    shards = open_shards(folder)
+    check_layout({n: s for n, s in shards.shapes.items() if not is_unread(n, shape)}, layout(shape), folder)
+    return shards
 
 
 def load_model(folder: Path, shape: Shape, device: str, dtype: torch.dtype, int8: bool) -> OpenVLAModel:
-    """The model of `folder`, frozen. int8: the layers of the language model with one byte per weight.
+    """Return the model of a folder, frozen; errors as `open_checked`.
 
-    Raises:
-        CheckpointError: as `open_shards` and `check_layout`.
+    Args:
+        folder: The folder.
+        shape: Its shape.
+        device: Device of the weights.
+        dtype: Number format of the weights.
+        int8: Whether the layers of the language model have one byte per weight.
     """
-    shards = open_shards(folder)
-    check_layout(shards.shapes, layout(shape), folder)
+    shards = open_checked(folder, shape)
     with torch.device("meta"):
         model = OpenVLAModel(shape)
     names = model.state_dict().keys()
@@ -178,10 +181,10 @@ def load_model(folder: Path, shape: Shape, device: str, dtype: torch.dtype, int8
 
 
 def check_finite(shards: Shards) -> int:
-    """Reads every number once -> how many there are.
+    """Read every number once. Return how many there are.
 
     Raises:
-        CheckpointError: a tensor holds numbers that are not finite.
+        CheckpointError: A tensor holds numbers that are not finite.
     """
     count = 0
     for name, tensor in shards.items():
@@ -192,6 +195,6 @@ def check_finite(shards: Shards) -> int:
 
 
 def digest_of(hashes: Mapping[str, str], settings: Mapping[str, Any]) -> str:
-    """One SHA-256 for weights in several files and the settings that change what they compute."""
+    """Return one SHA-256 for weights in several files and the settings that change what they compute."""
     text = json.dumps({"files": dict(sorted(hashes.items())), "settings": dict(settings)}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

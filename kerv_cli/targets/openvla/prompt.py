@@ -1,7 +1,7 @@
-"""Instructions -> token ids: OpenVLA's prompt through the tokenizer.json of its folder.
+"""Instructions to token ids: OpenVLA's prompt through the tokenizer.json of its folder.
 
-The prompt ends with the token of a lone word boundary (id 29871 of Llama-2), which the training data has in front of
-the action tokens and a tokenizer leaves out.
+The prompt ends with the token of a lone word boundary (id 29871 of Llama-2). The training data has it before the action
+tokens, and a tokenizer leaves it out.
 """
 
 from __future__ import annotations
@@ -22,35 +22,40 @@ PROMPTS = {
         "ASSISTANT:"
     ),
 }
-"""Text around the instruction by version; v0.1 checkpoints were trained with the second."""
+"""Text around the instruction by version. v0.1 checkpoints were trained with the second."""
 
 
 class Prompter:
-    """The prompt of one checkpoint. limit: most ids of a prompt."""
+    """The prompt of one checkpoint."""
 
     def __init__(self, folder: Path, shape: Shape, form: str, limit: int) -> None:
-        """
+        """Read the tokenizer.
+
+        Args:
+            folder: Folder of the checkpoint.
+            shape: Its shape.
+            form: Key of `PROMPTS`.
+            limit: Most ids of a prompt.
+
         Raises:
-            CheckpointError: no tokenizer, or that of another model. KervError: the package tokenizers is missing.
+            CheckpointError: There is no tokenizer, or that of another model.
+            KervError: The package tokenizers is missing.
         """
+        path = folder / TOKENIZER
         self.text, self.limit = PROMPTS[form], limit
-        self.tokenizer = _tokenizer_of(folder / TOKENIZER)
+        self.tokenizer = _tokenizer_of(path)
         size = self.tokenizer.get_vocab_size(with_added_tokens=False)
-        ids = {name: self.tokenizer.token_to_id(name) for name in (BEGIN, BOUNDARY)}
-        if size != shape.vocabulary:
+        self.begin, self.boundary = map(self.tokenizer.token_to_id, (BEGIN, BOUNDARY))
+        if size != shape.vocabulary or None in (self.begin, self.boundary):
             raise CheckpointError(
-                f"{folder / TOKENIZER} has {size} ids, the weights are for {shape.vocabulary}: it is another model's"
+                f"{path} has {size} ids, the weights are for {shape.vocabulary} of a Llama: it is another model's"
             )
-        absent = [repr(name) for name, token in ids.items() if token is None]
-        if absent:
-            raise CheckpointError(f"{folder / TOKENIZER} has no token {absent[0]}: it is not a Llama tokenizer")
-        self.begin, self.boundary = ids[BEGIN], ids[BOUNDARY]
 
     def ids(self, instruction: str) -> list[int]:
-        """The prompt's ids: begin of sequence, the text, the word boundary.
+        """Return the prompt's ids: begin of sequence, the text, the word boundary.
 
         Raises:
-            UsageError: longer than `limit`; cutting it could drop the decisive word.
+            UsageError: The prompt is longer than `limit`. Cutting it could drop the decisive word.
         """
         ids: list[int] = self.tokenizer.encode(self.text.format(instruction.lower())).ids
         if ids[:1] != [self.begin]:

@@ -1,8 +1,8 @@
 """The target of an OpenVLA checkpoint: `ReadableTarget` on published weights (arXiv 2406.09246).
 
-Prompt order: [begin] [vision patches] [text], as its own code inserts the patches behind the first token. Action token
-t is id vocabulary − 1 − t; the head's logits are those of these ids alone, so greedy decoding is that of the published
-code wherever its token is an action (it takes the argmax over all ids and executes any other as the last bin).
+Prompt order: [begin] [vision patches] [text], as its own code inserts the patches after the first token. Action token
+t is id vocabulary - 1 - t. The head's logits are those of these ids alone, so greedy decoding equals the published
+code's wherever its token is an action. (It takes the argmax over all ids and executes any other as the last bin.)
 """
 
 from __future__ import annotations
@@ -17,25 +17,34 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.transfer import upload
 from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.openvla.config import Shape, read_shape
-from kerv_cli.targets.openvla.image import Normalisation, check_image, pixels_of, read_normalisations
+from kerv_cli.targets.openvla.image import Normalisation, pixels_of, read_normalisations
 from kerv_cli.targets.openvla.loading import OpenVLAModel, load_model, open_shards
 from kerv_cli.targets.openvla.prompt import Prompter
 
 
 @dataclass(frozen=True)
 class OpenVLASettings:
-    """`settings` of a target.json of family openvla. checkpoint: folder of the published files. statistics: name of the
-    data set whose actions it emits. prompt: openvla or openvla_v01. crop: whether the central 90 % of an image are
-    shown (for checkpoints fine-tuned with augmented images). libero: whether an image goes through JPEG and Lanczos, as
-    in OpenVLA's evaluation on LIBERO. int8: the language model's layers with one byte a weight.
-    prompt_tokens: longest prompt without the patches. image_size: pixels of a tower. chunk: H. files: name -> bytes."""
+    """`settings` of a target.json of family openvla.
+
+    Attributes:
+        checkpoint: Folder of the published files.
+        statistics: Data set whose actions it emits.
+        files: File name to bytes.
+        prompt: `openvla` or `openvla_v01`.
+        crop: Whether it sees the central 90 % of an image (for checkpoints fine-tuned with augmented images).
+        libero: Whether an image goes through JPEG and Lanczos, as in OpenVLA's evaluation on LIBERO.
+        int8: Whether the language model's layers have one byte per weight.
+        prompt_tokens: Longest prompt without the patches.
+        image_size: Pixels of a tower.
+        chunk: H, control steps per decode.
+    """
 
     checkpoint: str
     statistics: str
@@ -50,7 +59,7 @@ class OpenVLASettings:
 
 
 class OpenVLATarget:
-    """The policy in a folder of published files. cameras: the one whose image it reads."""
+    """The policy in a folder of published files. It reads the image of one camera."""
 
     def __init__(
         self,
@@ -69,21 +78,12 @@ class OpenVLATarget:
         self.max_prompt = shape.patches + settings.prompt_tokens
         last = shape.vocabulary
         self.action_rows = model.language_model.lm_head.weight[last - shape.bins : last].flip(0).contiguous()
+        self.device, self.dtype = self.action_rows.device, self.action_rows.dtype
         self.words = functools.lru_cache(maxsize=64)(self._words)
 
     @property
-    def device(self) -> torch.device:
-        """Device of the weights."""
-        return self.action_rows.device
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Number format of the weights."""
-        return self.action_rows.dtype
-
-    @property
     def segments(self) -> Mapping[str, slice]:
-        """Slice of the prompt by the name of its part; the text ends where the prompt does."""
+        """Slice of the prompt by the name of its part. The text ends with the prompt."""
         patches = self.shape.patches
         return {"begin": slice(0, 1), "vision": slice(1, 1 + patches), "instruction": slice(1 + patches, None)}
 
@@ -93,26 +93,31 @@ class OpenVLATarget:
         return 2 * self.width
 
     def pooled(self, prompt: Tensor) -> Tensor:
-        """prompt (B, P, E) -> (B, F): mean patch, mean word."""
+        """Return mean patch and mean word of a prompt (B, P, E) as (B, F)."""
         return torch.cat([prompt[:, self.segments[name]].mean(1) for name in ("vision", "instruction")], -1)
 
     def encode(self, observation: Observation) -> Tensor:
-        """The prompt's embeddings (1, P, E).
+        """Return the prompt's embeddings (1, P, E).
 
         Raises:
-            CheckpointError: the camera's image is missing. UsageError: it is no (h, w, 3) uint8, or the instruction is
-                too long.
+            CheckpointError: The camera's image is missing.
+            UsageError: The image is not (h, w, 3) uint8, or the instruction is too long.
         """
         camera = self.cameras[0]
         if camera not in observation.images:
-            raise CheckpointError(f"the target is shown camera '{camera}', whose image was not drawn")
-        image = check_image(observation.images[camera], camera)
+            raise CheckpointError(f"the target sees camera '{camera}', whose image was not drawn")
+        image = np.asarray(observation.images[camera])
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or min(image.shape) < 2:
+            raise UsageError(
+                f"the image of camera '{camera}' has shape {image.shape} and type {image.dtype}: "
+                "height x width x 3 of uint8 are wanted"
+            )
         patches = self.see(pixels_of(image, self.shape, self.normalisations, self.settings.crop, self.settings.libero))
         words = self.words(observation.instruction)
         return torch.cat([words[:, :1], patches, words[:, 1:]], 1)
 
     def see(self, pixels: Tensor) -> Tensor:
-        """pixels (B, 6, s, s) -> vision tokens (B, n, E)."""
+        """Map pixels (B, 6, s, s) to vision tokens (B, n, E)."""
         return self.model.projector(self.model.vision_backbone(upload(pixels, self.device).to(self.dtype)))
 
     def _words(self, instruction: str) -> Tensor:
@@ -120,30 +125,30 @@ class OpenVLATarget:
         return self.model.language_model.model.embed_tokens(ids)
 
     def embed(self, tokens: Tensor) -> Tensor:
-        """Action tokens (B, T) int64 -> (B, T, E)."""
+        """Embed action tokens (B, T) int64 as (B, T, E)."""
         return self.model.language_model.model.embed_tokens(self.shape.vocabulary - 1 - tokens)
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
-        """An empty cache. fixed: every forward has the same shapes; default: on CUDA."""
+        """Return an empty cache. `fixed`: every forward has the same shapes, by default on CUDA."""
         fixed = self.action_rows.is_cuda if fixed is None else fixed
         return Cache(*self.shape.language.cache_sizes(batch, capacity), self.action_rows, fixed)
 
     def forward(
         self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
-        """Hidden states (B, T, E) of x (B, T, E) at `positions` (T,), behind the cached tokens."""
+        """Return hidden states (B, T, E) of x (B, T, E) at `positions` (T,), after the cached tokens."""
         return self.model.language_model.model(x, positions, cache, seen)
 
     def head(self, hidden: Tensor) -> Tensor:
-        """hidden (..., E) -> logits over the action tokens (..., V)."""
+        """Return logits over the action tokens (..., V) of hidden states (..., E)."""
         return F.linear(hidden, self.action_rows)
 
 
 def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> OpenVLATarget:
-    """The target that the target.json in `folder` describes, frozen.
+    """Return the target that the target.json in `folder` describes, frozen.
 
     Raises:
-        CheckpointError: the description is not OpenVLA's, its checkpoint is missing or does not fit its config.
+        CheckpointError: The description is not OpenVLA's, or its checkpoint is missing or does not fit its config.
     """
     settings = read_settings(folder, description)
     source = Path(settings.checkpoint)
@@ -155,29 +160,23 @@ def build(folder: Path, description: TargetDescription, device: str, dtype: torc
 
 
 def read_settings(folder: Path, description: TargetDescription) -> OpenVLASettings:
-    """The description's settings; errors as `build`."""
+    """Return the description's settings; errors as `build`."""
     path = str(folder / "target.json")
-    settings = read(OpenVLASettings, description.settings, path)
     if len(description.cameras) != 1:
-        raise CheckpointError(f"{path} names {len(description.cameras)} cameras: OpenVLA is shown one")
-    return settings
+        raise CheckpointError(f"{path} names {len(description.cameras)} cameras: OpenVLA sees one")
+    return read(OpenVLASettings, description.settings, path)
 
 
 def check_weights(folder: Path, description: TargetDescription) -> None:
-    """Compares the checkpoint's files with what was imported, by name and size: hashing 15 GB at every start would
-    take longer than loading them.
+    """Compare the checkpoint's files with what was imported, by name and size: hashing 15 GB takes too long.
 
     Raises:
-        CheckpointError: the folder is gone, or a file is missing, new or of another size.
+        CheckpointError: The folder is gone, or a file is missing, new or of another size.
     """
     settings = read_settings(folder, description)
     source = Path(settings.checkpoint)
-    if not source.is_dir():
+    if not source.is_dir() or open_shards(source).sizes() != settings.files:
         raise CheckpointError(
-            f"the checkpoint of {folder} lay in {source}, which is gone: import it again with 'kerv build target'"
-        )
-    if open_shards(source).sizes() != settings.files:
-        raise CheckpointError(
-            f"the weights in {source} are not the ones that {folder} was made from: import them again with "
+            f"the weights that {folder} was made from are no longer in {source}: import it again with "
             "'kerv build target'"
         )

@@ -1,6 +1,6 @@
 """The language model of OpenVLA: Llama-2 with tree attention over a key/value cache.
 
-Modules are named as in the published checkpoints, so that weights can stay where the file's memory map has them.
+Modules are named as in the published checkpoints, so that weights can stay in the file's memory map.
 
 Shapes: B batch, T new tokens, S cached tokens, E width, A heads, K heads of keys and values, C channels of a head.
 """
@@ -15,10 +15,15 @@ from torch import Tensor, nn
 from kerv_cli.targets.attention import Cache, Slots, attention_mask, rotate, write
 from kerv_cli.targets.openvla.config import Language
 
+Rotary = tuple[Tensor, Tensor]
+"""Cosines and sines (T, C) of the rotary embedding."""
 
-def rotation(positions: Tensor, channels: int, theta: float, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """positions (T,) -> cos and sin (T, C) of the rotary embedding, half-split layout, computed in float32. The sign
-    of the swapped half is part of the sine."""
+
+def rotation(positions: Tensor, channels: int, theta: float, dtype: torch.dtype) -> Rotary:
+    """Return the rotary embedding of positions (T,), half-split layout, computed in float32.
+
+    The sign of the swapped half is part of the sine.
+    """
     frequencies = theta ** (-torch.arange(0, channels, 2, device=positions.device, dtype=torch.float32) / channels)
     angles = positions[:, None].float() * frequencies
     cos, sin = angles.cos(), angles.sin()
@@ -26,7 +31,7 @@ def rotation(positions: Tensor, channels: int, theta: float, dtype: torch.dtype)
 
 
 class LlamaAttention(nn.Module):
-    """Rotary self-attention; several query heads may share a head of keys and values."""
+    """Rotary self-attention. Several query heads may share a head of keys and values."""
 
     def __init__(self, language: Language) -> None:
         super().__init__()
@@ -38,15 +43,17 @@ class LlamaAttention(nn.Module):
         self.o_proj = nn.Linear(width, width, bias=False)
 
     def forward(
-        self,
-        x: Tensor,
-        rotary: tuple[Tensor, Tensor],
-        mask: Tensor | None,
-        cache: Tensor | None = None,
-        slots: Slots | None = None,
+        self, x: Tensor, rotary: Rotary, mask: Tensor | None, cache: Tensor | None = None, slots: Slots | None = None
     ) -> Tensor:
-        """x (B, T, E) -> (B, T, E); without a cache and a mask attention is causal. cache: (2, B, K, capacity, C) of
-        this layer, written at `slots`."""
+        """Map x (B, T, E) to (B, T, E).
+
+        Args:
+            x: Input.
+            rotary: Rotary embedding of the positions.
+            mask: Additive mask. Without mask and cache attention is causal.
+            cache: (2, B, K, capacity, C) of this layer.
+            slots: Slots of the cache to write.
+        """
         batch, tokens, width = x.shape
         q = rotate(self.q_proj(x).view(batch, tokens, self.heads, -1).transpose(1, 2), *rotary)
         k = rotate(self.k_proj(x).view(batch, tokens, self.shared, -1).transpose(1, 2), *rotary)
@@ -70,13 +77,12 @@ class LlamaPerceptron(nn.Module):
         self.down_proj = nn.Linear(hidden, width, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """x (B, T, E) -> (B, T, E)."""
+        """Map x (B, T, E) to (B, T, E)."""
         return self.down_proj(F.silu(self.gate_proj(x)) * self.up_proj(x))
 
 
 class LlamaLayer(nn.Module):
-    """One pre-norm decoder layer. normed: whether a norm stands before the attention (in the first layer of a public
-    EAGLE drafter none does)."""
+    """One pre-norm decoder layer. The first layer of a public EAGLE drafter is not `normed` before its attention."""
 
     def __init__(self, language: Language, normed: bool = True) -> None:
         super().__init__()
@@ -87,14 +93,9 @@ class LlamaLayer(nn.Module):
         self.mlp = LlamaPerceptron(language)
 
     def forward(
-        self,
-        x: Tensor,
-        rotary: tuple[Tensor, Tensor],
-        mask: Tensor | None,
-        cache: Tensor | None = None,
-        slots: Slots | None = None,
+        self, x: Tensor, rotary: Rotary, mask: Tensor | None, cache: Tensor | None = None, slots: Slots | None = None
     ) -> Tensor:
-        """x (B, T, E) -> (B, T, E); arguments as in `LlamaAttention`."""
+        """Map x (B, T, E) to (B, T, E); arguments as in `LlamaAttention`."""
         x = x + self.self_attn(self.input_layernorm(x), rotary, mask, cache, slots)
         return x + self.mlp(self.post_attention_layernorm(x))
 
@@ -108,8 +109,17 @@ def run_layers(
     seen: np.ndarray | Tensor | None,
     mask: Tensor | None = None,
 ) -> Tensor:
-    """x (B, T, E) at `positions` (T,) -> output of the last layer (B, T, E); the cache grows by T. seen: as in
-    `attention_mask`; mask: one that is given instead."""
+    """Return the output of the last layer (B, T, E). The cache grows by T.
+
+    Args:
+        layers: `LlamaLayer`s.
+        language: Shape of the language model.
+        x: (B, T, E).
+        positions: (T,).
+        cache: Cache of earlier tokens.
+        seen: As in `attention_mask`.
+        mask: Additive mask instead of `seen`.
+    """
     rotary = rotation(positions, language.channels, language.rope_theta, x.dtype)
     mask = attention_mask(seen, x.shape[1], cache, x) if mask is None else mask
     slots = cache.next_slots(x.shape[1]) if cache is not None else None
@@ -133,7 +143,7 @@ class LlamaModel(nn.Module):
     def forward(
         self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
-        """x (B, T, E) at `positions` (T,) -> hidden states behind the final norm (B, T, E)."""
+        """Return hidden states after the final norm (B, T, E) of x (B, T, E) at `positions` (T,)."""
         return self.norm(run_layers(self.layers, self.language, x, positions, cache, seen))
 
 
@@ -147,29 +157,32 @@ class LanguageModel(nn.Module):
 
 
 class Int8Linear(nn.Module):
-    """A linear layer with one byte per weight and one factor per output: half of bfloat16's memory. The product is
-    computed in the format of its input.
+    """A linear layer with one byte per weight and one factor per output: half of bfloat16's memory.
 
-    weight (O, I) int8, scale (O,).
+    The product is computed in the number format of its input.
+
+    Attributes:
+        weight: (O, I) int8.
+        scale: (O,).
     """
 
     weight: Tensor
     scale: Tensor
 
     def __init__(self, weight: Tensor, dtype: torch.dtype) -> None:
-        """weight: (O, I) floats, rounded to 255 levels of each row's largest absolute value."""
+        """Round floats (O, I) to 255 levels of each row's largest absolute value."""
         super().__init__()
         scale = weight.float().abs().amax(1).clamp_min(1e-12) / 127
         self.register_buffer("weight", (weight.float() / scale[:, None]).round().to(torch.int8))
         self.register_buffer("scale", scale.to(dtype))
 
     def forward(self, x: Tensor) -> Tensor:
-        """x (…, I) -> (…, O)."""
+        """Map x (…, I) to (…, O)."""
         return F.linear(x, self.weight.to(x.dtype)) * self.scale
 
 
 def quantise(module: nn.Module) -> None:
-    """Replaces every linear layer below `module` by an `Int8Linear`."""
+    """Replace every linear layer below `module` by an `Int8Linear`."""
     for name, child in module.named_children():
         if isinstance(child, nn.Linear):
             setattr(module, name, Int8Linear(child.weight.data, child.weight.dtype))

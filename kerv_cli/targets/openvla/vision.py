@@ -1,7 +1,7 @@
-"""The vision tower of OpenVLA: DINOv2 ViT-L/14 with registers and SigLIP So400m/14, and the projector behind both.
+"""The vision tower of OpenVLA: DINOv2 ViT-L/14 with registers and SigLIP So400m/14, and the projector after both.
 
-Modules are named as in the published checkpoints. The towers lack what those hold and nothing reads: the last block of
-each (OpenVLA takes the output of the last but one), the norm behind it and SigLIP's pooling head.
+Modules are named as in the published checkpoints. The towers leave out what has no effect: the last block of each
+(OpenVLA takes the output of the last but one), the norm after it and SigLIP's pooling head.
 
 Shapes: B batch, n patches, W width of a tower, E width of the language model.
 """
@@ -18,14 +18,14 @@ EPSILON = 1e-6  # of every layer norm
 
 
 class PatchEmbedding(nn.Module):
-    """Pixels (B, 3, h, w) -> patches (B, n, W)."""
+    """Embeds patches by a convolution."""
 
     def __init__(self, tower: Tower) -> None:
         super().__init__()
         self.proj = nn.Conv2d(3, tower.width, tower.patch, stride=tower.patch)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """See the class."""
+        """Map pixels (B, 3, h, w) to patches (B, n, W)."""
         return self.proj(pixels).flatten(2).transpose(1, 2)
 
 
@@ -39,7 +39,7 @@ class Attention(nn.Module):
         self.proj = nn.Linear(tower.width, tower.width)
 
     def forward(self, x: Tensor) -> Tensor:
-        """x (B, n, W) -> (B, n, W)."""
+        """Map x (B, n, W) to (B, n, W)."""
         batch, tokens, width = x.shape
         q, k, v = self.qkv(x).view(batch, tokens, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
         attended = F.scaled_dot_product_attention(q, k, v)
@@ -55,7 +55,7 @@ class Perceptron(nn.Module):
         self.fc2 = nn.Linear(tower.feed_forward, tower.width)
 
     def forward(self, x: Tensor) -> Tensor:
-        """x (B, n, W) -> (B, n, W)."""
+        """Map x (B, n, W) to (B, n, W)."""
         return self.fc2(F.gelu(self.fc1(x)))
 
 
@@ -67,7 +67,7 @@ class LayerScale(nn.Module):
         self.scale_factor = nn.Parameter(torch.ones(width))
 
     def forward(self, x: Tensor) -> Tensor:
-        """x (B, n, W) scaled."""
+        """Scale x (B, n, W)."""
         return x * self.scale_factor
 
 
@@ -83,13 +83,13 @@ class Block(nn.Module):
         self.ls1, self.ls2 = (LayerScale(tower.width) if tower.scaled else nn.Identity() for _ in range(2))
 
     def forward(self, x: Tensor) -> Tensor:
-        """x (B, n, W) -> (B, n, W)."""
+        """Map x (B, n, W) to (B, n, W)."""
         x = x + self.ls1(self.attn(self.norm1(x)))
         return x + self.ls2(self.mlp(self.norm2(x)))
 
 
 class VisionTower(nn.Module):
-    """One tower up to its last but one block: normalised pixels (B, 3, h, w) -> patches (B, n, W)."""
+    """One tower up to its last but one block."""
 
     def __init__(self, tower: Tower) -> None:
         super().__init__()
@@ -102,7 +102,7 @@ class VisionTower(nn.Module):
         self.blocks = nn.ModuleList(Block(tower) for _ in range(tower.depth - 1))
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """See the class. Positions are added to the patches alone; class token and registers stand in front."""
+        """Map normalised pixels (B, 3, h, w) to patches (B, n, W). Only patches get positions."""
         x = self.patch_embed(pixels) + self.pos_embed
         if self.prefix:
             front = torch.cat([self.cls_token, self.reg_token], 1).expand(len(x), -1, -1)
@@ -112,31 +112,20 @@ class VisionTower(nn.Module):
         return x[:, self.prefix :]
 
 
-class PoolingHead(nn.Module):
-    """SigLIP's pooling head, which checkpoints hold and no output reads: its tensors alone."""
-
-    def __init__(self, tower: Tower) -> None:
-        super().__init__()
-        self.latent = nn.Parameter(torch.zeros(1, 1, tower.width))
-        self.q, self.kv = nn.Linear(tower.width, tower.width), nn.Linear(tower.width, 2 * tower.width)
-        self.proj, self.norm = nn.Linear(tower.width, tower.width), nn.LayerNorm(tower.width)
-        self.mlp = Perceptron(tower)
-
-
 class VisionBackbone(nn.Module):
-    """Both towers: pixels (B, 6, h, w), the first three channels for the first tower -> (B, n, W + W')."""
+    """Both towers side by side."""
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
         self.featurizer, self.fused_featurizer = (VisionTower(tower) for tower in shape.towers)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """See the class."""
+        """Map pixels (B, 6, h, w), three channels for each tower, to patches (B, n, W + W')."""
         return torch.cat([self.featurizer(pixels[:, :3]), self.fused_featurizer(pixels[:, 3:])], -1)
 
 
 class Projector(nn.Module):
-    """Patches (B, n, W + W') -> embeddings (B, n, E): three layers, the first four times as wide as its input."""
+    """Three layers, the first four times as wide as its input."""
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
@@ -146,5 +135,5 @@ class Projector(nn.Module):
         self.fc3 = nn.Linear(hidden, hidden)
 
     def forward(self, patches: Tensor) -> Tensor:
-        """See the class."""
+        """Map patches (B, n, W + W') to embeddings (B, n, E)."""
         return self.fc3(F.gelu(self.fc2(F.gelu(self.fc1(patches)))))
