@@ -1,4 +1,4 @@
-"""The families of targets that kerv has itself; imported for what they register."""
+"""Registers kerv's own families of targets."""
 
 from __future__ import annotations
 

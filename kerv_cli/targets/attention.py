@@ -1,5 +1,4 @@
-"""Attention of a trunk that decodes with a cache: the cache, its slots, the mask and the rotation. Both families of
-targets use it.
+"""Attention of a trunk that decodes with a cache: the cache, its slots, the mask and the rotation.
 
 Shapes: B batch, T new tokens, S cached tokens, A heads (of keys and values), C channels of a head.
 """
@@ -14,11 +13,13 @@ from kerv_cli.engine.transfer import upload
 
 
 class Cache:
-    """Keys and values of every layer in fixed buffers (layers, 2, B, A, slots, C) with slots ≥ capacity; the first
-    `length` slots are valid.
+    """Keys and values of every layer in buffers (layers, 2, B, A, slots, C) with slots ≥ capacity.
 
-    fixed: every forward has the same shapes: it attends to all slots under a mask. Modules and packed weights order key
-    channels differently, so they must not share a cache.
+    Modules and packed weights order key channels differently, so they must not share a cache.
+
+    Attributes:
+        fixed: Whether every forward has the same shapes: it attends to all slots under a mask.
+        length: The number of valid slots, from the first on.
     """
 
     def __init__(
@@ -32,24 +33,28 @@ class Cache:
         self.length = 0
 
     def compact(self, start: int, slots: Tensor) -> None:
-        """Commits a path: moves the entries at `slots` (n,), increasing and from `start` on, to start, start + 1, … and
-        sets the length behind them."""
+        """Commit a path: move the entries at `slots` (n,) to start, start + 1, … and set the length after them.
+
+        Args:
+            start: The first slot to write.
+            slots: Slots in increasing order, none before `start`.
+        """
         n = slots.shape[0]
         self.buffer[..., start : start + n, :] = self.buffer.index_select(-2, slots)
         self.length = start + n
 
     def next_slots(self, tokens: int) -> Slots:
-        """The slots behind the valid ones, for so many tokens."""
+        """Return the slots after the valid ones for a number of new tokens."""
         start, stop = self.length, self.length + tokens
         return torch.arange(start, stop, device=self.buffer.device) if self.fixed else slice(start, stop)
 
 
 Slots = slice | Tensor
-"""Slots of a cache that a forward of T tokens writes: a slice, for fixed shapes their indices (T,)."""
+"""Slots of a cache that a forward of T tokens writes: a slice, or for fixed shapes their indices (T,)."""
 
 
 def write(layer: Tensor, slots: Slots, k: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """k, v (B, A, T, C) into the slots of a layer (2, B, A, capacity, C) -> the keys and values to attend to."""
+    """Write k and v (B, A, T, C) into a layer (2, B, A, capacity, C). Return the keys and values to attend to."""
     if isinstance(slots, Tensor):
         layer[0].index_copy_(2, slots, k)
         layer[1].index_copy_(2, slots, v)
@@ -60,11 +65,18 @@ def write(layer: Tensor, slots: Slots, k: Tensor, v: Tensor) -> tuple[Tensor, Te
 
 
 def attention_mask(seen: np.ndarray | Tensor | None, tokens: int, cache: Cache | None, like: Tensor) -> Tensor | None:
-    """Additive mask of T = `tokens` new tokens behind a cache: (T, S + T); (T, slots) for a cache of fixed shapes.
+    """Return the additive mask of new tokens after a cache: (T, S + T), or (T, slots) for a cache of fixed shapes.
 
-    seen (T, M) bool says which of the newest M ≥ T tokens, the new ones last, each new token attends to; it attends to
-    all cached ones before those. None: the new tokens are causal. The mask is None where attention without one does the
-    same. A tensor `seen` lies on the device of `like`, where its mask is made.
+    Args:
+        seen: (T, M) bool: which of the newest M ≥ T tokens, the new ones last, each new token attends to. It attends to
+            all cached tokens before those. None means that new tokens are causal. A tensor must be on the device of
+            `like`.
+        tokens: T.
+        cache: Cache of earlier tokens.
+        like: Tensor whose device and number format the mask gets.
+
+    Returns:
+        The mask. None if attention without one does the same.
     """
     cached, fixed = (cache.length, cache.fixed) if cache is not None else (0, False)
     stop = cached + tokens
@@ -86,5 +98,5 @@ def attention_mask(seen: np.ndarray | Tensor | None, tokens: int, cache: Cache |
 
 
 def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-    """x rotated by its positions' cos and sin: x (B, T, heads, C) with (T, 1, C), or (B, heads, T, C) with (T, C)."""
+    """Rotate x by its positions' cos and sin: (B, T, heads, C) by (T, 1, C), or (B, heads, T, C) by (T, C)."""
     return torch.addcmul(x * cos, x.roll(x.shape[-1] // 2, -1), sin)

@@ -1,11 +1,10 @@
-"""Checkpoints: safetensors and one JSON with settings, spaces, vocabulary and provenance. Nothing is pickled."""
+"""Checkpoints: safetensors, and one JSON with settings, spaces, vocabulary and provenance. Nothing is pickled."""
 
 from __future__ import annotations
 
 import functools
-import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -24,12 +23,12 @@ WEIGHTS = "model.safetensors"
 FLOAT32, FLOAT16, INT8 = "float32", "float16", "int8"
 """How weights are stored."""
 SCALE = ".scale"
-"""Behind the name of a matrix of integers: its scales, a row each."""
+"""Ending of the name of the tensor that holds an int8 matrix's scales, one per row."""
 
 
 @dataclass(frozen=True)
 class Description:
-    """The fields that the JSON of every artifact with weights has. sha256: of the weights' file."""
+    """The fields in the JSON of every artifact with weights. `sha256` is that of the weights' file."""
 
     format: int
     kind: str
@@ -38,18 +37,28 @@ class Description:
 
 @dataclass(frozen=True)
 class TargetDescription(Description):
-    """A target's JSON. family: name of the registered target that reads `settings`. environment: that of the
-    demonstrations it was trained on. cameras: names of the images it reads. words: vocabulary of instructions.
-    state_range: 0.1th and 99.9th percentile of the demonstrations' states (s,); None: not recorded."""
+    """A target's JSON.
+
+    Attributes:
+        family: Name of the registered target that reads `settings`.
+        environment: Environment of the demonstrations that it was trained on.
+        settings: Settings of the family, `chunk` among them.
+        actions: Action space.
+        observation: Observation space.
+        cameras: Names of the images that it reads.
+        words: Vocabulary of instructions.
+        provenance: How it was made.
+        state_range: 0.1th and 99.9th percentile of the demonstrations' states (s,). None if not recorded.
+    """
 
     family: str
     environment: str
     settings: dict[str, Any]
     actions: ActionSpace
     observation: ObservationSpace
-    cameras: tuple[str, ...]
-    words: tuple[str, ...]
-    provenance: dict[str, Any]
+    cameras: tuple[str, ...] = ()
+    words: tuple[str, ...] = ()
+    provenance: dict[str, Any] = field(default_factory=dict)
     state_range: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     def __post_init__(self) -> None:
@@ -58,7 +67,7 @@ class TargetDescription(Description):
 
     @property
     def chunk(self) -> int:
-        """H, control steps it was trained to decode at once."""
+        """H, the control steps that it was trained to decode at once."""
         return int(self.settings["chunk"])
 
     @property
@@ -68,26 +77,26 @@ class TargetDescription(Description):
 
     @property
     def tasks(self) -> list[str]:
-        """Tasks and suites that it was trained on; empty where its provenance does not say."""
-        names = self._trained_with("task")
-        return names if isinstance(names, list) and all(isinstance(name, str) for name in names) else []
+        """Tasks and suites that it was trained on, empty if unknown."""
+        return list(self.provenance.get("settings", {}).get("task") or [])
 
     @property
     def demos(self) -> str:
-        """Name of the demonstrations that it was trained on; empty where its provenance does not say."""
-        name = self._trained_with("demos")
-        return name if isinstance(name, str) else ""
-
-    def _trained_with(self, key: str) -> Any:
-        training = self.provenance.get("settings")
-        return training.get(key) if isinstance(training, Mapping) else None
+        """Name of the demonstrations that it was trained on, empty if unknown."""
+        return self.provenance.get("settings", {}).get("demos") or ""
 
     def check_world(self, name: str, environment: str, actions: ActionSpace, size: int) -> None:
-        """Refuses a world that the target, called `name`, was not made for. actions, size: the environment's action
-        space, and the pixels of the frames that it would be shown.
+        """Refuse a world that the target was not made for.
+
+        Args:
+            name: Name of the target.
+            environment: Name of the world's environment.
+            actions: Action space of the environment.
+            size: Pixels of the frames that the target would see.
 
         Raises:
-            UsageError: frames of another size. CheckpointError: another action space.
+            UsageError: The frames have another size.
+            CheckpointError: The action space is another one.
         """
         trained = self.settings.get("image_size", size)
         if self.cameras and size != trained:
@@ -95,11 +104,14 @@ class TargetDescription(Description):
         self.actions.check_same(actions, f"target '{name}'", f"environment {environment}")
 
     def check_autoregressive(self, what: str, why: str) -> None:
-        """Refuses a target that decodes in parallel. what: the setting that needs another one. why: what this one
-        lacks.
+        """Refuse a target that decodes in parallel.
+
+        Args:
+            what: The setting that needs another target.
+            why: What this one lacks.
 
         Raises:
-            UsageError: it is parallel.
+            UsageError: It is parallel.
         """
         if self.parallel:
             raise UsageError(f"{what}: the target decodes all tokens at once, {why}; choose one that is autoregressive")
@@ -109,17 +121,21 @@ T = TypeVar("T", bound=Description)
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> None:
-    """Writes a safetensors file atomically. Raises StorageError: writing failed."""
+    """Write a safetensors file atomically. Raises StorageError if that fails."""
     from safetensors.torch import save
 
     write_bytes(path, save({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, metadata))
 
 
 def load_tensors(path: Path, what: str) -> dict[str, Tensor]:
-    """The tensors of a safetensors file. what: its name in messages.
+    """Return the tensors of a safetensors file.
+
+    Args:
+        path: The file.
+        what: Its name in messages.
 
     Raises:
-        CheckpointError: it is missing, damaged, or holds numbers that are not finite.
+        CheckpointError: It is missing, damaged, or holds numbers that are not finite.
     """
     import torch
     from safetensors import SafetensorError
@@ -140,8 +156,11 @@ def load_tensors(path: Path, what: str) -> dict[str, Tensor]:
 
 
 def compact(state: Mapping[str, Tensor], stored: str) -> dict[str, Tensor]:
-    """The tensors as they are stored. float16: all floats. int8: every matrix as integers of −127 to 127 and a float16
-    scale per row, `<name>{SCALE}`: a row's greatest number / 127; other floats as float16."""
+    """Return the tensors as they are stored.
+
+    float16 halves all floats. int8 stores every matrix as integers of -127 to 127 and a float16 scale per row, the
+    row's largest absolute value / 127, under `<name>{SCALE}`. Other floats become float16.
+    """
     import torch
 
     if stored == FLOAT32:
@@ -159,7 +178,7 @@ def compact(state: Mapping[str, Tensor], stored: str) -> dict[str, Tensor]:
 
 
 def expanded(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The inverse of `compact`: matrices with a scale as float32, the rest as it is."""
+    """Invert `compact`: matrices with a scale become float32, the rest stays as it is."""
     full = {}
     for name, tensor in tensors.items():
         if not (name.endswith(SCALE) and name.removesuffix(SCALE) in tensors):  # a module's own may be called so
@@ -171,8 +190,15 @@ def expanded(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def save_module(
     folder: Path, kind: str, module: nn.Module, description: Mapping[str, Any], stored: str = FLOAT32
 ) -> str:
-    """Writes the weights and, last, `<kind>.json` -> sha256 of the weights. stored: how; `load_state` converts it back
-    to float32."""
+    """Write the weights and, last, `<kind>.json`. Return the SHA-256 of the weights.
+
+    Args:
+        folder: Folder to write to.
+        kind: Kind of artifact.
+        module: Module whose weights are written.
+        description: Fields of the JSON.
+        stored: Number format of the weights. `load_state` converts them back to float32.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     save_tensors(folder / WEIGHTS, compact(module.state_dict(), stored))
     digest = sha256_of(folder / WEIGHTS)
@@ -186,29 +212,19 @@ def target_fields(
     environment: str,
     actions: ActionSpace,
     observation: ObservationSpace,
-    cameras: Sequence[str] = (),
-    words: Sequence[str] = (),
-    provenance: Mapping[str, Any] | None = None,
+    **others: Any,
 ) -> dict[str, Any]:
-    """What `save_module` writes into a target.json; the arguments are the fields of `TargetDescription`. settings: what
-    the family's `build` reads, `chunk` among them."""
-    return {
-        "family": family,
-        "environment": environment,
-        "settings": dict(settings),
-        "actions": actions.as_dict(),
-        "observation": observation.as_dict(),
-        "cameras": list(cameras),
-        "words": list(words),
-        "provenance": dict(provenance or {}),
-    }
+    """Return the fields of a target.json for `save_module`. The arguments are fields of `TargetDescription`."""
+    spaces = {"actions": actions.as_dict(), "observation": observation.as_dict()}
+    empty: dict[str, Any] = {"cameras": [], "words": [], "provenance": {}}
+    return {"family": family, "environment": environment, "settings": dict(settings), **spaces, **empty, **others}
 
 
 def read_description(folder: Path, kind: str, schema: type[T]) -> T:
-    """The JSON beside the weights, checked against its schema and their hash.
+    """Return the JSON beside the weights, checked against its schema and their hash.
 
     Raises:
-        CheckpointError: it is missing, of another version, damaged, or of other weights.
+        CheckpointError: It is missing, of another version, damaged, or of other weights.
     """
     description = described(folder, kind, schema)
     check_weights(folder, kind, description.sha256)
@@ -216,20 +232,20 @@ def read_description(folder: Path, kind: str, schema: type[T]) -> T:
 
 
 def described(folder: Path, kind: str, schema: type[T]) -> T:
-    """The JSON of a folder, checked against its schema but not against weights; errors as `read_description`."""
+    """Return the JSON of a folder, checked against its schema but not against weights; errors as `read_description`."""
     path = folder / f"{kind}.json"
     if not path.is_file():
         raise CheckpointError(f"no {kind} in {folder}: run 'kerv train {kind}', or name a folder that holds one")
-    status = os.stat(path)
+    status = path.stat()
     version = status.st_ino, status.st_size, status.st_mtime_ns
     return _read_description(path, kind, schema, version)  # type: ignore[arg-type]
 
 
 def check_weights(folder: Path, kind: str, sha256: str) -> None:
-    """Checks that the weights in `folder` are there and have this hash.
+    """Check that the weights in `folder` are there and have this hash.
 
     Raises:
-        CheckpointError: they are not.
+        CheckpointError: They are not.
     """
     weights = folder / WEIGHTS
     if not weights.is_file():
@@ -240,7 +256,7 @@ def check_weights(folder: Path, kind: str, sha256: str) -> None:
 
 @functools.lru_cache(maxsize=256)
 def _read_description(path: Path, kind: str, schema: type[T], version: tuple[int, int, int]) -> T:
-    """The JSON file, read once per process as long as inode, size and time of change (version) stay the same."""
+    """Read the JSON file, once per process as long as its `version` (inode, size, time of change) stays the same."""
     value = read_mapping(path)
     if (value.get("format"), value.get("kind")) != (FORMAT, kind):
         raise CheckpointError(f"{path} is not a {kind} of format {FORMAT}: it was written by another version of kerv")
@@ -248,10 +264,10 @@ def _read_description(path: Path, kind: str, schema: type[T], version: tuple[int
 
 
 def load_state(module: nn.Module, folder: Path, kind: str) -> None:
-    """Loads the folder's weights into `module`.
+    """Load the folder's weights into `module`.
 
     Raises:
-        CheckpointError: a tensor is missing, unknown or of another shape.
+        CheckpointError: They are missing, damaged, or do not fit the module.
     """
     try:
         module.load_state_dict(expanded(load_tensors(folder / WEIGHTS, kind)))
@@ -261,8 +277,11 @@ def load_state(module: nn.Module, folder: Path, kind: str) -> None:
 
 
 def read_target(folder: Path) -> TargetDescription:
-    """A target's description; errors as `read_description`. A family whose weights lie in another folder checks them
-    itself: its trait `weights` names a function of (folder, description)."""
+    """Return a target's description; errors as `read_description`.
+
+    A family whose weights are in another folder checks them itself: its trait `weights` names a function of
+    (folder, description).
+    """
     description = described(folder, "target", TargetDescription)
     family = parts("target").get(description.family)
     if family is not None and "weights" in family.traits:
@@ -273,11 +292,11 @@ def read_target(folder: Path) -> TargetDescription:
 
 
 def load_target(folder: Path, device: str = "cpu", dtype: torch.dtype | None = None) -> tuple[Any, TargetDescription]:
-    """The target in `folder`, ready for inference, built by its family, and its description. dtype: float32 by default.
+    """Return the target in `folder`, ready for inference, and its description. `dtype` is float32 by default.
 
     Raises:
-        CheckpointError: it is missing or damaged.
-        UnknownName: a family that is not registered.
+        CheckpointError: It is missing or damaged.
+        UnknownName: Its family is not registered.
     """
     import torch
 

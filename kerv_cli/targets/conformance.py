@@ -1,7 +1,7 @@
-"""Does a target keep the protocol? Checks that need nothing but the target and one observation of its kind.
+"""Checks that a target keeps the protocol. They need the target and one observation of its kind.
 
-They are what speculative decoding relies on: a token's hidden state depends on what it sees alone, however the tokens
-are cut into forwards. `kerv doctor target=NAME` runs them on a folder, `check_target` on any object.
+Speculative decoding relies on them: a token's hidden state depends only on what it sees, however the tokens are split
+into forwards. `kerv doctor target=NAME` runs them on a folder, `check_target` on any object.
 
 Shapes: P prompt tokens, T tokens, E width, V action tokens.
 """
@@ -21,18 +21,18 @@ from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.protocol import Cache, Target
 
 TOLERANCE = {torch.float64: 1e-6, torch.float32: 2e-4, torch.bfloat16: 0.2, torch.float16: 0.05}
-"""Largest difference of logits relative to their spread, by number format: products are summed in other orders."""
+"""Largest difference of logits relative to their spread, by number format. Sums in another order round differently."""
 MEMBERS = ("actions", "chunk", "cameras", "width", "max_prompt", "device")
 METHODS = ("encode", "embed", "new_cache", "forward", "head")
 TREE = Draft.of([0] * 7, [-1, 0, 0, 1, 1, 2, 4])
-"""The shape of a draft tree; its tokens are drawn anew for every check."""
+"""The shape of a draft tree. Every check draws new tokens for it."""
 Pairs = Iterable[tuple[Tensor, Tensor]]
-"""Hidden states (…, E) of one way to forward tokens, and of the plain way; their logits must be equal."""
+"""Hidden states (…, E) of one way to forward tokens, and of the plain way. Their logits must be equal."""
 
 
 @torch.inference_mode()
 def check_target(target: Target, observation: Observation) -> list[Finding]:
-    """One finding per check. observation: one that the target can encode."""
+    """Return one finding per check. The target must be able to encode `observation`."""
     trial, findings = Trial(target, observation), []
     for what, fault, check in CHECKS:
         findings.append(find(what, functools.partial(trial.compare, fault, check)))
@@ -42,15 +42,19 @@ def check_target(target: Target, observation: Observation) -> list[Finding]:
 
 
 class Trial:
-    """One observation's checks. Every check compares with `plain`: one causal forward without a cache."""
+    """The checks on one observation. Every check compares with `plain`: one causal forward without a cache."""
 
     def __init__(self, target: Target, observation: Observation) -> None:
         self.target, self.observation = target, observation
         self.random = torch.Generator().manual_seed(0)
 
     def compare(self, fault: str, check: Callable[[Trial], Pairs]) -> str:
-        """Compares a check's pairs by their logits -> the largest difference, in words. fault: what a larger difference
-        than rounding means."""
+        """Compare a check's pairs by their logits. Return the largest difference, in words.
+
+        Args:
+            fault: What a difference larger than rounding means.
+            check: The check.
+        """
         worst = 0.0
         for hidden, expected in check(self):
             a, b = self.target.head(hidden).double(), self.target.head(expected).double()
@@ -61,7 +65,7 @@ class Trial:
         return f"logits within {worst:.1g} of their spread" if worst else "as declared"
 
     def members(self) -> Pairs:
-        """The protocol's members are there."""
+        """Check that the protocol's members are there."""
         missing = [name for name in (*MEMBERS, *METHODS) if not hasattr(self.target, name)]
         need(not missing, f"{type(self.target).__name__} lacks {', '.join(missing)} (kerv_cli/engine/protocol.py)")
         need(not isinstance(self.target.cameras, str), "cameras is a text, must be a tuple of names")
@@ -70,7 +74,7 @@ class Trial:
         return ()
 
     def encode(self) -> Pairs:
-        """The prompt: shape, length, finite, the same twice."""
+        """Check the prompt: shape, length, finite, the same twice."""
         prompt, width, longest = self.target.encode(self.observation), self.target.width, self.target.max_prompt
         right = prompt.ndim == 3 and len(prompt) == 1 and prompt.shape[2] == width
         need(right, f"encode gives {tuple(prompt.shape)}, must be (1, P, {width})")
@@ -83,7 +87,7 @@ class Trial:
         return ()
 
     def embed_and_head(self) -> Pairs:
-        """Shapes and formats of `embed`, `forward` and `head`, for the first and the last token."""
+        """Check shapes and formats of `embed`, `forward` and `head`."""
         width, count, dtype = self.target.width, self.target.actions.tokens, self.prompt.dtype
         embedded = self.target.embed(torch.tensor([[0, count - 1]], device=self.prompt.device))
         right = embedded.shape == (1, 2, width) and embedded.dtype == dtype
@@ -96,24 +100,24 @@ class Trial:
         return ()
 
     def draw(self, count: int) -> Tensor:
-        """Random tokens (1, count)."""
+        """Draw random tokens (1, count)."""
         return torch.randint(self.target.actions.tokens, (1, count), generator=self.random).to(self.prompt.device)
 
     def positions(self, first: int, count: int) -> Tensor:
-        """first, first + 1, …"""
+        """Return `count` positions from `first` on."""
         return torch.arange(first, first + count, device=self.prompt.device)
 
     def plain(self, tokens: Tensor) -> Tensor:
-        """Hidden states (1, P + T, E) of prompt and tokens (1, T), forwarded at once without a cache."""
+        """Return hidden states (1, P + T, E) of prompt and tokens (1, T), forwarded at once without a cache."""
         x = torch.cat([self.prompt, self.target.embed(tokens)], 1) if tokens.shape[1] else self.prompt
         return self.target.forward(x, self.positions(0, x.shape[1]))
 
     def causality(self) -> Pairs:
-        """A token must not see what comes after it."""
+        """Check that a token does not see later ones."""
         yield self.plain(self.tokens[:, :4]), self.plain(self.tokens)[:, : self.length + 4]
 
     def cached(self, lengths: Sequence[int]) -> tuple[Cache, Tensor]:
-        """Prompt, then the tokens in pieces of these lengths -> the cache and the tokens' hidden states."""
+        """Forward the prompt, then tokens in pieces of these lengths. Return the cache and their hidden states."""
         cache, first, hidden = self.target.new_cache(1, self.capacity), self.length, []
         self.target.forward(self.prompt, self.positions(0, first), cache)
         need(cache.length == first, f"the cache has length {cache.length} after a prompt of {first} tokens")
@@ -124,27 +128,30 @@ class Trial:
         return cache, torch.cat(hidden, 1)
 
     def pieces(self, *lengths: int) -> Pairs:
-        """Tokens behind a cache, in pieces as decoding and verifying forward them, equal one forward."""
+        """Check that tokens after a cache, in pieces as decoding and verifying forward them, equal one forward."""
         size = sum(lengths)
         yield self.cached(lengths)[1], self.plain(self.tokens[:, :size])[:, -size:]
 
     def forward_tree(self) -> tuple[Cache, Tensor, Tensor]:
-        """Forwards the third token, behind two cached ones, and a tree behind it -> the cache, the tree's tokens
-        (1, n), hidden (1, 1 + n, E)."""
+        """Forward the third token, after two cached ones, and a tree after it.
+
+        Returns:
+            The cache, the tree's tokens (1, n), hidden states (1, 1 + n, E).
+        """
         (cache, _), drafted = self.cached([1, 1]), self.draw(len(TREE))
         x = self.target.embed(torch.cat([self.tokens[:, 2:3], drafted], 1))
         positions = TREE.positions(self.length + 2, 1, self.prompt.device)
         return cache, drafted, self.target.forward(x, positions, cache, TREE.visible(1))
 
     def tree(self) -> Pairs:
-        """Every node of a tree equals the last token of its own path, forwarded alone."""
+        """Check that every node of a tree equals the last token of its own path, forwarded alone."""
         _, drafted, hidden = self.forward_tree()
         for node in range(len(TREE)):
             tokens = torch.cat([self.tokens[:, :3], drafted[:, TREE.tree.path_to(node)]], 1)
             yield hidden[:, node + 1], self.plain(tokens)[:, -1]
 
     def commit(self) -> Pairs:
-        """Decoding goes on behind a committed path."""
+        """Check that decoding continues after a committed path."""
         (cache, drafted, _), path, start = self.forward_tree(), TREE.tree.path_to(6), self.length + 2
         cache.compact(start, torch.tensor([start, *(start + 1 + node for node in path)], device=self.prompt.device))
         length = start + 1 + len(path)
@@ -154,7 +161,7 @@ class Trial:
         yield hidden, self.plain(torch.cat([self.tokens[:, :3], drafted[:, path], last], 1))[:, -1:]
 
     def prefill_draft(self) -> Pairs:
-        """Prompt and a tree in one forward, as methods that draft before the prefill do."""
+        """Check prompt and tree in one forward, as methods that draft before the prefill do it."""
         drafted, positions = self.draw(len(TREE)), TREE.positions(0, self.length, self.prompt.device)
         x, cache = torch.cat([self.prompt, self.target.embed(drafted)], 1), self.target.new_cache(1, self.capacity)
         hidden = self.target.forward(x, positions, cache, TREE.visible(self.length))
@@ -162,20 +169,20 @@ class Trial:
             yield hidden[:, self.length + node], self.plain(drafted[:, TREE.tree.path_to(node)])[:, -1]
 
     def reused_cache(self) -> Pairs:
-        """A cache that is set back to length 0 holds nothing of before."""
+        """Check that a cache whose length was reset to 0 keeps nothing."""
         cache, _ = self.cached([5])
         cache.length = 0
         yield self.target.forward(self.prompt, self.positions(0, self.length), cache), self.plain(self.tokens[:, :0])
 
     def batch(self) -> Pairs:
-        """Two prompts at once, as training a drafter does."""
+        """Check two prompts at once, as training a drafter does it."""
         prompts, positions = torch.cat([self.prompt, self.prompt.flip(1)]), self.positions(0, self.length)
         hidden = self.target.forward(prompts, positions, self.target.new_cache(2, self.capacity))
         for row, prompt in zip(hidden, prompts, strict=True):
             yield row[None], self.target.forward(prompt[None], positions)
 
     def greedy_chunk(self) -> Pairs:
-        """Greedy decoding with a cache gives the tokens of greedy decoding without."""
+        """Check that greedy decoding gives the same tokens with and without a cache."""
         tokens = self.tokens[:, :0]
         for _ in range(self.size):
             tokens = torch.cat([tokens, self.target.head(self.plain(tokens)[:, -1]).argmax(-1)[None]], 1)
@@ -190,13 +197,13 @@ CHECKS: tuple[tuple[str, str, Callable[[Trial], Pairs]], ...] = (
     ("encode", "", Trial.encode),
     ("embed and head", "", Trial.embed_and_head),
     ("causality", "a token sees later ones", Trial.causality),
-    ("cache, token by token", "token by token behind a cache", lambda trial: trial.pieces(1, 1, 1, 1, 1, 1)),
-    ("cache, several tokens", "several tokens behind a cache", lambda trial: trial.pieces(1, 5, 3)),
+    ("cache, token by token", "token by token after a cache", lambda trial: trial.pieces(1, 1, 1, 1, 1, 1)),
+    ("cache, several tokens", "several tokens after a cache", lambda trial: trial.pieces(1, 5, 3)),
     ("tree attention", "a node of a tree sees others than its ancestors", Trial.tree),
-    ("commit of a path", "a token behind a committed path", Trial.commit),
+    ("commit of a path", "a token after a committed path", Trial.commit),
     ("draft in the prefill", "a node of a tree in the prefill", Trial.prefill_draft),
     ("cache used again", "a reused cache", Trial.reused_cache),
     ("batch", "a batch of two", Trial.batch),
     ("greedy chunk", "the chunk", Trial.greedy_chunk),
 )
-"""Name, what a failure means (empty: later checks need what this one sees), and the check."""
+"""Name, what a failure means, and the check. Without a meaning, later checks need this one."""

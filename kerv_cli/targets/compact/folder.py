@@ -27,11 +27,12 @@ def save_target(
 ) -> str:
     """Writes the folder of a target -> sha256 of its weights. environment: that of its demonstrations. stored: as in
     `save_module`. state_range: as in `TargetDescription`."""
-    settings, words = asdict(target.settings), target.words.words
+    others: dict[str, Any] = {"cameras": target.cameras, "words": target.words.words, "provenance": provenance}
+    if state_range:
+        others["state_range"] = state_range
     spaces = target.actions, target.observation
-    fields = target_fields("compact", settings, environment, *spaces, target.cameras, words, provenance)
-    measured = {"state_range": state_range} if state_range else {}
-    return save_module(folder, "target", target, {**fields, **measured}, stored)
+    fields = target_fields("compact", asdict(target.settings), environment, *spaces, **others)
+    return save_module(folder, "target", target, fields, stored)
 
 
 def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> CompactTarget:

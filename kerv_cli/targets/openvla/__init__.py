@@ -1,0 +1,1 @@
+"""Published OpenVLA checkpoints as targets."""

@@ -83,7 +83,7 @@ class Source:
         return cls(folder, info, rows, tasks, camera, keys[camera])
 
     def names(self, feature: str, prefix: str) -> list[str]:
-        """Return the names of a vector's numbers, empty without it. Incomplete ones are replaced by `prefix`_0, …"""
+        """Return the names of a vector's numbers, empty without it. Names that are incomplete become `prefix`_i."""
         entry = self.info["features"].get(feature)
         if entry is None:
             return []
