@@ -13,9 +13,11 @@ from kerv_cli.episodes.settings import RolloutSettings, TimingSettings
 from kerv_cli.lab.execute import RunEpisode
 from kerv_cli.lab.plan import Setting
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.latency import latency_summary, latency_table
+from kerv_cli.report.decide import verdict_of
+from kerv_cli.report.latency import latency_table
 from kerv_cli.report.plots import latency_figure
 from kerv_cli.report.report import report
+from kerv_cli.report.summary import summary_frame
 from kerv_cli.report.tables import load_study
 
 SHARE = {"ar": 1.0, "spec_vla": 0.4}
@@ -58,11 +60,10 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_every_setting_stands_beside_ar_at_its_latency(results: Path) -> None:
-    table = latency_table(load_study(StudyStore(results, "latency")))
-    assert table is not None
-    assert len(table) == 12  # not the world that waits
-    rows = table.set_index("label")
+def test_every_setting_is_compared_with_ar_at_its_latency(results: Path) -> None:
+    whole = load_study(StudyStore(results, "latency")).table
+    rows = latency_table(whole).set_index("label")
+    assert len(rows) == 12  # not the world that waits
     fast = rows.loc["spec_vla ar_ms=100 none"]
     assert fast["ar"] == "ar ar_ms=100 none"
     assert (fast["ar_latency_ms"], fast["felt_latency_ms"]) == pytest.approx((100.0, 40.0))
@@ -72,14 +73,16 @@ def test_every_setting_stands_beside_ar_at_its_latency(results: Path) -> None:
     assert (own["ar_latency_ms"], own["felt_latency_ms"]) == pytest.approx((30.0, 12.0))
     assert own["difference"] == 0.0
     assert fast["held_share"] == 0.0 < rows.loc["ar ar_ms=100 none"]["held_share"]  # four steps of its chunk, and nine
-    told = latency_summary(table).set_index("setting")
-    assert told.loc["spec_vla ar_ms=100 none"]["change against AR"].startswith("100 (")
-    assert told.loc["ar ar_ms=100 none"]["change against AR"] == ""
+    printed = summary_frame(whole).set_index("setting")
+    assert printed.loc["spec_vla ar_ms=100 none"]["a decode takes, ms"] == "40.0"
+    assert printed.loc["ar waits"]["a decode takes, ms"] == "–"
+    answer, _ = verdict_of(whole, 3.0)
+    assert "do not solve the tasks, nothing is compared: ar ar_ms=100 none" in answer
+    assert latency_table(whole[whole["label"] == "ar waits"]).empty
 
 
 def test_the_figure_has_a_panel_per_compensation_and_a_line_per_method(results: Path) -> None:
-    table = latency_table(load_study(StudyStore(results, "latency")))
-    assert table is not None
+    table = latency_table(load_study(StudyStore(results, "latency")).table)
     figure = latency_figure(table, "title")
     panels = [panel for panel in figure.axes if panel.get_visible()]
     assert [panel.get_title(loc="left") for panel in panels] == [
@@ -98,12 +101,3 @@ def test_a_report_has_the_section_where_the_world_goes_on_alone(results: Path) -
     assert {"latency.csv", "latency_latency.csv", "latency_latency.png", "report.html"} <= names
     page = (results / "studies" / "latency" / "report.html").read_text(encoding="utf-8")
     assert "Success against the time that AR takes" in page
-    whole = load_study(StudyStore(results, "latency")).table
-    waits = whole[whole["label"] == "ar waits"]
-    assert waits["felt_latency_ms"].isna().all()
-    felt = whole[whole["label"] == "ar ar_ms=100 none"]["felt_latency_ms"]
-    assert felt.to_list() == pytest.approx([100.0, 100.0])
-    assert set(whole["rollout.delay_compensation"]) == {"none", "chunk"}
-    store = StudyStore(results, "latency")
-    waiting = [one for one in store.load().episodes if "waits" in one.setting.label]
-    assert latency_table(load_study(store, waiting)) is None

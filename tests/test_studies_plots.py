@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
@@ -13,7 +12,7 @@ from studies_synthetic import part, settings_of, study_of, swept
 
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.report.measures import MICRO
-from kerv_cli.report.plots import has_task_map, series_of, study_figures, task_map
+from kerv_cli.report.plots import series_of, study_figures
 from kerv_cli.report.tables import load_study
 
 
@@ -80,31 +79,3 @@ def test_without_numbers_on_the_axis_every_setting_is_a_point(boundaries: pd.Dat
     figures = study_figures(boundaries, axis, "Title")
     assert set(figures) == {"_tradeoff"}
     assert legend(figures["_tradeoff"]) == set(boundaries["label"])
-
-
-def by_task(**columns: list[Any]) -> pd.DataFrame:
-    """Two settings on two tasks."""
-    rows = {
-        "task": ["reach", "reach", "push", "push"],
-        "label": ["ar", "bold"] * 2,
-        "stress": "none",
-        "stress_level": 0,
-    }
-    measures = {"successes": [9, 2, 5, 7], "episodes": 10, "difference": [np.nan, -0.7, np.nan, 0.2]}
-    return pd.DataFrame(rows | measures | columns)
-
-
-def test_a_map_has_a_field_for_every_task_and_setting_and_its_colours_are_differences() -> None:
-    panel = task_map(by_task(), "Title").axes[0]
-    assert [text.get_text() for text in panel.texts] == ["9/10", "2/10", "5/10", "7/10"]
-    assert [text.get_text() for text in panel.get_yticklabels()] == ["reach", "push"]
-    shown = np.ma.masked_invalid(np.ma.asarray(panel.get_images()[0].get_array()))
-    assert shown[:, 0].mask.all()
-    assert np.allclose(shown[:, 1], [-70.0, 20.0])
-
-
-def test_a_map_needs_two_tasks_two_settings_that_can_be_read_and_one_stress() -> None:
-    assert has_task_map(by_task())
-    many = pd.concat([by_task(label=[f"a{i}", f"b{i}"] * 2) for i in range(11)])
-    others = (by_task(task=["reach"] * 4), by_task(label=["ar"] * 4), by_task(stress_level=[0, 4, 0, 4]), many)
-    assert not any(map(has_task_map, others))

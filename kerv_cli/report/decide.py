@@ -23,7 +23,7 @@ from kerv_cli.lab.plan import Episode
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.lab.study import InterimAnalysis
 from kerv_cli.report import statistics as stats
-from kerv_cli.report import stressed, verdict
+from kerv_cli.report import verdict
 from kerv_cli.report.measures import MICRO, Row, pair_counts, paired
 from kerv_cli.report.tables import StudyData, is_baseline, is_number, load_study, rows_of
 from kerv_cli.report.verdict import LARGER, OPEN, SMALLER, Choice, Decision
@@ -35,10 +35,10 @@ SPEED = "episode_speedup"
 def verdict_of(table: pd.DataFrame, loss: float) -> tuple[str, bool]:
     """Return a study's answer in one sentence, and whether a setting is shown to be faster at that loss in points."""
     rows, is_shown = rows_of(table, MICRO), False
-    if stressed.is_stressed(table):
-        text = verdict.under_stress(table, stressed.reference_of(table))
-    elif not any(row["pairs"] and not is_baseline(row) for row in rows):
-        text = verdict.rates(rows)
+    if not any(row["pairs"] and not is_baseline(row) for row in rows):
+        text = "success: " + ", ".join(f"{row['label']} {POINTS * row['success']:.1f} %" for row in rows)
+    elif table["baseline"].nunique() > 1:
+        text = verdict.under_conditions(rows, next(row["method"] for row in rows if is_baseline(row)))
     else:
         choice = _choice("all tasks", rows, loss)
         text, is_shown = verdict.sentence(choice, loss, str(rows[0]["baseline"])), choice.is_shown

@@ -18,7 +18,7 @@ from kerv_cli.report.measures import MACRO, MICRO, Row
 from kerv_cli.report.plots import about
 from kerv_cli.report.summary import NOTE, SPEEDS, summary_frame
 from kerv_cli.report.tables import StudyData, is_baseline, is_number, rows_of
-from kerv_cli.report.verdict import caution, differing_speeds
+from kerv_cli.report.verdict import caution
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,6 @@ def render(
         planned=len(data.study.episodes),
         how_to_run=_how_to_run(store),
         suite=_suite(data.table),
-        speeds=differing_speeds(rows_of(data.table, MICRO)),
         decisions=read_decisions(store.root),
         figures=figures,
         sections=sections,

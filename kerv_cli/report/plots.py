@@ -17,7 +17,7 @@ from kerv_cli.report.measures import MICRO, Row
 from kerv_cli.report.stressed import by_kind, is_stressed
 from kerv_cli.report.tables import is_baseline, is_number, rows_of
 
-INK, MUTED, GRID, UNKNOWN = "#1f2933", "#6b7785", "#e3e8ee", "#f4f6f8"
+INK, MUTED, GRID = "#1f2933", "#6b7785", "#e3e8ee"
 COLOURS = ("#0b6fb8", "#d1495b", "#2a9d6f", "#8d5fd3", "#e08e1b", "#3aa6b9", "#7a5c3e")  # distinct when colour-blind
 MARKERS = "os^Dv"
 STYLE: Any = {
@@ -38,8 +38,6 @@ STYLE: Any = {
     "legend.frameon": False,
 }
 _ACROSS = 4  # panels beside one another
-_MOST_SETTINGS = 20  # columns of a map that can still be read
-_FAR = 50.0  # points of difference at which a map's colours end
 
 
 @dataclass(frozen=True)
@@ -202,31 +200,6 @@ def latency_figure(table: pd.DataFrame, heading: str) -> Figure:
         lines.setdefault(row["method"], []).append({**row, "baseline": row["ar"]})
     x = ("ar_latency_ms", "an autoregressive decode takes, ms")
     return lines_figure([Panel(title, *x, SUCCESS, lines) for title, lines in panels.items()], heading)
-
-
-def has_task_map(per_task: pd.DataFrame) -> bool:
-    """Return whether a table by task makes a readable map: several tasks, not too many settings, one stress."""
-    several = per_task["task"].nunique() > 1 and 1 < per_task["label"].nunique() <= _MOST_SETTINGS
-    return several and not is_stressed(per_task)
-
-
-def task_map(per_task: pd.DataFrame, heading: str) -> Figure:
-    """Draw tasks down and settings across: successes, coloured by the difference from the baseline in points."""
-    tasks, labels = (list(dict.fromkeys(per_task[name])) for name in ("task", "label"))
-    points = 100.0 * per_task.pivot(index="task", columns="label", values="difference").loc[tasks, labels]
-    with mpl.rc_context(STYLE):
-        figure = new_figure(3.4 + 0.95 * len(labels), 2.2 + 0.27 * len(tasks), heading)
-        axes = figure.subplots()
-        colours = mpl.colormaps["RdBu"].with_extremes(bad=UNKNOWN)
-        image = axes.imshow(points.to_numpy(float), cmap=colours, vmin=-_FAR, vmax=_FAR, aspect="auto")
-        for row in rows_of(per_task):
-            text = f"{int(row['successes'])}/{int(row['episodes'])}"
-            axes.text(labels.index(row["label"]), tasks.index(row["task"]), text, ha="center", va="center", fontsize=8)
-        axes.set_yticks(range(len(tasks)), tasks)
-        axes.set_xticks(range(len(labels)), labels, rotation=35, ha="right")
-        axes.grid(visible=False)
-        figure.colorbar(image, ax=axes, shrink=0.8, label="points, against the baseline")
-    return figure
 
 
 def new_figure(width: float, height: float, heading: str) -> Figure:

@@ -14,9 +14,9 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_bytes, write_json, write_text
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.store import ROLLOUT, StudyStore, studies
-from kerv_cli.report.latency import latency_summary, latency_table
+from kerv_cli.report.latency import latency_table
 from kerv_cli.report.page import Section, render
-from kerv_cli.report.plots import about, has_task_map, latency_figure, png, study_figures, task_map
+from kerv_cli.report.plots import about, latency_figure, png, study_figures
 from kerv_cli.report.publish import check_publishable
 from kerv_cli.report.reprice import ASSUMES, open_profiles, repriced_summary, repriced_table
 from kerv_cli.report.stressed import is_stressed, summed_table
@@ -115,8 +115,6 @@ def write_study(
     files.paths.append(files.folder / "tables" / f"{name}.json")
     write_json(files.paths[-1], further_of(data))
     figures = study_figures(data.table, data.study.axis, title)
-    if has_task_map(data.per_task):
-        figures["_tasks"] = task_map(data.per_task, f"{title}: task by task\n{about(data.table)}")
     plots = [files.add_plot(figure, f"{name}{suffix}") for suffix, figure in figures.items()]
     sections = _sections(data, priced, files)
     page = store.root / "report.html"
@@ -149,18 +147,13 @@ def _sections(data: StudyData, priced: pd.DataFrame | None, files: _Files) -> li
     if priced is not None:
         files.add_table(priced, f"{study}_on")
         sections.append(Section("On other machines", f"{ASSUMES}.", "", repriced_summary(priced)))
-    latencies = latency_table(data)
-    if latencies is not None:
+    latencies = latency_table(data.table)
+    if len(latencies):
         title, name = "Success against the time that AR takes", f"{study}_latency"
         files.add_table(latencies, name)
-        timed = latencies["ar_latency_ms"].any()
-        figure = files.add_plot(latency_figure(latencies, f"{title}\n{about(data.table)}"), name) if timed else ""
+        figure = files.add_plot(latency_figure(latencies, f"{title}\n{about(data.table)}"), name)
         note = "Every setting beside AR at the same latency and compensation, same episodes."
-        sections.append(Section(title, note, figure, latency_summary(latencies)))
+        sections.append(Section(title, note, figure))
     if is_stressed(data.table):
-        title, table, name = "Summed over levels, and over kinds", summed_table(data.table), f"{study}_summed"
-        files.add_table(table, name)
-        fields = table.drop(columns="label").rename(columns={"sum": "task", "method": "label"})
-        note = "Points against the baseline under the same stresses, same episodes."
-        sections.append(Section(title, note, files.add_plot(task_map(fields, f"{title}\n{about(data.table)}"), name)))
+        files.add_table(summed_table(data.table), f"{study}_summed")
     return sections

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import textwrap
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import pandas as pd
@@ -16,7 +16,6 @@ from rich.text import Text
 
 from kerv_cli.report.measures import MICRO, Row, registered_columns
 from kerv_cli.report.tables import is_baseline, is_number, rows_of
-from kerv_cli.report.verdict import differing_speeds
 
 TextOf = Callable[[Row], str]
 
@@ -47,13 +46,6 @@ class Column:
     title: str
     text: TextOf
     needs: str = ""
-
-
-def text_frame(rows: Iterable[Row], columns: Iterable[Column]) -> pd.DataFrame:
-    """Return the rows as text."""
-    rows = list(rows)
-    present = [c for c in columns if not c.needs or any(is_number(row[c.needs]) and row[c.needs] for row in rows)]
-    return pd.DataFrame([{column.title: column.text(row) for column in present} for row in rows])
 
 
 def numbers(name: str) -> TextOf:
@@ -124,6 +116,7 @@ def _columns() -> list[Column]:
         Column("tokens per verification", numbers("AL"), needs="AL"),
         Column("forwards per step", numbers("forwards_per_step")),
         Column("time per step, ms", numbers("time_per_step_ms")),
+        Column("steps per episode", lambda row: f"{row['steps'] / row['episodes']:.0f}"),
         Column("decodes skipped", shares("skip_rate"), needs="skip_rate"),
         Column("decodes compensated", shares("compensation_rate"), needs="compensation_rate"),
         Column("decodes retrieved", shares("retrieval_share"), needs="retrieval_share"),
@@ -140,7 +133,9 @@ def lost_won(row: Row) -> str:
 
 def summary_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame:
     """Return the rows of one averaging as text; columns that no row uses are left out."""
-    return text_frame(rows_of(table, averaging), _columns())
+    rows = rows_of(table, averaging)
+    present = [c for c in _columns() if not c.needs or any(is_number(row[c.needs]) and row[c.needs] for row in rows)]
+    return pd.DataFrame([{column.title: column.text(row) for column in present} for row in rows])
 
 
 @dataclass(frozen=True)
@@ -158,13 +153,12 @@ class SummaryTable:
         title = f"{first['study']}: {counts}, {first['device_name']}, {first['runtime.dtype']}"
         yield Text(title, style="bold", overflow="fold")
         yield _printed(frame)
-        stressed = ", under the same stress" if rows["baseline"].nunique() > 1 else ""
-        yield Text(f"{NOTE} Baseline: {first['baseline']}{stressed}.")
+        several = ", under the same stress and clock" if rows["baseline"].nunique() > 1 else ""
+        yield Text(f"{NOTE} Baseline: {first['baseline']}{several}.")
         if frame[SPEEDS["episode_speedup"]].str.endswith(APART).any():
             yield Text(f"{APART} only from pairs that were measured in turn")
         if untimed := list(rows.loc[rows["time_per_step_ms"].isna(), "label"]):
             yield Text(f"not timed, for success alone: {', '.join(untimed)}")
-        yield from (Text(line) for line in differing_speeds(rows_of(rows)))
 
 
 def _printed(frame: pd.DataFrame) -> Table:

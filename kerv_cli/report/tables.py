@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -15,10 +16,9 @@ import pandas as pd
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_text
 from kerv_cli.base.provenance import PACKAGES
-from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, flat, stress_of, without, work_of
+from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, flat, stress_of, without
 from kerv_cli.lab.plan import Episode, Setting, Study, seeds_text
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.methods.settings import MODEL
 from kerv_cli.report.measures import MACRO, MICRO, Row, measure
 from kerv_cli.worlds import specs
 
@@ -74,29 +74,24 @@ class StudyData:
     def references(self) -> dict[str, str]:
         """Label -> the label that it is compared with.
 
-        It is the baseline under the setting's own stress if the study has it, else the baseline.
+        It is the baseline under the setting's own stress and clock if the study has it, else the baseline.
         """
-        same: dict[tuple[str, int], str] = {}
+        same: dict[str, str] = {}
         if baseline := self.settings.get(self.study.baseline):
-            same = {_stress(one): one.label for one in self._same_but_stress[_unstressed(baseline)]}
-            same[_stress(baseline)] = baseline.label
-        return {label: same.get(_stress(one), self.study.baseline) for label, one in self.settings.items()}
+            group = [one for one in self.study.settings if _methods_of(one) == _methods_of(baseline)]
+            same = {_conditions_of(one): one.label for one in [*group, baseline]}
+        return {label: same.get(_conditions_of(one), self.study.baseline) for label, one in self.settings.items()}
 
     @functools.cached_property
     def unstressed(self) -> dict[str, str]:
         """Label -> the label of the same setting without stress; without one, the first of its stressed settings."""
-        names: dict[str, str] = {}
-        for group in self._same_but_stress.values():
-            plain = next((one for one in group if not _stress(one)[1]), group[0])
-            names |= {one.label: one.label if not _stress(one)[1] else plain.label for one in group}
-        return names
-
-    @functools.cached_property
-    def _same_but_stress(self) -> dict[str, list[Setting]]:
-        groups: dict[str, list[Setting]] = {}
-        for setting in self.study.settings:
-            groups.setdefault(_unstressed(setting), []).append(setting)
-        return groups
+        first: dict[str, str] = {}
+        for setting in sorted(self.study.settings, key=lambda one: bool(stress_of(one.settings)["level"])):
+            first.setdefault(_methods_of(setting), setting.label)
+        return {
+            label: first[_methods_of(one)] if stress_of(one.settings)["level"] else label
+            for label, one in self.settings.items()
+        }
 
     @functools.cached_property
     def table(self) -> pd.DataFrame:
@@ -110,15 +105,16 @@ class StudyData:
         return pd.DataFrame(row for _, episodes in by_task for row in _rows(self, episodes, "one task"))
 
 
-def _stress(setting: Setting) -> tuple[str, int]:
-    stress = stress_of(setting.settings)
-    return stress["kind"], stress["level"]
+def _conditions_of(setting: Setting) -> str:
+    """Return stress and clock, under which methods are compared, as text."""
+    return json.dumps([stress_of(setting.settings), setting.settings["rollout"]], sort_keys=True)
 
 
-def _unstressed(setting: Setting) -> str:
-    """Return the hash of what determines a setting, apart from its stress."""
-    plain = {**setting.settings, "world": without(setting.settings["world"], {"stress"})}
-    return work_of(plain, setting.identity)
+def _methods_of(setting: Setting) -> str:
+    """Return everything else that determines a setting, as text."""
+    world = without(setting.settings["world"], {"stress"})
+    others = without(setting.settings, (NOT_DETERMINING - {"policy"}) | {"world", "rollout"})
+    return json.dumps([world, others, dict(setting.identity)], sort_keys=True)
 
 
 def load_study(store: StudyStore, wanted: Sequence[Episode] | None = None) -> StudyData:
@@ -194,12 +190,6 @@ def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataF
         "stress_level": stress["level"],
         **{key: _joined(episodes[key].dropna()) if key in episodes else "" for key in _PROVENANCE},
     }
-
-
-def is_autoregressive(settings: Plain) -> bool:
-    """Return whether a setting is a model that decodes token by token: nothing drafts, nothing is skipped."""
-    drafts = any(settings[part]["kind"] != "none" for part in ("prefill_draft", "proposer", "skip"))
-    return not drafts and settings["policy"]["kind"] == MODEL
 
 
 def flatten(settings: Plain) -> Row:

@@ -18,8 +18,6 @@ from kerv_cli.report.tables import is_baseline, is_number, rows_of
 
 SOLVED = 0.20
 """Smallest success rate at which a baseline counts as solving its tasks."""
-BEHIND = 0.10
-"""Loss of success that is worth naming in a study of stress."""
 SMALLER, LARGER, OPEN = "loss is smaller", "loss is larger", "open"
 
 
@@ -134,36 +132,18 @@ def _missing(choice: Choice) -> str:
     return f"at these rates, {count} more pairs would show it for {choice.candidate}"
 
 
-def rates(rows: Sequence[Row]) -> str:
-    """Return the success rates of settings that have no pairs with a baseline."""
-    return "success: " + ", ".join(f"{row['label']} {100 * row['success']:.1f} %" for row in rows)
-
-
-def under_stress(table: pd.DataFrame, reference: str) -> str:
-    """Say under which stress each method succeeds less often than the baseline, in one sentence.
-
-    Args:
-        table: A study's table.
-        reference: Name of the baseline whatever its stress.
-    """
-    rows = [row for row in rows_of(table, MICRO) if row["pairs"] and not is_baseline(row)]
-    solved = [row for row in rows if (row["both"] + row["only_baseline"]) / row["pairs"] >= SOLVED]
-    behind: dict[str, list[str]] = {}
-    for row in solved:
-        if row["difference"] <= -BEHIND:
-            star = "*" if row["difference_high"] < 0 else ""
-            behind.setdefault(str(row["unstressed"]), []).append(f"{_stress(row)}{star}")
-    bound = f"{100 * BEHIND:.0f} points of success or more below {reference} in the same worlds"
-    clauses = [f"{name}: {', '.join(worlds)}" for name, worlds in behind.items()]
-    text = f"{bound} (* shown with 95 % confidence): {'; '.join(clauses)}" if clauses else f"no method is {bound}"
-    if len(solved) < len(rows):
-        worlds = dict.fromkeys(_stress(row) for row in rows if row not in solved)
-        text += f"; {reference} does not solve the tasks under {', '.join(worlds)}, so nothing is compared there"
-    return text
-
-
-def _stress(row: Row) -> str:
-    return f"{row['stress']} {row['stress_level']}" if row["stress_level"] else "no stress"
+def under_conditions(rows: Sequence[Row], baseline: str) -> str:
+    """Say which settings succeed less or more often than the baseline under the same stress and clock."""
+    compared = [row for row in rows if row["pairs"] and not is_baseline(row)]
+    solved = [row for row in compared if (row["both"] + row["only_baseline"]) / row["pairs"] >= SOLVED]
+    less = [str(row["label"]) for row in solved if row["difference_high"] < 0]
+    more = [str(row["label"]) for row in solved if row["difference_low"] > 0]
+    text = (
+        f"under the same conditions, with 95 % confidence each, less successful than {baseline}: "
+        f"{'; '.join(less) or 'no setting'}. More successful: {'; '.join(more) or 'no setting'}"
+    )
+    unsolved = dict.fromkeys(str(row["baseline"]) for row in compared if row not in solved)
+    return text + (f". These do not solve the tasks, nothing is compared: {'; '.join(unsolved)}" if unsolved else "")
 
 
 def caution(table: pd.DataFrame) -> str:
@@ -177,25 +157,6 @@ def caution(table: pd.DataFrame) -> str:
     if unverified:
         clauses.append(f"{', '.join(unverified)}: nothing is verified")
     return "; ".join(clauses)
-
-
-def differing_speeds(rows: Sequence[Row]) -> list[str]:
-    """Return a line for every setting whose intervals of speed per episode and per control step do not overlap."""
-    by_label = {row["label"]: row for row in rows}
-    lines = []
-    for row in rows:
-        reference = by_label.get(row["baseline"])
-        low, high = (
-            max(row["episode_speedup_low"], row["speedup_low"]),
-            min(row["episode_speedup_high"], row["speedup_high"]),
-        )
-        if reference is not None and low > high:
-            own, other = (one["steps"] / one["episodes"] for one in (row, reference))
-            lines.append(
-                f"{row['label']}: {row['episode_speedup']:.2f} times as fast per episode, {row['speedup']:.2f} per "
-                f"control step; its episodes take {own:.0f} control steps, those of {reference['label']} {other:.0f}"
-            )
-    return lines
 
 
 def stopping_rule(loss: float, looks: int, confidence: float) -> str:
