@@ -8,7 +8,7 @@ import pytest
 
 from kerv_cli.base.config import compose, conf_dir
 from kerv_cli.episodes.identity import effective, idle_keys, without_effect
-from kerv_cli.episodes.resolve import ResolvedStudy, idle_overrides
+from kerv_cli.episodes.resolve import Point, ResolvedStudy, idle_overrides
 from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 
 
@@ -49,6 +49,7 @@ def test_no_rectifier_counts_in_the_shipped_methods_that_verify_nothing() -> Non
 def test_a_sweep_names_what_none_of_its_settings_reads() -> None:
     written = {"a": "method=ar threshold.r=3", "b": "method=spec_vla"}
     settings = {label: compose("rollout", text.split(), RolloutSettings) for label, text in written.items()}
+    points = {label: Point(label, tuple(text.split())) for label, text in written.items()}
     common = ("acceptance=relaxed", "policy.artifacts.early=mine", "runtime.workers=2")
-    found = idle_overrides(ResolvedStudy(SweepSettings(), settings, written, common))
+    found = idle_overrides(ResolvedStudy(SweepSettings(), settings, points, common))
     assert list(found) == ["a: threshold.r=3", "policy.artifacts.early=mine"]

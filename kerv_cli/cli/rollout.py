@@ -52,7 +52,7 @@ def rollout(
         typer.echo("---\n".join(settings_yaml(settings) for settings in resolved.settings.values()), nl=False)
         return
     for label, settings in resolved.settings.items():
-        print_notes(without_effect(settings, resolved.overrides[label].split()))
+        print_notes(without_effect(settings, resolved.points[label].overrides))
     planned = planned_rollout(resolved, ["rollout", *(["-m"] if multirun else []), *words])
     if plan:
         names = ", ".join(f"{label}{_stressed(asdict(settings))}" for label, settings in resolved.settings.items())

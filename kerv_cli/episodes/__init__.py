@@ -1,0 +1,1 @@
+"""One episode: its settings, policy and clock, and what determines its result."""

@@ -1,4 +1,4 @@
-"""Which code computes an episode: a hash of what its source means, so that what other code computed is not reused."""
+"""Hash of the code that computes an episode. Provenance: it tells which episodes other code computed."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ import kerv_cli
 from kerv_cli.base.registry import kinds, parts
 
 _COMPUTING = ("base", "engine", "methods", "targets", "worlds", "episodes")
-"""Rooms whose code an episode runs; not how it is shown or reported."""
+"""Rooms whose code an episode runs."""
 
 
 @functools.cache
 def code_hash() -> str:
-    """Hex SHA-256 over the names and syntax trees of the files that compute an episode: kerv's own, and those of parts
-    that are registered from outside. Comments, docstrings and layout do not count. Computed once per process."""
+    """Return the hex SHA-256 over the names and syntax trees of the files that compute an episode.
+
+    These are kerv's own and those of registered plugins. Comments, docstrings and layout do not count.
+    """
     digest = hashlib.sha256()
     for name, path in [*_package(), *_outside()]:
         content = _meaning(path.read_bytes()) if path.suffix == ".py" else path.read_bytes()
@@ -28,7 +30,7 @@ def code_hash() -> str:
 
 
 def _meaning(source: bytes) -> bytes:
-    """The syntax tree as text, without strings that stand alone: docstrings."""
+    """Return the syntax tree as text, without docstrings."""
     return ast.dump(_WithoutDocstrings().visit(ast.parse(source))).encode()
 
 

@@ -1,4 +1,4 @@
-"""The scripted expert as a policy: the reference of success tables (docs/methods.md §6)."""
+"""The scripted expert as a policy, the reference of success tables (docs/methods.md §6)."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ MODE = "expert"
 
 
 class ExpertDecoder:
-    """The environment's scripted controller of the episode's task; it decodes one control step at a time.
+    """Decodes one control step at a time with the environment's scripted controller of the task.
 
-    It reads the privileged state, as `observation=state` does. Without a target its records have no forwards, rounds
-    and tokens, and measures per verification are undefined. Its time is that of a few scalar formulas and is not
-    compared with a decoding method's.
+    It reads the privileged state, as `observation=state` does. It has no target: its records have no forwards, rounds
+    and tokens. Its time is not compared with a decoding method's.
     """
 
     cameras: tuple[str, ...] = ()
@@ -31,16 +30,16 @@ class ExpertDecoder:
         self.dofs = 0
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
-        """Begins an episode. Raises UnknownName for a task that no environment has."""
+        """Begin an episode."""
         if self.expert is None or task != self.task:
             spec = spec_of(task)
             self.task, self.expert, self.dofs = task, spec.expert(task), spec.actions.dofs
 
     def decode(self, observation: Observation) -> DecodeRecord:
-        """The state -> one control step's action (1, D) in environment units.
+        """Return one control step's action (1, D), environment units.
 
         Raises:
-            KervError: before the first reset, or the answer is not D finite numbers.
+            KervError: There was no reset, or the expert's answer is not D finite numbers.
         """
         if self.expert is None:
             raise KervError("the expert does not know its task yet: reset it before decoding")
@@ -60,7 +59,7 @@ class ExpertDecoder:
         )
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
-        """It needs no history."""
+        """Do nothing: it needs no history."""
 
     def finish(self, success: bool) -> None:
-        """It learns nothing."""
+        """Do nothing: it does not learn."""

@@ -1,7 +1,7 @@
-"""The meaning of an episode: the settings that have an effect, the weights and data, the task, the seeds and `ENGINE`.
+"""What determines an episode's result: settings that have an effect, weights and data, task, seeds and `ENGINE`.
 
-Not the code, versions, machine, workers or layout of files: those are provenance, written beside. So what was measured
-stays, whatever is renamed or added, and what would give the same tokens is the same work in any study.
+Code, versions, machine, workers and file layout are provenance and are stored beside it. So results stay valid when
+something is renamed or added, and settings that give the same tokens are the same work in any study.
 """
 
 from __future__ import annotations
@@ -20,36 +20,32 @@ from kerv_cli.episodes.settings import CONSTANT, PROFILE, WAITS, RolloutSettings
 from kerv_cli.methods.settings import EXPERT
 
 ENGINE = 1
-"""Which tokens the code gives. Raised by hand in a change that alters tokens or actions, and in no other:
-tests/test_golden.py holds both."""
+"""Version of the tokens that the code gives. A change that alters tokens or actions raises it; tests/test_golden.py
+checks that."""
 
 Plain = Mapping[str, Any]
-"""RolloutSettings as nested plain values: those of a Setting, as they are stored."""
+"""RolloutSettings as nested plain values, as they are stored."""
 
 Identity = Mapping[str, str]
 """Hashes of the weights and data behind a setting, e.g. {"target": sha256, "drafter": sha256}."""
 
 OBSERVATION = "observation"
-"""Key of the identity's only entry that is not a hash: what the target observes. The target's hash determines it."""
+"""Key of the identity's only entry that is not a hash: what the target observes."""
 
-# Fields of RolloutSettings that do not change an episode's result (where it is written, how much of it is recorded,
-# names), or that count otherwise (task and seed on their own, the policy by its hashes). All other fields count,
-# so that a new setting makes new episodes instead of being overlooked.
+# Fields of RolloutSettings that do not change an episode's result (folders, recording, names), or that count otherwise
+# (task and seed on their own, the policy by its hashes). All others count, so that a new setting makes new episodes.
 NOT_DETERMINING = frozenset(
     {"task", "episodes", "seed", "policy", "method", "results", "store", "record", "record_size"}
 )
 NOT_DETERMINING_RUNTIME = frozenset({"workers", "executor", "executor_options"})
 
-_JUDGED = ("acceptance", "threshold", "rectifier")
-"""The parts that judge drafts."""
-
 
 def hash_of(value: object) -> str:
-    """First 16 hex digits of the SHA-256 of canonical JSON.
+    """Return the first 16 hex digits of the SHA-256 of canonical JSON.
 
     Raises:
         ValueError: NaN or infinity, which JSON lacks.
-        TypeError: a value that is not JSON's.
+        TypeError: A value that JSON lacks.
     """
     return hashlib.sha256(_canonical(value).encode("ascii")).hexdigest()[:16]
 
@@ -59,8 +55,7 @@ def _canonical(value: object) -> str:
 
 
 def work_of(settings: Plain, identity: Identity, engine: int = ENGINE) -> str:
-    """Hash of what determines the results of a setting, apart from task, seeds and repeat. engine: version that
-    computes them."""
+    """Return the hash of what determines the results of a setting, apart from task, seeds and repeat."""
     determining = without(settings, NOT_DETERMINING - {"policy", "method"})
     policy = settings["policy"]["kind"]
     return _work(_canonical(determining), _canonical(dict(identity)), policy, engine)
@@ -74,10 +69,10 @@ def _work(settings: str, identity: str, policy: str, engine: int) -> str:
 
 
 def effective(settings: Plain) -> dict[str, Any]:
-    """The settings that determine a result: complete, without those that have no effect."""
+    """Return the settings that determine a result: all of them, without those that have no effect."""
     try:
         complete = settings_from(settings)
-    except KervError:  # a part that is not registered here, e.g. somebody else's: its settings as they stand
+    except KervError:  # a part that is not registered here, such as somebody else's
         return without(settings, NOT_DETERMINING)
     determining = without(asdict(complete), NOT_DETERMINING)
     for key in idle_keys(complete) if complete.policy.kind != EXPERT else ():
@@ -95,25 +90,25 @@ def _drop(settings: dict[str, Any], path: Sequence[str]) -> None:
 
 
 def depends_on_order(settings: Plain) -> bool:
-    """Whether an episode's result depends on the episodes before it in its block: feedback moves a skip level."""
+    """Return whether an episode's result depends on those before it in its block: feedback moves a skip level."""
     skip = settings["skip"]
     return any(skip.get(name) for name in ("up", "down"))
 
 
 def stress_of(settings: Plain) -> dict[str, Any]:
-    """Kind and level of a setting's stress; `none` where nothing is shifted."""
+    """Return kind and level of a setting's stress. At level 0 the kind is `none`."""
     stress = settings["world"]["stress"]
     level = int(stress["level"])
     return {"kind": stress["kind"] if level else "none", "level": level}
 
 
 def batch_of(settings: Plain) -> int:
-    """Episodes that a setting runs at the same time; with more than one they have no times."""
+    """Return how many episodes a setting runs at the same time. With more than one they have no times."""
     return int(settings["rollout"]["batch"])
 
 
 def flat(settings: Plain, prefix: str = "") -> dict[str, Any]:
-    """Nested settings as dotted keys: {"threshold": {"r": 5}} -> {"threshold.r": 5}."""
+    """Return nested settings with dotted keys: {"threshold": {"r": 5}} becomes {"threshold.r": 5}."""
     pairs: dict[str, Any] = {}
     for key, value in settings.items():
         pairs |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
@@ -121,14 +116,17 @@ def flat(settings: Plain, prefix: str = "") -> dict[str, Any]:
 
 
 def without(settings: Plain, names: Collection[str]) -> dict[str, Any]:
-    """The settings without those keys."""
+    """Return the settings without the keys `names`."""
     return {key: value for key, value in settings.items() if key not in names}
 
 
 def without_effect(settings: RolloutSettings, overrides: Iterable[str], sweep: bool = False) -> dict[str, str]:
-    """Those of the overrides `key=value` that have no effect on the rollout -> why. sweep: it is one of a sweep's.
+    """Return those overrides `key=value` that have no effect on the rollout, and why.
 
-    An expert's are left out: it refuses the settings of a method.
+    Args:
+        settings: The rollout's. The expert refuses the settings of a method, so that none of its own is idle.
+        overrides: As written.
+        sweep: Whether the rollout is part of a sweep.
     """
     if settings.policy.kind == EXPERT:
         return {}
@@ -136,11 +134,11 @@ def without_effect(settings: RolloutSettings, overrides: Iterable[str], sweep: b
     if not sweep:
         idle |= {f"runtime.{name}": "a rollout runs in one process" for name in sorted(NOT_DETERMINING_RUNTIME)}
     reasons = {}
-    for word in overrides:
-        key = word.partition("=")[0].lstrip("+")
+    for override in overrides:
+        key = override.partition("=")[0].lstrip("+")
         reason = next((why for name, why in idle.items() if key == name or key.startswith(f"{name}.")), None)
         if reason is not None:
-            reasons[word] = reason
+            reasons[override] = reason
     return reasons
 
 
@@ -159,13 +157,13 @@ def _idle_timing(timing: TimingSettings) -> dict[str, str]:
 
 
 def idle_keys(settings: RolloutSettings) -> dict[str, str]:
-    """Key of a setting that has no effect -> why."""
+    """Return the keys of settings that have no effect, and why."""
     method = settings.parts()
     parts = {kind: part_of(kind, method[kind].kind) for kind in METHOD_KINDS}
     draft, proposer, skip, acceptance = (parts[k] for k in ("prefill_draft", "proposer", "skip", "acceptance"))
     idle: dict[str, str] = {}
     if proposer.absent and draft.absent:
-        idle |= dict.fromkeys(_JUDGED, f"method {settings.method} drafts nothing")
+        idle |= dict.fromkeys(("acceptance", "threshold", "rectifier"), f"method {settings.method} drafts nothing")
     elif not skip.traits.get("verifies", True) and (draft.traits.get("drafts_whole_chunk") or proposer.absent):
         idle["rectifier"] = f"skip={skip.name} verifies nothing, so nothing is rejected"
     elif not acceptance.traits.get("reads_threshold", True):

@@ -1,4 +1,4 @@
-"""Episodes and decodes as rows: what the database stores of a record."""
+"""Episodes and decodes as rows of the database."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from kerv_cli.engine.record import PHASES, DecodeRecord, Delay, EpisodeRecord, R
 
 INT, FLOAT, TEXT, FLAG = pa.int64(), pa.float64(), pa.string(), pa.bool_()
 Fields = dict[str, tuple[pa.DataType, Callable[..., Any]]]
-"""Column -> its type, and its value: of an episode's record, or of a decode's."""
+"""Column -> its type, and the function that takes its value from a record."""
 
 
 def _summed(value: Callable[[DecodeRecord], Any]) -> Callable[[EpisodeRecord], Any]:
-    """The sum over an episode's decodes; None counts as 0."""
+    """Sum over an episode's decodes. None counts as 0."""
     return lambda episode: sum(value(decode) or 0 for decode in episode.decodes)
 
 
 def _judged(value: Callable[[Round], int]) -> Callable[[EpisodeRecord], int]:
-    """The sum over an episode's verifications."""
+    """Sum over an episode's verifications."""
     return _summed(lambda decode: sum(value(one) for one in decode.rounds if one.is_verification))
 
 
 def _delays(value: Callable[[Delay], Any]) -> Callable[[EpisodeRecord], Any]:
-    """The sum over the decodes during which the world went on."""
+    """Sum over the decodes during which the world went on."""
     return _summed(lambda decode: 0 if decode.delay is None else value(decode.delay))
 
 
@@ -41,7 +41,6 @@ def _phase(phase: str) -> Callable[[DecodeRecord], float | None]:
 
 
 def _attributes(*names: str, kind: pa.DataType = INT) -> Fields:
-    """Columns that are attributes of the record."""
     return {name: (kind, attrgetter(name)) for name in names}
 
 
@@ -82,7 +81,7 @@ _EPISODE: Fields = {
     "initial_state": (pa.list_(FLOAT), lambda episode: np.asarray(episode.initial_state, np.float64).ravel().tolist()),
 }
 EPISODE_SCHEMA = pa.schema((name, kind) for name, (kind, _) in _EPISODE.items())
-"""Columns of an episode that come from its record. The database adds what it means and when it ran."""
+"""Columns of an episode's record. The database adds its identity and when it ran."""
 
 _TOKENS = pa.list_(pa.int32())
 _COUNTS = ("start", "accepted", "committed", "tree_size")
@@ -109,8 +108,8 @@ _DECODE: Fields = {
     **_attributes("compensated"),
     **_attributes("skipped", kind=FLAG),
     **_attributes("variability", "similarity", "metric", "deviation", kind=FLOAT),
-    **_attributes("reason", kind=TEXT),  # of a skip rule: trusted, streak; null without one that says so
-    "delay_seconds": (FLOAT, _delay("seconds")),  # these: null where the world waited
+    **_attributes("reason", kind=TEXT),  # of a skip rule: trusted, streak; null if it says none
+    "delay_seconds": (FLOAT, _delay("seconds")),  # this and the next: null if the world waited
     "delay_steps": (INT, _delay("steps")),
     **{name: (INT, _delay(name)) for name in ("observed", "carried", "held", "dropped")},
 }

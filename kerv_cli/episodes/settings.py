@@ -1,4 +1,4 @@
-"""Settings of rollouts and of studies."""
+"""Settings of rollouts and studies."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MEASURED, CONSTANT, PROFILE = "measured", "constant", "profile"
 class TimingSettings:
     """What the world does while the policy decodes (docs/methods.md §8)."""
 
-    clock: str = choice(WAITS, WAITS, REAL, help="while the policy decodes, the world stands still, or goes on")
+    clock: str = choice(WAITS, WAITS, REAL, help="whether the world waits while the policy decodes, or goes on")
     latency: str = choice(MEASURED, MEASURED, CONSTANT, PROFILE, help="how long a decode takes for the world")
     latency_ms: float = number(0.0, 0, 600_000, help="latency=constant: milliseconds of a decode")
     profile: str = setting("", "latency=profile: a document of `kerv bench`, its path or its name in <results>/bench")
@@ -31,7 +31,11 @@ class TimingSettings:
     batch: int = number(1, 1, 1024, help="episodes that are decoded together; above 1: for success, without times")
 
     def check_together(self, prefix: str) -> None:
-        """Raises UsageError for latency=profile without a profile, and for a batch in a world that feels its time."""
+        """Refuse settings that exclude each other.
+
+        Raises:
+            UsageError: latency=profile without a profile, or a batch, which has no times, with clock=real.
+        """
         if self.batch > 1 and self.clock == REAL:
             raise UsageError(
                 f"{prefix}batch={self.batch} with {prefix}clock=real: decodes of a batch have no times, use one of them"
@@ -43,18 +47,18 @@ class TimingSettings:
 
 
 DEFAULT_TASKS = ["MT10"]
-"""Where neither a word nor a target names any."""
+"""Default tasks, if the target names none."""
 
 
 @dataclass
 class RolloutSettings(MethodSettings, TaskSettings):
     """`kerv rollout`: episodes of one method."""
 
-    # the method's parts are overridden by its file, so that it comes last
+    # a method's file overrides its parts, so it comes last
     groups: ClassVar = {"policy": "vision", "world": "default", "runtime": "cpu", "method": "ar"}
 
     episodes: int = number(3, 1, 1_000_000, help="episodes per task")
-    # in every setting: that is the pairing
+    # the same in every setting, so that episodes are paired
     seed: int = number(EVALUATION_SEED, 0, 2**31 - 1, help="first seed; episode i has seed + i")
     world: RolloutWorldSettings = setting(RolloutWorldSettings, "camera, length of an episode, stress")
     rollout: TimingSettings = setting(TimingSettings, "what the world does while the policy decodes")
@@ -64,15 +68,15 @@ class RolloutSettings(MethodSettings, TaskSettings):
 
     def __post_init__(self) -> None:
         if self.policy.kind == EXPERT:
-            self.method = EXPERT  # it decodes nothing, so that no method's name fits
+            self.method = EXPERT  # it decodes nothing, so no method's name fits
 
 
 @dataclass
 class StudySettings:
     """`conf/study/*.yaml`: which settings are compared."""
 
-    name: str = setting("", "of its folder in <results>/studies; empty: that of its file")
-    title: str = setting("", "of its tables and plots")
+    name: str = setting("", "name in the results; empty: the file's")
+    title: str = setting("", "title of its tables and plots")
     baseline: str = setting("ar", "label of the setting that the others are compared with")
     common: str = setting("", "overrides of every setting, e.g. task=MT10 episodes=20; the command line's outrank them")
     settings: dict[str, str] = setting({}, "label -> overrides; comma lists expand into a grid")
@@ -90,13 +94,13 @@ class SweepSettings(CommandSettings):
 
     study: StudySettings = setting(StudySettings, "which settings are compared: a name of conf/study, or a file")
     until: str = choice(
-        "done", "done", "decided", help="every planned episode, or until each setting's question is answered"
+        "done", "done", "decided", help="run every planned episode, or stop a setting once its question is answered"
     )
-    # timed: settings whose times were not taken in turn with the baseline; changed: episodes of other code
-    rerun: str = choice("never", "never", "timed", "changed", "all", help="what is run again although it is there")
+    # timed: settings whose times were not taken in turn with the baseline's; changed: episodes of other code
+    rerun: str = choice("never", "never", "timed", "changed", "all", help="which existing episodes run again")
     loss: float = number(3.0, above=0, most=99.9, help="until=decided: is the loss of success below so many points?")
 
 
 def settings_from(plain: Mapping[str, Any]) -> RolloutSettings:
-    """The settings of a rollout from nested dicts and lists: `read_settings` with its class."""
+    """Return the settings of a rollout from nested dicts and lists."""
     return read_settings(RolloutSettings, plain)

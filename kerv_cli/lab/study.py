@@ -97,11 +97,11 @@ def study_of(resolved: ResolvedStudy, kind: str = SWEEP) -> Study:
     settings = [
         Setting(
             label,
-            resolved.overrides[label],
+            " ".join(resolved.points[label].overrides),
             plain_settings(asdict(one)),
             identities[label],
-            resolved.varies.get(label, {}),
-            resolved.names.get(label, ""),
+            resolved.points[label].varies,
+            resolved.points[label].name,
         )
         for label, one in resolved.settings.items()
     ]
