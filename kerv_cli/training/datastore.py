@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,6 @@ from kerv_cli.base.files import read_mapping, sha256_of, visible, write_folder, 
 from kerv_cli.base.places import artifact, check_not_shipped
 from kerv_cli.base.provenance import provenance_of
 from kerv_cli.base.runtime import set_up
-from kerv_cli.base.spaces import ObservationSpace
-from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.heisd.datastore import (
     PAYLOAD,
@@ -43,49 +41,6 @@ BATCH = 128
 """Observations encoded together, at most."""
 KEYS = ("vision", "scene", "proprioception")
 """Parts of the prompt that a key can have. The instruction is the same for all entries of a task."""
-
-
-@dataclass(frozen=True)
-class Entries:
-    """The n entries of one episode, in step order."""
-
-    keys: np.ndarray  # (n, d) float32
-    tokens: np.ndarray  # (n, N) uint8
-    seed: np.ndarray  # (n,) int64
-    step: np.ndarray  # (n,) int64, control steps since the start
-    left: np.ndarray  # (n,) int64, control steps until the success
-
-
-@torch.inference_mode()
-def entries_of(
-    target: ReadableTarget, episode: DemoEpisode, segments: Sequence[str], stride: int, space: ObservationSpace
-) -> Entries:
-    """Return every `stride`-th observation as a key, with the expert's next H clean actions as its tokens.
-
-    Args:
-        target: Encodes the observations.
-        episode: A demonstration.
-        segments: Parts of the prompt that make the key.
-        stride: Observations between two entries.
-        space: Observation space of the demonstrations.
-
-    Raises:
-        CheckpointError: Too few labels, or frames of another size than the target takes.
-    """
-    steps = steps_of(episode, bool(target.cameras))[::stride]
-    tokens = target.actions.encode(read_chunks(episode, steps, target.chunk)).reshape(len(steps), -1)
-    observations = observations_of(target, episode, steps, space)
-    size = -(-len(steps) // -(-len(steps) // BATCH))  # equal batches
-    keys = [prompt_key(prompt, target, segments) for prompt in prompts_of(target, observations, size)]
-    seed = np.full(len(steps), episode.seed)
-    return Entries(np.concatenate(keys), tokens.astype(np.uint8), seed, steps.astype(np.int64), episode.steps - steps)
-
-
-def directions(keys: np.ndarray, count: int) -> np.ndarray:
-    """Return (d, count) float32: the orthonormal directions with most of the squared length of keys (n, d)."""
-    values, vectors = np.linalg.eigh(keys.T.astype(np.float64) @ keys)
-    leading: np.ndarray = vectors[:, np.argsort(-values)[:count]].astype(np.float32)
-    return leading
 
 
 class DatastoreBuild:
@@ -140,26 +95,45 @@ class DatastoreBuild:
             CheckpointError: Too few labels, or frames of another size than the target takes.
             StorageError: The disk refused.
         """
-        target: Any = self.artifacts.target
-        space, settings = self.dataset.manifest.observation, self.settings
-        total, parts, shards, rows = sum(map(len, self.chosen.values())), list[Entries](), {}, 0
+        total, parts, shards, rows = sum(map(len, self.chosen.values())), list[dict[str, np.ndarray]](), {}, 0
         for name, chosen in self.chosen.items():
             first = rows
             for index in chosen:
-                parts.append(entries_of(target, self.dataset.load(index), settings.key, settings.stride, space))
-                rows += len(parts[-1].step)
+                parts.append(self._entries(self.dataset.load(index)))
+                rows += len(parts[-1]["step"])
                 progress(len(parts), total)
             shards[name] = Shard((first, rows), tuple(self.seeds[name]))
-        columns = {name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])}
-        files = self._contents(columns, shards)
+        files = self._contents({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, shards)
         write_folder(self.folder, lambda folder: self._write(folder, files, shards), replace=True)
         return Datastore.open(self.folder, self.artifacts.description)
+
+    @torch.inference_mode()
+    def _entries(self, episode: DemoEpisode) -> dict[str, np.ndarray]:
+        """Return the columns of an episode's entries: one for every `stride`-th observation.
+
+        The key is the encoded observation; the tokens are the expert's next H clean actions.
+        """
+        target: Any = self.artifacts.target
+        steps = steps_of(episode, bool(target.cameras))[:: self.settings.stride]
+        tokens = target.actions.encode(read_chunks(episode, steps, target.chunk)).reshape(len(steps), -1)
+        observations = observations_of(target, episode, steps, self.dataset.manifest.observation)
+        size = -(-len(steps) // -(-len(steps) // BATCH))  # equal batches
+        keys = [prompt_key(prompt, target, self.settings.key) for prompt in prompts_of(target, observations, size)]
+        return {
+            "seed": np.full(len(steps), episode.seed),
+            "step": steps.astype(np.int64),  # control steps since the start
+            "left": episode.steps - steps,  # control steps until the success
+            "tokens": tokens.astype(np.uint8),
+            "keys": np.concatenate(keys),
+        }
 
     def _contents(self, columns: dict[str, np.ndarray], shards: Mapping[str, Shard]) -> dict[str, Any]:
         """Return file name -> its array or table."""
         keys, tokens, files = columns.pop("keys"), columns.pop("tokens"), {}
         if self.settings.components:
-            files[PROJECTION] = directions(keys, self.settings.components)
+            # the orthonormal directions with most of the keys' squared length
+            values, vectors = np.linalg.eigh(keys.T.astype(np.float64) @ keys)
+            files[PROJECTION] = vectors[:, np.argsort(-values)[: self.settings.components]].astype(np.float32)
             keys = projected(keys, files[PROJECTION])
         files[VECTORS] = keys.astype(np.float16 if self.settings.half else np.float32)
         counts = [shard.rows[1] - shard.rows[0] for shard in shards.values()]

@@ -241,15 +241,6 @@ class Imitation:
         return metrics
 
 
-def new_target(
-    settings: TargetSettings, dataset: DemoDataset, samples: Samples, words: WordTokenizer, camera: str, seed: int
-) -> CompactTarget:
-    """Return a fresh policy of the dataset's spaces, with the samples' action statistics."""
-    torch.manual_seed(seed)
-    actions = dataset.manifest.actions.fitted(samples.chunks[:, 0].numpy().astype(np.float64))
-    return CompactTarget(replace(settings), actions, dataset.manifest.observation, words, camera)
-
-
 def check_init(settings: TargetSettings, camera: str, description: TargetDescription, folder: Path) -> None:
     """Refuse a target in `folder` that cannot be trained on with these settings and frames of `camera`.
 

@@ -22,32 +22,33 @@ FIRST_EPISODES = "per task, the first ones by seed; 0: all"
 
 @dataclass
 class TrainSettings:
-    """Optimisation. The batch of step s depends on (seed, s) alone, so a resumed run repeats the uninterrupted one."""
+    """Optimisation. The batch of step s depends only on (seed, s), so a resumed run repeats the uninterrupted one."""
 
     steps: int = number(20_000, 1, 10**9, help="optimisation steps")
     batch: int = number(64, 1, 65_536, help="samples per step")
     lr: float = number(1e-3, 0, 10, help="highest learning rate")
-    warmup: int = number(300, 0, 10**9, help="first steps, in which the learning rate rises")
+    warmup: int = number(300, 0, 10**9, help="first steps, while the learning rate rises")
     weight_decay: float = number(0.02, 0, 100, help="AdamW's")
     clip: float = number(1.0, above=0, most=1e9, help="largest norm of the gradient")
-    ema: float = number(0.999, 0, 0.999999, help="moving average of the weights, which is what is kept")
-    init: str | None = setting(None, "target that gives the initial weights; its chunk may be shorter or longer")
+    ema: float = number(0.999, 0, 0.999999, help="decay of the moving average of the weights, which is what is saved")
+    init: str | None = setting(None, "target whose weights it begins with; its chunk may be shorter or longer")
     label_sigma: float = number(1.0, 0, 1000, help="bins over which a label is spread (Gaussian); 0: one-hot")
-    balance: float = number(0.0, 0, 1, help="0: every sample is drawn as often as any other; 1: every task")
+    balance: float = number(0.0, 0, 1, help="0 draws all samples alike, 1 all tasks")
     scene_weight: float = number(1.0, 0, 1e6, help="weight of the position loss (vision only)")
     places: str = choice(
-        "state", "state", "path", help="positions learnt: of object and goal; path: of the hand, later in the episode"
+        "state",
+        "state",
+        "path",
+        help="positions learnt: state: of object and goal; path: of the hand, later in the episode",
     )
-    colour: float = number(0.0, 0, 3, help="random light on the images (target only): spread of its logarithm")
-    scene_steps: int = number(0, 0, 10**9, help="first steps that train only the vision encoder, on positions")
+    colour: float = number(0.0, 0, 3, help="random light on the images: spread of its logarithm")
+    scene_steps: int = number(0, 0, 10**9, help="first steps, which train only the vision encoder, on positions")
     held_out: float = number(0.1, above=0, most=0.5, help="share of episodes kept for validation")
     validate_every: int = number(2_000, 1, 10**9, help="steps between two validations")
-    closed_loop: int = number(0, 0, 100_000, help="episodes per task and validation, closed loop")
+    closed_loop: int = number(0, 0, 100_000, help="closed-loop episodes per task at every validation")
     seed: int = number(0, 0, 2**31 - 1, help="of initial weights and order of samples")
     bf16: bool = setting(True, "training forward in bfloat16, on a GPU or a CPU with AMX")
-    stored: str = choice(
-        "float32", "float32", "float16", "int8", help="weights on disk: for shipping, a half or a quarter"
-    )
+    stored: str = choice("float32", "float32", "float16", "int8", help="number format of the weights on disk")
 
 
 @dataclass
@@ -76,7 +77,7 @@ class DemosSettings(MethodSettings, TaskSettings):
     episodes: int = number(100, 1, 100_000, help="episodes per task")
     seed: int = number(0, 0, 2**31 - 1, help="first seed")
     perturbed: float = number(0.5, 0, 1, help="share of episodes in which the expert is disturbed")
-    expert_share: float = number(0.3, 0, 1, help="of a policy's chunks: those that the expert executes")
+    expert_share: float = number(0.3, 0, 1, help="share of a policy's chunks in which the expert acts")
     frame_stride: int = number(2, 1, 10_000, help="control steps between two images that are kept")
     world: WorldSettings = setting(WorldSettings, "camera and length of an episode")
 
@@ -133,9 +134,9 @@ class BuildDatastoreSettings(DemonstrationSettings):
 
     name: str | None = setting(None, "default: datastore/ beside the target")
     episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)
-    stride: int = number(1, 1, 10_000, help="every so many of an episode's observations become entries")
-    half: bool = setting(False, "keys on disk in float16: half the size, for shipping")
-    components: int = number(0, 0, 65_536, help="directions that keys are projected onto; 0: keys stay as they are")
+    stride: int = number(1, 1, 10_000, help="observations between two entries")
+    half: bool = setting(False, "store keys in float16, half the size")
+    components: int = number(0, 0, 65_536, help="directions onto which keys are projected; 0: none")
     key: list[str] = setting(["scene"], "pooled parts of the prompt: scene, vision, proprioception")
 
 
@@ -148,9 +149,9 @@ class CalibrateSettings(DemonstrationSettings):
     held_out: float = number(0.1, above=0, most=0.5, help="share of episodes that the errors are measured on")
     window: int = number(10, 4, 10_000, help="control steps of history; predictors need four")
     epsilon: float = number(
-        0.1, above=0, most=1e6, help="verify-skip: mean abs error of a chunk that is good enough, normalised units"
+        0.1, above=0, most=1e6, help="verify-skip: largest mean absolute error of a good chunk, normalised units"
     )
-    confidence: float = number(0.9, 0.5, 0.999999, help="verify-skip: share of skipped chunks below epsilon")
+    confidence: float = number(0.9, 0.5, 0.999999, help="verify-skip: share of skipped chunks that must be good")
     boundary_windows: list[int] = setting([5, 15, 30], "positions; each has ranges of its own", **limits(3, 10_000))
     decodes: int = number(60, 0, 100_000, help="per task: decodes whose median variability is K_S; 0: none")
     proposer: Any = part("proposer", "drafter", "of the pre-sampling's decodes")
@@ -158,7 +159,7 @@ class CalibrateSettings(DemonstrationSettings):
     threshold: Any = part("threshold", "fixed", "of the pre-sampling's decodes")
 
     def check_together(self, prefix: str) -> None:
-        """Raises UsageError without a window, or for a pre-sampling that drafts nothing."""
+        """Refuse a calibration without a window, or pre-sampling that drafts nothing."""
         if not self.boundary_windows:
             raise UsageError(f"{prefix}boundary_windows=[]: name at least one number of positions")
         if self.decodes and self.proposer.kind == "none":

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch import nn
 
 from kerv_cli.base.durations import about
@@ -25,7 +26,6 @@ from kerv_cli.training.imitation import (
     check_init,
     continued_target,
     load_samples,
-    new_target,
     vocabulary,
 )
 from kerv_cli.training.run import TrainingRun, refuse_unused
@@ -140,7 +140,10 @@ class TargetRun(TrainingRun):
         words = init.words if init else vocabulary(self.dataset.manifest.environment)
         samples = load_samples(self.dataset, settings.target, words, self.tasks, progress, settings.train.places)
         if init is None:
-            target = new_target(settings.target, self.dataset, samples, words, camera, settings.train.seed)
+            torch.manual_seed(settings.train.seed)
+            actions = self.dataset.manifest.actions.fitted(samples.chunks[:, 0].numpy().astype(np.float64))
+            observation = self.dataset.manifest.observation
+            target = CompactTarget(replace(settings.target), actions, observation, words, camera)
         else:
             target = continued_target(settings.target, init, camera)
         closed_loop = self.closed_loop if settings.train.closed_loop else None
