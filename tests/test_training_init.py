@@ -117,34 +117,43 @@ def test_the_weights_belong_to_the_runs_identity_and_their_name_does_not(results
             trained(results, other)
 
 
+def test_scores_with_and_without_success_are_of_different_runs(results: Path) -> None:
+    alone, some, more = (TargetRun(settings(results, f"train.closed_loop={n}")).hash for n in (0, 1, 2))
+    assert some == more != alone
+
+
 @pytest.mark.parametrize(
     ("override", "shape"),
     [("target.width=64", "width"), ("target.observation=vision", "observation"), ("target.layers=1", "layers")],
 )
 def test_another_shape_is_refused_by_its_name(results: Path, override: str, shape: str) -> None:
     old = read_target(results / "artifacts/target/old").settings[shape]
-    with pytest.raises(UsageError, match=rf"train\.init: .* {shape}={old}, the run {override}: set both alike"):
+    with pytest.raises(UsageError, match=rf"{shape}={old}, the run {override}"):
         TargetRun(settings(results, override))
 
 
-def test_what_cannot_begin_a_run_is_refused(results: Path) -> None:
-    with pytest.raises(UsageError, match="no target 'nobody'"):
-        TargetRun(settings(results, "train.init=nobody"))
-    for same in ("train.init=old", f"train.init={results}/artifacts/target/old"):
-        with pytest.raises(UsageError, match="would be overwritten"):
-            TargetRun(settings(results, "name=old", same))
-    with pytest.raises(UsageError, match=r"train\.init=old: only the training of a target"):
-        DrafterRun(compose("train_drafter", ["train.init=old"], TrainDrafterSettings))
-    for word in ("colour=0.3", "places=path", "balance=0.5", "closed_loop=2"):
-        with pytest.raises(UsageError, match=rf"train\.{word}: only the training of a target has this setting"):
-            DrafterRun(compose("train_drafter", [f"train.{word}"], TrainDrafterSettings))
-    for word in ("colour=0.3", "places=path"):
-        with pytest.raises(UsageError, match=rf"train\.{word} needs images, and target\.observation=state has none"):
-            TargetRun(settings(results, "target.observation=state", f"train.{word}"))
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        (["train.init=nobody"], "no target 'nobody'"),
+        (["name=old"], "would be overwritten"),
+        (["train.colour=0.3"], "train.colour=0.3 needs images"),
+        (["train.places=path"], "train.places=path needs images"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused(results: Path, overrides: list[str], says: str) -> None:
+    with pytest.raises(UsageError, match=says):
+        TargetRun(settings(results, *overrides))
+
+
+@pytest.mark.parametrize("setting", ["init=old", "colour=0.3", "places=path", "balance=0.5", "closed_loop=2"])
+def test_settings_of_targets_are_refused_for_a_drafter(setting: str) -> None:
+    with pytest.raises(UsageError, match=rf"train\.{setting}"):
+        DrafterRun(compose("train_drafter", [f"train.{setting}"], TrainDrafterSettings))
 
 
 def test_demonstrations_without_places_are_refused(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nameless = SimpleNamespace(**{**vars(Demos.manifest), "observation": dataclasses.replace(OBSERVATION, places=())})
     monkeypatch.setattr(Demos, "manifest", nameless)
-    with pytest.raises(UsageError, match=r"name no places .* a compact policy cannot be trained on them"):
+    with pytest.raises(UsageError, match="no places"):
         TargetRun(settings(results))
