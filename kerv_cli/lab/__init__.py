@@ -1,0 +1,1 @@
+"""Studies: plans, blocks, executors and the database."""

@@ -1,8 +1,8 @@
-"""Executors run blocks, on this machine or on a cluster. Each is a registered part; nothing heavy is imported here.
+"""Executors run blocks, on this machine or on a cluster. Importing this module imports nothing heavy.
 
-A new one is a class with the three members of `Executor` and a `build(options, slots, threads, folder)` that returns
-it. options: its registered settings, filled from `runtime.executor_options`. slots: `runtime.workers`. threads: for
-torch and its libraries in each process. folder: for files of its own, not yet created.
+A new executor is a registered part: a class with the members of `Executor`, and a function `build(options, slots,
+threads, folder)` that returns one. `options` are its settings from `runtime.executor_options`, `slots` is
+`runtime.workers`, `threads` the number of threads of a process, `folder` a folder for its files, not yet created.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from kerv_cli.base.settings import RuntimeSettings
 
 T = TypeVar("T")
 
-# Numerical libraries read these when they load, before torch.set_num_threads can be called.
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+"""Numerical libraries read these when they load, before torch.set_num_threads can be called."""
 
 
 class WorkerLost(KervError):
@@ -30,26 +30,25 @@ class WorkerLost(KervError):
 
 
 class Executor(Protocol):
-    """Runs functions in worker processes; `execute` decides which, and handles their results and failures."""
+    """Runs functions in worker processes. `execute` decides which, and handles their results and failures."""
 
     @property
     def slots(self) -> int:
-        """How many functions may run at the same time."""
+        """Number of functions that may run at the same time."""
 
     def submit(self, work: Callable[[], T], /) -> Future[T]:
-        """Starts `work`, a picklable function. The future holds its result or exception, `WorkerLost` if its process
-        ended before."""
+        """Start a picklable function. Its future holds the result or the exception; WorkerLost if the process died."""
 
     def close(self, abandon: bool) -> None:
-        """Ends the workers. abandon: kill them while they work."""
+        """End the workers. With `abandon`, kill those that work."""
 
 
 def check_executor(runtime: RuntimeSettings) -> Any:
-    """The options of the chosen executor, checked without importing its package.
+    """Check and return the options of the chosen executor, without importing its package.
 
     Raises:
-        UnknownName: no such executor.
-        UsageError: an unknown option, a package that is not installed, a setting out of range.
+        UnknownName: There is no such executor.
+        UsageError: An option is unknown or out of range, or a package is not installed.
     """
     part = find("executor", runtime.executor)
     check_settings(runtime, "runtime")
@@ -66,12 +65,12 @@ def check_executor(runtime: RuntimeSettings) -> Any:
 
 @dataclass
 class LocalOptions:
-    """The local executor has no `runtime.executor_options`."""
+    """The local executor has no options."""
 
 
 @dataclass
 class SlurmOptions:
-    """`runtime.executor_options` of slurm: a block is a job."""
+    """Options of slurm, where a block is a job."""
 
     cluster: str = "slurm"  # slurm | local (submitit's own processes on this machine)
     partition: str = ""  # empty: the cluster's default
@@ -83,9 +82,9 @@ class SlurmOptions:
 
 @dataclass
 class RayOptions:
-    """`runtime.executor_options` of ray: a block is a task."""
+    """Options of ray, where a block is a task."""
 
-    address: str = ""  # of a running cluster, e.g. auto or ray://host:10001; empty: a Ray of its own on this machine
+    address: str = ""  # of a running cluster, e.g. auto or ray://host:10001; empty: start Ray on this machine
     gpus: float = number(0.0, 0, 1024)  # per block
 
 

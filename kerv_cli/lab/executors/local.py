@@ -1,4 +1,4 @@
-"""Processes of this machine (loky); a single worker is this process itself."""
+"""Runs blocks in processes of this machine (loky). A single worker is this process itself."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ T = TypeVar("T")
 
 
 def build(options: Any, slots: int, threads: int, folder: Path) -> Executor:
-    """This process for one slot, else that many worker processes."""
+    """Return an executor: this process for one slot, else one process per slot."""
     return InProcess() if slots == 1 else Processes(slots, threads)
 
 
 class InProcess:
-    """Runs each function at once in this process; KeyboardInterrupt is raised to the caller."""
+    """Runs each function at once in this process. A KeyboardInterrupt reaches the caller."""
 
     slots = 1
 
     def submit(self, work: Callable[[], T], /) -> Future[T]:
-        """Runs `work` -> a future that is done."""
+        """Run a function."""
         future: Future[T] = Future()
         try:
             future.set_result(work())
@@ -36,11 +36,11 @@ class InProcess:
         return future
 
     def close(self, abandon: bool) -> None:
-        """Nothing to end."""
+        """Do nothing."""
 
 
 class Processes:
-    """One loky pool per worker: when a worker dies, only its own work is lost, and which one is known."""
+    """Has one loky pool per worker, so that a worker that dies loses only its own block."""
 
     def __init__(self, slots: int, threads: int) -> None:
         check_workers()
@@ -49,7 +49,7 @@ class Processes:
         self._all: list[Any] = []
 
     def submit(self, work: Callable[[], T], /) -> Future[T]:
-        """Gives `work` to a free worker or starts one; the caller keeps at most `slots` at work."""
+        """Give a function to a free worker, or start one."""
         pool = self._free.pop() if self._free else self._new_pool()
         outer: Future[T] = Future()
         pool.submit(work).add_done_callback(lambda inner: self._settle(outer, inner, pool))
@@ -73,10 +73,9 @@ class Processes:
             outer.set_result(inner.result())
 
     def _new_pool(self) -> Any:
-        """A pool whose worker starts with its first work."""
         from joblib.externals.loky import ProcessPoolExecutor
 
-        # loky replaces a worker whose memory grew (open worlds, drawing contexts) and warns of it; no work is lost
+        # loky replaces a worker whose memory grew and warns of it; no work is lost
         warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given", category=UserWarning)
         pool = ProcessPoolExecutor(
             max_workers=1,
@@ -88,6 +87,6 @@ class Processes:
         return pool
 
     def close(self, abandon: bool) -> None:
-        """Ends the workers; abandoned ones are killed."""
+        """End the workers, or kill them."""
         for pool in list(self._all):
             pool.shutdown(wait=True, kill_workers=abandon)

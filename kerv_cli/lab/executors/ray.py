@@ -1,4 +1,4 @@
-"""Tasks of a Ray cluster, or of a Ray that is started on this machine; a block is a task.
+"""Runs blocks as tasks of a Ray cluster, or of a Ray that it starts on this machine.
 
 The nodes must share the results folder.
 """
@@ -22,10 +22,10 @@ _CONNECT_SECONDS = 5.0
 
 
 def build(options: RayOptions, slots: int, threads: int, folder: Path) -> Executor:
-    """Connects to the cluster, or starts a Ray with as many processors as the slots need.
+    """Connect to the cluster, or start a Ray with as many processors as the slots need.
 
     Raises:
-        UsageError: the cluster cannot be reached.
+        UsageError: The cluster cannot be reached.
     """
     import ray
 
@@ -36,7 +36,7 @@ def build(options: RayOptions, slots: int, threads: int, folder: Path) -> Execut
         stack.enter_context(guard())
     try:
         ray.init(address=options.address or "local", log_to_driver=False, logging_level="error", **started)
-    except Exception as error:  # noqa: BLE001 - Ray raises it bare where a machine is slow
+    except Exception as error:  # noqa: BLE001 - Ray raises a bare Exception on a slow machine
         stack.close()
         why = next(iter(str(error).strip().splitlines()), type(error).__name__)
         raise UsageError(f"the Ray cluster {options.address or 'of this machine'} cannot be reached: {why}") from None
@@ -44,11 +44,7 @@ def build(options: RayOptions, slots: int, threads: int, folder: Path) -> Execut
 
 
 def _check_reachable(address: str) -> None:
-    """Fails within seconds where Ray itself would try for minutes.
-
-    Raises:
-        UsageError: nothing listens at `host:port` or `ray://host:port`.
-    """
+    """Refuse a cluster at `host:port` or `ray://host:port` that does not answer. Ray itself would try for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not port.isdigit():
         return
@@ -59,7 +55,7 @@ def _check_reachable(address: str) -> None:
 
 
 class Tasks:
-    """Ray tasks without Ray's retries: `execute` decides about lost blocks."""
+    """Submits Ray tasks without Ray's retries, because `execute` decides about lost blocks."""
 
     def __init__(self, slots: int, threads: int, gpus: float, stack: contextlib.ExitStack) -> None:
         import ray
@@ -71,7 +67,7 @@ class Tasks:
         self._open: list[Any] = []
 
     def submit(self, work: Callable[[], T], /) -> Future[T]:
-        """Starts a task."""
+        """Start a task."""
         reference = self._call.remote(work)
         self._open.append(reference)
         outer: Future[T] = Future()
@@ -79,7 +75,7 @@ class Tasks:
         return outer
 
     def close(self, abandon: bool) -> None:
-        """Leaves the cluster; abandoned tasks are killed."""
+        """Leave the cluster. With `abandon`, kill its tasks."""
         import ray
 
         if abandon:
@@ -96,12 +92,11 @@ def _call(work: Callable[[], T]) -> T:
 def _settle(outer: Future[Any], inner: Future[Any]) -> None:
     from ray.exceptions import NodeDiedError, RayTaskError, WorkerCrashedError
 
-    error = inner.exception()
-    if error is None:
+    try:
         outer.set_result(inner.result())
-    elif isinstance(error, RayTaskError):
+    except RayTaskError as error:
         outer.set_exception(error.cause)
-    elif isinstance(error, WorkerCrashedError | NodeDiedError):
+    except (WorkerCrashedError, NodeDiedError):
         outer.set_exception(WorkerLost("its worker process was lost"))
-    else:
+    except Exception as error:  # noqa: BLE001 - the future holds any exception
         outer.set_exception(error)

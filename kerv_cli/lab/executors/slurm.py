@@ -1,4 +1,4 @@
-"""Jobs of a Slurm cluster through submitit; a block is a job. With `cluster: local` jobs are processes of this machine.
+"""Runs blocks as jobs of a Slurm cluster, through submitit. With `cluster: local` jobs are processes of this machine.
 
 The nodes must share the results folder. A job that the cluster ends is a lost worker.
 """
@@ -23,10 +23,10 @@ _POLL_SECONDS = {"local": 0.2, "slurm": 5.0}
 
 
 def build(options: SlurmOptions, slots: int, threads: int, folder: Path) -> Executor:
-    """Jobs of `threads` processors each.
+    """Return an executor whose jobs have `threads` processors each.
 
     Raises:
-        UsageError: this machine has no Slurm, or Slurm refuses the options.
+        UsageError: This machine has no Slurm, or Slurm refuses the options.
     """
     import submitit
 
@@ -34,7 +34,15 @@ def build(options: SlurmOptions, slots: int, threads: int, folder: Path) -> Exec
         raise UsageError(f"runtime.executor_options.cluster={options.cluster}: known are {', '.join(_POLL_SECONDS)}")
     try:
         jobs = submitit.AutoExecutor(folder=folder, cluster=options.cluster)
-        jobs.update_parameters(**_parameters(options, threads))
+        jobs.update_parameters(
+            name="kerv",
+            timeout_min=options.minutes,
+            cpus_per_task=threads,
+            mem_gb=options.memory_gb,
+            gpus_per_node=options.gpus,
+            slurm_setup=[*options.setup, *(f"export {name}={threads}" for name in THREAD_VARIABLES)],
+            **({"slurm_partition": options.partition} if options.partition else {}),
+        )
     except (RuntimeError, ValueError, TypeError) as error:
         raise UsageError(f"Slurm cannot be used from here: {' '.join(str(error).split())}") from None
     stack = contextlib.ExitStack()
@@ -43,15 +51,8 @@ def build(options: SlurmOptions, slots: int, threads: int, folder: Path) -> Exec
     return Jobs(jobs, slots, _POLL_SECONDS[options.cluster], stack)
 
 
-def _parameters(options: SlurmOptions, threads: int) -> dict[str, Any]:
-    exports = [f"export {name}={threads}" for name in THREAD_VARIABLES]
-    common = {"name": "kerv", "timeout_min": options.minutes, "cpus_per_task": threads, "mem_gb": options.memory_gb}
-    partition = {"slurm_partition": options.partition} if options.partition else {}
-    return {**common, "gpus_per_node": options.gpus, "slurm_setup": [*options.setup, *exports], **partition}
-
-
 class Jobs:
-    """Submitted jobs; one thread polls them all."""
+    """Submits jobs. One thread polls them all."""
 
     def __init__(self, jobs: Any, slots: int, poll_seconds: float, stack: contextlib.ExitStack) -> None:
         self.slots, self._stack = slots, stack
@@ -62,7 +63,7 @@ class Jobs:
         threading.Thread(target=self._watch, daemon=True).start()
 
     def submit(self, work: Callable[[], T], /) -> Future[T]:
-        """Queues a job."""
+        """Queue a job."""
         future: Future[T] = Future()
         job = self._jobs.submit(work)
         with self._changed:
@@ -78,7 +79,7 @@ class Jobs:
                 _settle(future, job)
 
     def close(self, abandon: bool) -> None:
-        """Cancels the jobs that run or wait. abandon: waits until they have ended, at most ten seconds."""
+        """Cancel the jobs that run or wait. With `abandon`, wait until they have ended, at most ten seconds."""
         self._closed.set()
         with self._changed:
             jobs = list(self._open.values())
@@ -91,7 +92,6 @@ class Jobs:
 
 
 def _settle(future: Future[Any], job: Any) -> None:
-    """Sets the job's result or exception, `WorkerLost` if it ended without either."""
     from submitit.core.utils import FailedJobError, UncompletedJobError
 
     try:
