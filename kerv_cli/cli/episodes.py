@@ -105,19 +105,15 @@ def print_study_plan(planned: Plan, as_json: bool) -> None:
         why = "; ".join(dict.fromkeys(planned.missing[one] for one in to_run))
         seeds = seeds_text(one.seed for one in wanted)
         rows.append((label, len(to_run), len(wanted) - len(to_run), tasks, seeds, repeats, why))
-    store, time, to_run, reused = (
-        planned.store,
-        estimate(planned, SECONDS_PER_EPISODE),
-        planned.to_run,
-        planned.existing,
-    )
+    store, to_run, reused = planned.store, planned.to_run, planned.existing
+    seconds, source = estimate(planned, SECONDS_PER_EPISODE)
     if as_json:
         settings = [dict(zip(columns, row, strict=True)) for row in rows]
         print_json({"study": store.name, "folder": store.root, "settings": settings, "to run": len(to_run),
-                    "reused": len(reused), "seconds": time.seconds, "source": time.source})  # fmt: skip
+                    "reused": len(reused), "seconds": seconds, "source": source})  # fmt: skip
         return
     print_table(columns, rows, f"study {store.name}, episodes")
-    typer.echo(f"{count(len(to_run), 'episode')} to run, {len(reused)} reused, {about(time.seconds, time.source)}")
+    typer.echo(f"{count(len(to_run), 'episode')} to run, {len(reused)} reused, {about(seconds, source)}")
 
 
 def run_study(resolved: ResolvedStudy, planned: Plan) -> Outcome:

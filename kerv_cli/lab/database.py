@@ -94,18 +94,23 @@ BLOCKS = _table(
     sa.Column("code", sa.Text, nullable=False),  # hash of the source code
     sa.Column("about", _JSON, nullable=False),  # machine, versions, commit, executor, workers
 )
-_CLAIMED = BLOCKS.c.claim.is_not(None)
-sa.Index("claimed", BLOCKS.c.id, sqlite_where=_CLAIMED, postgresql_where=_CLAIMED)
-
-
-def _episode_columns() -> Iterator[sa.Column[Any]]:
-    from kerv_cli.episodes.rows import EPISODE_SCHEMA, FLAG, FLOAT, INT, TEXT
-
-    types = {INT: sa.BigInteger, FLOAT: sa.Double, TEXT: sa.Text, FLAG: sa.Boolean}
-    return (sa.Column(field.name, types.get(field.type, _JSON)) for field in EPISODE_SCHEMA)
-
-
-MEASURES = tuple(_episode_columns())
+_INTEGERS = (
+    "steps", "decodes", "forwards", "verifications", "tokens", "committed", "accepted", "first_rejected_sum",
+    "first_rejected_count", "compensated_tokens", "compensated_decodes", "skipped_decodes", "unverified_tokens",
+    "executed_tokens", "retrieval_decodes", "deviation_count", "delay_decodes", "delay_steps", "carried_steps",
+    "held_steps", "dropped_steps",
+)  # fmt: skip
+_NUMBERS = (
+    "seconds", "seconds.vision", "seconds.prefill", "seconds.propose", "seconds.verify", "seconds.accept",
+    "seconds.rectify", "seconds.other", "deviation_sum", "delay_seconds", "path_length", "jerk", "wall_seconds",
+)  # fmt: skip
+MEASURES: tuple[sa.Column[Any], ...] = (
+    sa.Column("success", sa.Boolean),
+    *(sa.Column(name, sa.BigInteger) for name in _INTEGERS),
+    *(sa.Column(name, sa.Double) for name in _NUMBERS),
+    sa.Column("initial_state", _JSON),
+)
+"""Columns of an episode's record, those of rows.EPISODE_SCHEMA. Listed here because rows.py imports pyarrow."""
 EPISODES = _table(
     "episodes",
     sa.Column("id", sa.Integer, primary_key=True),

@@ -65,16 +65,16 @@ class SettingFailed:
     """A setting failed in a block; the other settings of the block go on.
 
     Attributes:
-        episodes: The episodes that do not run. The one that failed is the first.
         reason: The error in one line.
         trace: Its traceback.
-        error: The error, if kerv raised it deliberately.
+        error: The error, if kerv raised it deliberately. Other errors may not be picklable.
+        episodes: The episodes that do not run. The one that failed is the first.
     """
 
-    episodes: tuple[Episode, ...]
     reason: str
     trace: str = ""
     error: KervError | None = None
+    episodes: tuple[Episode, ...] = ()
 
 
 @dataclass

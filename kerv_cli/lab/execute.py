@@ -28,7 +28,7 @@ import sqlalchemy as sa
 
 from kerv_cli.base.errors import KervError, StorageError
 from kerv_cli.base.files import storage_errors, visible
-from kerv_cli.base.leftovers import temporary_beside
+from kerv_cli.base.leftovers import clean, temporary_beside
 from kerv_cli.base.provenance import stamp
 from kerv_cli.base.registry import find
 from kerv_cli.engine.record import EpisodeRecord
@@ -48,7 +48,7 @@ from kerv_cli.lab.events import (
 )
 from kerv_cli.lab.executors import Executor, WorkerLost, check_executor
 from kerv_cli.lab.plan import Block, Episode, Setting, seeds_text, split
-from kerv_cli.lab.runs import RUNNING, Run, is_running, run_rows
+from kerv_cli.lab.runs import Run, is_running
 from kerv_cli.lab.store import Plan, insert_episode, stored_episodes
 
 _POLL_SECONDS = 0.2
@@ -58,27 +58,6 @@ RunEpisode = Callable[[int], EpisodeRecord]
 
 Prepare = Callable[[Setting, str], RunEpisode]
 """Builds and warms up a setting on a task. Picklable. For a batch it also has the method `EpisodeRunner.together`."""
-
-
-@dataclass(frozen=True)
-class Failure:
-    """An error of a worker.
-
-    Attributes:
-        reason: The error in one line.
-        trace: Its traceback.
-        error: The error, if kerv raised it deliberately. Other errors may not be picklable.
-    """
-
-    reason: str
-    trace: str = ""
-    error: KervError | None = None
-
-    @staticmethod
-    def of(error: BaseException) -> Failure:
-        """Return the failure that describes an error."""
-        own = error if isinstance(error, KervError) else None
-        return Failure(one_line(error), "".join(traceback.format_exception(error)), own)
 
 
 @dataclass(frozen=True)
@@ -97,7 +76,7 @@ class Message:
     row: dict[str, Any] = field(default_factory=dict)
     decodes: bytes = b""
     about: dict[str, Any] = field(default_factory=dict)
-    failure: Failure | None = None
+    failure: SettingFailed | None = None
 
 
 Send = Callable[[Message], None]
@@ -166,7 +145,7 @@ class BlockRun:
         try:
             return function()
         except Exception as error:  # noqa: BLE001 - the other settings go on
-            failure = Failure.of(error)
+            failure = failure_of(error)
         self.send(Message(self.block.episodes.index(one), failure=failure))
         return None
 
@@ -186,7 +165,7 @@ class BlockRun:
                 self.send(self._ended(one, result, next(order), started))
             else:
                 failed.add(one.task)
-                self.send(Message(self.block.episodes.index(one), failure=Failure.of(result)))
+                self.send(Message(self.block.episodes.index(one), failure=failure_of(result)))
 
     def _batch_results(self) -> Iterator[tuple[Episode, EpisodeRecord | Exception]]:
         """Yield each episode when it ends. An error of all decodes fails an episode of each task."""
@@ -208,14 +187,15 @@ class BlockRun:
         return Message(self.block.episodes.index(one), row, decodes_blob(record), about)
 
 
-def one_line(error: BaseException) -> str:
-    """Return the message of an error in one line, with type and place if it is not one of kerv's own."""
+def failure_of(error: BaseException) -> SettingFailed:
+    """Return what to tell of an error: its message in one line, with type and place if it is not one of kerv's own."""
+    trace = "".join(traceback.format_exception(error))
     text = " ".join(str(error).split())
     if isinstance(error, KervError):
-        return text
+        return SettingFailed(text, trace, error)
     frames = traceback.extract_tb(error.__traceback__)
     line = f" ({os.path.basename(frames[-1].filename)}:{frames[-1].lineno})" if frames else ""
-    return f"{type(error).__name__}: {text[:200]}{line}"
+    return SettingFailed(f"{type(error).__name__}: {text[:200]}{line}", trace)
 
 
 def execute(plan: Plan, prepare: Prepare, record: Run, on_event: OnEvent = lambda event: None) -> Outcome:
@@ -237,7 +217,7 @@ def execute(plan: Plan, prepare: Prepare, record: Run, on_event: OnEvent = lambd
     return _Sweep(plan, prepare, record, on_event).run()
 
 
-@dataclass
+@dataclass(eq=False)
 class _Attempt:
     """A block that runs.
 
@@ -247,6 +227,7 @@ class _Attempt:
         spool: Where its worker sends messages.
         last: The episode that began last.
         is_here: Whether it runs in this process.
+        future: Its end.
         ended: Episodes that ended.
         failed: Episodes that failed, or that do not run because their setting failed.
     """
@@ -255,7 +236,8 @@ class _Attempt:
     id: str
     spool: Spool
     last: Episode
-    is_here: bool = False
+    is_here: bool
+    future: Future[None] = field(default_factory=Future)
     ended: set[Episode] = field(default_factory=set)
     failed: set[Episode] = field(default_factory=set)
 
@@ -273,13 +255,13 @@ class _Sweep:
         self.outcome = Outcome(reused=list(plan.existing))
         self.waiting: deque[Block] = deque(plan.blocks())
         self.elsewhere: list[Block] = []  # another sweep runs them
-        self.attempts: dict[Future[None], _Attempt] = {}
-        self.spool = self.database.results / "spool" / record.id
+        self.attempts: list[_Attempt] = []
+        self.spool = temporary_beside(self.database.results / "spool")
 
     def run(self) -> Outcome:
         clock, to_run = time.perf_counter(), self.plan.to_run
         options = check_executor(self.runtime)
-        self._clean()
+        clean(self.database.results)  # messages to processes that were killed
         self.record.beat(0, len(to_run))
         self.on_event(Started(len(to_run), len(self.plan.existing)))
         if to_run:
@@ -289,13 +271,6 @@ class _Sweep:
         self.outcome.seconds = time.perf_counter() - clock
         return self.outcome
 
-    def _clean(self) -> None:
-        """Remove messages that the workers of killed runs left."""
-        live = {row.id for row in run_rows(self.database) if row.status == RUNNING}
-        for folder in visible(self.spool.parent):
-            if folder.name not in live:
-                shutil.rmtree(folder, ignore_errors=True)
-
     def _run_blocks(self, executor: Executor) -> None:
         """Keep every slot of the executor busy until all blocks have ended."""
         finished = False
@@ -303,11 +278,12 @@ class _Sweep:
             while self.waiting or self.attempts or self.elsewhere:
                 while self.waiting and len(self.attempts) < executor.slots:
                     self._begin(executor, self.waiting.popleft())
-                done = wait(self.attempts, timeout=_POLL_SECONDS, return_when=FIRST_COMPLETED).done
-                for attempt in self.attempts.values():
+                futures = [attempt.future for attempt in self.attempts]
+                done = wait(futures, timeout=_POLL_SECONDS, return_when=FIRST_COMPLETED).done
+                for attempt in list(self.attempts):
                     self._take(attempt)
-                for future in done:
-                    self._end(self.attempts.pop(future), future)
+                    if attempt.future in done:
+                        self._end(attempt)
                 if self.elsewhere and not self.waiting and not self.attempts:
                     time.sleep(1.0)
                     self.waiting.extend(self.elsewhere)
@@ -315,13 +291,11 @@ class _Sweep:
             finished = True
         finally:
             executor.close(abandon=not finished)
-            for attempt in self.attempts.values():
+            for attempt in self.attempts:
                 with contextlib.suppress(KervError):  # the first error is the one to show
                     self._take(attempt)
-                self._give_up(attempt)
+                self._release(attempt)
             shutil.rmtree(self.spool, ignore_errors=True)
-            with contextlib.suppress(OSError):
-                self.spool.parent.rmdir()  # fails while other sweeps use it
 
     def _begin(self, executor: Executor, block: Block) -> None:
         """Claim a block and give it to the executor, without the episodes that another sweep has run since."""
@@ -330,23 +304,18 @@ class _Sweep:
             self.elsewhere.append(block)
             self.on_event(BlockWaits(block))
             return
-        attempt = _Attempt(block, name, Spool(self.spool / name), block.episodes[0])
+        is_here = executor.slots == 1 and self.runtime.executor == "local"
+        attempt = _Attempt(block, name, Spool(self.spool / name), block.episodes[0], is_here)
+        self.attempts.append(attempt)
         if not self._leave_out_existing(attempt):
             self._release(attempt)
             return
         self.on_event(BlockStarted(attempt.block))
-        send: Send = attempt.spool
-        if executor.slots == 1 and self.runtime.executor == "local":
-            send, attempt.is_here = functools.partial(self._receive, attempt), True
-        else:
+        send: Send = functools.partial(self._receive, attempt) if is_here else attempt.spool
+        if not is_here:
             with storage_errors(attempt.spool.folder):
-                attempt.spool.folder.mkdir(parents=True, exist_ok=True)
-        try:
-            future = executor.submit(BlockRun(attempt.block, self.prepare, send))
-        except BaseException:  # Ctrl-C while the block ran here
-            self._give_up(attempt)
-            raise
-        self.attempts[future] = attempt
+                attempt.spool.folder.mkdir(parents=True)
+        attempt.future = executor.submit(BlockRun(attempt.block, self.prepare, send))
 
     def _claim(self, block: Block, name: str) -> bool:
         """Insert the row of a block. Return False if a live run holds one of its episodes for the same study."""
@@ -410,7 +379,7 @@ class _Sweep:
             name = self.plan.study.name
             raise KervError(f"study {name} was deleted while it ran: the same command begins it anew")
 
-    def _fail(self, attempt: _Attempt, one: Episode, failure: Failure) -> None:
+    def _fail(self, attempt: _Attempt, one: Episode, failure: SettingFailed) -> None:
         """Note that a setting failed on a task. Its other episodes of the block do not run."""
         if isinstance(failure.error, StorageError):
             raise failure.error
@@ -423,25 +392,23 @@ class _Sweep:
             for other in same:
                 update = self.plan.store.update_of(other).values(error=failure.trace or failure.reason)
                 connection.execute(update)
-        event = SettingFailed(tuple(same), failure.reason, failure.trace, failure.error)
-        self.outcome.failed.append(event)
-        self.on_event(event)
+        failure = replace(failure, episodes=tuple(same))
+        self.outcome.failed.append(failure)
+        self.on_event(failure)
 
-    def _end(self, attempt: _Attempt, future: Future[None]) -> None:
+    def _end(self, attempt: _Attempt) -> None:
         """End a block: take its last messages, and queue the episodes that a lost worker left."""
         self._take(attempt)
-        shutil.rmtree(attempt.spool.folder, ignore_errors=True)
-        error = future.exception()
+        error = attempt.future.exception()
         lost: list[Episode] = []
         if isinstance(error, StorageError) or (error is not None and attempt.is_here):
-            self._give_up(attempt)
             raise error
         if isinstance(error, WorkerLost):  # the episode that ran has failed; the others run again
-            self._fail(attempt, attempt.last, Failure(one_line(error)))
+            self._fail(attempt, attempt.last, SettingFailed(str(error)))
             lost = self._lost(attempt)
         elif error is not None:
             for one in attempt.block.episodes:
-                self._fail(attempt, one, Failure.of(error))
+                self._fail(attempt, one, failure_of(error))
         self._release(attempt)
         self.on_event(BlockEnded(attempt.block))
         if lost:
@@ -455,15 +422,11 @@ class _Sweep:
         self.outcome.done[:] = [one for one in self.outcome.done if one not in again]
         return [one for one in attempt.block.episodes if one in again or one in rest]
 
-    def _give_up(self, attempt: _Attempt) -> None:
-        """Release a block after an error. That error is shown even if the disk refuses; a dead run's claim is void."""
-        with contextlib.suppress(StorageError):
-            self._release(attempt)
-
     def _release(self, attempt: _Attempt) -> None:
-        with self.database.writing() as connection:
-            mine = BLOCKS.c.id == attempt.id
-            if attempt.ended:
-                connection.execute(sa.update(BLOCKS).where(mine).values(claim=None))
-            else:
-                connection.execute(sa.delete(BLOCKS).where(mine))
+        """Give up the claim on a block. If the disk refuses, the claim is void as soon as this run has ended."""
+        shutil.rmtree(attempt.spool.folder, ignore_errors=True)
+        mine = BLOCKS.c.id == attempt.id
+        release = sa.update(BLOCKS).values(claim=None) if attempt.ended else sa.delete(BLOCKS)
+        with contextlib.suppress(StorageError), self.database.writing() as connection:
+            connection.execute(release.where(mine))
+        self.attempts = [other for other in self.attempts if other is not attempt]

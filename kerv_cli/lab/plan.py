@@ -9,8 +9,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-import numpy as np
-
 from kerv_cli.base.errors import UsageError
 from kerv_cli.episodes.identity import (
     ENGINE,
@@ -220,6 +218,8 @@ class Block:
 
     def turns(self) -> Iterator[Episode]:
         """Yield its episodes seed by seed, with the settings in an order drawn from task, seed and repeat."""
+        import numpy as np
+
         for seed in self.seeds:
             turn = [one for one in self.episodes if one.seed == seed]
             digest = hashlib.sha256(f"{self.task} {seed} {turn[0].repeat}".encode()).digest()

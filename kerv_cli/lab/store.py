@@ -8,13 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import sqlalchemy as sa
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import check_label, check_name
 from kerv_cli.base.settings import RuntimeSettings
-from kerv_cli.episodes.rows import read_decodes, seconds_blob, table_blob
 from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, MEASURES, RUNS, SETTINGS, STUDIES, WANTED, Database, now
 from kerv_cli.lab.plan import NEVER, Block, Episode, Key, Setting, StoredEpisode, Study, blocks_of, split
 from kerv_cli.lab.runs import Run, run_rows
@@ -206,6 +204,7 @@ class StudyStore:
         Args:
             episodes: Only these.
         """
+        import numpy as np
         import pandas as pd
 
         keys = ("label", "task", "seed", "repeat")
@@ -247,6 +246,8 @@ class StudyStore:
         """
         import pyarrow as pa
 
+        from kerv_cli.episodes.rows import read_decodes
+
         blobs: dict[int, bytes] = {}
         with self.database.reading() as connection:
             for first in range(0, len(episodes), _AT_ONCE):
@@ -267,6 +268,8 @@ class StudyStore:
             episodes: Those that exist.
             command: Words after `kerv`, for the row of the run.
         """
+        from kerv_cli.episodes.rows import seconds_blob, table_blob
+
         with Run(self.database, study.kind, self.name, command) as record, self.database.writing() as connection:
             self._save(connection, study, {}, whole=True)
             blocks = set(connection.scalars(sa.select(BLOCKS.c.id)))

@@ -239,19 +239,11 @@ def _run_until_decided(
     return total
 
 
-@dataclass(frozen=True)
-class TimeEstimate:
-    """Wall time for the missing episodes of a plan, and in words where the number comes from."""
+def estimate(planned: Plan, guess: float) -> tuple[float, str]:
+    """Estimate the seconds that the missing episodes take, and say where the number comes from.
 
-    seconds: float
-    source: str
-
-
-def estimate(planned: Plan, guess: float) -> TimeEstimate:
-    """Estimate wall time from the mean wall seconds per episode of each setting.
-
-    A setting without stored episodes gets the mean of the others. Workers are taken to scale perfectly, up to one per
-    block.
+    A setting's mean wall time per episode counts; without stored episodes, the mean of the others. Workers are taken to
+    scale perfectly, up to one per block.
 
     Args:
         planned: What is to run.
@@ -265,4 +257,4 @@ def estimate(planned: Plan, guess: float) -> TimeEstimate:
     mean = sum(means.values()) / len(means) if means else guess
     seconds = sum(means.get(one.setting.work, mean) for one in planned.to_run)
     source = f"measured on {stored} stored episodes" if stored else f"a guess of {guess:g} s per episode"
-    return TimeEstimate(seconds / max(1, min(planned.runtime.workers, len(planned.blocks()))), source)
+    return seconds / max(1, min(planned.runtime.workers, len(planned.blocks()))), source
