@@ -1,18 +1,20 @@
-"""Methods, a file or a folder per family (docs/methods.md). A file, and a folder's `__init__.py` with settings and
-registration, imports neither torch nor numpy; code that does lies beside it.
+"""Methods: a file or a folder per family (docs/methods.md).
 
-    ar                          autoregressive decoding: the absence of every part
-    spec_vla                    Spec-VLA: acceptance token by token within one radius; strict acceptance
-    eagle                       EAGLE-2: the drafter on the target's hidden states, own and public ones
-    kerv                        KERV: predictions as drafts and behind a rejection, thresholds that follow the motion
-    heisd                       HeiSD: the datastore and its drafts; two sides of a boundary, verify-skip
-    jacobi, parallel            PD-VLA's and OpenVLA-OFT's decoding
+    ar                          autoregressive decoding: no part at all
+    spec_vla                    Spec-VLA: strict acceptance, and acceptance within one radius
+    eagle                       EAGLE-2: the drafter on the target's hidden states, our own and public ones
+    kerv                        KERV: kinematic predictions, and thresholds that follow the motion
+    heisd                       HeiSD: retrieved drafts, a boundary between two drafters, skipped verification
+    jacobi, parallel            the decoding of PD-VLA and OpenVLA-OFT
     early, merged               ours: a draft before the prefill (`one_pass`)
-    scout                       ours: whole chunks from the images, without the target
-    streak, unverified          ours: drafts that are executed without a verification
-    certified                   ours: … on the tasks of a certificate of success
-    sp_vla                      SP-VLA: a regression where motion is fast
+    scout                       ours: a drafter with its own vision encoder
+    streak, unverified          ours: drafts that are executed without verification
+    certified                   ours: the same, on the tasks of a certificate of success
+    sp_vla                      SP-VLA: a regression where the motion is fast
 
-`compose.py` makes a decoder of a method's parts, `context.py` is what they are made from, `artifacts.py` finds, checks
-and loads their files. `calibration.py` is the file that KERV and HeiSD share.
+A file, and the `__init__.py` of a folder, holds settings and registrations and imports neither torch nor numpy.
+
+`compose.py` makes a decoder of a method's parts. `context.py` is what parts are made from. `artifacts.py` finds, checks
+and loads files. `drafters.py` is the base of drafters with weights. `calibration.py` is the file that KERV and HeiSD
+share.
 """

@@ -1,4 +1,4 @@
-"""Autoregressive decoding (docs/methods.md §1): the absence of every part. Registration."""
+"""Registers autoregressive decoding: no part of any kind (docs/methods.md §1)."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The files of a policy: the target and the artifacts that belong to it, each loaded and hashed once per process,
-however many settings of a study share them."""
+"""The files of a policy: its target and the artifacts that belong to it. Each is loaded and hashed once per process."""
 
 from __future__ import annotations
 
@@ -33,7 +32,7 @@ W = TypeVar("W", bound="WeightsDescription")
 
 @dataclass(frozen=True)
 class Request:
-    """The target to load an artifact for. search: settings of a datastore's search."""
+    """What an artifact is loaded for."""
 
     description: TargetDescription
     target: Any = None  # a ReadableTarget, as networks read it
@@ -61,7 +60,13 @@ class Use:
 
 @dataclass(frozen=True)
 class MadeFor:
-    """The target that an artifact was made for: SHA-256 of its weights, its action space, H (0: any)."""
+    """The target that an artifact was made for.
+
+    Attributes:
+        sha256: Hash of its weights.
+        actions: Its action space.
+        chunk: H; 0 if it does not matter.
+    """
 
     sha256: str
     actions: ActionSpace
@@ -69,14 +74,20 @@ class MadeFor:
 
     @classmethod
     def of(cls, target: TargetDescription) -> MadeFor:
-        """The target described."""
+        """Return the target of a description."""
         return cls(target.sha256, target.actions, target.chunk)
 
     def check_same(self, target: MadeFor, what: str, made: str, again: str) -> None:
-        """Refuses another target. what: the artifact in messages. made: e.g. trained. again: the remedy.
+        """Refuse another target.
+
+        Args:
+            target: The policy's.
+            what: Names the artifact in messages.
+            made: How it was made, e.g. `trained`.
+            again: The remedy.
 
         Raises:
-            CheckpointError: another action space, normalisation, chunk length or other weights.
+            CheckpointError: Another action space, normalisation, chunk length or other weights.
         """
         self.actions.check_same(target.actions, what, "the target", statistics=True)
         if self.chunk and self.chunk != target.chunk:
@@ -85,12 +96,16 @@ class MadeFor:
 
 
 def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str, again: str) -> None:
-    """Refuses an artifact that was made from others than the policy's. sources, used: kind -> hash of what it was made
-    from, and of the policy's target and artifacts; a source of a kind that the policy does not use does not matter.
-    what: the beginning of the message, e.g. `the early drafter in FOLDER was trained`. again: the remedy.
+    """Refuse an artifact that was made from other artifacts than those of the policy.
+
+    Args:
+        sources: Kind -> hash of what it was made from. Kinds that the policy does not use do not matter.
+        used: Kind -> hash of the policy's target and artifacts.
+        what: Beginning of the message, e.g. `the early drafter in FOLDER was trained`.
+        again: The remedy.
 
     Raises:
-        CheckpointError: the policy uses another artifact of the same kind as one of the sources.
+        CheckpointError: The policy uses another artifact of one of these kinds.
     """
     for kind, digest in sources.items():
         if used.get(kind, digest) != digest:
@@ -99,16 +114,21 @@ def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str
 
 
 def removal(kind: str, path: Path) -> str:
-    """The remedy where an artifact stands in the way of a new one."""
+    """Return how to make room for a new artifact."""
     return f"remove it with 'kerv runs rm {kind}/{path.name}'" if path.parent.name == kind else f"move {path} aside"
 
 
 class Artifact(Generic[T]):
-    """A kind of artifact: one JSON of the dataclass `schema`, with other files beside it or none, made for one target.
+    """A kind of artifact: one JSON of the dataclass `schema`, perhaps with other files beside it, made for one target.
+
     `Weights` is the base of those that are a network.
 
-    kind: as `needs` name it. noun: its name in messages. made: e.g. trained. command: words behind `kerv` that make
-    one; none where no command does.
+    Attributes:
+        kind: Its name among the parts.
+        noun: Its name in messages.
+        made: How it is made, e.g. `trained`.
+        command: Words after `kerv` that make one; empty if no command does.
+        seconds: A guess of how long `command` takes.
     """
 
     kind: str
@@ -120,33 +140,36 @@ class Artifact(Generic[T]):
 
     @property
     def again(self) -> str:
-        """The remedy where one is missing or does not fit."""
+        """How to get one that is missing or does not fit."""
         return f"run 'kerv {' '.join(self.command)}'"
 
     def anew(self, path: Path) -> str:
-        """The remedy where the one in `path` was made for another target; its command replaces it."""
+        """Return how to replace one that was made for another target."""
         return self.again
 
     def path(self, results: str, name: str | None, target: Path) -> Path:
-        """Its path; name None: the one beside the target in the folder `target`."""
+        """Return its path: that of a name, else the one beside the target in the folder `target`."""
         return artifact(results, self.kind, name) if name else beside(target, self.kind)
 
     def json(self, path: Path) -> Path:
-        """The file of its description."""
+        """Return the file of its description."""
         return path / f"{self.kind}.json"
 
     def load(self, path: Path, request: Request) -> Any:
-        """The artifact, loaded for the target; without more files its description. Raises CheckpointError as `checked`,
-        or for files that do not fit."""
+        """Return the artifact, loaded for a target. One without other files is its description.
+
+        Raises:
+            CheckpointError: As `checked`, or files that do not fit.
+        """
         return self.checked(path, request.description)
 
     def made_for(self, description: T) -> MadeFor:
-        """The target that it was made for."""
+        """Return the target that it was made for."""
         fields: Any = description
         return MadeFor(fields.target, fields.actions, fields.chunk)
 
     def sources(self, description: T) -> Mapping[str, str]:
-        """Kind -> hash of the other artifacts that it was made from; none, where target and demonstrations suffice."""
+        """Return kind -> hash of the other artifacts that it was made from."""
         return {}
 
     def needs(self, description: T) -> tuple[str, ...]:
@@ -170,14 +193,14 @@ class Artifact(Generic[T]):
         return True
 
     def digest(self, path: Path, description: T) -> str:
-        """The hash that is part of the identity of results."""
+        """Return the hash by which it counts in the identity of results."""
         return sha256_of(self.json(path))
 
     def read(self, path: Path) -> T:
-        """Its description, of any target.
+        """Return its description, whatever its target.
 
         Raises:
-            CheckpointError: missing, damaged, of another format, or its files are not those that it names.
+            CheckpointError: It is missing, damaged or of another format, or its files are not those that it names.
         """
         file = self.json(path)
         if not file.is_file():
@@ -185,7 +208,7 @@ class Artifact(Generic[T]):
         return self.described(file)
 
     def described(self, file: Path) -> T:
-        """The description in `file`, which exists; errors as `read`."""
+        """Return the description in an existing file. The errors are those of `read`."""
         try:
             description = read_file(self.schema, file)
         except CheckpointError as error:
@@ -194,10 +217,10 @@ class Artifact(Generic[T]):
         return description
 
     def checked(self, path: Path, target: TargetDescription) -> T:
-        """Its description, of an artifact that was made for this target.
+        """Return its description, if it was made for this target.
 
         Raises:
-            CheckpointError: as `read`, or another target, action space or chunk length.
+            CheckpointError: As `read`, or another target, action space or chunk length.
         """
         description = self.read(path)
         made_for, what = self.made_for(description), f"the {self.noun} in {path}"
@@ -207,8 +230,14 @@ class Artifact(Generic[T]):
 
 @dataclass(frozen=True, kw_only=True)
 class WeightsDescription(checkpoint.Description):
-    """The JSON of an artifact with weights; a kind adds fields of its own. target: SHA-256 of the target's weights,
-    actions: its action space, chunk: its H, 0 where that does not matter."""
+    """The JSON of an artifact with weights; a kind may add fields.
+
+    Attributes:
+        target: Hash of the target's weights.
+        actions: The target's action space.
+        chunk: The target's H; 0 if it does not matter.
+        provenance: How it was made.
+    """
 
     target: str
     actions: ActionSpace
@@ -217,31 +246,31 @@ class WeightsDescription(checkpoint.Description):
 
 
 class Weights(Artifact[W]):
-    """Base of kinds that are a network: safetensors and a JSON, `<kind>.json`."""
+    """Base of kinds that are a network: safetensors and `<kind>.json`."""
 
     any_chunk = False  # whether the target's H does not matter
     step_seconds = 0.05  # a guess of how long a training step takes on one core
 
     def anew(self, path: Path) -> str:
-        """The remedy where the one in `path` was made for another target: a training goes on with none but its own."""
+        """Return how to replace one of another target: a training goes on only with its own."""
         return f"{removal(self.kind, path)}, then {self.again}"
 
     def module(self, description: W, target: ReadableTarget) -> nn.Module:
-        """A fresh network of this description."""
+        """Return a fresh network of this description."""
         raise NotImplementedError
 
     def load(self, path: Path, request: Request) -> Any:
-        """The network with its weights, frozen, on the target's device in its number format."""
+        """Return the network with its weights, frozen, on the target's device in its number format."""
         target = request.target
         module = self.module(self.checked(path, request.description), target)
         return load_packed(module, path, self.kind, target.device, target.dtype)
 
     def digest(self, path: Path, description: W) -> str:
-        """SHA-256 of the weights."""
+        """Return the hash of the weights."""
         return description.sha256
 
     def described(self, file: Path) -> W:
-        """The description in `file`, whose weights lie beside it and are checked; errors as `read`."""
+        """Return the description in a file, after checking the weights beside it."""
         return checkpoint.read_description(file.parent, self.kind, self.schema)
 
     def save(
@@ -253,18 +282,26 @@ class Weights(Artifact[W]):
         stored: str = checkpoint.FLOAT32,
         **fields: Any,
     ) -> str:
-        """Writes weights and description -> SHA-256 of the weights. stored: how, as in `TrainSettings`. fields: those
-        that this kind's description adds."""
+        """Write weights and description.
+
+        Args:
+            path: The folder.
+            module: The network.
+            made_for: Its target.
+            provenance: How it was made.
+            stored: Number format on disk, as `train.stored`.
+            fields: Further fields of this kind's description.
+
+        Returns:
+            The hash of the weights.
+        """
         shared = {"target": made_for.sha256, "actions": made_for.actions.as_dict(), "provenance": dict(provenance)}
         chunk = {} if self.any_chunk else {"chunk": made_for.chunk}
         return checkpoint.save_module(path, self.kind, module, {**fields, **shared, **chunk}, stored)
 
 
 class Artifacts:
-    """The artifacts of one policy, checked and loaded on demand.
-
-    results, policy, search: as in RolloutSettings. device, dtype: of what is loaded, as `runtime.set_up` gives them.
-    """
+    """The artifacts of one policy, checked and loaded on demand."""
 
     def __init__(
         self, results: str, policy: PolicySettings, search: Any = None, device: str = "cpu", dtype: str = "float32"
@@ -276,7 +313,7 @@ class Artifacts:
 
     @functools.cached_property
     def description(self) -> TargetDescription:
-        """The target's description; its weights are not loaded."""
+        """The target's description. Its weights are not loaded."""
         return checkpoint.read_target(self.folder)
 
     @property
@@ -285,7 +322,7 @@ class Artifacts:
         return _target(self.folder, self.description.sha256, self.device, self.dtype)
 
     def path(self, kind: str) -> Path:
-        """Path of the artifact of this kind."""
+        """Return the path of the artifact of this kind."""
         return kind_of(kind).path(self.results, self.policy.artifacts.get(kind), self.folder)
 
     def check(self, kinds: Iterable[str], use: Use | None = None) -> dict[str, str]:
@@ -320,17 +357,17 @@ class Artifacts:
         return hashes
 
     def _making(self, files: Artifact[Any]) -> tuple[str, ...]:
-        """Words of the command that makes an artifact of the policy: beside its target, or of the name that it has."""
+        """Return the words of the command that makes a missing artifact."""
         target, name = f"policy.target={self.policy.target}", self.policy.artifacts.get(files.kind)
         if name is None or "/" in name:
             return "prepare", target
         return *files.command, target, f"policy.artifacts.{files.kind}={name}"
 
     def load(self, kind: str) -> Any:
-        """The artifact, for the loaded target; one object per process.
+        """Return the artifact, loaded for the target. It is one object per process.
 
         Raises:
-            CheckpointError: as `check`.
+            CheckpointError: As `check`.
         """
         digest = self.check([kind])[kind]
         return _artifact(kind, self.path(kind), digest, _Key(self.folder, self.device, self.dtype, self.search))
@@ -338,7 +375,7 @@ class Artifacts:
 
 @dataclass(frozen=True)
 class _Key:
-    """What a loaded artifact depends on besides its files. search: settings without a hash, compared by their text."""
+    """What a loaded artifact depends on besides its files. `search` has no hash and is compared by its text."""
 
     folder: Path
     device: str
@@ -350,7 +387,11 @@ class _Key:
 
 
 def kind_of(name: str) -> Artifact[Any]:
-    """The kind of artifact of this name. Raises UnknownName: there is none."""
+    """Return the kind of artifact of this name.
+
+    Raises:
+        UnknownName: There is none.
+    """
     return find("artifact", name).built()
 
 

@@ -1,6 +1,6 @@
-"""The calibration file: figures fitted on training demonstrations, read and checked (docs/methods.md §3, §4).
+"""The calibration: figures fitted on training demonstrations (docs/methods.md §3, §4).
 
-`kerv calibrate` writes it (training/calibration.py); thresholds, predictors, boundaries and verify-skip read it.
+`kerv calibrate` writes it. Thresholds, predictors, boundaries and verify-skip read it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,12 @@ Errors = dict[str, dict[str, dict[str, list[float]]]]
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """The demonstrations of a calibration, by hash. tasks: task -> {"training": episodes, "held_out": episodes}."""
+    """The demonstrations of a calibration.
+
+    Attributes:
+        sha256: Their hash.
+        tasks: Task -> {"training": episodes, "held_out": episodes}.
+    """
 
     sha256: str
     tasks: dict[str, dict[str, int]]
@@ -32,7 +37,7 @@ class Demonstrations:
 
 @dataclass(frozen=True)
 class Variability:
-    """Distribution of K over the pre-sampled decodes of a task, normalised action units; p25, p90: percentiles."""
+    """Distribution of the variability K over a task's pre-sampled decodes, in normalised action units."""
 
     k_s: float  # the reference level K_S
     decodes: int
@@ -43,7 +48,7 @@ class Variability:
 
 @dataclass(frozen=True)
 class BoundarySection:
-    """Ranges of the hybrid boundary by how many positions it looks at (§4.4)."""
+    """Ranges of the hybrid boundary by the number of positions that it looks at (§4.4)."""
 
     episodes: int
     windows: dict[str, BoundaryRanges]
@@ -51,9 +56,17 @@ class BoundarySection:
 
 @dataclass(frozen=True)
 class SkipLevel:
-    """Verify-skip levels of a task (§4.3), cosines. share: part of the datastore's `entries` that s_min would skip,
-    with another episode's best neighbour. within: part of those with an error of at most epsilon. error: their mean
-    error, normalised action units."""
+    """Verify-skip levels of a task, cosines (§4.3).
+
+    Attributes:
+        s_min: Similarity from which a chunk is executed without verification.
+        low: Lowest value that feedback may move `s_min` to.
+        high: Highest value.
+        share: Part of the datastore's entries that `s_min` would skip, each with another episode's best neighbour.
+        entries: Entries of the task that were looked up.
+        within: Part of the skipped ones whose error is at most epsilon.
+        error: Mean error of the skipped ones, normalised action units.
+    """
 
     s_min: float
     low: float
@@ -66,7 +79,7 @@ class SkipLevel:
 
 @dataclass(frozen=True)
 class SkipSection:
-    """Skip levels by task, for the datastore of this content."""
+    """Skip levels by task, for the datastore with this hash."""
 
     datastore: str
     epsilon: float
@@ -76,7 +89,7 @@ class SkipSection:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Contents of `calibration.json`; `boundary` and `skip` are None and `variability` is empty where not measured."""
+    """Contents of `calibration.json`. Sections that were not measured are None or empty."""
 
     target: MadeFor
     demos: Demonstrations
@@ -96,10 +109,10 @@ class Calibration:
         return self.variability
 
     def k_s(self, task: str) -> float:
-        """The task's reference level K_S, normalised action units.
+        """Return the task's reference level K_S, in normalised action units.
 
         Raises:
-            CheckpointError: the task was not pre-sampled.
+            CheckpointError: The task was not pre-sampled.
         """
         if task not in self.variability:
             raise CheckpointError(
@@ -109,10 +122,10 @@ class Calibration:
         return self.variability[task].k_s
 
     def ranges(self, window: int) -> BoundaryRanges:
-        """Ranges that normalise R and D for a boundary with a window of `window` positions.
+        """Return the ranges of R and D for a boundary that looks at `window` positions.
 
         Raises:
-            CheckpointError: none were taken, or none over so many positions.
+            CheckpointError: None were measured, or none for so many positions.
         """
         if self.boundary is None:
             raise CheckpointError(f"the calibration has no ranges for the boundary: {AGAIN}")
@@ -125,12 +138,14 @@ class Calibration:
         return windows[str(window)]
 
     def skip_levels(self, task: str, datastore: str) -> tuple[float, float, float]:
-        """(low, s_min, high) of the task: cosine similarities, low <= s_min <= high; NEVER where nothing is skipped.
+        """Return (low, s_min, high) of the task, cosines in ascending order; NEVER if nothing is skipped.
 
-        datastore: `content` of the datastore that retrieves.
+        Args:
+            task: Full name.
+            datastore: Hash of the datastore that retrieves.
 
         Raises:
-            CheckpointError: no levels, none for this task, or those of another datastore.
+            CheckpointError: No levels, none for this task, or those of another datastore.
         """
         if self.skip is None:
             raise CheckpointError(f"the calibration has no skip levels: build a datastore, then {AGAIN}")
@@ -145,15 +160,18 @@ class Calibration:
 
 
 class CalibrationArtifact(Artifact[Calibration]):
-    """The calibration: one file, which its path names."""
+    """The calibration: a single file, which its path names."""
 
     kind = noun = "calibration"
     made, command = "made", ("calibrate",)
     schema = Calibration
 
     def path(self, results: str, name: str | None, target: Path) -> Path:
-        """Path of the named calibration, else of the target's: pretrained/<name>/calibration.json where it is shipped,
-        artifacts/calibration/<name>/calibration.json where it was made here."""
+        """Return the named calibration, else the target's.
+
+        A shipped one is pretrained/<name>/calibration.json, one made here
+        artifacts/calibration/<name>/calibration.json.
+        """
         if name is None and target.name == "target":
             return target.parent / FILE
         if name is None and target.parent.name != "target":
@@ -161,7 +179,7 @@ class CalibrationArtifact(Artifact[Calibration]):
         return super().path(results, name, target) / FILE
 
     def json(self, path: Path) -> Path:
-        """`path` itself."""
+        """Return the path itself."""
         return path
 
     def check_use(self, description: Calibration, use: Use) -> None:
@@ -180,5 +198,5 @@ class CalibrationArtifact(Artifact[Calibration]):
         return all(section for kind, section in sections.items() if kind in kinds)
 
     def made_for(self, description: Calibration) -> MadeFor:
-        """The target that it was made for."""
+        """Return the target that it was made for."""
         return description.target

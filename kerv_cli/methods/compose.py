@@ -22,7 +22,7 @@ DRAFTS = ("prefill_draft", "proposer")
 
 
 def is_parallel(target: object) -> bool:
-    """Whether a target decodes all tokens at once; see `engine.protocol.ParallelTarget`."""
+    """Return whether a target decodes all tokens at once (`engine.protocol.ParallelTarget`)."""
     return bool(getattr(target, "parallel", False))
 
 
@@ -30,7 +30,10 @@ def is_parallel(target: object) -> bool:
 class Method:
     """A method: its parts and its chunk.
 
-    settings: kind -> settings, for every kind of METHOD_KINDS. chunk: H, 0 for the target's. name: in messages.
+    Attributes:
+        settings: Kind -> settings, for every kind of METHOD_KINDS.
+        chunk: H; 0 for the target's.
+        name: Its name in messages.
     """
 
     settings: Mapping[str, Any]
@@ -39,27 +42,37 @@ class Method:
 
     @classmethod
     def of(cls, settings: MethodSettings) -> Method:
-        """The method of a command's settings."""
+        """Return the method of a command's settings."""
         return cls(settings.parts(), settings.chunk, settings.method)
 
     @functools.cached_property
     def parts(self) -> dict[str, Part]:
-        """Kind -> part. Raises UnknownName: no such part."""
+        """Kind -> part.
+
+        Raises:
+            UnknownName: There is no such part.
+        """
         return {kind: part_of(kind, self.settings[kind].kind) for kind in METHOD_KINDS}
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """The kinds of artifacts that its parts read, each once, in the order of its parts."""
+        """The kinds of artifacts that its parts read, each once."""
         kinds = (need for kind, part in self.parts.items() for need in part.needs(self.settings[kind]))
         return tuple(dict.fromkeys(kinds))
 
     def check(self, target: Target | TargetDescription, batch: int = 1, key: str = "rollout.batch") -> None:
-        """Refuses parts that do not belong together or to the target, and numbers out of range, before anything heavy
-        is loaded. target: a description of one, or a loaded one. batch: episodes whose decodes are computed together;
-        key: the setting that says so.
+        """Refuse parts that do not fit together or to the target, and numbers out of range.
+
+        Nothing heavy is loaded yet.
+
+        Args:
+            target: A loaded target, or the description of one.
+            batch: Episodes that are decoded together.
+            key: The setting that says how many.
 
         Raises:
-            UnknownName: no such part. UsageError: a composition that cannot work, or a number out of range.
+            UnknownName: There is no such part.
+            UsageError: A composition that cannot work, or a number out of range.
         """
         for kind, part in self.parts.items():
             if not isinstance(self.settings[kind], part.settings):
@@ -72,7 +85,7 @@ class Method:
         self._check_batch(batch, key)
 
     def _check_drafts(self) -> None:
-        """A boundary chooses between two sides, and an in-prefill draft comes before the target's states."""
+        """Check that a boundary has two drafters to choose from, and that an in-prefill draft needs no states."""
         proposer, boundary, draft = (self.parts[kind] for kind in ("proposer", "boundary", "prefill_draft"))
         if bool(proposer.traits.get("sides")) != bool(boundary.traits.get("chooses")):
             raise UsageError(
@@ -86,7 +99,7 @@ class Method:
             )
 
     def _check_parallel(self, parallel: bool) -> None:
-        """A parallel target has one way to decode, no other target has it, and it leaves nothing to draft."""
+        """Check that a parallel target decodes in its own way, without drafts, and no other target does."""
         has_pass = bool(self.parts["skip"].traits.get("parallel"))
         if has_pass and not parallel:
             raise UsageError(
@@ -100,7 +113,7 @@ class Method:
             raise UsageError(f"skip=parallel with {idle[0]}: nothing is drafted, leave it out")
 
     def _check_skip(self) -> None:
-        """What executes drafts unverified has one source that drafts whole chunks before the prefill."""
+        """Check that a rule that executes drafts unverified has one source of whole chunks before the prefill."""
         skip, draft = self.parts["skip"], self.parts["prefill_draft"]
         joined = skip.traits.get("merges") and draft.traits.get("merged")
         if skip.traits.get("takes_draft") and not draft.traits.get("chains") and not joined:
@@ -110,7 +123,7 @@ class Method:
             )
 
     def _check_batch(self, batch: int, key: str) -> None:
-        """Several episodes at a time go through the same forwards."""
+        """Check that several episodes at a time run through the same forwards."""
         if batch == 1:
             return
         draft, proposer, skip, threshold = (self.parts[k] for k in ("prefill_draft", "proposer", "skip", "threshold"))
@@ -125,11 +138,16 @@ class Method:
             raise UsageError(f"{key}={batch}: threshold={threshold.name} follows one episode. Use threshold=fixed")
 
     def decoder(self, target: Target, artifact: Callable[[str], Any], task: str = "") -> Decoder:
-        """The decoder of the method around a target. artifact: kind -> the loaded artifact; called for the kinds in
-        `needs` alone. task: full name, for parts whose calibrated levels differ between tasks.
+        """Return the decoder of the method around a target.
+
+        Args:
+            target: The policy that verifies.
+            artifact: Returns the loaded artifact of a kind. Called only for the kinds in `needs`.
+            task: Full name, for parts whose calibrated levels differ between tasks.
 
         Raises:
-            UsageError: as `check`. CheckpointError: an artifact is missing or belongs to another target.
+            UsageError: As `check`.
+            CheckpointError: An artifact is missing or belongs to another target.
         """
         self.check(target)
         context = Context(target, artifact, task, method=self.settings, chunk=self.chunk)
@@ -139,5 +157,5 @@ class Method:
 
 
 def native_decoder(target: Any) -> Decoder:
-    """A target as it was trained to decode: autoregressive, or all tokens in one pass."""
+    """Return a decoder that decodes as the target was trained to: one token after the other, or all in one pass."""
     return Decoder(target, Parts(skip=ParallelPass(target)) if is_parallel(target) else None)

@@ -1,5 +1,4 @@
-"""What a part is made from. The registry's `build` of a part of a method takes (settings, context) and returns the
-part, or None for the absence of one."""
+"""What parts are made from: `build` of a method's part takes (settings, context) and returns the part, or None."""
 
 from __future__ import annotations
 
@@ -12,8 +11,16 @@ from kerv_cli.base.errors import UsageError
 
 @dataclass(frozen=True)
 class Context:
-    """The surroundings of a part. artifact: kind -> the loaded artifact. task: full name, or empty. built: the method's
-    parts so far, by kind. method: the settings of all its parts, by kind. chunk: H, 0: the target's."""
+    """The surroundings of a part.
+
+    Attributes:
+        target: A Target. Some parts want a ReadableTarget.
+        artifact: Returns the loaded artifact of a kind.
+        task: Full name, or empty.
+        built: The parts that are built already, by kind.
+        method: Settings of all parts, by kind.
+        chunk: H; 0 for the target's.
+    """
 
     target: Any  # a Target; some parts want a ReadableTarget
     artifact: Callable[[str], Any]
@@ -24,11 +31,19 @@ class Context:
 
     @property
     def calibration(self) -> Any:
-        """The target's `Calibration`; not by its type, which the parts that it is read for would import."""
+        """The target's `Calibration`. Its type would be a circular import."""
         return self.artifact("calibration")
 
     def check_radius(self, name: str, r: int) -> None:
-        """Raises UsageError for a radius above the largest distance of two tokens. name: of the threshold's setting."""
+        """Refuse a radius above the largest distance of two tokens.
+
+        Args:
+            name: Of the threshold's setting.
+            r: The radius in bins.
+
+        Raises:
+            UsageError: It is too large.
+        """
         most = self.target.actions.tokens - 1
         if r > most:
             raise UsageError(f"threshold.{name}={r}: bins from 0 to {most}")

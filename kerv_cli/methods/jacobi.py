@@ -1,4 +1,4 @@
-"""Jacobi decoding, as in PD-VLA (docs/methods.md §6). Nothing heavy is imported here."""
+"""Jacobi decoding, as in PD-VLA (docs/methods.md §6)."""
 
 from __future__ import annotations
 
@@ -19,17 +19,20 @@ if TYPE_CHECKING:
 
 @dataclass
 class JacobiProposerSettings:
-    """PD-VLA: the parallel argmax of the guess before, over the rest of the chunk (§6)."""
+    """PD-VLA: the next guess is the parallel argmax of the last one (§6)."""
 
     kind: str = "jacobi"
     depth: int = number(0, 0, MOST_TOKENS)  # tokens guessed at once; 0: all that are left
 
 
 class JacobiProposer(ChainProposer):
-    """PD-VLA's parallel decoding: guess all tokens, take the parallel argmax as the next guess, up to its fixed point.
+    """Guesses all tokens and takes their parallel argmax as the next guess, up to the fixed point.
 
-    With strict acceptance the fixed point is AR's chunk. The first guess is the target tokens that the in-prefill
-    draft's verification gave behind its rejection, then zero actions. `depth`: tokens guessed at once; 0: all.
+    With strict acceptance the fixed point is the chunk of AR. The first guess is the target tokens after a rejection in
+    the in-prefill draft, then zero actions.
+
+    Attributes:
+        depth: Tokens guessed at once; 0 for all.
     """
 
     name = "jacobi"
@@ -40,20 +43,20 @@ class JacobiProposer(ChainProposer):
 
     @classmethod
     def build(cls, settings: JacobiProposerSettings, context: Context) -> JacobiProposer:
-        """proposer=jacobi."""
+        """Build proposer=jacobi."""
         return cls(settings.depth)
 
     def begin(self, chunk: Chunk) -> None:
-        """Makes the first guess."""
+        """Make the first guess."""
         tokens = chunk.rejection.target[: chunk.remaining]
         self.guess = [*tokens, *[chunk.space.tokens // 2] * (chunk.remaining - len(tokens))]
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """The present guess."""
+        """Return the present guess."""
         return [self.guess[: min(depth, self.depth or depth)]]
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
-        """The next guess: this round's target tokens behind the committed ones, then the old guess."""
+        """Make the next guess: this round's target tokens after the committed ones, then the old guess."""
         accepted = len(chunk.tokens) - first - 2
         self.guess = [*target_tokens[accepted + 1 :], *self.guess[len(target_tokens) - 1 :]]
 

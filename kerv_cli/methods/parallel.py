@@ -1,4 +1,4 @@
-"""Parallel decoding (docs/methods.md §6): registration, and the part, which needs nothing heavy."""
+"""Parallel decoding, as in OpenVLA-OFT (docs/methods.md §6)."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ if TYPE_CHECKING:
 
 
 class ParallelPass(Skip):
-    """Decodes all tokens by one bidirectional pass of a parallel target, as OpenVLA-OFT does (§6): each is chosen
-    without knowing the others, and none is verified."""
+    """Decodes all tokens by one bidirectional pass of a parallel target.
+
+    Each token is chosen without knowing the others, and none is verified.
+    """
 
     phase = "prefill"
 
@@ -25,18 +27,18 @@ class ParallelPass(Skip):
 
     @classmethod
     def build(cls, settings: NoSettings, context: Context) -> ParallelPass:
-        """skip=parallel."""
+        """Build skip=parallel."""
         return cls(context.target)
 
     def take(self, chunk: Chunk) -> bool:
-        """Commits all tokens after one pass of the target; always True."""
+        """Commit all tokens after one pass of the target. Always True."""
         chunk.cache.length = 0
         hidden = self.target.parallel_pass(chunk.prompt, chunk.cache)
         chunk.commit_at_once(self.target.head(hidden[0, : chunk.size]).argmax(-1).tolist())
         return True
 
     def take_many(self, chunks: Sequence[Chunk], cache: Callable[[int], Cache]) -> None:
-        """Commits the tokens of several chunks, whose prompts are equally long, after one pass."""
+        """Commit the tokens of several chunks with equally long prompts after one pass."""
         import torch
 
         prompt = torch.cat([chunk.prompt for chunk in chunks])

@@ -57,5 +57,5 @@ class MethodSettings(RunSettings):
     datastore: Any = part("datastore", "exact", "what searches the stored chunks")
 
     def parts(self) -> dict[str, Any]:
-        """Kind -> settings, for every part of the method."""
+        """Return kind -> settings, for every part of the method."""
         return {kind: getattr(self, kind) for kind in METHOD_KINDS}

@@ -1,5 +1,4 @@
-"""Acceptance token by token, strict or within Spec-VLA's one radius (docs/methods.md §2.1). Its drafter is `eagle`.
-Nothing heavy is imported here."""
+"""Spec-VLA's acceptance: token by token, strict or within one radius (docs/methods.md §2.1). Its drafter is `eagle`."""
 
 from __future__ import annotations
 
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class RelaxedAcceptanceSettings:
-    """Spec-VLA: a draft token within r bins of the target's is kept."""
+    """Spec-VLA: accepts a draft token within r bins of the target's."""
 
     kind: str = "relaxed"
     strict_dofs: bool = True  # ours: the action space's strict DoFs must match; the paper has one r for all
@@ -25,22 +24,26 @@ class RelaxedAcceptanceSettings:
 
 @dataclass(frozen=True)
 class RelaxedRule(DistanceRule):
-    """A draft token within r bins of the target's is kept. strict_dofs: the space's strict DoFs must match."""
+    """Accepts a draft token within r bins of the target's.
+
+    Attributes:
+        strict_dofs: Whether the action space's strict DoFs must match exactly.
+    """
 
     strict_dofs: bool = True
 
     @classmethod
     def build(cls, settings: RelaxedAcceptanceSettings, context: Context) -> RelaxedRule:
-        """acceptance=relaxed."""
+        """Build acceptance=relaxed."""
         return cls(context.target.actions, settings.strict_dofs)
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """Largest accepted distance per DoF, bins (D,): r, for strict DoFs 0 where those must match."""
+        """Return the largest accepted distance per DoF, in bins (D,): r, or 0 for strict DoFs that must match."""
         return tuple(0 if self.strict_dofs and strict else r for strict in self.space.is_strict)
 
 
 def strict(settings: NoSettings, context: Context) -> StrictRule:
-    """acceptance=strict: a draft token must equal the target's, which is lossless."""
+    """Build acceptance=strict: a draft token must equal the target's, so nothing is lost."""
     return StrictRule(context.target.actions)
 
 
@@ -53,10 +56,10 @@ class FixedThresholdSettings:
 
 
 def fixed(settings: FixedThresholdSettings, context: Context) -> Fixed:
-    """threshold=fixed.
+    """Build threshold=fixed.
 
     Raises:
-        UsageError: a radius above the largest distance of two tokens.
+        UsageError: A radius above the largest distance of two tokens.
     """
     context.check_radius("r", settings.r)
     return Fixed(settings.r)

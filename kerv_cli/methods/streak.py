@@ -1,4 +1,4 @@
-"""Trust for as long as verification agrees (docs/methods.md §4.5, ours). Nothing heavy is imported here."""
+"""Trust drafts for as long as verifications agree with them (docs/methods.md §4.5, ours)."""
 
 from __future__ import annotations
 
@@ -20,8 +20,10 @@ TRUSTED, STREAK = "trusted", "streak"
 
 @dataclass
 class StreakSkipSettings:
-    """Verified chunks that agree with their draft allow 1, 2, 4, … unverified decodes (§4.5). The draft is the
-    in-prefill one, of `merged` its first source's."""
+    """Chunks that agree with their draft allow 1, 2, 4, … unverified decodes (§4.5).
+
+    The draft is the in-prefill one; of `merged`, that of its first source.
+    """
 
     kind: str = "streak"
     most: int = number(8, 1)  # decodes in a row without a verification
@@ -30,9 +32,15 @@ class StreakSkipSettings:
 
 
 class StreakSkip(Skip):
-    """A chunk whose draft agrees with the target's tokens allows one unverified decode before the next verification,
-    the next one in a row two, then four, up to `most`; a chunk that does not agree ends it. An episode begins with a
-    verification, or with `opening` unverified decodes."""
+    """Lets each verified chunk that agrees with its draft allow unverified decodes: 1, then 2, 4, … up to `most`.
+
+    A chunk that does not agree ends this. An episode begins with `opening` unverified decodes.
+
+    Attributes:
+        allowed: Unverified decodes after the last verification.
+        left: How many of these are still to come.
+        chain: The source's draft of this chunk.
+    """
 
     def __init__(self, settings: StreakSkipSettings, source: ChainProposer) -> None:
         self.settings, self.source = settings, source
@@ -42,16 +50,16 @@ class StreakSkip(Skip):
 
     @classmethod
     def build(cls, settings: StreakSkipSettings, context: Context) -> StreakSkip:
-        """skip=streak."""
+        """Build skip=streak."""
         draft = context.built["prefill_draft"]
         return cls(settings, getattr(draft, "sources", [draft])[0])  # of a merged draft its first source
 
     def begin(self, task: str, seed: int) -> None:
-        """An episode begins."""
+        """Begin an episode."""
         self.allowed = self.left = self.settings.opening
 
     def take(self, chunk: Chunk) -> bool:
-        """Fills the chunk with the source's draft while unverified decodes are left -> whether it did."""
+        """Fill the chunk with the source's draft while unverified decodes are left -> whether it did."""
         chains = self.source.chains(chunk, chunk.size)
         self.chain = tuple(chains[0]) if chains else ()
         trusted = self.left > 0 and len(self.chain) == chunk.size
@@ -63,13 +71,15 @@ class StreakSkip(Skip):
         return True
 
     def verified(self, chunk: Chunk) -> None:
-        """The prefill verified the chunk: allows twice as many unverified decodes, or none."""
+        """Allow twice as many unverified decodes if the verified chunk agrees with the draft, else none."""
         self.allowed = min(self.settings.most, 2 * self.allowed or 1) if self._agrees(chunk) else 0
         self.left = self.allowed
 
     def _agrees(self, chunk: Chunk) -> bool:
-        """Whether the source's draft was judged, and was accepted whole or is at most `tolerance` from the target's
-        tokens along it, strict DoFs equal."""
+        """Return whether the draft was accepted whole or is on average within `tolerance` of the target's tokens.
+
+        Strict DoFs must be equal.
+        """
         targets = chunk.targets_along(self.chain)
         if targets is None:
             return False

@@ -1,4 +1,4 @@
-"""Drafts that are never verified (docs/methods.md §6): registration, and the part, which needs nothing heavy."""
+"""Drafts that are never verified (docs/methods.md §6)."""
 
 from __future__ import annotations
 
@@ -16,19 +16,18 @@ if TYPE_CHECKING:
 
 
 class AlwaysSkip(Skip):
-    """Executes every draft unverified: what a method costs and loses without verification (§6). Where the source has no
-    whole chunk yet, the target decodes."""
+    """Executes every draft unverified. If the source has no whole chunk yet, the target decodes."""
 
     def __init__(self, source: ChainProposer) -> None:
         self.source = source
 
     @classmethod
     def build(cls, settings: NoSettings, context: Context) -> AlwaysSkip:
-        """skip=always."""
+        """Build skip=always."""
         return cls(context.built["prefill_draft"])
 
     def take(self, chunk: Chunk) -> bool:
-        """Fills the chunk with the source's draft -> whether it had one of all N tokens."""
+        """Fill the chunk with the source's draft -> whether there was one of all N tokens."""
         chains = self.source.chains(chunk, chunk.size)
         if not chains or len(chains[0]) < chunk.size:
             return False
@@ -36,7 +35,7 @@ class AlwaysSkip(Skip):
         return True
 
     def take_many(self, chunks: Sequence[Chunk], cache: Callable[[int], Cache]) -> None:
-        """Fills B chunks with the source's drafts."""
+        """Fill several chunks with the source's drafts."""
         for chunk, tokens in zip(chunks, self.source.tokens_of(chunks), strict=True):
             chunk.skip(tokens, self.source.name)
 

@@ -1,5 +1,4 @@
-"""Success, certified (docs/methods.md §4.6, ours): trusts drafts on the tasks that a certificate covers. Settings and
-registration."""
+"""Success, certified (docs/methods.md §4.6, ours): trust drafts on the tasks that a certificate covers."""
 
 from __future__ import annotations
 
@@ -12,7 +11,7 @@ from kerv_cli.base.registry import PREFILL, add, find, part_of
 
 @dataclass
 class CertifiedSkipSettings:
-    """On the certificate's tasks the rule that it certifies; elsewhere a streak of at most `most` (§4.5)."""
+    """The rule that the certificate names on its tasks; elsewhere a streak of at most `most` (§4.5)."""
 
     kind: str = "certified"
     most: int = number(8, 1)
@@ -20,14 +19,18 @@ class CertifiedSkipSettings:
 
 @dataclass
 class ScopedSettings:
-    """The draft that the certificate names on its tasks, another elsewhere."""
+    """The draft that the certificate names on its tasks; elsewhere another one."""
 
     kind: str = "scoped"
     outside: str = "merged"
 
 
 def check_scoped(settings: ScopedSettings) -> None:
-    """Raises UsageError for a draft elsewhere that cannot draft whole chunks before the prefill."""
+    """Refuse a draft for other tasks that cannot draft whole chunks before the prefill.
+
+    Raises:
+        UsageError: It cannot.
+    """
     outside = find("proposer", settings.outside, "prefill_draft.outside")
     if not (outside.traits.get("merged") or outside.traits.get("chains")):
         raise UsageError(
@@ -37,7 +40,7 @@ def check_scoped(settings: ScopedSettings) -> None:
 
 
 def _needs(settings: ScopedSettings) -> tuple[str, ...]:
-    """The certificate, which brings what its draft reads, and what the other draft reads."""
+    """Return the certificate, which names what its own draft reads, and what the other draft reads."""
     outside = part_of("prefill_draft", settings.outside)
     return "certificate", *outside.needs(outside.default)
 

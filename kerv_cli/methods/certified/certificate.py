@@ -1,7 +1,6 @@
-"""The certificate of success, and what deploys it (docs/methods.md §4.6, ours).
+"""The certificate of success, and the parts that apply it (docs/methods.md §4.6, ours).
 
-Decoders are put together for one task, so whether the certificate covers the task is decided there, once, and the parts
-that come of it are ordinary ones.
+A decoder is built for one task. So whether the certificate covers the task is decided once, when it is built.
 """
 
 from __future__ import annotations
@@ -24,10 +23,19 @@ from kerv_cli.methods.streak import StreakSkipSettings
 
 @dataclass(frozen=True)
 class Candidate:
-    """One rule of the fixed order. skip, draft: settings of its skip rule and of its in-prefill draft. pairs: episodes
-    paired with AR's on the same seeds, of which AR solved `ar`, the rule `successes`; lost, won: pairs that only one of
-    both solved. p: of the hypothesis that the rule loses more than the margin; None: not tested, because one before it
-    was not certified."""
+    """One rule of the fixed order.
+
+    Attributes:
+        skip: Settings of its skip rule.
+        draft: Settings of its in-prefill draft.
+        pairs: Episodes paired with AR's on the same seeds.
+        ar: Those that AR solved.
+        successes: Those that the rule solved.
+        lost: Those that only AR solved.
+        won: Those that only the rule solved.
+        p: Of the hypothesis that the rule loses more than the margin. None if an earlier rule was not certified.
+        needed: About how many more pairs would certify it; 0: none, −1: never.
+    """
 
     label: str
     skip: dict[str, Any]
@@ -52,17 +60,23 @@ class Candidate:
 
 
 def _part_settings(kind: str, plain: dict[str, Any]) -> Any:
-    """Settings of a part from plain values."""
     return read(part_of(kind, plain["kind"]).settings, plain, f"the certificate's {kind}")
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """What was certified: over `tasks`, the rule `chosen` (index of `candidates`) loses at most `margin` points of AR's
-    success, with confidence 1 − delta.
+    """What was certified: on `tasks`, the rule `chosen` loses at most `margin` points of AR's success.
 
-    drafts: kind -> hash of the artifacts that drafted. method: kind -> settings of the other parts. chunk: H. world:
-    camera and horizon. dtype: number format. seeds: the selection seeds, as text.
+    Attributes:
+        chunk: H.
+        drafts: Kind -> hash of the artifacts that drafted.
+        method: Kind -> settings of the other parts.
+        world: Camera and horizon.
+        dtype: Number format.
+        delta: 1 − the confidence.
+        seeds: The selection seeds, as text.
+        candidates: The rules in their order.
+        chosen: Index of the certified rule; None if there is none.
     """
 
     target: str
@@ -83,14 +97,18 @@ class Certificate:
 
     @property
     def certified(self) -> Candidate | None:
-        """The boldest rule of those that were certified; None: none was."""
+        """The boldest certified rule; None if none was certified."""
         return None if self.chosen is None else self.candidates[self.chosen]
 
     def check_method(self, method: Mapping[str, Any], dtype: str) -> None:
-        """Refuses a method that decodes otherwise than what was certified. method: kind -> settings of its parts.
+        """Refuse a method that decodes differently from the certified one.
+
+        Args:
+            method: Kind -> settings of its parts.
+            dtype: Number format.
 
         Raises:
-            UsageError: the draft, another part or the number format differs; names both values.
+            UsageError: The draft, another part or the number format differs; the message names both values.
         """
         draft = method["prefill_draft"]
         if self.certified is not None and draft.kind != "scoped" and draft != self.certified.source:
@@ -110,26 +128,26 @@ class Certificate:
             raise UsageError(f"skip=certified with runtime.dtype={dtype}: the certificate is of {self.dtype}")
 
     def check_world(self, world: Mapping[str, Any]) -> None:
-        """Refuses another camera or horizon. A stressed world is not refused: the certificate says nothing of it.
+        """Refuse another camera or horizon. A stressed world is allowed: the certificate says nothing about stress.
 
         Raises:
-            UsageError: another one; names both values.
+            UsageError: Another one; the message names both values.
         """
         for key, certified in self.world.items():
             if world.get(key) != certified:
                 raise UsageError(f"skip=certified with world.{key}={world.get(key)}: the certificate is of {certified}")
 
     def check_environment(self, name: str) -> None:
-        """Refuses to be served with a policy of another environment. Camera and horizon are the client's.
+        """Refuse a policy of another environment.
 
         Raises:
-            UsageError: another one; names both.
+            UsageError: Another one; the message names both.
         """
         if name != self.environment:
             raise UsageError(f"skip=certified with a policy of {name}: the certificate is of {self.environment}")
 
     def sentence(self) -> str:
-        """The certificate in one sentence."""
+        """Return the certificate in one sentence."""
         chosen = self.certified
         if chosen is None:
             return "nothing is certified: every draft is verified"
@@ -140,18 +158,18 @@ class Certificate:
 
 
 class CertificateArtifact(Artifact[Certificate]):
-    """`certificate/` beside the target: certificate.json."""
+    """The certificate's single file."""
 
     kind, noun, made, seconds = "certificate", "certificate", "issued", 120.0
     command = ("calibrate", "success")
     schema = Certificate
 
     def made_for(self, description: Certificate) -> MadeFor:
-        """Its target; the chunk is the method's, see `certified`."""
+        """Return its target. Its chunk is checked with the method."""
         return MadeFor(description.target, description.actions)
 
     def sources(self, description: Certificate) -> Mapping[str, str]:
-        """The drafters whose drafts were certified."""
+        """Return the drafters whose drafts were certified."""
         return description.drafts
 
     def check_use(self, description: Certificate, use: Use) -> None:
@@ -171,13 +189,13 @@ class CertificateArtifact(Artifact[Certificate]):
 
 
 def covering(context: Context) -> Certificate | None:
-    """The certificate, where it covers the decoder's task."""
+    """Return the certificate if it covers the decoder's task."""
     certificate: Certificate = context.artifact("certificate")
     return certificate if context.task in certificate.tasks else None
 
 
 def scoped(settings: ScopedSettings, context: Context) -> Proposer:
-    """prefill_draft=scoped: the draft for the task at hand."""
+    """Build prefill_draft=scoped: the draft for the task at hand."""
     certificate = covering(context)
     if certificate is not None and certificate.certified is not None:
         source = certificate.certified.source
@@ -187,7 +205,7 @@ def scoped(settings: ScopedSettings, context: Context) -> Proposer:
 
 
 def certified(settings: CertifiedSkipSettings, context: Context) -> Skip | None:
-    """skip=certified: the certified rule, or a streak outside the certificate."""
+    """Build skip=certified: the certified rule, or a streak on other tasks."""
     certificate = covering(context)
     if certificate is None:
         return _built(StreakSkipSettings(most=settings.most), context)

@@ -1,4 +1,4 @@
-"""EAGLE-style drafting from the target's hidden states (docs/methods.md §2.2). Settings and registration."""
+"""EAGLE-style drafting from the target's hidden states (docs/methods.md §2.2)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from kerv_cli.base.registry import DRAFTING, STATES, add_drafter
 
 @dataclass
 class DrafterSettings:
-    """Decoder layers of the target's width behind its states, and their training (§2.2)."""
+    """Decoder layers of the target's width after its states, and their training (§2.2)."""
 
     kind: str = "eagle"
     layers: int = number(1, 0, 1024)
@@ -22,8 +22,11 @@ class DrafterSettings:
 
 @dataclass
 class DrafterProposerSettings:
-    """EAGLE-style drafter (§2.2). The default is a greedy chain as deep as the chunk: on a CPU it beats a tree, because
-    relaxed acceptance accepts most of what siblings would catch, and every verified node costs time."""
+    """EAGLE-style drafter (§2.2). The default is a greedy chain as deep as the chunk.
+
+    On a CPU the chain beats a tree: relaxed acceptance accepts most of what siblings would catch, and every verified
+    node costs time.
+    """
 
     kind: str = "drafter"
     depth: int = number(15, 1, MOST_TOKENS)  # tokens

@@ -1,9 +1,8 @@
-"""The EAGLE-style drafter, its dynamic tree, its proposer and its files (docs/methods.md §2.2; EAGLE-2; Spec-VLA §3).
+"""The EAGLE-style drafter: network, dynamic tree, training and files (docs/methods.md §2.2; EAGLE-2; Spec-VLA §3).
 
-Input at position i: concat(embedding of the token at i + 1, the target's last hidden state at i), mapped to the model's
-width; the decoder layers predict the hidden state at i + 1, from which the target's frozen head gives the logits for
-position i + 2. The prompt, vision tokens included, is in the drafter's cache. Rotary positions count from the prompt's
-beginning, in training and at inference.
+The input at position i is the embedding of the token at i + 1 beside the target's last hidden state at i, mapped to the
+model's width. The layers predict the hidden state at i + 1, from which the target's frozen head gives the logits of
+position i + 2. The drafter's cache holds the whole prompt. Rotary positions count from the prompt's beginning.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ VALIDATED = 60
 
 
 class EagleNetwork(LayerStack):
-    """One decoder layer (or a few) of the target's shape; the head and the token embeddings are the target's own."""
+    """Decoder layers of the target's shape. Head and token embeddings are the target's own."""
 
     def __init__(self, settings: DrafterSettings, width: int, heads: int, feed_forward: int) -> None:
         super().__init__(width, settings.layers, heads, feed_forward)
@@ -53,7 +52,7 @@ class EagleNetwork(LayerStack):
         self.fuse = nn.Linear(2 * width, width)
 
     def draft_position(self, index: int) -> int:
-        """Rotary position of the drafted token at `index` of the sequence: `index` itself."""
+        """Return the rotary position of the drafted token at `index` of the sequence."""
         return index
 
     def forward(
@@ -64,17 +63,28 @@ class EagleNetwork(LayerStack):
         cache: Cache | None = None,
         seen: np.ndarray | Tensor | None = None,
     ) -> Tensor:
-        """following, hidden (B, T, E) at positions (T,) -> predicted hidden states (B, T, E); seen (T, M) bool as in
-        `attention_mask`."""
+        """Return the predicted hidden states (B, T, E).
+
+        Args:
+            following: Embeddings of the next tokens (B, T, E).
+            hidden: Hidden states (B, T, E).
+            positions: Rotary positions (T,).
+            cache: Keys and values before these positions.
+            seen: Which keys each query sees, (T, M) bool, as in `attention_mask`.
+        """
         x = self.fuse(torch.cat([following, hidden], -1))
         return self.norm(self.run_layers(x, positions, cache, seen))
 
 
 class DrafterProposer(Proposer):
-    """EAGLE-style drafter with a dynamic tree (docs/methods.md §2.2).
+    """Drafts a chain or a dynamic tree (docs/methods.md §2.2). Drafts stay on the device; nothing waits for it.
 
-    cache: the drafter's, of every committed position but the last. hidden: (E,) predicted state from which the first
-    draft token follows. Drafts stay on the device, nothing here waits for it.
+    Attributes:
+        depth: Tokens of a path.
+        top_k: Children expanded per level.
+        nodes: Nodes kept after reranking.
+        cache: The drafter's, of every committed position but the last.
+        hidden: Predicted state (E,) from which the first draft token follows.
     """
 
     name = "drafter"
@@ -83,38 +93,42 @@ class DrafterProposer(Proposer):
     def __init__(
         self, drafter: EagleNetwork | PublicDrafter, target: Target, depth: int, top_k: int, nodes: int
     ) -> None:
-        """depth: tokens; top_k: children expanded per level; nodes: kept after reranking."""
         self.drafter, self.target = drafter, target
         self.depth, self.top_k, self.nodes = depth, top_k, nodes
         capacity = target.max_prompt + target.chunk * target.actions.dofs + top_k * depth
         self.cache, self.hidden = drafter.new_cache(1, capacity), torch.empty(0)
 
     def begin(self, chunk: Chunk) -> None:
-        """Feeds the drafter the prompt's states and embeddings."""
+        """Feed the drafter the prompt's states and embeddings."""
         self.observe(torch.cat([chunk.prompt[:, 1:], self.embed(chunk.tokens)], 1), chunk.hidden, 0)
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """A chain or dynamic tree of the settings' size."""
+        """Return a chain or a dynamic tree."""
         depth = min(self.depth, depth)
         return Draft(self.chain(min(depth, self.nodes))) if self.top_k == 1 else self.tree(depth)
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
-        """Feeds the drafter the states of the newly committed positions."""
+        """Feed the drafter the states of the newly committed positions."""
         self.observe(self.embed(chunk.tokens[first + 1 :]), hidden, chunk.prompt_length + first)
 
     def embed(self, tokens: list[int]) -> Tensor:
-        """T tokens -> the target's embeddings (1, T, E)."""
+        """Return the target's embeddings (1, T, E) of T tokens."""
         return self.target.embed(upload([tokens], self.target.device))
 
     def observe(self, following: Tensor, hidden: Tensor, first: int) -> None:
-        """Feeds the target's own states: hidden (1, T, E) at positions first, first + 1, … and the embedding of the
-        token after each of them (1, T, E). Cache entries from `first` on (the last draft's) are overwritten."""
+        """Feed the target's own states. They replace the last draft's in the cache.
+
+        Args:
+            following: Embedding of the token after each position, (1, T, E).
+            hidden: The target's states (1, T, E) at positions first, first + 1, …
+            first: The first position.
+        """
         self.cache.length = first
         positions = torch.arange(first, first + hidden.shape[1], device=hidden.device)
         self.hidden = self.drafter(following, hidden, positions, self.cache)[0, -1]
 
     def chain(self, depth: int) -> Tensor:
-        """The greedy draft tokens (depth,), without the bookkeeping of a tree."""
+        """Return the greedy draft tokens (depth,)."""
         base = self.cache.length
         first = self.drafter.draft_position(base)
         positions = torch.arange(first, first + depth, device=self.hidden.device).split(1)
@@ -128,8 +142,11 @@ class DrafterProposer(Proposer):
         return torch.cat(drafted)
 
     def tree(self, depth: int) -> Draft:
-        """EAGLE-2's dynamic tree: expand the top-k nodes of a level by cumulative log-probability, then keep the best
-        of all. A child is never more probable than its parent, so the best nodes form a tree."""
+        """Return EAGLE-2's dynamic tree.
+
+        It expands the top-k nodes of a level by cumulative log-probability, then keeps the best of all. A child is
+        never more probable than its parent, so the best nodes form a tree.
+        """
         target, top_k, device = self.target, self.top_k, self.hidden.device
         scores = torch.log_softmax(target.head(self.hidden).float(), -1)
         values, tokens = scores.topk(min(top_k, self.nodes))
@@ -198,7 +215,10 @@ class EagleDrafter(TrainableDrafter):
 
     @classmethod
     def proposer(cls, settings: Any, context: Context) -> DrafterProposer:
-        """proposer=drafter, and the drafter's side of hybrid: settings of either have depth, top_k and nodes."""
+        """Build proposer=drafter, and the drafter of proposer=hybrid.
+
+        The settings of both have depth, top_k and nodes.
+        """
         return DrafterProposer(
             context.artifact(cls.kind), context.target, settings.depth, settings.top_k, settings.nodes
         )

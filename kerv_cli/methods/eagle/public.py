@@ -1,8 +1,7 @@
-"""Drafters in the layout of the public EAGLE and Spec-VLA codes (docs/methods.md §2.2): `fc`, one Llama layer without a
-norm in front, no norm behind; embeddings and head are the target's.
+"""Drafters in the layout of the public EAGLE and Spec-VLA codes (docs/methods.md §2.2).
 
-Their inputs are those of our own drafter. Where they and kerv disagree is a switch (`Convention`): the rotary positions
-of drafted tokens, and which keys they see. Everything else follows from the layout.
+They are `fc` and one Llama layer without a norm before or after it. Embeddings and head are the target's. Their inputs
+are those of our own drafter. Two differences are switches of `Convention`.
 """
 
 from __future__ import annotations
@@ -31,10 +30,11 @@ EMBEDDING = "embed_tokens.weight"
 class Convention:
     """How a public drafter's code differs from kerv's.
 
-    positions: `sequence`, drafted tokens go on counting where the whole prompt ends; `text`, where its text ends: the
-    vision tokens are not counted (EAGLE's tree counts the ids it is handed, and Spec-VLA's hands it none for patches).
-    mask: `causal`, every token sees all before it; `prompt`, tokens see no key behind the prompt's last but one (so
-    Spec-VLA's drafters are trained: its attention mask is zero from there on).
+    Attributes:
+        positions: `sequence`: drafted tokens go on counting after the whole prompt. `text`: vision tokens are not
+            counted. EAGLE's tree counts token ids, and Spec-VLA gives vision tokens none.
+        mask: `causal`: every token sees all before it. `prompt`: no token sees a key after the prompt's last but one.
+            Spec-VLA trains so: its attention mask is zero from there on.
     """
 
     positions: str = "sequence"
@@ -43,7 +43,11 @@ class Convention:
 
 @dataclass(frozen=True)
 class PublicShape:
-    """Shape of a public drafter. skipped: vision tokens, which `positions=text` does not count."""
+    """Shape of a public drafter.
+
+    Attributes:
+        skipped: Vision tokens, which `positions=text` does not count.
+    """
 
     language: Language
     bias: bool
@@ -52,13 +56,13 @@ class PublicShape:
 
 
 class DraftCache(Cache):
-    """A cache that remembers where the prompt ended. prompt: its tokens."""
+    """A cache that remembers the length of the prompt."""
 
     prompt = 0
 
 
 class PublicDrafter(nn.Module):
-    """The drafter; called as `Drafter` is."""
+    """The network; called like `EagleNetwork`."""
 
     def __init__(self, shape: PublicShape) -> None:
         super().__init__()
@@ -67,12 +71,12 @@ class PublicDrafter(nn.Module):
         self.layers = nn.ModuleList(LlamaLayer(language, normed=i > 0) for i in range(language.num_hidden_layers))
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> DraftCache:
-        """An empty cache. fixed: of fixed shapes; default: on CUDA."""
+        """Return an empty cache, on CUDA of fixed shapes unless `fixed` says otherwise."""
         weight, sizes = self.fc.weight, self.shape.language.cache_sizes(batch, capacity)
         return DraftCache(*sizes, weight, weight.is_cuda if fixed is None else fixed)
 
     def draft_position(self, index: int) -> int:
-        """Rotary position of the drafted token at `index` of the sequence."""
+        """Return the rotary position of the drafted token at `index` of the sequence."""
         return index - self.shape.skipped * (self.shape.convention.positions == "text")
 
     def forward(
@@ -83,8 +87,10 @@ class PublicDrafter(nn.Module):
         cache: DraftCache | None = None,
         seen: np.ndarray | Tensor | None = None,
     ) -> Tensor:
-        """following, hidden (B, T, E) at positions (T,) -> predicted hidden states (B, T, E); seen (T, M) bool as in
-        `attention_mask`. A call on an empty cache is the prompt's."""
+        """Return the predicted hidden states (B, T, E). A call on an empty cache is the prompt's.
+
+        The arguments are those of `EagleNetwork.forward`.
+        """
         if cache is not None and not cache.length:
             cache.prompt = hidden.shape[1]
         x = self.fc(torch.cat([following, hidden], -1))
@@ -92,7 +98,7 @@ class PublicDrafter(nn.Module):
         return run_layers(self.layers, self.shape.language, x, positions, cache, seen, mask)
 
     def prompt_mask(self, x: Tensor, cache: DraftCache | None, seen: np.ndarray | Tensor | None) -> Tensor:
-        """Additive mask (T, S + T) in which no key behind the prompt's last but one is seen."""
+        """Return an additive mask (T, S + T) in which no key after the prompt's last but one is seen."""
         prompt = cache.prompt if cache is not None else x.shape[1]
         mask = attention_mask(np.tri(x.shape[1], dtype=bool) if seen is None else seen, x.shape[1], cache, x)
         if mask is None:
@@ -103,17 +109,16 @@ class PublicDrafter(nn.Module):
 
 
 def layout_of(shape: PublicShape) -> dict[str, Sizes]:
-    """Name -> shape of a drafter's own tensors."""
+    """Return name -> shape of a drafter's own tensors."""
     with torch.device("meta"):
         return sizes_of(PublicDrafter(shape))
 
 
 def read_public(folder: Path, target: ReadableTarget, convention: Convention) -> tuple[PublicShape, dict[str, Tensor]]:
-    """The shape and tensors of a public drafter's folder (config.json, model.safetensors). Its copy of the embeddings
-    is left out: drafts are made with the target's.
+    """Return shape and tensors of a public drafter's folder, without its copy of the embeddings.
 
     Raises:
-        CheckpointError: an incomplete, damaged or pickled folder, or a drafter of another width than the target's.
+        CheckpointError: An incomplete, damaged or pickled folder, or a drafter of another width than the target's.
     """
     config, pickled = folder / CONFIG, folder / "pytorch_model.bin"
     language = read(Language, read_json(config), str(config), tolerant=True)
@@ -132,10 +137,10 @@ def read_public(folder: Path, target: ReadableTarget, convention: Convention) ->
 
 
 def load_public(folder: Path, shape: PublicShape, target: ReadableTarget) -> PublicDrafter:
-    """The drafter in `folder`, frozen, on the target's device.
+    """Return the drafter in `folder`, frozen, on the target's device.
 
     Raises:
-        CheckpointError: the weights are damaged or of another shape.
+        CheckpointError: The weights are damaged or of another shape.
     """
     tensors = load_tensors(folder / WEIGHTS, "drafter")
     layout = {name: tuple(tensor.shape) for name, tensor in tensors.items()}

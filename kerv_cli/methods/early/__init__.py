@@ -1,5 +1,4 @@
-"""The early drafter: the whole chunk from the prompt, before the target's trunk runs (docs/methods.md §5, ours).
-Settings and registration."""
+"""The early drafter: the whole chunk from the prompt, before the target's trunk runs (docs/methods.md §5, ours)."""
 
 from __future__ import annotations
 

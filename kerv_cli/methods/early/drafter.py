@@ -1,8 +1,7 @@
-"""The early drafter: drafts the whole chunk from the encoded prompt, before the target's trunk runs (docs/methods.md
-§5, ours).
+"""The early drafter: network, proposer, training and files (docs/methods.md §5, ours).
 
-It reads the pooled prompt (scene, proprioception, words and vision tokens): a residual network gives every token a few
-features, and one head turns features into bins. Nothing is autoregressive, so a chunk costs one small pass.
+It drafts the whole chunk from the encoded prompt, before the target's trunk runs. A residual network turns the pooled
+prompt into a few features per token, and one head turns features into bins. A chunk costs one small pass.
 """
 
 from __future__ import annotations
@@ -53,16 +52,13 @@ class Block(nn.Module):
         nn.init.zeros_(self.down.weight)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, W) -> (B, W)."""
+        """Return (B, W) of (B, W)."""
         gate, up = self.gate_up(self.norm(x)).chunk(2, -1)
         return x + self.down(F.silu(gate) * up)
 
 
 class EarlyNetwork(Packable):
-    """A residual network from the pooled prompt (F,) to the logits (N, V) of all tokens.
-
-    actions: the action space of its tokens; chunk: H; features: F.
-    """
+    """A residual network from the pooled prompt (F,) to the logits (N, V) of all tokens."""
 
     mean: Tensor
     scale: Tensor
@@ -84,18 +80,18 @@ class EarlyNetwork(Packable):
         self.head = nn.Linear(settings.rank, actions.tokens)
 
     def pack_weights(self) -> PackedEarly | None:
-        """The packed weights of a float32 drafter; None in other number formats."""
+        """Return the packed weights of a float32 drafter; None in other number formats."""
         from kerv_cli.methods.early.packed import PackedEarly  # ONNX Runtime, which a GPU does not need
 
         return PackedEarly(self) if self.mean.dtype == torch.float32 else None
 
     def standardise(self, features: Tensor) -> None:
-        """Takes mean and spread from the training features (n, F)."""
+        """Take mean and spread from the training features (n, F)."""
         self.mean.copy_(features.float().mean(0))
         self.scale.copy_(1.0 / features.float().std(0).clamp_min(1e-3))
 
     def forward(self, features: Tensor) -> Tensor:
-        """pooled prompts (B, F) -> logits (B, N, V)."""
+        """Return the logits (B, N, V) of pooled prompts (B, F)."""
         if self.packed is not None and len(features) == 1:
             return self.packed(features)
         x = self.enter((features - self.mean) * self.scale)
@@ -105,30 +101,41 @@ class EarlyNetwork(Packable):
 
     @torch.inference_mode()
     def draft(self, features: Tensor, radius: int) -> Tensor:
-        """features (B, F) -> N tokens and the odds that all are accepted, (B, N + 1) float64, without a wait for the
-        device. radius: r in bins, see `choose`."""
+        """Return N tokens and the odds that all are accepted, (B, N + 1) float64, without waiting for the device.
+
+        Args:
+            features: Pooled prompts (B, F).
+            radius: r in bins, see `choose`.
+        """
         return self.chosen(self(features.to(self.head.weight.dtype)), radius)
 
     def chosen(self, logits: Tensor, radius: int) -> Tensor:
-        """logits (B, N, V) -> what `draft` gives."""
+        """Return the result of `draft` from logits (B, N, V)."""
         tokens, odds = choose_with_odds(logits, radius, self.strict)
         return torch.cat([tokens.double(), odds.double()[:, None]], -1)
 
 
 def choose(logits: Tensor, radius: int, strict: Tensor) -> Tensor:
-    """logits (B, N, V), strict (N,) bool -> tokens (B, N): the bins that are most likely to be accepted at `radius`.
+    """Return the tokens (B, N) that are most likely to be accepted at a radius.
 
-    The most probable bin is not the one with the most probability within ±radius. Many bins tie within a wide radius;
-    probabilities within a third of it and of the bin itself break the tie, so that accepted tokens stay near the target
-    token. Where `strict`, a token must equal the target's: it is always the most probable one.
+    The most probable bin need not have the most probability within ±radius. Many bins tie within a wide radius. The
+    probabilities within a third of it and of the bin itself break the tie, so that accepted tokens stay near the
+    target's. A strict token must equal the target's: it is the most probable one.
+
+    Args:
+        logits: (B, N, V).
+        radius: In bins.
+        strict: (N,) bool.
     """
     return logits.argmax(-1) if not radius else choose_with_odds(logits, radius, strict)[0]
 
 
 def choose_with_odds(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tensor, Tensor]:
-    """The tokens of `choose`, and the odds (B,): probability that each token lies within `radius` of the target's, the
-    strict ones exactly on it, if the tokens were independent. They are not, and training on soft labels keeps
-    probabilities low: use it to compare chunks, not as a probability."""
+    """Return the tokens of `choose` and the odds (B,) that all of them are accepted.
+
+    The odds assume independent tokens, and training on soft labels keeps them low. Compare chunks by them; they are no
+    probabilities.
+    """
     probability = logits.float().softmax(-1)
     below = F.pad(probability, (radius + 1, radius)).cumsum(-1)  # one sum for both radii
     near, best = _between(below, radius, radius, logits.shape[-1]), logits.argmax(-1)
@@ -141,20 +148,20 @@ def choose_with_odds(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tenso
 
 
 def _between(below: Tensor, pad: int, radius: int, bins: int) -> Tensor:
-    """below (…, V + 2 pad + 1): cumulated probability -> that of lying at most `radius` ≤ pad bins away (…, V)."""
+    """Return the probability within `radius` ≤ pad bins (…, V), from the cumulated one (…, V + 2 pad + 1)."""
     return below[..., pad + radius + 1 :][..., :bins] - below[..., pad - radius :][..., :bins]
 
 
 def radius_of(chunks: Sequence[Chunk]) -> int:
-    """r of chunks whose limits are equal."""
+    """Return r of chunks whose limits are equal."""
     return max(chunks[0].limits, default=0)
 
 
 class EarlyProposer(ChainProposer):
     """The early drafter's chunk (docs/methods.md §5), drafted once per observation.
 
-    waits: whether the host reads a draft before its verification; otherwise it reads it together with the target's
-    tokens, which on a CPU gains nothing.
+    Attributes:
+        waits: Whether the CPU reads a draft before its verification. On a GPU it reads it with the target's tokens.
     """
 
     name = "early"
@@ -165,29 +172,29 @@ class EarlyProposer(ChainProposer):
         self._drafted: tuple[Chunk, list[int], float] | None = None  # the chunk, its draft and the odds
 
     def drafted(self, chunk: Chunk) -> tuple[list[int], float]:
-        """The draft of the chunk's N tokens, and the odds that all are accepted."""
+        """Return the draft of the chunk's N tokens and the odds that all are accepted."""
         if self._drafted is None or self._drafted[0] is not chunk:
             self.receive(chunk, read(self._rows([chunk])[0])[0])
         assert self._drafted is not None
         return self._drafted[1:]
 
     def _rows(self, chunks: Sequence[Chunk]) -> Tensor:
-        """The drafts of B chunks whose limits are equal, (B, N + 1) as `EarlyNetwork.draft`."""
+        """Return the drafts (B, N + 1) of chunks whose limits are equal, as `EarlyNetwork.draft`."""
         features = torch.cat([self.target.pooled(chunk.prompt) for chunk in chunks])
         return self.early.draft(features, radius_of(chunks))
 
     def on_device(self, chunk: Chunk) -> Tensor | None:
-        """The draft and its odds on the device, (N + 1,); None where the host has them."""
+        """Return the draft and its odds on the GPU, (N + 1,); None if the CPU has them."""
         if self.waits or (self._drafted is not None and self._drafted[0] is chunk):
             return None
         return self._rows([chunk])[0]
 
     def receive(self, chunk: Chunk, numbers: np.ndarray) -> None:
-        """The host has read the vector of `on_device`."""
+        """Take the vector of `on_device` that the CPU has read."""
         self._drafted = chunk, numbers[:-1].astype(np.int64).tolist(), float(numbers[-1])
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """The drafted chain."""
+        """Return the drafted chain."""
         numbers, start = self.on_device(chunk), len(chunk.tokens)
         if numbers is None:
             return super().propose(chunk, depth)
@@ -195,15 +202,15 @@ class EarlyProposer(ChainProposer):
         return Draft(numbers[start : min(chunk.size, start + depth)].long())
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """The drafted tokens behind the committed ones."""
+        """Return the drafted tokens after the committed ones."""
         return [self.drafted(chunk)[0][len(chunk.tokens) : chunk.size][:depth]]
 
     def tokens_of(self, chunks: Sequence[Chunk]) -> list[list[int]]:
-        """The drafts of B chunks whose limits are equal."""
+        """Return the drafts of chunks whose limits are equal."""
         return self._rows(chunks)[:, :-1].long().tolist()
 
     def is_sure(self, chunk: Chunk) -> bool:
-        """Whether the estimate that the whole chunk is accepted reaches SURE."""
+        """Return whether the odds of the whole chunk reach SURE."""
         return self.drafted(chunk)[1] >= SURE
 
 
@@ -235,7 +242,7 @@ class EarlyDrafter(TrainableDrafter):
 
     @classmethod
     def proposer(cls, settings: NoSettings, context: Context) -> EarlyProposer:
-        """proposer=early."""
+        """Build proposer=early."""
         return EarlyProposer(context.artifact(cls.kind), context.target)
 
     @torch.inference_mode()

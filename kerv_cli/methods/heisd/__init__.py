@@ -1,6 +1,8 @@
-"""HeiSD (docs/methods.md §2.1, §4): drafts by retrieval from a datastore, retrieval and the drafter on two sides of a
-boundary, acceptance by kinematic groups, and execution without verification where a stored observation is similar.
-Settings and registration."""
+"""HeiSD (docs/methods.md §2.1, §4): drafts by retrieval, beside the drafter, and skipped verification.
+
+A boundary chooses between retrieval and the drafter. Kinematic groups are accepted as a whole. If a stored observation
+is similar enough, its chunk is executed without verification.
+"""
 
 from __future__ import annotations
 
@@ -54,8 +56,10 @@ add("datastore", "qdrant", "kerv_cli.methods.heisd.qdrant:QdrantIndex", QdrantSe
 
 @dataclass
 class HybridProposerSettings:
-    """HeiSD: retrieval on one side of the boundary, the drafter on the other (§4.4). The paper's five neighbours need
-    about 50 nodes and cost more than they gain here."""
+    """HeiSD: retrieval or the drafter, as the boundary says (§4.4).
+
+    The paper's five neighbours need about 50 nodes and cost more than they gain here.
+    """
 
     kind: str = "hybrid"
     depth: int = number(15, 1, MOST_TOKENS)  # the drafter's, tokens
@@ -127,7 +131,7 @@ add("boundary", "random", _RULES + "Random.build", RandomBoundarySettings, choos
 
 @dataclass
 class SimilaritySkipSettings:
-    """HeiSD: a retrieved chunk whose similarity reaches s_min is executed without a forward of the target's trunk."""
+    """HeiSD: executes a retrieved chunk of at least similarity s_min without a forward of the target's trunk."""
 
     kind: str = "similarity"
     s_min: float | None = number(None, -1e9, 1e9)  # None: the task's, from the calibration
@@ -139,7 +143,7 @@ class SimilaritySkipSettings:
 
 
 def needs_of_similarity(settings: SimilaritySkipSettings) -> tuple[str, ...]:
-    """The datastore, and the calibration where no level is given."""
+    """Return the datastore, and the calibration if no level is given."""
     return ("datastore", "calibration") if settings.s_min is None else ("datastore",)
 
 

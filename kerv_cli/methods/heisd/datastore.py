@@ -1,14 +1,13 @@
-"""The datastore: action chunks of the demonstrations, searched by the target's own encoding of the observation
-(docs/methods.md §4.1; HeiSD).
+"""The datastore: action chunks of the demonstrations, searched by the target's encoding (docs/methods.md §4.1; HeiSD).
 
-The key is the target's own prompt, pooled: of each chosen segment the mean token, L2-normalised, and the whole
-normalised again; optionally projected onto the directions that hold nearly all of the keys. The default is the scene
-segment alone, which holds the vision encoder's object and goal positions together with hand and gripper. On MT10 the
-nearest neighbour by this key in another episode has the most similar chunk; adding pooled patch tokens makes the
-agreement worse. The payload is the expert's next H actions as tokens.
+The key is the target's own prompt, pooled: the mean token of each chosen segment, L2-normalised, and the whole
+normalised again. It may be projected onto the directions that hold nearly all of the keys. The default is the scene
+segment alone: the encoder's positions of object and goal with hand and gripper. On MT10 the nearest neighbour by this
+key in another episode has the most similar chunk; pooled patch tokens make it worse. The stored value is the expert's
+next H actions as tokens.
 
-On disk: `vectors.npy` (rows, d) float32 or float16, `payload.parquet`, `projection.npy` where keys are projected, and
-`manifest.json`; rows by task, seed, step.
+On disk: `vectors.npy` (rows, d) float32 or float16, `payload.parquet`, `projection.npy` if keys are projected, and
+`manifest.json`. Rows are sorted by task, seed and step.
 """
 
 from __future__ import annotations
@@ -51,8 +50,14 @@ class Shard:
 class Manifest:
     """`manifest.json`: the entries' keys and sizes, the target they were made for, and their seeds.
 
-    key: parts of the prompt that are pooled. width: numbers of a key. chunk: H. actions: the target's action space.
-    target, demos, files: SHA-256 of the target's weights, the demonstrations and the files beside this one.
+    Attributes:
+        key: Segments of the prompt that are pooled.
+        width: Numbers of a key.
+        chunk: H.
+        actions: The target's action space.
+        target: Hash of the target's weights.
+        demos: Hash of the demonstrations.
+        files: Name -> hash of the files beside this one.
     """
 
     format: Literal[2]
@@ -70,20 +75,23 @@ class Manifest:
 
     @property
     def content(self) -> str:
-        """SHA-256 over keys, chunks and target; a rebuild from the same target and demonstrations keeps it."""
+        """Hash over keys, chunks and target. A rebuild from the same target and demonstrations keeps it."""
         return content_of(self.key, self.chunk, self.target, self.files)
 
 
 def prompt_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) -> np.ndarray:
-    """prompt (B, P, E) -> keys (B, d) float32 of length 1, on the host; errors as `pooled_key`."""
+    """Return the keys (B, d) float32 of length 1 of prompts (B, P, E), on the CPU.
+
+    The errors are those of `pooled_key`.
+    """
     return pooled_key(prompt, target, segments).cpu().numpy()
 
 
 def pooled_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) -> Tensor:
-    """prompt (B, P, E) -> keys (B, d) float32 of length 1, d = segments · E.
+    """Return the keys (B, d) float32 of length 1 of prompts (B, P, E), with d = segments · E.
 
     Raises:
-        UnknownName: a segment that this target's prompt does not have.
+        UnknownName: A segment that this target's prompt does not have.
     """
     parts = target.segments
     for name in segments:
@@ -98,18 +106,21 @@ def _unit(vectors: Tensor) -> Tensor:
 
 
 def projected(keys: np.ndarray, projection: np.ndarray) -> np.ndarray:
-    """keys (n, d) along the directions projection (d, c) -> (n, c) float32 of length 1."""
+    """Return keys (n, d) along the directions projection (d, c): (n, c) float32 of length 1."""
     vectors = keys @ projection
     units: np.ndarray = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
     return units.astype(np.float32)
 
 
 def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
-    """Checks that all seeds (per task) are training seeds, so that no stored episode has the initial state of an
-    evaluation episode.
+    """Check that no stored episode has the initial state of an evaluation episode.
+
+    Args:
+        seeds: Seeds per task.
+        where: The folder, for the message.
 
     Raises:
-        CheckpointError: one is not.
+        CheckpointError: One is no training seed.
     """
     for task, numbers in seeds.items():
         training = spec_of(task).seeds.training
@@ -122,14 +133,21 @@ def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
 
 
 class Index(Protocol):
-    """Finds candidate rows; it may return more than k, `best` ranks them."""
+    """Finds candidate rows. It may return more than k, because `best` ranks them."""
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Rows, ascending, among which are the task's k best for key (d,) float32; `without`: seed passed over."""
+        """Return rows, ascending, among which are the task's k best for a key.
+
+        Args:
+            key: (d,) float32.
+            task: Full name.
+            k: Number of rows wanted.
+            without: Seed of an episode that is left out.
+        """
 
 
 def best(vectors: np.ndarray, rows: np.ndarray, key: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """The k best of `rows`, ascending -> (rows, scores float32), best first, equal scores in the rows' order.
+    """Return the k best of `rows` (ascending) and their scores float32, best first; equal scores in the rows' order.
 
     The last bit of a float32 product depends on a row's place in the matrix, so rows are compared in float64.
     """
@@ -149,12 +167,20 @@ class ExactIndex:
         digest: str = "",
         settings: object = None,
     ) -> None:
-        """vectors (rows, d) float32, seeds (rows,), shards: task -> rows; digest, settings: read by other searches."""
+        """Keep the vectors.
+
+        Args:
+            vectors: (rows, d) float32.
+            seeds: (rows,) seed of each row's episode.
+            shards: Task -> rows.
+            digest: Hash of the datastore, for other searches.
+            settings: For other searches.
+        """
         self.vectors, self.seeds, self.shards = vectors, seeds, shards
         self.longest = float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """See `Index`. Rows that rounding may have put behind the k-th are among them."""
+        """Return candidate rows, also those that rounding may have put after the k-th."""
         shard = self.shards[task]
         scores = self.vectors[shard] @ key
         if without is not None:
@@ -180,7 +206,7 @@ class Neighbours:
 
 @dataclass(frozen=True)
 class Datastore:
-    """An opened datastore. shards: task -> its rows."""
+    """An opened datastore."""
 
     manifest: Manifest
     vectors: np.ndarray  # (rows, d) float32
@@ -198,14 +224,17 @@ class Datastore:
 
     @classmethod
     def open(cls, folder: Path, description: TargetDescription, search: Any = None) -> Datastore:
-        """The datastore in `folder`, made for the target described.
+        """Open the datastore in `folder`, made for the target described.
 
-        search: settings of the search (registry kind datastore), None for exact search; each finds the same neighbours.
+        Args:
+            folder: Its folder.
+            description: The target's.
+            search: Settings of the search; None for exact search. Each finds the same neighbours.
 
         Raises:
-            CheckpointError: no datastore there, a damaged one, one that was built for another target, other action
+            CheckpointError: No datastore there, a damaged one, one that was built for another target, other action
                 statistics or another chunk length, or from evaluation seeds.
-            UsageError: an unknown backend, one whose packages are not installed, a server that does not answer.
+            UsageError: An unknown search, one whose packages are not installed, or a server that does not answer.
         """
         manifest = DatastoreArtifact().checked(folder, description)
         parts = _arrays(folder, manifest)
@@ -222,24 +251,28 @@ class Datastore:
 
     @property
     def content(self) -> str:
-        """SHA-256 over keys, chunks and target, see `Manifest.content`."""
+        """Hash over keys, chunks and target, see `Manifest.content`."""
         return self.manifest.content
 
     def pooled(self, prompt: Tensor, target: ReadableTarget) -> Tensor:
-        """prompt (1, P, E) of the target -> pooled (p,) float32 for `key_of`, on the device."""
+        """Return the pooled prompt (p,) float32 for `key_of`, on the device; prompt (1, P, E)."""
         return pooled_key(prompt, target, self.manifest.key)[0]
 
     def key_of(self, pooled: np.ndarray) -> np.ndarray:
-        """pooled (p,) float32 -> (d,) float32."""
+        """Return the key (d,) float32 of a pooled prompt (p,)."""
         return pooled if self.projection is None else projected(pooled[None], self.projection)[0]
 
     def query(self, key: np.ndarray, task: str, k: int, without: int | None = None) -> Neighbours:
-        """Exact search among the entries of `task`: key (d,) -> its k nearest (all, where there are fewer).
+        """Return the k nearest entries of a task, or all if there are fewer.
 
-        without: seed of an episode that is passed over, for leave-one-episode-out measurements.
+        Args:
+            key: (d,).
+            task: Full name.
+            k: Number of entries.
+            without: Seed of an episode that is left out, for leave-one-episode-out measurements.
 
         Raises:
-            UnknownName: a task that the datastore does not hold.
+            UnknownName: A task that the datastore does not hold.
         """
         if task not in self.shards:
             raise UnknownName("task of the datastore", task, self.shards)
@@ -251,7 +284,7 @@ class Datastore:
 
 
 def _arrays(folder: Path, manifest: Manifest) -> dict[str, Any]:
-    """Reads a datastore's files and checks them against its manifest."""
+    """Read a datastore's files and check them against its manifest."""
     try:
         vectors = np.load(folder / VECTORS).astype(np.float32, copy=False)
         payload = _read_payload(folder / PAYLOAD)
@@ -283,19 +316,19 @@ class DatastoreArtifact(Artifact[Manifest]):
     schema = Manifest
 
     def json(self, path: Path) -> Path:
-        """`manifest.json`."""
+        """Return the path of `manifest.json`."""
         return path / "manifest.json"
 
     def read(self, path: Path) -> Manifest:
-        """See `Artifact.read`; the seeds must be training seeds."""
+        """Return the manifest. Its seeds must be training seeds."""
         manifest = super().read(path)
         check_seeds({task: shard.seeds for task, shard in manifest.tasks.items()}, path)
         return manifest
 
     def digest(self, path: Path, description: Manifest) -> str:
-        """`Manifest.content`."""
+        """Return `Manifest.content`."""
         return description.content
 
     def load(self, path: Path, request: Request) -> Datastore:
-        """The datastore, opened."""
+        """Return the datastore, opened."""
         return Datastore.open(path, request.description, request.search)

@@ -63,7 +63,7 @@ class QdrantIndex:
                 self.client.upload_collection(self.name, vectors[rows], payloads, rows, wait=True)
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """See `Index`."""
+        """Return candidate rows, see `Index`."""
         m, shard = self.models, self.shards[task]
         must = [m.FieldCondition(key="task", match=m.MatchValue(value=task))]
         other = [] if without is None else [m.FieldCondition(key="seed", match=m.MatchValue(value=without))]

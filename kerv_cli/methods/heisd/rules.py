@@ -1,8 +1,8 @@
 """HeiSD's proposers, acceptance rules, verify-skip and boundaries (docs/methods.md §2.1, §4.2 to §4.4).
 
-A boundary chooses the side that drafts, retrieval or the drafter. R is the radius of curvature of the measured
-end-effector path, D its length. A straight, fast reach (large R, large D) repeats demonstrated motion; a tight or slow
-path is precise work, for which the drafter is better.
+A boundary chooses who drafts: retrieval or the drafter. R is the radius of curvature of the hand's measured path, D its
+length. A straight, fast reach (large R, large D) repeats demonstrated motion. A tight or slow path is precise work, for
+which the drafter is better.
 """
 
 from __future__ import annotations
@@ -59,14 +59,19 @@ def neighbour_tree(
     depth: int | None = None,
     cross: float = CROSS,
 ) -> Draft:
-    """The neighbours' chunks behind `start` committed tokens as one tree by kinematic group (docs/methods.md §4.2).
+    """Return the neighbours' chunks after `start` committed tokens as one tree by kinematic group (§4.2).
 
-    chunks: (k, N) tokens, best neighbour first. A path is made of whole groups: behind each it may go on with any
-    neighbour's next one, but a group of strict DoFs always comes from a neighbour that has the group before it, too.
-    The tree has at most `nodes` nodes and reaches `depth` tokens deep (default: to the chunk's end).
+    A path consists of whole groups. After each it may go on with any neighbour's next group. But a group of strict DoFs
+    always comes from a neighbour that has the group before it too. The most probable groups are kept (*ours*): the i-th
+    neighbour weighs 1 / i, and a path changes to other neighbours with probability `cross`.
 
-    Within `nodes` the most probable groups are kept (*ours*): the i-th neighbour weighs 1 / i, and a path changes to
-    other neighbours with probability `cross`; 0 merges whole chunks only.
+    Args:
+        chunks: (k, N) tokens, best neighbour first.
+        start: Number of committed tokens.
+        space: The action space.
+        nodes: Most nodes of the tree.
+        depth: Most tokens of a path; None for up to the chunk's end.
+        cross: 0 merges only whole chunks.
     """
     stop = chunks.shape[1] if depth is None else min(chunks.shape[1], start + depth)
     continuations = _Continuations(chunks.tolist(), list(space.segments(start, stop)), cross)
@@ -97,13 +102,15 @@ def neighbour_tree(
 
 @functools.lru_cache(maxsize=4096)
 def _weight(members: int) -> float:
-    """Bit set of neighbours -> sum of their weights; the i-th neighbour, counted from 1, weighs 1 / i."""
+    """Return the summed weight of a bit set of neighbours; the i-th, counted from 1, weighs 1 / i."""
     return sum([1 / (1 + i) for i in range(members.bit_length()) if members >> i & 1])
 
 
 class _Continuations:
-    """The groups that may follow a path. A path is described by two sets of neighbours: `last`, those that have its
-    last group, and `whole`, those among them that have all its groups."""
+    """The groups that may follow a path.
+
+    Two bit sets of neighbours describe a path: `last` have its last group, and `whole` among them have all its groups.
+    """
 
     def __init__(self, rows: list[list[int]], cuts: list[tuple[int, int, bool]], cross: float) -> None:
         self.everyone = (1 << len(rows)) - 1
@@ -117,7 +124,7 @@ class _Continuations:
             self.levels.append((strict, list(givers.items())))
 
     def on(self, level: int, last: int, whole: int) -> Iterator[tuple[float, tuple[int, ...], int, int]]:
-        """Yields (−log probability, the group's tokens, the two sets of the lengthened path), best neighbour first."""
+        """Yield (−log probability, the group's tokens, the two sets of the longer path), best neighbour first."""
         if level == len(self.levels):
             return
         strict, givers = self.levels[level]
@@ -135,7 +142,7 @@ class _Continuations:
 
 
 def _shared(children: Mapping[tuple[int, int], int], node: int, group: Sequence[int]) -> int:
-    """Number of the group's leading tokens that the tree already has below `node`."""
+    """Return how many of the group's leading tokens the tree already has below `node`."""
     for depth, token in enumerate(group):
         if (node, token) not in children:
             return depth
@@ -155,18 +162,18 @@ class RetrievalProposer(ChainProposer):
 
     @classmethod
     def build(cls, settings: RetrievalProposerSettings | HybridProposerSettings, context: Context) -> RetrievalProposer:
-        """proposer=retrieval, and retrieval's side of hybrid."""
+        """Build proposer=retrieval, and retrieval's part of proposer=hybrid."""
         return cls(context.artifact("datastore"), context.target, settings.neighbours, settings.nodes)
 
     def neighbours(self, chunk: Chunk) -> Neighbours:
-        """The task's nearest entries to this observation; searched once per chunk. Sets `chunk.similarity`."""
+        """Return the task's entries nearest to this observation, searched once per chunk. Sets `chunk.similarity`."""
         if self._nearest is None or self._nearest[0] is not chunk:
             self._search(chunk, read(self.datastore.pooled(chunk.prompt, self.target))[0])
         assert self._nearest is not None
         return self._nearest[1]
 
     def prepare(self, chunk: Chunk) -> None:
-        """Adds the pooled prompt, which the search key is made of, to `chunk.reads`."""
+        """Add the pooled prompt, which the search key is made of, to `chunk.reads`."""
         if not self.waits and (self._nearest is None or self._nearest[0] is not chunk):
             vector = self.datastore.pooled(chunk.prompt, self.target)
             chunk.reads.append((vector, lambda pooled: self._search(chunk, pooled)))
@@ -177,19 +184,22 @@ class RetrievalProposer(ChainProposer):
         chunk.similarity = float(self._nearest[1].similarity[0])
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """The neighbours' chunks as one tree, merged by kinematic group."""
+        """Return the neighbours' chunks as one tree."""
         chunks = self.neighbours(chunk).chunks[:, : chunk.size]
         return neighbour_tree(chunks, len(chunk.tokens), chunk.space, self.nodes, depth)
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Each neighbour's remaining tokens as a chain of its own, best neighbour first."""
+        """Return each neighbour's remaining tokens as a chain, best neighbour first."""
         start = len(chunk.tokens)
         return self.neighbours(chunk).chunks[:, start : min(chunk.size, start + depth)].tolist()
 
 
 class HybridProposer(Proposer):
-    """HeiSD: retrieval on one side of the boundary, the drafter on the other (docs/methods.md §4.4). name: of the side
-    that drafts this chunk."""
+    """HeiSD: lets retrieval or the drafter draft, as the boundary says (docs/methods.md §4.4).
+
+    Attributes:
+        name: Of the one that drafts this chunk.
+    """
 
     needs_states = True
 
@@ -200,83 +210,93 @@ class HybridProposer(Proposer):
 
     @classmethod
     def build(cls, settings: HybridProposerSettings, context: Context) -> HybridProposer:
-        """proposer=hybrid."""
+        """Build proposer=hybrid."""
         return cls(EagleDrafter.proposer(settings, context), RetrievalProposer.build(settings, context))
 
     def prepare(self, chunk: Chunk) -> None:
-        """Takes the side that the boundary chose for this chunk."""
+        """Take the proposer that the boundary chose for this chunk."""
         assert chunk.choice is not None, "a hybrid proposer needs a boundary"
         self.side = self.sides[chunk.choice.mode]
         self.name = self.side.name
         self.side.prepare(chunk)
 
     def begin(self, chunk: Chunk) -> None:
-        """Tells the side that drafts."""
+        """Tell the chosen proposer."""
         self.side.begin(chunk)
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """The draft of the boundary's side."""
+        """Return the draft of the chosen proposer."""
         return self.side.propose(chunk, depth)
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
-        """Tells the side that drafts."""
+        """Tell the chosen proposer."""
         self.side.committed(chunk, first, hidden, target_tokens)
 
 
 @dataclass(frozen=True)
 class GroupRule(DistanceRule):
-    """A kinematic group of one control step is accepted or rejected as a whole; strict DoFs must match. group_limit:
-    summed bias of a group, token_limit: bias of a token, bins."""
+    """Accepts or rejects a kinematic group of one control step as a whole; strict DoFs must match.
+
+    Attributes:
+        group_limit: Largest summed bias of a group, bins.
+        token_limit: Largest bias of a token, bins.
+    """
 
     group_limit: int
     token_limit: int
 
     @classmethod
     def build(cls, settings: SequenceAcceptanceSettings, context: Context) -> GroupRule:
-        """acceptance=sequence."""
+        """Build acceptance=sequence."""
         return cls(context.target.actions, settings.group_limit, settings.token_limit)
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """Largest accepted distance per DoF, bins (D,): `token_limit` whatever r, for strict DoFs 0."""
+        """Return the largest accepted distance per DoF, bins (D,): `token_limit` whatever r, 0 for strict DoFs."""
         return tuple(0 if strict else self.token_limit for strict in self.space.is_strict)
 
     def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
-        """The longest path of whole groups, by `accept_by_group`."""
+        """Return the longest path of whole groups, by `accept_by_group`."""
         limits, bounds = self.limits(r), self.space.bounds
         return accept_by_group(tree, target_tokens, start, limits, group_limit=self.group_limit, bounds=bounds)
 
 
 @dataclass(frozen=True, kw_only=True)
 class HybridRule(RelaxedRule):
-    """Retrieved drafts by group, all others within one radius, as `RelaxedRule`."""
+    """Judges retrieved drafts by group, all others within one radius."""
 
     retrieved: GroupRule
 
     def of_drafts_from(self, proposer: str) -> Acceptance:
-        """The rule for drafts of `proposer`."""
+        """Return the rule for drafts of `proposer`."""
         return self.retrieved if proposer == "retrieval" else self
 
 
 def by_proposer(settings: HybridAcceptanceSettings, context: Context) -> HybridRule:
-    """acceptance=hybrid."""
+    """Build acceptance=hybrid."""
     space = context.target.actions
     by_group = GroupRule(space, settings.group_limit, settings.token_limit)
     return HybridRule(space, settings.strict_dofs, retrieved=by_group)
 
 
 class VerifySkip(Skip):
-    """Executes the best neighbour's chunk without verification where its similarity is at least s_min.
+    """Executes the best neighbour's chunk without verification if its similarity is at least s_min.
 
-    At most `max_skips` decodes in a row; where a boundary decides, only on retrieval's side; and after a stored episode
-    was followed to its end, none of its chunks is executed unverified again in this episode. With `up` or `down` above
-    0 s_min carries over between episodes: after a failure it rises by `up` times the calibrated range, after a success
-    it falls by `down` times it. Results then depend on the order of episodes and on the evaluator's flag.
+    It does so for at most `max_skips` decodes in a row, and with a boundary only where retrieval drafts. After a stored
+    episode was followed to its end, none of its chunks is executed unverified again in this episode. With `up` or
+    `down` above 0, s_min carries over between episodes: a failure raises it by `up` times the calibrated range, a
+    success lowers it by `down` times. Results then depend on the order of episodes and on the evaluator's success flag.
     """
 
     def __init__(
         self, settings: SimilaritySkipSettings, retrieval: RetrievalProposer, levels: tuple[float, float, float]
     ) -> None:
-        """levels: the task's s_min between the bounds within which feedback moves it, cosines: (low, s_min, high)."""
+        """Start with the calibrated level.
+
+        Args:
+            settings: Those of skip=similarity.
+            retrieval: Finds the neighbours.
+            levels: The task's (low, s_min, high), cosines. Feedback moves s_min between low and high.
+        """
         self.settings, self.retrieval = settings, retrieval
         self.low, self.s_min, self.high = levels
         self.in_a_row = 0
@@ -284,7 +304,7 @@ class VerifySkip(Skip):
 
     @classmethod
     def build(cls, settings: SimilaritySkipSettings, context: Context) -> VerifySkip:
-        """skip=similarity; it shares the retrieval of the method's proposer, where that retrieves."""
+        """Build skip=similarity. It shares the retrieval of the method's proposer, if that retrieves."""
         proposer: Proposer | None = context.built["proposer"]
         retrieval = proposer.sides["retrieval"] if isinstance(proposer, HybridProposer) else proposer
         if not isinstance(retrieval, RetrievalProposer):
@@ -294,18 +314,18 @@ class VerifySkip(Skip):
         return cls(settings, retrieval, context.calibration.skip_levels(context.task, retrieval.datastore.content))
 
     def begin(self, task: str, seed: int) -> None:
-        """An episode begins."""
+        """Begin an episode."""
         self.in_a_row = 0
         self.ended.clear()
 
     def finish(self, success: bool) -> None:
-        """An episode ended."""
+        """End an episode."""
         span = self.high - self.low
         s_min = self.s_min + span * (-self.settings.down if success else self.settings.up)
         self.s_min = min(self.high, max(self.low, s_min))
 
     def take(self, chunk: Chunk) -> bool:
-        """Fills the chunk with the best neighbour's tokens if it may be executed unverified -> whether it did."""
+        """Fill the chunk with the best neighbour's tokens if it may be executed unverified -> whether it did."""
         if chunk.choice is not None and chunk.choice.mode != "retrieval":
             self.in_a_row = 0
             return False
@@ -322,11 +342,12 @@ class VerifySkip(Skip):
 
 
 def radius_of_curvature(points: np.ndarray) -> float:
-    """Radius in metres of the circle through points (n, 3); infinite where there is no circle.
+    """Return the radius in metres of the circle through points (n, 3); infinite if there is no circle.
 
-    The best-fit plane by singular values, in it Taubin's algebraic circle fit, which is exact on arcs. Centred and
-    scaled to unit mean square, the fit's smallest singular vector (a, b, c) over [(z − 1) / 2, x, y], z = x² + y²,
-    gives R = scale / |a|. Infinite for fewer than three points, a hand at rest and a straight line.
+    The points are projected onto their best plane by singular values, then fitted by Taubin's algebraic method, which
+    is exact on arcs. Centred and scaled to unit mean square, the fit's smallest singular vector (a, b, c) over [(z − 1)
+    / 2, x, y] with z = x² + y² gives R = scale / |a|. Fewer than three points, a hand at rest and a straight line have
+    no circle.
     """
     points = np.asarray(points, dtype=np.float64)
     if len(points) < LEAST:
@@ -347,10 +368,10 @@ def radius_of_curvature(points: np.ndarray) -> float:
 class BoundaryRanges:
     """Ranges of R and D over the training demonstrations: minimum and 95th percentile, metres.
 
-    Infinite radii (straight lines, a hand at rest) are left out: one straight reach would make every other radius zero.
+    Infinite radii are left out: one straight reach would make every other radius zero.
 
     Raises:
-        CheckpointError: no range between finite numbers.
+        CheckpointError: No range between finite numbers.
     """
 
     radius_low: float
@@ -365,12 +386,14 @@ class BoundaryRanges:
 
     @classmethod
     def fit(cls, paths: Iterable[np.ndarray], window: int) -> BoundaryRanges:
-        """Ranges over every window that decoding would see, including the short ones at an episode's beginning.
+        """Return the ranges over every window that decoding would see, also the short ones at an episode's beginning.
 
-        paths: (T, 3) measured positions of whole episodes, metres.
+        Args:
+            paths: (T, 3) measured positions of whole episodes, metres.
+            window: Positions of a window.
 
         Raises:
-            CheckpointError: no path bends, or none moves.
+            CheckpointError: No path bends, or none moves.
         """
         measured = []
         for path in paths:
@@ -385,54 +408,59 @@ class BoundaryRanges:
         return cls(float(radii.min()), next(high), float(lengths.min()), next(high))
 
     def normalise(self, radius: float, length: float) -> tuple[float, float]:
-        """(R̂, D̂) in [0, 1], clipped. R̂ is 1 for an infinite radius of a moving hand (a straight reach) and 0 for a hand
-        at rest, whose radius is infinite too."""
+        """Return (R̂, D̂), clipped to [0, 1].
+
+        R̂ is 1 for a straight reach and 0 for a hand at rest, both of infinite radius.
+        """
         scaled = 0.0
         if length >= STILL:
             scaled = min(1.0, max(0.0, (radius - self.radius_low) / (self.radius_high - self.radius_low)))
         return scaled, min(1.0, max(0.0, (length - self.length_low) / (self.length_high - self.length_low)))
 
     def fused(self, radius: float, length: float, alpha: float) -> float:
-        """F = α·R̂ + (1 − α)·D̂, in [0, 1]."""
+        """Return F = α·R̂ + (1 − α)·D̂, in [0, 1]."""
         radius, length = self.normalise(radius, length)
         return alpha * radius + (1 - alpha) * length
 
 
 class Seeded:
-    """Base of all boundaries: the episode's generator."""
+    """Base of boundaries."""
 
     seed = 0
 
     def numbers(self, task: str, seed: int) -> np.random.Generator:
-        """The generator of an episode; depends on the boundary's seed, task and episode seed alone."""
+        """Return an episode's generator. It depends on the boundary's seed, the task and the episode's seed alone."""
         return np.random.default_rng([self.seed, zlib.crc32(task.encode()), seed])
 
 
 @dataclass(frozen=True)
 class Random(Seeded):
-    """Retrieval with probability p, without looking at the path: a control; 1 and 0 are one side for all chunks."""
+    """Retrieval with probability p, without looking at the path: a control.
+
+    With 1 and 0 one proposer drafts all chunks.
+    """
 
     p: float
     seed: int = 0
 
     @classmethod
     def build(cls, settings: RandomBoundarySettings, context: Context) -> Random:
-        """boundary=random."""
+        """Build boundary=random."""
         return cls(settings.p, settings.seed)
 
     @classmethod
     def always(cls, settings: NoSettings, context: Context) -> Random:
-        """boundary=always_retrieval, always_drafter."""
+        """Build boundary=always_retrieval or always_drafter."""
         return cls(float(settings.kind == "always_retrieval"))
 
     def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
-        """Retrieval with probability p, else the drafter."""
+        """Choose retrieval with probability p, else the drafter."""
         return Choice("retrieval" if rng.random() < self.p else "drafter")
 
 
 @dataclass(frozen=True)
 class Fused(Seeded):
-    """F ≥ F* → retrieval; fewer than three positions → drafter."""
+    """Retrieval if F ≥ F*; the drafter with fewer than three positions."""
 
     ranges: BoundaryRanges
     alpha: float
@@ -441,12 +469,12 @@ class Fused(Seeded):
 
     @classmethod
     def build(cls, settings: FusedBoundarySettings, context: Context) -> Fused:
-        """boundary=fused."""
+        """Build boundary=fused."""
         ranges = context.calibration.ranges(settings.window)
         return cls(ranges, settings.alpha, settings.window, settings.f_star)
 
     def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
-        """The side by F of the path's newest `window` positions (m, 3), metres, and F."""
+        """Choose by F of the path's newest `window` positions (m, 3), metres."""
         points = np.asarray(path)[-self.window :]
         if len(points) < LEAST:
             return Choice("drafter")

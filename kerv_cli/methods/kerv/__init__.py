@@ -1,5 +1,4 @@
-"""KERV (docs/methods.md §3): kinematic predictions as drafts, a prediction instead of decoding on after a rejection,
-and thresholds that follow the motion. Settings and registration, and the thresholds, which need nothing heavy."""
+"""KERV (docs/methods.md §3): a kinematic prediction after a rejection, and thresholds that follow the motion."""
 
 from __future__ import annotations
 
@@ -43,10 +42,10 @@ DRAFT = "draft"
 
 
 def find_predictor(name: str) -> Part:
-    """Return the proposer that predicts under this name. Fills in as well as drafts.
+    """Return the proposer whose predictor has this name.
 
     Raises:
-        UnknownName: No proposer of that name has a predictor.
+        UnknownName: There is none.
     """
     predictors = {key: part for key, part in parts("proposer").items() if "predictor" in part.traits}
     if name not in predictors:
@@ -71,7 +70,12 @@ class CompensateSettings:
 
 
 def check_compensate(settings: CompensateSettings) -> None:
-    """Raises UnknownName for a predictor that does not exist, UsageError for one that lacks the target's token."""
+    """Refuse a predictor that does not exist or that would lack the target's token.
+
+    Raises:
+        UnknownName: There is no such predictor.
+        UsageError: It needs the target's token.
+    """
     if settings.predictor != DRAFT:
         find_predictor(settings.predictor)
     elif not settings.use_target_token:
@@ -81,7 +85,7 @@ def check_compensate(settings: CompensateSettings) -> None:
 
 
 def needs_of_compensation(settings: CompensateSettings) -> tuple[str, ...]:
-    """What the predictor reads."""
+    """Return what the predictor reads."""
     return () if settings.predictor == DRAFT else find_predictor(settings.predictor).needs(None)
 
 
@@ -94,8 +98,10 @@ add("rectifier", "compensate", *_compensation, needs_of_compensation, check_comp
 
 @dataclass
 class KinematicThresholdSettings:
-    """KERV: the radius follows the kinematic variability K of the decode before. `change`: it moves against the change
-    of K (ablation)."""
+    """KERV: the radius follows the kinematic variability K of the decode before.
+
+    `change` is an ablation: the radius moves against the change of K.
+    """
 
     kind: str = "kinematic"
     r_min: int = number(5, 0, MOST_BINS)
@@ -116,7 +122,11 @@ class ScheduleThresholdSettings:
 
 
 def check_radii(settings: KinematicThresholdSettings | ScheduleThresholdSettings) -> None:
-    """Raises UsageError for radii that are negative or not in order."""
+    """Refuse radii that are negative or not in order.
+
+    Raises:
+        UsageError: They are.
+    """
     if not 0 <= settings.r_min <= settings.r_max:
         raise UsageError(
             f"threshold.r_min={settings.r_min} threshold.r_max={settings.r_max}: bins from 0 on, r_min not above r_max"
@@ -124,12 +134,12 @@ def check_radii(settings: KinematicThresholdSettings | ScheduleThresholdSettings
 
 
 def needs_of_variability(settings: KinematicThresholdSettings) -> tuple[str, ...]:
-    """The calibration, where no reference level is given."""
+    """Return the calibration if no reference level is given."""
     return ("calibration",) if settings.k_s is None else ()
 
 
 class Kinematic:
-    """r = r_min + (r_max − r_min) · exp(−(K / K_S)^φ) of the last decode that compared anything (KERV, level form).
+    """KERV, level form: r = r_min + (r_max − r_min) · exp(−(K / K_S)^φ), K of the last decode that compared anything.
 
     An episode begins at K = K_S, the reference level.
     """
@@ -140,29 +150,29 @@ class Kinematic:
 
     @classmethod
     def build(cls, settings: KinematicThresholdSettings, context: Context) -> Self:
-        """threshold=kinematic, change; K_S is the task's, from the calibration, where none is given.
+        """Build threshold=kinematic or change. K_S is the task's, from the calibration, if none is given.
 
         Raises:
-            UsageError: a radius above the largest distance of two tokens.
+            UsageError: A radius above the largest distance of two tokens.
         """
         context.check_radius("r_max", settings.r_max)
         k_s = settings.k_s if settings.k_s is not None else context.calibration.k_s(context.task)
         return cls(settings.r_min, settings.r_max, settings.phi, k_s)
 
     def reset(self) -> None:
-        """r as after a decode with K = K_S."""
+        """Set r as after a decode with K = K_S."""
         self.r = self.level(self.k_s)
 
     def level(self, variability: float) -> float:
-        """K in normalised action units -> r, not rounded."""
+        """Return r, not rounded, for K in normalised action units."""
         return falling(self.r_min, self.r_max, variability / self.k_s, self.phi)
 
     def radius(self) -> int:
-        """r rounded to the nearest bin."""
+        """Return r rounded to the nearest bin."""
         return nearest(self.r)
 
     def update(self, variability: float | None) -> None:
-        """Sets r from K; a decode without K leaves it."""
+        """Set r from K. A decode without K leaves it."""
         if variability is not None:
             self.r = self.level(variability)
 
@@ -171,16 +181,16 @@ class Change(Kinematic):
     """Ablation: r shrinks when K grows and grows when K shrinks.
 
     r ← clamp(r − (r_max − r_min) · sign(Δ) · (1 − exp(−|Δ / K_S|^φ)), r_min, r_max), Δ = K_t − K_{t−1} over decodes
-    that compared something. An episode begins where `Kinematic` does, with K_{t−1} = K_S.
+    that compared something. An episode begins with K_{t−1} = K_S.
     """
 
     def reset(self) -> None:
-        """r as after a decode with K = K_S, which is also the K to compare with."""
+        """Set r as after a decode with K = K_S, which is also the K to compare with."""
         super().reset()
         self.last = self.k_s
 
     def update(self, variability: float | None) -> None:
-        """Moves r against the change of K; a decode without K leaves it."""
+        """Move r against the change of K. A decode without K leaves it."""
         if variability is None:
             return
         change = (variability - self.last) / self.k_s
@@ -190,9 +200,9 @@ class Change(Kinematic):
 
 
 class Schedule:
-    """r(t) = r_min + (r_max − r_min) · exp(−(t / τ)^φ), t decodes into the episode: open loop.
+    """Open loop: r(t) = r_min + (r_max − r_min) · exp(−(t / τ)^φ), t decodes into the episode.
 
-    KERV's public code has 3 + 12 · exp(−(t / τ)^3): r_min 3, r_max 15, φ 3, the defaults here.
+    The defaults are KERV's public code: 3 + 12 · exp(−(t / τ)^3).
     """
 
     def __init__(self, r_min: int, r_max: int, phi: float, tau: float) -> None:
@@ -201,25 +211,25 @@ class Schedule:
 
     @classmethod
     def build(cls, settings: ScheduleThresholdSettings, context: Context) -> Schedule:
-        """threshold=schedule; errors as `Kinematic.build`."""
+        """Build threshold=schedule. The errors are those of `Kinematic.build`."""
         context.check_radius("r_max", settings.r_max)
         return cls(settings.r_min, settings.r_max, settings.phi, settings.tau)
 
     def reset(self) -> None:
-        """Starts again at t = 0."""
+        """Start again at t = 0."""
         self.decodes = 0
 
     def radius(self) -> int:
-        """r(t) rounded to the nearest bin."""
+        """Return r(t) rounded to the nearest bin."""
         return nearest(falling(self.r_min, self.r_max, self.decodes / self.tau, self.phi))
 
     def update(self, variability: float | None) -> None:
-        """t grows by one; K is not used."""
+        """Increase t. K is not used."""
         self.decodes += 1
 
 
 def falling(low: float, high: float, x: float, phi: float) -> float:
-    """low + (high − low) · exp(−x^φ): `high` at x ≤ 0, falling to `low`."""
+    """Return low + (high − low) · exp(−x^φ): `high` at x ≤ 0, falling to `low`."""
     if x <= 0:
         return float(high)
     power = math.exp(min(700.0, phi * math.log(x)))  # x^φ without overflow; exp(−e^700) is zero
@@ -227,7 +237,7 @@ def falling(low: float, high: float, x: float, phi: float) -> float:
 
 
 def nearest(r: float) -> int:
-    """r rounded to the nearest bin, halves up."""
+    """Return r rounded to the nearest bin, halves up."""
     return math.floor(r + 0.5)
 
 

@@ -1,9 +1,7 @@
-"""Kinematic prediction of the next actions from the last ones, as a draft, and after a rejection instead of decoding on
-(docs/methods.md §3.1, KERV §3).
+"""Kinematic prediction of the next actions: as a draft, and after a rejection (docs/methods.md §3.1).
 
-Every predictor here is a fixed linear function of its window for given noise and window length. The weights are
-computed once; predicting is one small matrix product.
-Actions are normalised to [-1, 1], one control step is the unit of time.
+Every predictor is a fixed linear function of its window, for a given noise and window length. The weights are computed
+once; a prediction is one small matrix product. Actions are normalised to [-1, 1]. The unit of time is a control step.
 """
 
 from __future__ import annotations
@@ -26,11 +24,14 @@ HORIZON = 8  # steps ahead that weights are computed for
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of a Kalman filter per DoF; entries of strict DoFs are not used, because those are held.
+    """Noise of a Kalman filter per DoF. Strict DoFs are held, so their entries are not used.
 
-    q: variance of the random acceleration in one step. r: variance of the observation. Only their ratio matters,
-    because the prior is scaled by r. damping: share of the velocity that is left after one step; 1 is the paper's
-    constant velocity, less is *ours*.
+    Only the ratio of q and r matters, because the prior is scaled by r.
+
+    Attributes:
+        q: Variance of the random acceleration in one step.
+        r: Variance of the observation.
+        damping: Share of the velocity that is left after one step; 1 is the paper's constant velocity, less is *ours*.
     """
 
     q: tuple[float, ...]
@@ -39,21 +40,21 @@ class Noise:
 
     @classmethod
     def uniform(cls, dofs: int, q: float) -> Noise:
-        """One q for all DoFs, r = 1, no damping."""
+        """Return one q for all DoFs, r = 1, no damping."""
         return cls((q,) * dofs, (1.0,) * dofs, (1.0,) * dofs)
 
 
 def transition_of(damping: float) -> np.ndarray:
-    """F of the state [a, ȧ], discrete white noise, dt = 1."""
+    """Return F of the state [a, ȧ], discrete white noise, dt = 1."""
     return np.array([[1.0, damping], [0.0, damping]])
 
 
 @functools.lru_cache(maxsize=64)
 def filter_state(ratio: float, window: int, damping: float) -> np.ndarray:
-    """The filter's state after `window` actions (2, window): column i is what action i contributes.
+    """Return the filter's state after `window` actions, (2, window): column i is what action i contributes.
 
-    ratio: q / r. The filter begins on the first action with state [a₀, 0] and covariance r · I; it then predicts
-    and updates once per further action.
+    The filter begins on the first action with state [a₀, 0] and covariance r · I. It predicts and updates once per
+    further action. `ratio` is q / r.
     """
     from filterpy.kalman import KalmanFilter
 
@@ -73,46 +74,57 @@ def filter_state(ratio: float, window: int, damping: float) -> np.ndarray:
 
 
 def kalman_weights(q: float, r: float, window: int, horizon: int, damping: float = 1.0) -> np.ndarray:
-    """(horizon, window): row h − 1 times the window, oldest first, is the filter's prediction h steps ahead."""
+    """Return (horizon, window): row h − 1 times the window, oldest first, is the prediction h steps ahead."""
     transition = transition_of(damping)
     state = filter_state(q / r, window, damping)
     return np.stack([(np.linalg.matrix_power(transition, h) @ state)[0] for h in range(1, horizon + 1)])
 
 
 class Predictor:
-    """Predicts the next actions from the last ones; strict DoFs are held at their last value."""
+    """Predicts the next actions from the last ones. Strict DoFs are held at their last value.
+
+    Attributes:
+        least: Actions without which the weights are not defined.
+    """
 
     name = ""
     least = 1  # actions without which the weights are not defined
 
     def __init__(self, held: np.ndarray, minimum: int = MINIMUM, window: int = WINDOW, horizon: int = HORIZON) -> None:
-        """held: (D,) bool, DoFs that are never extrapolated. minimum: actions without which predict() gives None."""
+        """Compute the weights.
+
+        Args:
+            held: (D,) bool, DoFs that are never extrapolated.
+            minimum: Fewer actions give no prediction.
+            window: Most actions that count.
+            horizon: Most steps ahead.
+        """
         self.held, self.dofs = np.asarray(held, dtype=bool), len(held)
         self.minimum, self.window, self.horizon = minimum, window, horizon
         self.tables = {m: self._table(m) for m in range(minimum, window + 1)}
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """(horizon, window) of one DoF; here all weight on the newest action."""
+        """Return (horizon, window) of one DoF; here all weight is on the newest action."""
         weights = np.zeros((self.horizon, window))
         weights[:, -1] = 1.0
         return weights
 
     def _table(self, window: int) -> np.ndarray:
-        """(D, horizon, window)."""
+        """Return the weights (D, horizon, window)."""
         last = Predictor.weights(self, 0, window)
         return np.stack([last if self.held[dof] else self.weights(dof, window) for dof in range(self.dofs)])
 
     def predict(self, history: np.ndarray, steps: int) -> np.ndarray | None:
-        """history (m, D) in [-1, 1], oldest first, its last `window` count -> (steps, D) in [-1, 1].
+        """Return the next `steps` actions (steps, D) in [-1, 1]; None for a history shorter than `minimum`.
 
-        None when the history is shorter than `minimum`.
+        history (m, D) is oldest first.
         """
         if len(history) < self.minimum:
             return None
         return self.predict_many(np.asarray(history, dtype=np.float64)[None], steps)[0]
 
     def predict_many(self, histories: np.ndarray, steps: int) -> np.ndarray:
-        """(B, m, D) with m ≥ `minimum` -> (B, steps, D)."""
+        """Return (B, steps, D) of histories (B, m, D) with m ≥ `minimum`."""
         past = histories[:, -self.window :]
         table = self.tables[past.shape[1]][:, :steps]
         predicted: np.ndarray = np.einsum("dhm,bmd->bhd", table, past)
@@ -132,7 +144,7 @@ class Linear(Predictor):
     least = 2
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """(horizon, window): 1 + h on the newest action, −h on the one before, for h steps ahead."""
+        """Return (horizon, window): 1 + h on the newest action, −h on the one before, for h steps ahead."""
         ahead = np.arange(1, self.horizon + 1)
         weights = np.zeros((self.horizon, window))
         weights[:, -1], weights[:, -2] = 1 + ahead, -ahead
@@ -140,7 +152,7 @@ class Linear(Predictor):
 
 
 class Kalman(Predictor):
-    """A Kalman filter per DoF (docs/methods.md §3.1), run from the window's first action; see `kalman_weights`."""
+    """A Kalman filter per DoF (docs/methods.md §3.1), run from the window's first action."""
 
     name = "kalman"
     least = 2
@@ -157,13 +169,13 @@ class Kalman(Predictor):
         super().__init__(held, minimum, window, horizon)
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """(horizon, window) of the filter with this DoF's noise, see `kalman_weights`."""
+        """Return (horizon, window) of the filter with this DoF's noise."""
         q, r, damping = self.noise.q[dof], self.noise.r[dof], self.noise.damping[dof]
         return kalman_weights(q, r, window, self.horizon, damping)
 
 
 class Damped(Kalman):
-    """Kalman filter whose velocity is damped in every step (*ours*): actions are bounded, so no slope lasts."""
+    """A Kalman filter whose velocity is damped in every step (*ours*): actions are bounded, so no slope lasts."""
 
     name = "damped"
 
@@ -181,8 +193,15 @@ def build_predictor(
     window: int = WINDOW,
     horizon: int = HORIZON,
 ) -> Predictor:
-    """The predictor `kind`; held: (D,) bool, DoFs that keep their last value; `noise` holds the fitted noise of each
-    kind of filter.
+    """Return the predictor `kind`.
+
+    Args:
+        kind: Its name.
+        held: (D,) bool, DoFs that keep their last value.
+        noise: Fitted noise of each kind of filter.
+        minimum: As `Predictor`, like the next two.
+        window: Most actions that count.
+        horizon: Most steps ahead.
     """
     if kind in PLAIN:
         return PLAIN[kind](held, minimum, window, horizon)
@@ -190,7 +209,7 @@ def build_predictor(
 
 
 def predictor_of(settings: NoSettings, context: Context) -> Predictor:
-    """A kinematic predictor over the target's chunk; a filter's noise comes from the calibration."""
+    """Return a predictor over the target's chunk. A filter's noise comes from the calibration."""
     name, held, horizon = settings.kind, context.target.actions.is_strict, context.target.chunk
     if name in PLAIN:
         return PLAIN[name](held, PLAIN[name].least, horizon=horizon)
@@ -199,19 +218,21 @@ def predictor_of(settings: NoSettings, context: Context) -> Predictor:
 
 
 class PredictionProposer(ChainProposer):
-    """A kinematic prediction of the chunk (docs/methods.md §3.1, §6: `hold`, `kalman`). Committed steps of the chunk
-    count as executed. Drafts nothing while the history is shorter than the predictor's minimum."""
+    """Drafts a kinematic prediction of the chunk (docs/methods.md §3.1, §6: `hold`, `kalman`).
+
+    Committed steps of the chunk count as executed. It drafts nothing while the history is too short.
+    """
 
     def __init__(self, predictor: Predictor) -> None:
         self.name, self.predictor = predictor.name, predictor
 
     @classmethod
     def build(cls, settings: NoSettings, context: Context) -> PredictionProposer:
-        """proposer=hold, linear, kalman, …"""
+        """Build proposer=hold, linear, kalman or damped."""
         return cls(predictor_of(settings, context))
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """The predicted tokens of the chunk's remaining places; none while the history is too short."""
+        """Return the predicted tokens of the chunk's remaining places."""
         whole = len(chunk.tokens) // chunk.dofs
         pending = np.array(chunk.tokens[: whole * chunk.dofs], dtype=np.int64).reshape(whole, chunk.dofs)
         history = chunk.situation.history.values(chunk.space.values_of(pending))
@@ -223,12 +244,12 @@ class PredictionProposer(ChainProposer):
 
 
 class Compensation:
-    """KERV: keep what was accepted, predict the rest of that control step, drop the rest of the chunk.
+    """KERV: keeps what was accepted, predicts the rest of that control step, drops the rest of the chunk.
 
-    With `use_target_token` (ours) the target token at the rejected position is kept too; the verification has computed
-    it already. `steps` (PL) lets the prediction fill further control steps. With `predictor: draft` (ours) the rejected
-    draft's remaining tokens fill first and the prediction only what they lack: unlike a filter, the draft knows the
-    observation. After a compensation there is none for `rest` decodes.
+    With `use_target_token` (ours) the target token at the rejected position is kept too: it is already computed.
+    `steps` (PL) lets the prediction fill further control steps. With `predictor: draft` (ours) the rejected draft's
+    remaining tokens fill first, because the draft knows the observation and a filter does not. After a compensation
+    there is none for `rest` decodes.
     """
 
     def __init__(self, settings: CompensateSettings, predictor: Predictor) -> None:
@@ -237,7 +258,7 @@ class Compensation:
 
     @classmethod
     def build(cls, settings: CompensateSettings, context: Context) -> Compensation:
-        """rectifier=compensate."""
+        """Build rectifier=compensate."""
         name = Hold.name if settings.predictor == DRAFT else settings.predictor
         return cls(settings, load(find_predictor(name).traits["predictor"])(NoSettings(name), context))
 
@@ -247,15 +268,15 @@ class Compensation:
         return self.settings.use_target_token
 
     def reset(self) -> None:
-        """A new episode begins."""
+        """Begin an episode."""
         self.resting = 0
 
     def next_decode(self) -> None:
-        """A decode ended."""
+        """End a decode."""
         self.resting = max(0, self.resting - 1)
 
     def close(self, chunk: Chunk) -> bool:
-        """Ends the chunk after a rejection, if a prediction can fill what is missing -> whether it did."""
+        """End the chunk after a rejection, if a prediction can fill what is missing -> whether it did."""
         if self.resting:
             return False
         tokens = chunk.tokens if self.settings.use_target_token else chunk.tokens[:-1]
@@ -276,10 +297,10 @@ def assemble(
     settings: CompensateSettings,
     drafted: Sequence[int] = (),
 ) -> np.ndarray | None:
-    """Known tokens, then `drafted` ones, then the prediction -> (steps, D) normalised actions; None where the history
-    is too short to predict what is still missing.
+    """Return known tokens, then drafted ones, then the prediction as normalised actions (steps, D).
 
-    A step of which fewer than `min_verified` DoFs are known is dropped, unless nothing would be left.
+    None if the history is too short to predict what is still missing. A step with fewer than `min_verified` known DoFs
+    is dropped, unless nothing would be left.
     """
     dofs, horizon = chunk.dofs, chunk.steps
     whole, part = divmod(len(tokens), dofs)

@@ -1,4 +1,4 @@
-"""Drafts of several sources as one tree (docs/methods.md §5, ours), e.g. of `one_pass`. Settings and registration."""
+"""Drafts of several sources as one tree (docs/methods.md §5, ours), e.g. of `one_pass`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from kerv_cli.base.registry import PREFILL, add, find
 
 @dataclass
 class MergedProposerSettings:
-    """Merges whole drafts of several sources into one prefix tree (§5, ours). The fallback sources draft only where
-    none of the others is sure of its chunk, because every node costs time."""
+    """Merges whole drafts of several sources into one prefix tree (§5, ours).
+
+    The fallback sources draft only if no other is sure of its chunk, because every node costs time.
+    """
 
     kind: str = "merged"
     sources: list[str] = field(default_factory=lambda: ["early"])
@@ -22,7 +24,11 @@ class MergedProposerSettings:
 
 
 def check_merged(settings: MergedProposerSettings) -> None:
-    """Raises UsageError without a source, or for one that cannot draft whole chains before the prefill."""
+    """Refuse settings without a source, or with one that cannot draft whole chains before the prefill.
+
+    Raises:
+        UsageError: One of these.
+    """
     if not settings.sources:
         raise UsageError("merged: name at least one of sources")
     for name in (*settings.sources, *settings.fallback):
@@ -31,7 +37,7 @@ def check_merged(settings: MergedProposerSettings) -> None:
 
 
 def needs_of_sources(settings: MergedProposerSettings) -> tuple[str, ...]:
-    """The artifacts that the sources need together."""
+    """Return the artifacts that the sources need together."""
     names = (*settings.sources, *settings.fallback)
     return tuple(dict.fromkeys(kind for name in names for kind in find("proposer", name).needs(None)))
 

@@ -21,10 +21,10 @@ from kerv_cli.methods.merged import MergedProposerSettings
 
 
 class MergedProposer(ChainProposer):
-    """Merges the chains of several sources into one prefix tree (docs/methods.md §5). At most `nodes` nodes: the last
-    chains are dropped first.
+    """Merges the chains of several sources into one prefix tree of at most `nodes` nodes.
 
-    fallback: sources that draft only where none of the others is sure of its chunk, because every node costs time.
+    If there are too many, the last chains are dropped first. The fallback sources draft only if no other is sure of its
+    chunk.
     """
 
     def __init__(self, sources: Sequence[ChainProposer], nodes: int, fallback: Sequence[ChainProposer] = ()) -> None:
@@ -34,7 +34,7 @@ class MergedProposer(ChainProposer):
 
     @classmethod
     def build(cls, settings: MergedProposerSettings, context: Context) -> MergedProposer:
-        """proposer=merged."""
+        """Build proposer=merged."""
 
         def source(name: str) -> ChainProposer:
             part = find("proposer", name)
@@ -47,12 +47,12 @@ class MergedProposer(ChainProposer):
         return cls(sources, settings.nodes, fallback)
 
     def reset(self) -> None:
-        """Tells the sources."""
+        """Begin an episode."""
         for source in (*self.sources, *self.fallback):
             source.reset()
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """One prefix tree of all sources' chains; fallback sources join where none of the others is sure."""
+        """Return one prefix tree of all chains."""
         draft = self._on_device(chunk, depth)
         if draft is None:
             tree = self._tree(chunk, depth)
@@ -60,7 +60,7 @@ class MergedProposer(ChainProposer):
         return draft
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """The sources' chains, in order; the fallback sources' too where none of the others is sure."""
+        """Return the chains of the sources, and of the fallback sources if no source is sure."""
         sources = list(self.sources)
         if not any(source.is_sure(chunk) for source in sources):
             sources += self.fallback
@@ -77,8 +77,11 @@ class MergedProposer(ChainProposer):
         return tree
 
     def _on_device(self, chunk: Chunk, depth: int) -> Draft | None:
-        """The early draft on the device with the chains of all other sources behind it; the host decides which of them
-        become nodes when it has read the draft. None where the early draft is on the host, or the rows have no room."""
+        """Return the early draft on the GPU followed by the chains of all other sources.
+
+        When the CPU has read the early draft, it decides which rows become nodes. None if the early draft is on the CPU
+        or if the rows have no room.
+        """
         early = next((source for source in self.sources if isinstance(source, EarlyProposer)), None)
         if early is None or (numbers := early.on_device(chunk)) is None:
             return None
@@ -105,7 +108,7 @@ class MergedProposer(ChainProposer):
 
 
 def rows_of(tree: TokenTree, chains: Sequence[Sequence[int]]) -> list[int]:
-    """The rows of a merged tree's nodes where its chains were forwarded one behind the other, unmerged."""
+    """Return the row of each node of a merged tree whose chains were forwarded one after the other."""
     children = {(parent, token): i for i, (parent, token) in enumerate(zip(tree.parents, tree.tokens, strict=True))}
     rows, first = [0] * len(tree), 0
     for chain in reversed(chains):

@@ -1,4 +1,4 @@
-"""The scout: a drafter with eyes of its own (docs/methods.md §5.1, ours). Settings and registration."""
+"""The scout: a drafter with its own vision encoder (docs/methods.md §5.1, ours)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kerv_cli.methods.early import EarlySettings
 
 @dataclass
 class ScoutSettings(EarlySettings):
-    """Shapes of a scout: its stem, then the early drafter's network (§5.1)."""
+    """Shapes of a scout: its stem, then the network of the early drafter (§5.1)."""
 
     kind: str = "scout"
     channels: int = number(8, 1, 4096, help="of the stem's first stage")

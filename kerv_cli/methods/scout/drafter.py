@@ -1,8 +1,8 @@
-"""The scout: its network, its proposer and its files (docs/methods.md §5.1, ours).
+"""The scout: network, proposer, training and files (docs/methods.md §5.1, ours).
 
-It reads the image, the hand and the instruction, and nothing that the target computes: so a chunk that is executed
-unverified costs no encoding of the target's, and what goes wrong in one view need not go wrong in the other. Behind its
-stem and its estimate of positions stands the early drafter's network.
+It reads the image, the hand and the instruction, and nothing that the target computes. So unverified chunks never pay
+for the target's encoding, and an error in one encoder need not repeat in the other. After its stem and its estimated
+positions comes the network of the early drafter.
 """
 
 from __future__ import annotations
@@ -46,7 +46,10 @@ if TYPE_CHECKING:
 
 
 class ScoutNetwork(Packable):
-    """From one observation to the logits (N, V) of a chunk. Shapes: B batch, p proprioception, K places, W words."""
+    """From one observation to the logits (N, V) of a chunk.
+
+    Shapes: B batch, p proprioception, K places, W words.
+    """
 
     centre: Tensor
     packed: PackedScout | None
@@ -61,7 +64,17 @@ class ScoutNetwork(Packable):
         size: int,
         words: int,
     ) -> None:
-        """chunk: H. views, size: of the camera's frame, pixels. words: of the target's vocabulary."""
+        """Build the network.
+
+        Args:
+            settings: Its shapes.
+            actions: The action space.
+            observation: The observation space.
+            chunk: H.
+            views: Number of views in the camera's frame.
+            size: Pixels of a view.
+            words: Size of the target's vocabulary.
+        """
         super().__init__()
         s = self.settings = settings
         self.observation, self.size = observation, size
@@ -77,7 +90,7 @@ class ScoutNetwork(Packable):
         self.drafter = EarlyNetwork(s, actions, chunk, of_views + s.word_width + scene_width(observation))
 
     def see(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
-        """What the drafter's network reads (B, F), and the estimated positions of the places (B, K, 3), metres."""
+        """Return what the drafter's network reads (B, F), and estimated positions of the places (B, K, 3), metres."""
         assert inputs.images is not None
         proprioception, words = inputs.proprioception, self.words(inputs.words).mean(1)
         views = [stem(image) for stem, image in zip(self.stems, inputs.images.split(self.size, -1), strict=True)]
@@ -89,14 +102,14 @@ class ScoutNetwork(Packable):
         return torch.cat([*cells, words, scene], -1), places
 
     def forward(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
-        """Observations -> logits (B, N, V), positions (B, K, 3)."""
+        """Return logits (B, N, V) and positions (B, K, 3)."""
         if self.packed is not None and len(inputs.proprioception) == 1:
             return self.packed(inputs)
         features, places = self.see(inputs)
         return self.drafter(features.to(self.drafter.head.weight.dtype)), places
 
     def pack_weights(self) -> PackedScout | None:
-        """The packed weights of a float32 scout; None in other number formats."""
+        """Return the packed weights of a float32 scout; None in other number formats."""
         from kerv_cli.methods.scout.packed import PackedScout  # ONNX Runtime, which a GPU does not need
 
         return PackedScout(self) if self.cells.weight.dtype == torch.float32 else None
@@ -113,7 +126,7 @@ class ScoutProposer(EarlyProposer):
 
     @torch.inference_mode()
     def _rows(self, chunks: Sequence[Chunk]) -> Tensor:
-        """The drafts of B chunks whose limits are equal, (B, N + 1), from their observations."""
+        """Return the drafts (B, N + 1) of chunks whose limits are equal, from their observations."""
         seen = [chunk.observation for chunk in chunks if chunk.observation is not None]
         logits = torch.cat([self.scout(self.inputs(observation))[0] for observation in seen])
         return self.early.chosen(logits, radius_of(chunks))
@@ -145,7 +158,7 @@ class ScoutDrafter(EarlyDrafter):
 
     @classmethod
     def proposer(cls, settings: NoSettings, context: Context) -> ScoutProposer:
-        """proposer=scout."""
+        """Build proposer=scout."""
         return ScoutProposer(context.artifact(cls.kind), context.target)
 
     @torch.inference_mode()
@@ -201,10 +214,10 @@ class ScoutDrafter(EarlyDrafter):
 
 
 def check_sees(target: object) -> CompactTarget:
-    """The target, if it sees.
+    """Return the target, if it sees.
 
     Raises:
-        CheckpointError: it is of another family, or is given the state.
+        CheckpointError: It is of another family, or reads the state.
     """
     if not isinstance(target, CompactTarget) or not target.cameras:
         raise CheckpointError("a scout looks through the camera of a compact target that sees; this target has none")

@@ -1,5 +1,4 @@
-"""SP-VLA's schedule (docs/methods.md §6.1): a regression where motion is fast, the target where it is slow. Settings
-and registration."""
+"""SP-VLA's schedule (docs/methods.md §6.1): a regression where the motion is fast, the target where it is slow."""
 
 from __future__ import annotations
 
@@ -12,7 +11,7 @@ from kerv_cli.base.registry import add
 
 @dataclass
 class SpeedSkipSettings:
-    """Chunks of a ridge regression over the last actions, executed where the hand is fast."""
+    """Executes chunks of a ridge regression over the last actions while the hand is fast."""
 
     kind: str = "speed"
     v_min: float = number(0.3, 0, 1000)  # speed of the hand from which on motion is intuitive, metres per second
@@ -23,7 +22,11 @@ class SpeedSkipSettings:
 
 
 def check_speeds(settings: SpeedSkipSettings) -> None:
-    """Raises UsageError for speeds that are not in order."""
+    """Refuse speeds that are not in order.
+
+    Raises:
+        UsageError: They are not.
+    """
     if settings.v_min > settings.v_max:
         raise UsageError(f"skip.v_min={settings.v_min:g} skip.v_max={settings.v_max:g}: v_min not above v_max")
 

@@ -1,4 +1,4 @@
-"""SP-VLA's schedule (docs/methods.md §6.1): decides by the hand's speed who gives the next chunk."""
+"""SP-VLA's schedule (docs/methods.md §6.1): the hand's speed decides who gives the next chunk."""
 
 from __future__ import annotations
 
@@ -14,7 +14,11 @@ from kerv_cli.methods.sp_vla import SpeedSkipSettings
 
 
 class Ridge(Predictor):
-    """The line through the last `window` actions by ridge regression on time; strict DoFs are held."""
+    """The line through the last `window` actions, by ridge regression on time. Strict DoFs are held.
+
+    Attributes:
+        penalty: λ, on both coefficients.
+    """
 
     name = "ridge"
     least = 2
@@ -25,7 +29,10 @@ class Ridge(Predictor):
         super().__init__(held, window, window, horizon)
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """(horizon, window): X' (XᵀX + λI)⁻¹ Xᵀ, a row of X being (t, 1) for t = 0, 1, …, one of X' a later step's."""
+        """Return (horizon, window): X' (XᵀX + λI)⁻¹ Xᵀ.
+
+        The rows of X are (t, 1) for t = 0, 1, …; X' has later steps.
+        """
         times = np.arange(window + self.horizon)
         rows = np.stack([times, np.ones(len(times))], 1)
         past, ahead = rows[:window], rows[window:]
@@ -34,8 +41,13 @@ class Ridge(Predictor):
 
 
 class SpeedSkip(Skip):
-    """Fills a chunk from the regression where the hand is fast and the target decoded enough of the actions that the
-    regression reads; everything else the target decodes."""
+    """Fills a chunk by the regression if the hand is fast and the target decoded enough of the buffered actions.
+
+    Attributes:
+        decoded: Whether the target decoded each of the last executed actions.
+        executed: Actions of the episode so far.
+        by_target: Whether the chunk being executed is the target's.
+    """
 
     def __init__(self, settings: SpeedSkipSettings, ridge: Ridge) -> None:
         self.settings, self.ridge = settings, ridge
@@ -45,17 +57,17 @@ class SpeedSkip(Skip):
 
     @classmethod
     def build(cls, settings: SpeedSkipSettings, context: Context) -> SpeedSkip:
-        """skip=speed."""
+        """Build skip=speed."""
         target = context.target
         return cls(settings, Ridge(target.actions.is_strict, settings.penalty, settings.buffer, target.chunk))
 
     def begin(self, task: str, seed: int) -> None:
-        """An episode begins."""
+        """Begin an episode."""
         self.decoded.clear()
         self.executed, self.by_target = 0, True
 
     def take(self, chunk: Chunk) -> bool:
-        """Fills the chunk where motion is intuitive -> whether it did."""
+        """Fill the chunk if the motion is intuitive -> whether it did."""
         executed = len(chunk.situation.path) - 1
         self.decoded.extend([self.by_target] * (executed - self.executed))
         self.executed = executed
@@ -67,8 +79,7 @@ class SpeedSkip(Skip):
         return True
 
     def _is_intuitive(self, situation: Situation, control_hz: float) -> bool:
-        """Whether the hand's speed in the last control step lies in the range, and the target decoded more than `share`
-        of the buffer."""
+        """Return whether the hand's speed is in range and the target decoded more than `share` of the buffer."""
         speed = control_hz * float(np.linalg.norm(situation.path[-1] - situation.path[-2]))
         s = self.settings
         return s.v_min <= speed <= s.v_max and sum(self.decoded) > s.share * s.buffer
