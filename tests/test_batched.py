@@ -133,12 +133,7 @@ def test_prompts_of_different_lengths_are_decoded_apart() -> None:
     policy = MockTarget()
     seen = [Observation(np.array([0.1 * i]), np.zeros(0), "on " * (i % 3)) for i in range(6)]
     assert len({policy.encode(one).shape[1] for one in seen}) == 3
-    alone = Decoder(policy)
-    together = BatchDecoder(alone)
-    found = together.decode([together.new_episode() for _ in seen], seen)
-    for one, record in zip(seen, found, strict=True):
-        alone.reset("", 0, HOME)
-        assert alone.decode(one).tokens == record.tokens
+    same(*decoded(Decoder(policy), seen))
 
 
 # --- episodes
@@ -411,10 +406,3 @@ def test_a_rollout_in_batches_prints_success_and_goes_on_where_it_was(
         ]
         assert a["time_per_step_ms"] > 0
         assert b["time_per_step_ms"] is None
-
-
-def test_a_batch_refuses_a_method_in_one_line(policies: Path) -> None:
-    words = ["policy=state", "policy.target=nano-state", f"results={policies}", "method=naive_sd", "rollout.batch=4"]
-    run = CliRunner().invoke(app, ["rollout", *words])
-    assert run.exit_code == 2
-    assert "rollout.batch=4: method=naive_sd" in run.stderr

@@ -12,7 +12,7 @@ from examples.own_target import SEVEN, MockTarget
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kerv_cli.base.errors import CheckpointError, KervError
+from kerv_cli.base.errors import KervError
 from kerv_cli.base.spaces import ActionSpace, Group, Observation
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
@@ -180,21 +180,24 @@ def test_ar_takes_exactly_n_forwards(chunk: int) -> None:
     result = Decoder(target).decode_prompt(prompt)
     assert result.tokens == plain_greedy(target, prompt)
     assert result.forwards == size_of(target)
-    assert {r.mode for r in result.rounds} == {"prefill", "decode"} if chunk else True
 
 
-def test_a_perfect_draft_commits_depth_plus_bonus_and_never_overshoots() -> None:
+@pytest.mark.parametrize(("where", "most", "committed"), [("proposer", 5, [1, 6, 6, 3]), ("prefill_draft", 16, [16])])
+def test_a_perfect_draft_commits_depth_plus_bonus_and_never_overshoots(
+    where: str, most: int, committed: list[int]
+) -> None:
     target = random_target(11, 2, 2, 4)
     prompt = random_prompt(target, 11)
     truth = plain_greedy(target, prompt)
 
     class Perfect(RandomTrees):
         def propose(self, chunk: Chunk, depth: int) -> Draft:
-            return Draft.of(self.truth[len(chunk.tokens) :][: min(5, depth)])
+            return Draft.of(self.truth[len(chunk.tokens) :][: min(most, depth)])
 
-    result = decode(target, Perfect(truth, 0, 5), prompt)
+    result = Decoder(target, Parts(**{where: Perfect(truth, 0, 16)})).decode_prompt(prompt)  # type: ignore[arg-type]
     assert result.tokens == truth
-    assert [r.committed for r in result.rounds] == [1, 6, 6, 3]
+    assert [r.committed for r in result.rounds] == committed
+    assert result.forwards == len(committed)
 
 
 @settings(max_examples=60, deadline=None)
@@ -221,21 +224,6 @@ def test_drafts_verified_inside_the_prefill_are_lossless(
     result = Decoder(target, parts).decode_prompt(prompt)
     assert result.tokens == truth
     assert_adds_up(result)
-
-
-def test_a_perfect_draft_in_the_prefill_takes_one_forward() -> None:
-    target = random_target(5, 2, 2, 4)
-    prompt = random_prompt(target, 5)
-    truth = plain_greedy(target, prompt)
-
-    class Whole(RandomTrees):
-        def propose(self, chunk: Chunk, depth: int) -> Draft:
-            return Draft.of(self.truth[:depth])
-
-    result = Decoder(target, Parts(prefill_draft=Whole(truth, 0, 16))).decode_prompt(prompt)
-    assert result.tokens == truth
-    assert result.forwards == 1
-    assert [r.committed for r in result.rounds] == [16]
 
 
 def test_a_drafter_drafts_the_same_tree_from_a_cache_of_fixed_shapes() -> None:
@@ -304,14 +292,6 @@ def test_any_target_is_decoded_losslessly(
     assert_adds_up(result)
 
 
-@settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 10_000), actions=spaces(), chunk=st.integers(1, 4))
-def test_jacobi_decoding_of_any_target_ends_at_ar(seed: int, actions: ActionSpace, chunk: int) -> None:
-    target = MockTarget(actions, chunk, seed=seed)
-    prompt = target.encode(Observation(np.array([0.1 * seed]), np.zeros(0), "go"))
-    assert decode(target, JacobiProposer(), prompt).tokens == plain_greedy(target, prompt)
-
-
 def test_the_mock_sees_a_wrong_mask_position_or_cache() -> None:
     """Otherwise it would prove nothing."""
     target = MockTarget()
@@ -337,10 +317,3 @@ def test_a_target_of_your_own_is_loaded_by_its_family(tmp_path: Path) -> None:
     assert isinstance(target, MockTarget)
     assert target.actions == described.actions == SEVEN
     assert target.chunk == 3
-
-
-def test_a_description_without_a_chunk_gets_one_line(tmp_path: Path) -> None:
-    save_module(tmp_path, "target", torch.nn.Module(), target_fields("mock", {}, "metaworld", SEVEN, OBSERVATION))
-    with pytest.raises(CheckpointError, match=r"target\.json is damaged: .*settings lack chunk") as refused:
-        load_target(tmp_path)
-    assert "\n" not in str(refused.value)

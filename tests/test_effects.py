@@ -30,6 +30,9 @@ from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
         ("method=ar runtime.workers=4", "runtime.workers=4"),
         ("method=ar record=0 record_size=64", "record_size=64"),
         ("method=ar episodes=2 seed=100007 world.horizon=9", ""),
+        ("rollout.ar_ms=20", "rollout.ar_ms=20"),
+        ("rollout.clock=real rollout.latency_ms=20 rollout.ar_ms=20", "rollout.latency_ms=20"),
+        ("rollout.clock=real rollout.latency=constant rollout.ar_ms=20", "rollout.ar_ms=20"),
     ],
 )
 def test_an_override_without_effect_is_found(words: str, idle: str) -> None:

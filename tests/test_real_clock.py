@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,7 +13,6 @@ import numpy as np
 import pytest
 from examples.insertion import SPEC as INSERTION
 from examples.point_mass import SPEC, PointWorld
-from studies_synthetic import still_episode
 from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
@@ -108,33 +108,26 @@ def episode_of(results: Path, *overrides: str) -> EpisodeRecord:
     return run.Runner(chosen, TASK).episode(EVALUATION_SEED, run.is_recorded(chosen, EVALUATION_SEED))
 
 
-@pytest.mark.parametrize("steps", [1, 2, 3, 4])
-def test_the_chunk_in_hand_is_executed_on(steps: int) -> None:
-    """k ≤ H: k old actions between an observation and the first action that it led to, and no pause after the first."""
-    record = point_episode(constant(steps))
-    assert played(record)[: steps + 8] == [(0, 0)] * steps + [(n, i) for n in (1, 2) for i in range(4)]
-    first, second, *_ = record.decodes
-    assert first.delay == Delay(steps / HZ, steps, 0, carried=0, held=steps)
-    assert second.delay == Delay(steps / HZ, steps, 4, carried=steps, held=0)
-    assert record.decode_steps[:3] == (steps, steps + 4, steps + 8)
+@pytest.mark.parametrize(
+    ("steps", "chunk"), [(1, (0, 1, 2, 3)), (3, (0, 1, 2, 3)), (4, (0, 1, 2, 3)), (6, (0, 1, 2, 3, 3, 3))]
+)
+def test_the_chunk_before_is_executed_on_and_then_its_last_action_is_held(steps: int, chunk: tuple[int, ...]) -> None:
+    """k <= H: k old actions after an observation, and no pause after the first chunk."""
+    record, pause = point_episode(constant(steps)), max(0, steps - 4)
+    assert played(record)[: steps + 2 * len(chunk)] == [(0, 0)] * steps + [(n, i) for n in (1, 2) for i in chunk]
+    assert record.decodes[0].delay == Delay(steps / HZ, steps, 0, carried=0, held=steps)
+    assert record.decodes[1].delay == Delay(steps / HZ, steps, max(4, steps), steps - pause, pause)
+    assert record.decode_steps[:2] == (steps, steps + len(chunk))
 
 
-def test_a_chunk_that_is_used_up_is_held() -> None:
-    record = point_episode(constant(6))
-    assert played(record)[:24] == [(0, 0)] * 6 + [(n, i) for n in (1, 2, 3) for i in (0, 1, 2, 3, 3, 3)]
-    second = record.decodes[1].delay
-    assert second == Delay(6 / HZ, 6, 6, carried=4, held=2)
-
-
-def test_between_observation_and_first_action_lie_k_steps_whatever_the_chunk() -> None:
-    for chunk in (1, 2, 5):
-        for steps in (1, 2, 3, 7):
-            record = point_episode(constant(steps), Numbered(chunk))
-            begun = zip(record.decodes[:-1], record.decode_steps, strict=False)
-            for number, (decode, start) in enumerate(begun, 1):
-                assert decode.delay is not None
-                assert start - decode.delay.observed == steps == decode.delay.carried + decode.delay.held
-                assert played(record)[start] == (number, 0)
+def test_k_steps_are_between_observation_and_first_action_whatever_the_chunk() -> None:
+    for chunk, steps in itertools.product((1, 2, 5), (1, 3, 7)):
+        record = point_episode(constant(steps), Numbered(chunk))
+        begun = zip(record.decodes[:-1], record.decode_steps, strict=False)
+        for number, (decode, start) in enumerate(begun, 1):
+            assert decode.delay is not None
+            assert start - decode.delay.observed == steps == decode.delay.carried + decode.delay.held
+            assert played(record)[start] == (number, 0)
 
 
 def test_a_fake_clock_says_how_long_each_decode_took() -> None:
@@ -161,14 +154,17 @@ def test_an_episode_can_end_while_the_policy_decodes() -> None:
         (0, 6, 6),
         (6, 6, 0),
     ]
-    waited = decodes_table(point_episode(None)).to_pylist()[0]
+    waiting = point_episode(None)
+    waited, sums = decodes_table(waiting).to_pylist()[0], episode_row(waiting)
     assert waited["delay_steps"] is waited["observed"] is waited["delay_seconds"] is None
+    assert {sums[f"{name}_steps"] for name in ("delay", "carried", "held", "dropped")} == {0}
+    assert (sums["delay_decodes"], sums["delay_seconds"]) == (0, 0.0)
 
 
 def test_rounding_up_ignores_float_noise_and_refuses_nonsense() -> None:
     assert [steps_of(s, 80.0) for s in (0.0, 0.0001, 0.0125, 0.0126, 5 * 0.0125, 0.2)] == [0, 1, 1, 2, 5, 16]
     for wrong in (-0.001, float("nan"), float("inf")):
-        with pytest.raises(KervError, match="cannot last"):
+        with pytest.raises(KervError):
             steps_of(wrong, 80.0)
 
 
@@ -263,7 +259,7 @@ def test_ar_takes_what_was_asked_for_and_the_others_their_share(results: Path) -
 
 
 def test_measured_latency_is_scaled_by_ars_median_here(policies: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(policies_of, "_ar_seconds", lambda *key: 0.02)
+    monkeypatch.setattr(policies_of, "ar_seconds", lambda *key: 0.02)
     record = episode_of(policies, "method=ar", "rollout.clock=real", "rollout.ar_ms=100")
     for decode in record.decodes:
         assert decode.delay is not None
@@ -273,10 +269,10 @@ def test_measured_latency_is_scaled_by_ars_median_here(policies: Path, monkeypat
 def test_ar_is_measured_once_per_process(policies: Path) -> None:
     chosen = compose("rollout", [f"results={policies}", "policy.target=nano-state"], RolloutSettings)
     chosen.rollout = dataclasses.replace(chosen.rollout, clock="real", ar_ms=50)
-    policies_of._ar_seconds.cache_clear()
+    policies_of.ar_seconds.cache_clear()
     for _ in range(2):
         clock = policies_of.clock_for(chosen, TASK)
-    assert policies_of._ar_seconds.cache_info().misses == 1
+    assert policies_of.ar_seconds.cache_info().misses == 1
     assert clock is not None
     assert 0 < clock.latency(AR) / AR.seconds < 1000
 
@@ -301,7 +297,6 @@ FROM_PROFILE = "rollout.clock=real rollout.latency=profile rollout.profile=there
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (f"{CONSTANT} rollout.latency_ms=-1", "rollout.latency_ms=-1.0: from 0 to 600000"),
         (f"{CONSTANT} rollout.latency_ms=nan", "rollout.latency_ms=nan: from 0"),
         (f"{CONSTANT} rollout.latency_ms=6250", "500 control steps, but an episode of metaworld has 500"),
         (
@@ -309,7 +304,6 @@ FROM_PROFILE = "rollout.clock=real rollout.latency=profile rollout.profile=there
             "all 4 control steps of a chunk are stale",
         ),
         (f"{CONSTANT} rollout.latency_ms=13 rollout.delay_compensation=chunk chunk=2", "all 2 control steps"),
-        (f"{CONSTANT} rollout.delay_compensation=chunks", "did you mean chunk"),
         ("rollout.clock=reel", "did you mean real"),
         ("rollout.clock=real rollout.latency=profile", "name a document of 'kerv bench"),
         (FROM_PROFILE.replace("there", "nowhere"), "rollout.profile=nowhere: no such document"),
@@ -321,11 +315,15 @@ FROM_PROFILE = "rollout.clock=real rollout.latency=profile rollout.profile=there
 )
 def test_what_cannot_be_is_refused_in_one_line(results: Path, words: str, message: str) -> None:
     profile_file(results, draft={"rows": [], "seconds": []})
+    assert_refused(results, words, message)
+
+
+def assert_refused(results: Path, words: str, message: str) -> None:
     target = [] if "expert" in words else ["policy.target=nano-state"]
     done = CliRunner().invoke(app, ["rollout", f"task={TASK}", f"results={results}", *target, *words.split()])
     assert done.exit_code == 2, done.output
     assert message in done.stderr
-    assert [line[:5] for line in done.stderr.splitlines()][-1:] == ["kerv:"]
+    assert done.stderr.splitlines()[-1].startswith("kerv:")
     assert done.stderr.count("kerv:") == 1
 
 
@@ -343,26 +341,4 @@ def test_what_cannot_be_is_refused_in_one_line(results: Path, words: str, messag
 )
 def test_an_impossible_profile_is_refused(results: Path, phases: dict[str, Any], message: str) -> None:
     profile_file(results, **phases)
-    words = [f"task={TASK}", f"results={results}", "policy.target=nano-state", *FROM_PROFILE.split()]
-    done = CliRunner().invoke(app, ["rollout", *words])
-    assert done.exit_code == 2, done.output
-    assert message in done.stderr
-    assert [line[:5] for line in done.stderr.splitlines()][-1:] == ["kerv:"]
-    assert done.stderr.count("kerv:") == 1
-
-
-def test_settings_without_effect_are_named(policies: Path) -> None:
-    from kerv_cli.episodes.identity import without_effect
-
-    def idle(*words: str) -> list[str]:
-        return list(without_effect(compose("rollout", words, RolloutSettings), words))
-
-    assert idle("rollout.ar_ms=20") == ["rollout.ar_ms=20"]
-    assert idle("rollout.clock=real", "rollout.latency_ms=20", "rollout.ar_ms=20") == ["rollout.latency_ms=20"]
-    assert idle("rollout.clock=real", "rollout.latency=constant", "rollout.ar_ms=20") == ["rollout.ar_ms=20"]
-
-
-def test_a_waiting_episode_has_no_delay_in_its_sums() -> None:
-    row = episode_row(still_episode("reach-v3", 1, True, [AR]))
-    assert [row[f"{name}_steps"] for name in ("delay", "carried", "held", "dropped")] == [0, 0, 0, 0]
-    assert (row["delay_decodes"], row["delay_seconds"]) == (0, 0.0)
+    assert_refused(results, FROM_PROFILE, message)

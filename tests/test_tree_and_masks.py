@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import product
-
 import numpy as np
 import pytest
 import torch
@@ -15,7 +13,6 @@ from kerv_cli.engine.draft import Draft, ancestors_of, ancestors_on_device
 from kerv_cli.engine.tree import ROOT, TokenTree, merge
 from kerv_cli.methods.merged.proposer import rows_of
 from kerv_cli.targets.attention import Cache, attention_mask
-from kerv_cli.targets.compact.trunk import Trunk
 
 
 @st.composite
@@ -122,37 +119,6 @@ def test_acceptance_is_its_definition(tree: TokenTree, data: st.DataObject, star
     end = found.path[-1] if found.path else ROOT
     children = [i for i, parent in enumerate(tree.parents) if parent == end]
     assert (found.rejected is None) == (not children)
-
-
-@pytest.mark.parametrize(("start", "path"), list(product([0, 5], [[0], [0, 2], [0, 1, 4, 5]])))
-def test_commit_leaves_the_path_behind_the_prefix(start: int, path: list[int]) -> None:
-    cache = Cache(2, 1, 2, 16, 3, torch.zeros(()))
-    cache.buffer.copy_(torch.arange(16.0).view(1, 1, 1, 1, 16, 1).expand_as(cache.buffer).clone())
-    cache.length = start + 6
-    cache.compact(start, torch.tensor(path) + start)
-    assert cache.length == start + len(path)
-    expected = [*range(start), *(start + p for p in path)]
-    assert (cache.layers[1][1][0, 1, : cache.length, 0] == torch.tensor(expected, dtype=torch.float32)).all()
-
-
-@pytest.mark.bits
-def test_tree_forward_equals_forwarding_every_path_alone() -> None:
-    """Positions and masks together: each node's state is what the plain causal trunk gives for its own path."""
-    torch.manual_seed(0)
-    trunk = Trunk(24, 2, 3, 40).eval()
-    prefix, nodes = torch.randn(1, 5, 24), torch.randn(1, 4, 24)
-    tree = TokenTree.build([0, 0, 0, 0], [-1, 0, 0, 1])
-    root = torch.randn(1, 1, 24)
-    with torch.inference_mode():
-        cache = trunk.new_cache(1, 16)
-        trunk(prefix, torch.arange(5), cache)
-        positions = Draft.of(tree.tokens, tree.parents).positions(5, 1, prefix.device)
-        assert positions.tolist() == [5, *(6 + d for d in tree.depths)]
-        together = trunk(torch.cat([root, nodes], 1), positions, cache, visible(tree, 1))
-        for node in range(4):
-            alone = torch.cat([prefix, root, nodes[:, tree.path_to(node)]], 1)
-            expected = trunk(alone, torch.arange(alone.shape[1]))[0, -1]
-            assert torch.allclose(together[0, 1 + node], expected, atol=1e-5)
 
 
 @settings(max_examples=60, deadline=None)

@@ -171,13 +171,13 @@ def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:
         if clock.calibrates(settings):
             loaded: Any = artifacts.target
             pixels, threads = settings.world.camera.size, settings.runtime.threads
-            measured = _ar_seconds(loaded, settings.chunk, task, pixels, threads)
+            measured = ar_seconds(loaded, settings.chunk, task, pixels, threads)
     latency = clock.latency_of(settings, target, measured)
     return RealClock(latency, spec_of(task).actions, settings.rollout.delay_compensation)
 
 
 @functools.cache
-def _ar_seconds(target: Any, chunk: int, task: str, pixels: int, threads: int) -> float:
+def ar_seconds(target: Any, chunk: int, task: str, pixels: int, threads: int) -> float:
     """Return the median seconds of a target's autoregressive decode here, measured once per process."""
     decoder, space = Decoder(target, chunk=chunk), spec_of(task).observation
     warm_up(decoder, task, space, pixels)
