@@ -376,7 +376,7 @@ def test_seven_numbers_for_four_dofs_end_the_episode_in_one_line(tmp_path: Path)
     assert [episode.reason for episode in one.episodes] == ["env_step"]
     with sqlite3.connect(tmp_path / "recording-seven.sqlite") as file:
         (detail,) = file.execute("SELECT failure_detail FROM episode_results").fetchone()
-    assert "takes 4 finite numbers (dx, dy, dz, gripper), the model server sent an array of shape (7,)" in detail
+    assert "4 finite numbers" in detail
 
 
 # --- recordings as studies

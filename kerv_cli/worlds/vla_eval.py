@@ -1,7 +1,7 @@
 """Meta-World as a benchmark of vla-eval: `benchmark: kerv_cli.worlds.vla_eval:MetaWorld` in its YAML.
 
 Any model server that takes an image, a sentence and four numbers of state meets kerv's tasks, initial states, cameras
-and stress: episode i has seed `seed` + i, whoever is evaluated, so that evaluations are paired.
+and stress. Episode i always has seed `seed` + i, so that evaluations of different servers are paired.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ class MetaWorld(StepBenchmark):
         - An episode ends with the first step at which the task's success flag is set, or at the horizon (500).
         - Episode i starts from the initial state of seed `seed` + i, which is among the recorded metrics.
         - Images are upright; several cameras joined with `+` are one image, side by side.
-        - A stress shifts the world from the one that a policy was trained in; it is drawn per task and seed.
+        - A stress shifts the world from the one of the training. It is drawn per task and seed.
 
     Args:
-        tasks: tasks and suites, e.g. "reach" or ["MT10"].
-        seed: of the first episode of every task; 100000 and above are for evaluation.
-        camera: corner4, corner, corner2, corner3, topview, behindGripper or gripperPOV; empty: corner4.
-        image_size: pixels of an image, square.
-        horizon: control steps of an episode; 0: 500.
+        tasks: Tasks and suites, e.g. "reach" or ["MT10"].
+        seed: Seed of the first episode of every task. Seeds from 100000 on are for evaluation.
+        camera: corner4 (default), corner, corner2, corner3, topview, behindGripper or gripperPOV.
+        image_size: Pixels of an image, square.
+        horizon: Control steps of an episode. 0 means 500.
         stress: push, actuation, sensor, light, colour, camera or object.
         stress_level: 0 (none) to 4.
-        send_images: whether a frame is drawn at every step.
-        privileged: the state holds all 39 numbers of the simulator, objects and goal too, not the robot's own 4.
+        send_images: Whether to draw an image at every step.
+        privileged: Whether the state is all 39 numbers of the simulator, goal included, instead of the robot's 4.
     """
 
     _ALL_RECORD_FIELDS = frozenset({"success", "action", "state"})
@@ -48,7 +48,7 @@ class MetaWorld(StepBenchmark):
 
     @classmethod
     def configure_render(cls, mode: str) -> dict[str, str]:
-        """Chooses MuJoCo's renderer."""
+        """Choose MuJoCo's renderer."""
         return dict(configure_mujoco_render(mode))
 
     def __init__(
@@ -63,7 +63,12 @@ class MetaWorld(StepBenchmark):
         send_images: bool = True,
         privileged: bool = False,
     ) -> None:
-        """Raises UnknownName, UsageError: no such task, camera or kind of stress, or an impossible number."""
+        """Check the arguments.
+
+        Raises:
+            UnknownName: There is no such task, camera or kind of stress.
+            UsageError: A number is out of range.
+        """
         super().__init__()
         self.tasks = resolve_tasks([tasks] if isinstance(tasks, str) else list(tasks))
         self.spec, self.seed = spec_of(self.tasks[0]), seed
@@ -75,78 +80,71 @@ class MetaWorld(StepBenchmark):
         self.world: World | None = None
 
     def get_tasks(self) -> list[dict[str, Any]]:
-        """The tasks; the group of difficulty is their suite."""
+        """Return the tasks. Their suite is their group of difficulty."""
         tasks = (self.spec.tasks[name] for name in self.tasks)
         return [{"name": t.name, "suite": t.difficulty, "instruction": t.instruction, "seed": self.seed} for t in tasks]
 
     def reset(self, task: dict[str, Any]) -> Observation:
-        """Starts the episode `episode_idx` of a task."""
+        """Start the episode `episode_idx` of a task."""
         if self.world is None or self.world.task != task["name"]:
             self.cleanup()
             self.world = self.spec.open_world(task["name"], self.camera, self.horizon)
             self.world.stress = self.stress
-        return self.world.reset(self.seed + int(task.get("episode_idx", 0)))
+        return self.world.reset(self._seed(task))
+
+    def _seed(self, task: dict[str, Any]) -> int:
+        return self.seed + int(task.get("episode_idx", 0))
 
     def step(self, action: dict[str, Any]) -> StepResult:
-        """Executes 4 numbers. Raises ValueError: others."""
+        """Execute an action of 4 numbers. Raises KervError for any other."""
         assert self.world is not None
         numbers = np.asarray(action.get("actions", action.get("action")), dtype=np.float64)
-        space = self.spec.actions
-        if numbers.shape != (space.dofs,) or not np.isfinite(numbers).all():
-            expected = f"{space.dofs} finite numbers ({', '.join(space.names)})"
-            raise ValueError(f"Meta-World takes {expected}, the model server sent an array of shape {numbers.shape}")
-        observation = self.world.step(numbers)
-        done, success = self.world.done, self.world.succeeded
-        self._recorder.record_step(success=success, action=numbers, state=observation.proprioception)
-        return StepResult(observation, float(self.world.success), done, {})
+        observation, world = self.world.step(numbers), self.world
+        self._recorder.record_step(success=world.succeeded, action=numbers, state=observation.proprioception)
+        return StepResult(observation, float(world.success), world.done, {})
 
     def make_obs(self, raw_obs: Observation, task: dict[str, Any]) -> dict[str, Any]:
-        """The message to the model server."""
+        """Return the message to the model server."""
         assert self.world is not None
         images = self.world.observe([self.camera.name]).images if self.send_images else {}
         state = raw_obs.state if self.privileged else raw_obs.proprioception
         return {"images": images, "task_description": self.world.instruction, "state": state}
 
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
-        """Success at any step, which episode it was, and where the hand is."""
+        """Return success at any step, which episode it was, and where the hand is."""
         world = self.world
         assert world is not None
-        seed = self.seed + int(self._task.get("episode_idx", 0))
-        places = {"initial_state": world.initial_state, "end_effector": world.end_effector}
-        return {"success": bool(world.succeeded), "seed": seed} | {name: at.tolist() for name, at in places.items()}
+        places = {"initial_state": world.initial_state.tolist(), "end_effector": world.end_effector.tolist()}
+        return {"success": bool(world.succeeded), "seed": self._seed(self._task), **places}
 
     def get_hold_action(self, last_action: dict[str, Any] | None) -> dict[str, Any]:
-        """No displacement; the gripper goes on as it did, open at first."""
+        """Return an action without displacement. The gripper continues as before, open at first."""
         action = self.spec.standstill(1.0)
         if last_action is not None:
             action[self.spec.actions.is_strict] = np.asarray(last_action["actions"])[self.spec.actions.is_strict]
         return {"actions": action}
 
     def get_metadata(self) -> dict[str, Any]:
-        """The horizon, and what the episodes depend on."""
+        """Return the horizon and the control rate."""
         return {"max_steps": self.horizon, "control_hz": self.spec.actions.control_hz}
 
     def get_action_spec(self) -> dict[str, DimSpec]:
-        """Displacement and gripper."""
+        """Describe an action: displacement and gripper."""
         return {"position": POSITION_DELTA, "gripper": DimSpec("gripper", 1, "binary_close_positive", (-1, 1))}
 
     def get_observation_spec(self) -> dict[str, DimSpec]:
-        """One image, the instruction, the robot's state."""
+        """Describe an observation: one image, the instruction, the robot's state."""
         names, numbers = self.spec.observation.proprioception, self.spec.observation.state
-        state = (
-            DimSpec("state", numbers, f"privileged{numbers}")
-            if self.privileged
-            else DimSpec("state", len(names), "_".join(names))
-        )
-        seen = {self.camera.name: IMAGE_RGB} if self.send_images else {}
-        return {**seen, "language": LANGUAGE, "state": state}
+        state = (numbers, f"privileged{numbers}") if self.privileged else (len(names), "_".join(names))
+        images = {self.camera.name: IMAGE_RGB} if self.send_images else {}
+        return {**images, "language": LANGUAGE, "state": DimSpec("state", *state)}
 
     def render(self) -> np.ndarray | None:
-        """The present frame."""
+        """Return the current frame."""
         return None if self.world is None else self.world.frame()
 
     def cleanup(self) -> None:
-        """Frees the simulator."""
+        """Free the simulator."""
         if self.world is not None:
             self.world.close()
         self.world = None

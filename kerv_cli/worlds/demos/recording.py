@@ -32,7 +32,7 @@ from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.camera import choose_backend
 from kerv_cli.worlds.demos.dataset import FORMAT, DemoManifest, EpisodeEntry, OnProgress, episode_path, totals
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode, save_episode
-from kerv_cli.worlds.demos.perturbation import Perturbation, is_perturbed
+from kerv_cli.worlds.demos.perturbation import BURST_PROBABILITY, SIGMA, Perturbation, is_perturbed
 from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import EnvironmentSpec, World
 
@@ -50,9 +50,6 @@ class DemoConfig:
         episodes: Successful episodes per task.
         first_seed: First seed of every task. Only training seeds are allowed.
         perturbed: Share of episodes executed with noise. `is_perturbed` says which.
-        noise_low: Lowest standard deviation of the noise, where 1 is half of a DoF's range. Drawn once per episode.
-        noise_high: Highest standard deviation of the noise.
-        burst_probability: Probability per step that a burst of 3 to 8 steps in one random direction begins.
         camera: View of the frames, by default the environment's first camera.
         frame_stride: Control steps per recorded frame.
         tail: Labels recorded beyond the success, for action chunks that begin near the end.
@@ -66,9 +63,6 @@ class DemoConfig:
     episodes: int = field(metadata=limits(1))
     first_seed: int = 0
     perturbed: float = number(0.5, 0, 1)
-    noise_low: float = number(0.2, 0)
-    noise_high: float = number(0.6, 0)
-    burst_probability: float = number(0.02, 0, 1)
     camera: CameraSettings = field(default_factory=CameraSettings)
     frame_stride: int = number(1, 1)
     tail: int = number(8, 0)
@@ -120,8 +114,7 @@ def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None)
         actor.reset(world, seed)
         act = actor.act
     elif noisy:
-        noise = config.noise_low, config.noise_high
-        act = Perturbation(world.task, seed, world.spec.actions, noise, config.burst_probability)
+        act = Perturbation(world.task, seed, world.spec.actions)
     states, labels, executed, frames, frame_steps = [], [], [], [], []
     last_step = min(config.horizon, world.horizon - config.tail)
     while not world.success:
@@ -221,7 +214,7 @@ def _collect(
 
 def _identity(config: DemoConfig) -> dict[str, Any]:
     """Return the manifest's fields that are known before the recording, as JSON."""
-    settings = asdict(config)
+    settings = asdict(config) | {"noise_low": SIGMA[0], "noise_high": SIGMA[1], "burst_probability": BURST_PROBABILITY}
     del settings["workers"]
     spec = config.spec
     experts = {task: spec.experts[task] for task in config.tasks if task in spec.experts}

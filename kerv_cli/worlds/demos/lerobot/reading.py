@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -226,14 +227,8 @@ def _groups(names: Sequence[str], strict: Sequence[str]) -> tuple[Group, ...]:
     """Return position, rotation and gripper for seven DoFs whose last is strict, else runs of strict and other DoFs."""
     if len(names) == 7 and tuple(strict) == tuple(names[-1:]):
         return Group("position", 3), Group("rotation", 3), Group("gripper", 1)
-    groups: list[Group] = []
-    for name in names:
-        kind = "strict" if name in strict else "motion"
-        if groups and groups[-1].name.startswith(kind):
-            groups[-1] = Group(groups[-1].name, groups[-1].size + 1)
-        else:
-            groups.append(Group(f"{kind}_{len(groups)}" if groups else kind, 1))
-    return tuple(groups)
+    runs = [(is_strict, len(list(run))) for is_strict, run in itertools.groupby(names, lambda name: name in strict)]
+    return tuple(Group(f"{'strict' if is_strict else 'motion'}_{i}", n) for i, (is_strict, n) in enumerate(runs))
 
 
 def _task_names(tasks: Mapping[int, str]) -> dict[int, str]:
