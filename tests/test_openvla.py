@@ -8,7 +8,7 @@ import json
 import math
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -68,24 +68,16 @@ def shown(seed: int, instruction: str = "pick up the cup", size: tuple[int, int]
 # --- the published layout
 
 
-SPAN = re.compile(r"\{(\d+)\.\.(\d+)\}")  # {0..23}: all numbers from 0 to 23
-
-
 def published() -> dict[str, Any]:
     """The shape card of openvla/openvla-7b: `config`, `sizes` (its widths, layers and heads), `total_size` (bytes in
-    bfloat16) and `tensors`, name -> shape."""
-    text = Path(__file__).with_name("fixtures").joinpath("openvla-7b.json").read_text(encoding="utf-8")
-    card: dict[str, Any] = json.loads(text)
-    card["tensors"] = dict(expanded(card["tensors"]))
-    return card
-
-
-def expanded(patterns: Mapping[str, list[int]]) -> Iterator[tuple[str, tuple[int, ...]]]:
-    for pattern, sizes in patterns.items():
-        spans = [range(int(a), int(b) + 1) for a, b in SPAN.findall(pattern)]
-        form = SPAN.sub("{}", pattern)
-        for numbers in itertools.product(*spans):
-            yield form.format(*numbers), tuple(sizes)
+    bfloat16) and `tensors`, name -> shape; {0..23} in a name stands for all numbers from 0 to 23."""
+    card: dict[str, Any] = json.loads(Path(__file__).with_name("fixtures").joinpath("openvla-7b.json").read_text())
+    tensors = {}
+    for pattern, sizes in card["tensors"].items():
+        spans = [range(int(a), int(b) + 1) for a, b in re.findall(r"\{(\d+)\.\.(\d+)\}", pattern)]
+        form = re.sub(r"\{.*?\}", "{}", pattern)
+        tensors |= {form.format(*numbers): tuple(sizes) for numbers in itertools.product(*spans)}
+    return {**card, "tensors": tensors}
 
 
 def test_the_layout_and_the_shape_are_those_of_the_published_checkpoint(tmp_path: Path) -> None:
@@ -104,20 +96,16 @@ def test_the_layout_and_the_shape_are_those_of_the_published_checkpoint(tmp_path
 # --- equal to transformers' own models, composed as OpenVLA composes them
 
 
-def split_qkv(state: dict[str, torch.Tensor], name: str) -> dict[str, torch.Tensor]:
-    return {
-        f"{part}_proj.{kind}": chunk
-        for kind in ("weight", "bias")
-        for part, chunk in zip("qkv", state[f"{name}.{kind}"].chunk(3), strict=True)
-    }
-
-
 def block_weights(state: dict[str, torch.Tensor], block: str, names: dict[str, str]) -> dict[str, torch.Tensor]:
-    return {
-        f"{theirs}.{kind}": state[f"{block}.{ours}.{kind}"]
-        for ours, theirs in names.items()
-        for kind in ("weight", "bias")
-    }
+    """A vision block's weights under transformers' names. names: ours -> theirs; `qkv` is split."""
+    found = {}
+    for kind in ("weight", "bias"):
+        found |= {
+            f"{theirs}.{kind}": state[f"{block}.{ours}.{kind}"] for ours, theirs in names.items() if ours != "qkv"
+        }
+        split = zip("qkv", state[f"{block}.attn.qkv.{kind}"].chunk(3), strict=True)
+        found |= {f"{names['qkv']}.{part}_proj.{kind}": chunk for part, chunk in split}
+    return found
 
 
 class Composed:
@@ -128,81 +116,77 @@ class Composed:
         self.state = {k: v for path in sorted(folder.glob("*.safetensors")) for k, v in load_file(path).items()}
         self.dino, self.siglip, self.llama = self._dino(), self._siglip(), self._llama()
 
+    def _part(self, prefix: str) -> dict[str, torch.Tensor]:
+        return {k.removeprefix(prefix): v for k, v in self.state.items() if k.startswith(prefix)}
+
+    def _vision(self, model: Any, weights: dict[str, torch.Tensor]) -> Any:
+        assert not model.load_state_dict(weights, strict=False).unexpected_keys
+        return model.eval()
+
     def _dino(self) -> Any:
         from transformers import Dinov2WithRegistersConfig, Dinov2WithRegistersModel
 
         tower = self.shape.towers[0]
-        model = Dinov2WithRegistersModel(
-            Dinov2WithRegistersConfig(
-                hidden_size=tower.width,
-                num_hidden_layers=tower.depth - 1,  # OpenVLA takes the last but one
-                num_attention_heads=tower.heads,
-                mlp_ratio=tower.feed_forward // tower.width,
-                num_register_tokens=tower.registers,
-                image_size=tower.image,
-                patch_size=tower.patch,
-            )
+        config = Dinov2WithRegistersConfig(
+            hidden_size=tower.width,
+            num_hidden_layers=tower.depth - 1,  # OpenVLA takes the last but one
+            num_attention_heads=tower.heads,
+            mlp_ratio=tower.feed_forward // tower.width,
+            num_register_tokens=tower.registers,
+            image_size=tower.image,
+            patch_size=tower.patch,
         )
-        own = {k.removeprefix("vision_backbone.featurizer."): v for k, v in self.state.items() if ".featurizer." in k}
-        # timm adds positions to the patches alone: transformers' class token gets a position of zero
-        position = torch.cat([torch.zeros(1, 1, tower.width), own["pos_embed"]], 1)
+        own = self._part("vision_backbone.featurizer.")
         weights = {
             "embeddings.cls_token": own["cls_token"],
             "embeddings.mask_token": torch.zeros(1, tower.width),
             "embeddings.register_tokens": own["reg_token"],
-            "embeddings.position_embeddings": position,
+            # timm adds positions to the patches alone: transformers' class token gets a position of zero
+            "embeddings.position_embeddings": torch.cat([torch.zeros(1, 1, tower.width), own["pos_embed"]], 1),
             "embeddings.patch_embeddings.projection.weight": own["patch_embed.proj.weight"],
             "embeddings.patch_embeddings.projection.bias": own["patch_embed.proj.bias"],
         }
-        names = {"norm1": "norm1", "norm2": "norm2", "mlp.fc1": "mlp.fc1", "mlp.fc2": "mlp.fc2"}
+        names = {name: name for name in ("norm1", "norm2", "mlp.fc1", "mlp.fc2")}
+        names |= {"attn.proj": "attention.o_proj", "qkv": "attention"}
         for i in range(tower.depth - 1):
-            layer = block_weights(own, f"blocks.{i}", {**names, "attn.proj": "attention.o_proj"})
-            layer |= {f"attention.{k}": v for k, v in split_qkv(own, f"blocks.{i}.attn.qkv").items()}
+            layer = block_weights(own, f"blocks.{i}", names)
             layer |= {f"layer_scale{n}.lambda1": own[f"blocks.{i}.ls{n}.scale_factor"] for n in (1, 2)}
             weights |= {f"encoder.layer.{i}.{k}": v for k, v in layer.items()}
-        assert not model.load_state_dict(weights, strict=False).unexpected_keys
-        return model.eval()
+        return self._vision(Dinov2WithRegistersModel(config), weights)
 
     def _siglip(self) -> Any:
         from transformers import SiglipVisionConfig, SiglipVisionModel
 
         tower = self.shape.towers[1]
-        model = SiglipVisionModel(
-            SiglipVisionConfig(
-                hidden_size=tower.width,
-                intermediate_size=tower.feed_forward,
-                num_hidden_layers=tower.depth - 1,  # OpenVLA takes the last but one
-                num_attention_heads=tower.heads,
-                image_size=tower.image,
-                patch_size=tower.patch,
-                hidden_act="gelu",  # timm's; transformers' own default is its tanh approximation
-            )
+        config = SiglipVisionConfig(
+            hidden_size=tower.width,
+            intermediate_size=tower.feed_forward,
+            num_hidden_layers=tower.depth - 1,
+            num_attention_heads=tower.heads,
+            image_size=tower.image,
+            patch_size=tower.patch,
+            hidden_act="gelu",  # timm's; transformers' own default is its tanh approximation
         )
-        prefix = "vision_backbone.fused_featurizer."
-        own = {k.removeprefix(prefix): v for k, v in self.state.items() if k.startswith(prefix)}
+        own = self._part("vision_backbone.fused_featurizer.")
         weights = {
             "embeddings.patch_embedding.weight": own["patch_embed.proj.weight"],
             "embeddings.patch_embedding.bias": own["patch_embed.proj.bias"],
             "embeddings.position_embedding.weight": own["pos_embed"][0],
         }
         names = {"norm1": "layer_norm1", "norm2": "layer_norm2", "mlp.fc1": "mlp.fc1", "mlp.fc2": "mlp.fc2"}
+        names |= {"attn.proj": "self_attn.out_proj", "qkv": "self_attn"}
         for i in range(tower.depth - 1):
-            layer = block_weights(own, f"blocks.{i}", {**names, "attn.proj": "self_attn.out_proj"})
-            layer |= {f"self_attn.{k}": v for k, v in split_qkv(own, f"blocks.{i}.attn.qkv").items()}
+            layer = block_weights(own, f"blocks.{i}", names)
             weights |= {f"encoder.layers.{i}.{k}": v for k, v in layer.items()}
-        assert not model.load_state_dict(weights, strict=False).unexpected_keys
-        return model.eval()
+        return self._vision(SiglipVisionModel(config), weights)
 
     def _llama(self) -> Any:
-        from dataclasses import asdict
-
         from transformers import LlamaConfig, LlamaForCausalLM
 
         numbers = asdict(self.shape.language)
-        theta = numbers.pop("rope_theta")
-        model = LlamaForCausalLM(LlamaConfig(**numbers, rope_parameters={"rope_type": "default", "rope_theta": theta}))
-        prefix = "language_model."
-        model.load_state_dict({k.removeprefix(prefix): v for k, v in self.state.items() if k.startswith(prefix)})
+        rope = {"rope_type": "default", "rope_theta": numbers.pop("rope_theta")}
+        model = LlamaForCausalLM(LlamaConfig(**numbers, rope_parameters=rope))
+        model.load_state_dict(self._part("language_model."))
         return model.eval()
 
     def patches(self, pixels: torch.Tensor) -> torch.Tensor:
@@ -211,9 +195,8 @@ class Composed:
         second = self.siglip(pixels[:, 3:], output_hidden_states=True).hidden_states[-1]
         x = torch.cat([first[:, 1 + self.shape.towers[0].registers :], second], -1)
         for number in (1, 2, 3):
-            x = torch.nn.functional.linear(
-                x, self.state[f"projector.fc{number}.weight"], self.state[f"projector.fc{number}.bias"]
-            )
+            layer = self._part(f"projector.fc{number}.")
+            x = torch.nn.functional.linear(x, layer["weight"], layer["bias"])
             x = torch.nn.functional.gelu(x) if number < 3 else x
         return x
 
