@@ -19,9 +19,10 @@ import pandas as pd
 
 from kerv_cli.base.config import as_overrides, compose
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
-from kerv_cli.base.places import results_dir, store_of_words
+from kerv_cli.base.places import results_dir
 from kerv_cli.catalogue.entries import RunEntry, find_run, find_runs, matching, store_of
 from kerv_cli.episodes.resolve import resolve, resolve_rollout, study_name
+from kerv_cli.lab.database import chosen_store
 from kerv_cli.lab.store import ROLLOUT, StudyStore
 from kerv_cli.lab.study import plan, plan_rollout, run
 from kerv_cli.report import decide
@@ -99,7 +100,7 @@ def rollout(*words: str, grid: bool = False, **settings: object) -> Study:
         UsageError: a setting that does not exist or cannot be. CheckpointError: no such policy, or a damaged one.
         Interrupted: Ctrl-C; complete episodes are kept. KervError: an episode failed.
     """
-    with store_of_words(as_overrides(*words, **settings)) as overrides:
+    with chosen_store(as_overrides(*words, **settings)) as overrides:
         resolved = resolve_rollout(overrides, grid)
         planned = plan_rollout(resolved, ["rollout", *(["-m"] if grid else []), *overrides])
         run(planned, save=save_recording)
@@ -116,7 +117,7 @@ def sweep(study: str | Path, *words: str, **settings: object) -> Study:
     Raises:
         UsageError, CheckpointError, Interrupted: as `rollout`. KervError: episodes failed; the others are kept.
     """
-    with store_of_words(as_overrides(f"study={study}", *words, **settings)) as overrides:
+    with chosen_store(as_overrides(f"study={study}", *words, **settings)) as overrides:
         resolved = resolve(overrides)
         planned = plan(resolved, ["sweep", *overrides])
         analysis = decide.judge(resolved.sweep.loss, print) if resolved.sweep.until == "decided" else None
@@ -139,7 +140,7 @@ def load_study(name: str, results: str | Path = "results", store: str = "") -> S
     Raises:
         UsageError: none or several have that name, or it has no episodes.
     """
-    with store_of_words([f"store={store}"] if store else []):
+    with chosen_store([f"store={store}"] if store else []):
         return Study(store_of(find_run(results_dir(str(results)), study_name(name))))
 
 
@@ -154,7 +155,7 @@ def runs(results: str | Path = "results", store: str = "", **filters: str) -> pd
     Raises:
         UsageError: no such filter or kind.
     """
-    with store_of_words([f"store={store}"] if store else []):
+    with chosen_store([f"store={store}"] if store else []):
         there = matching(find_runs(results_dir(str(results))), filters)
     return pd.DataFrame([asdict(run) for run in there], columns=[column.name for column in fields(RunEntry)])
 

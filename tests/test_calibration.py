@@ -20,7 +20,6 @@ from typer.testing import CliRunner
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import read_json, sha256_of, write_json
-from kerv_cli.base.places import find_target
 from kerv_cli.base.registry import find
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
@@ -42,6 +41,7 @@ from kerv_cli.methods.kerv import KinematicThresholdSettings
 from kerv_cli.methods.kerv.prediction import PREDICTORS, Noise, build_predictor
 from kerv_cli.methods.spec_vla import FixedThresholdSettings
 from kerv_cli.targets.checkpoint import TargetDescription, read_target
+from kerv_cli.targets.folders import find_target
 from kerv_cli.training.calibration import CalibrationRun, distribution
 from kerv_cli.training.predictor_fit import (
     Windows,

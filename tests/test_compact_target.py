@@ -13,7 +13,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kerv_cli.base.errors import CheckpointError, UnknownName
-from kerv_cli.base.places import shipped_dir
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
 from kerv_cli.methods.artifacts import Request
 from kerv_cli.methods.eagle.drafter import EagleDrafter
@@ -27,6 +26,7 @@ from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Trunk
+from kerv_cli.targets.folders import shipped_dir
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 ARM = ObservationSpace(

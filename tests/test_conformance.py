@@ -17,11 +17,11 @@ from examples.own_target import MockTarget
 from test_decoding_lossless import RandomTrees, decode, plain_greedy
 from typer.testing import CliRunner
 
-from kerv_cli.base.findings import Finding
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
 from kerv_cli.targets.conformance import check_target
 from kerv_cli.worlds.conformance import check_environment
+from kerv_cli.worlds.findings import Finding
 
 SEEN = Observation(np.array([0.3]), np.zeros(0), "push the red block gently away")
 

@@ -43,7 +43,7 @@ def test_drafts_of_seven_tasks_are_made_as_the_note_of_their_study_says(policies
         assert result.exit_code == 0, result.output
         return str(result.output)
 
-    study = read_yaml((conf_dir() / "study/coverage_unseen.yaml").read_text())
+    study = read_yaml(conf_dir() / "study/coverage_unseen.yaml")
     making = re.findall(r"kerv (train drafter .*?\])", study["note"])
     few = ("train.steps=2", "train.batch=8", "train.validate_every=2", "drafter.samples=50")
     target = "policy.target=nano-state"

@@ -18,13 +18,14 @@ import pytest
 from studies_synthetic import swept, threshold_study
 from typer.testing import CliRunner
 
-from kerv_cli.base import foreign
-from kerv_cli.base.foreign import foreign_sqlite, foreign_table
 from kerv_cli.catalogue.lerobot import read_info
+from kerv_cli.catalogue.sqlite import foreign_sqlite
 from kerv_cli.cli.app import app
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MACRO
 from kerv_cli.report.tables import CSV_COLUMNS, load_study
+from kerv_cli.worlds.demos import parquet
+from kerv_cli.worlds.demos.parquet import foreign_table
 
 ARCHIVE = Path(__file__).parent / "fixtures" / "results-0.1.0.tar.xz"
 STUDY = """
@@ -187,7 +188,7 @@ def test_a_foreign_database_that_never_ends_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_small_parquet_file_that_expands_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(foreign, "MOST_EXPANDED", 2**24)
+    monkeypatch.setattr(parquet, "MOST_EXPANDED", 2**24)
     text = pa.DictionaryArray.from_arrays(pa.array(np.zeros(50_000, np.int32)), pa.array(["x" * 1000]))
     texts = pa.ListArray.from_arrays(pa.array([0, 50_000], pa.int32()), text).cast(pa.list_(pa.string()))
     for name, column in enumerate((text, texts, text.cast(pa.string()), np.zeros(2**22))):

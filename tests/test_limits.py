@@ -13,10 +13,11 @@ import kerv_cli.cli.app  # noqa: F401 - registers the commands
 from kerv_cli.base.config import MOST_POINTS, compose, expand
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import check_label, check_settings
-from kerv_cli.base.places import artifact, find_target, results_dir
+from kerv_cli.base.places import artifact, results_dir
 from kerv_cli.base.registry import SETTINGS_GROUPS, parts
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.kerv.prediction import MINIMUM
+from kerv_cli.targets.folders import find_target
 from kerv_cli.training.settings import CalibrateSettings
 
 SCHEMAS = {name.replace(" ", "_"): part.settings for name, part in parts("command").items()}

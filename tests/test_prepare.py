@@ -15,9 +15,9 @@ from test_calibration import write_dataset
 from typer.testing import CliRunner
 
 from kerv_cli.base import files
-from kerv_cli.base.places import RESUME
 from kerv_cli.cli.app import app
 from kerv_cli.episodes.resolve import resolve, resolve_rollout
+from kerv_cli.targets.folders import RESUME
 from kerv_cli.training.preparation import needs
 
 TASK = "reach-v3"

@@ -51,7 +51,7 @@ time.sleep(60)
 """
 GUARD = """
 import os, subprocess, sys, time
-from kerv_cli.base.processes import guard
+from kerv_cli.lab.executors.guard import guard
 with guard():
     server = subprocess.Popen(["sh", "-c", "sleep 60 & echo $!; sleep 1.5"], stdout=-1, text=True)
     agent = int(server.stdout.readline())

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from kerv_cli.base import places
 from kerv_cli.base.files import sha256_of
 from kerv_cli.cli.app import app
+from kerv_cli.targets import folders
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -29,18 +29,18 @@ def kerv(*words: str, code: int = 0) -> str:
 
 def test_the_hashes_are_those_of_the_shipped_policies() -> None:
     shipped = (ROOT / "results/pretrained").glob("*/target/target.json")
-    assert {path.parts[-3]: json.loads(path.read_text())["sha256"] for path in shipped} == places.RELEASED
+    assert {path.parts[-3]: json.loads(path.read_text())["sha256"] for path in shipped} == folders.RELEASED
 
 
 @pytest.fixture
 def archive(policies: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An archive of a policy that this kerv does not have beside it, called as one of the released ones."""
-    monkeypatch.setattr(places, "shipped_dir", lambda: tmp_path / "nothing")
+    monkeypatch.setattr(folders, "shipped_dir", lambda: tmp_path / "nothing")
     policy = tmp_path / "release/mt50-vision"
     for kind in ("target", "drafter"):
         shutil.copytree(policies / "artifacts" / kind / "nano-vision", policy / kind)
     digest = json.loads((policy / "target/target.json").read_text())["sha256"]
-    monkeypatch.setitem(places.RELEASED, "mt50-vision", digest)
+    monkeypatch.setitem(folders.RELEASED, "mt50-vision", digest)
     path = tmp_path / "mt50-vision.tar.gz"
     with tarfile.open(path, "w:gz") as file:
         file.add(policy, "mt50-vision")
@@ -70,9 +70,9 @@ def test_another_file_than_the_one_asked_for_is_refused(
         return kerv("build", "policy", f"source={archive}", f"results={tmp_path}/results", *words, code=code)
 
     assert "not sha256=00" in refused("sha256=00")
-    monkeypatch.setitem(places.RELEASED, "mt50-vision", "0" * 64)
+    monkeypatch.setitem(folders.RELEASED, "mt50-vision", "0" * 64)
     assert "another target than kerv's mt50-vision" in refused()
-    monkeypatch.delitem(places.RELEASED, "mt50-vision")
+    monkeypatch.delitem(folders.RELEASED, "mt50-vision")
     assert f"set sha256={sha256_of(archive)}" in refused(code=2)
     archive.write_bytes(archive.read_bytes()[:-500])
     assert "no intact archive" in refused()

@@ -15,10 +15,9 @@ from test_training import quadratic
 from typer.testing import CliRunner
 
 from kerv_cli.base.errors import CheckpointError, Interrupted, UsageError
-from kerv_cli.base.places import STORE
 from kerv_cli.cli.app import app
 from kerv_cli.engine.cost import read_profile
-from kerv_cli.lab.database import Database
+from kerv_cli.lab.database import STORE, Database
 from kerv_cli.lab.runs import Curve, making, run_rows
 from kerv_cli.report.curves import read_log
 from kerv_cli.training.demonstrations import open_demos

@@ -25,7 +25,7 @@ def commit(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     """Sets the commit that computes what follows."""
 
     def is_of(name: str) -> None:
-        monkeypatch.setattr("kerv_cli.base.provenance.git_commit", lambda: name)
+        monkeypatch.setattr("kerv_cli.targets.provenance.git_commit", lambda: name)
 
     is_of(COMMIT)
     return is_of

@@ -1,4 +1,4 @@
-"""Atomic writes (a file or a folder is complete or absent), the readers of text, JSON, YAML and tables, hashes."""
+"""Atomic writes, readers of text, JSON and YAML, hashes. A written file or folder is complete or absent."""
 
 from __future__ import annotations
 
@@ -11,15 +11,12 @@ import json
 import os
 import shutil
 import stat
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from kerv_cli.base.errors import CheckpointError, StorageError, UsageError
 from kerv_cli.base.leftovers import clean, temporary_beside
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 MOST_TEXT = 2**28
 """Bytes of a JSON or YAML file; kerv's own are far smaller."""
@@ -194,20 +191,6 @@ def read_text(path: Path) -> str:
     return regular(path, MOST_TEXT).read_text(encoding="utf-8")
 
 
-def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
-    """A parquet file, or those of `columns` that it has.
-
-    Raises:
-        OSError, ValueError: it is missing or no parquet.
-    """
-    import pyarrow.parquet as pq
-
-    # without pyarrow's dataset machinery, which costs several times the reading of a small file
-    with pq.ParquetFile(path) as file:
-        present = None if columns is None else [name for name in columns if name in file.schema_arrow.names]
-        return file.read(columns=present, use_threads=False)
-
-
 def read_json(path: Path) -> Any:
     """The value in a JSON file.
 
@@ -230,21 +213,17 @@ def read_mapping(path: Path) -> dict[str, Any]:
     return value
 
 
-def read_yaml_file(path: Path) -> Any:
-    """The plain values in a YAML file; raises as `read_text` and `read_yaml`."""
-    return read_yaml(read_text(path))
-
-
-def read_yaml(text: str) -> Any:
-    """The plain values in a YAML text.
+def read_yaml(path: Path) -> Any:
+    """Return the plain values in a YAML file.
 
     Raises:
-        ValueError: it is not YAML.
+        OSError: As `regular`.
+        ValueError: It is not YAML, or as `regular`.
     """
     import yaml
 
     try:
-        return yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        return yaml.load(read_text(path), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     except (yaml.YAMLError, RecursionError) as error:
         raise ValueError(f"not YAML: {error}") from error
 
@@ -288,14 +267,6 @@ def read_yaml_lines(path: Path, what: str) -> tuple[dict[str, Any], dict[str, in
     if not isinstance(value, dict):
         raise UsageError(f"{what} holds no keys: write key: value")
     return value, lines
-
-
-def to_yaml(value: Any, **options: Any) -> str:
-    """Plain values as YAML."""
-    import yaml
-
-    text: str = yaml.dump(value, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False, **options)
-    return text
 
 
 def sha256_of(path: Path) -> str:

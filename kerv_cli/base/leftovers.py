@@ -2,7 +2,6 @@
 
 .<name>.<host>.<process>-<8 digits>.tmp   a file or a folder that is being written, or removed; its process is named, so
                                           that what a dead one left can be removed
-.<name>.lock                              held while <name> is changed
 """
 
 from __future__ import annotations
@@ -26,11 +25,6 @@ def temporary_beside(path: Path) -> Path:
     """A new hidden name in the folder of `path` that names this machine and process: `.<name>.<host>.<pid>-<8>.tmp`."""
     mark = f"{socket.gethostname().replace('.', '-')}.{os.getpid()}-{secrets.token_hex(4)}"
     return path.with_name(f".{path.name[:150]}.{mark}.tmp")
-
-
-def lock_beside(path: Path) -> Path:
-    """The lock of `path`."""
-    return path.with_name(f".{path.name}.lock")
 
 
 def is_left_over(path: Path) -> bool:

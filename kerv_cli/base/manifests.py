@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import hashlib
 import json
+import operator
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, get_args, get_type_hints
 
 from kerv_cli.base.errors import CheckpointError, KervError
 from kerv_cli.base.files import read_mapping, sha256_of
@@ -54,7 +56,7 @@ def read(kind: type[T], value: Any, what: str, tolerant: bool = False) -> T:
     except ValidationError as error:
         first = error.errors()[0]
         if tolerant and any(one["type"] == _UNKNOWN for one in error.errors()):
-            return read(kind, _without_unknown(kind, value), what)
+            return read(kind, _without(value, [one["loc"] for one in error.errors() if one["type"] == _UNKNOWN]), what)
         where = ".".join(map(str, first["loc"])) or "the whole"
         raise CheckpointError(f"{what} is damaged: {where}: {first['msg'].lower()}") from error
     except KervError as error:  # what the dataclass itself refuses, and settings out of range
@@ -62,21 +64,12 @@ def read(kind: type[T], value: Any, what: str, tolerant: bool = False) -> T:
     return checked
 
 
-def _without_unknown(hint: Any, value: Any) -> Any:
-    """`value` without the keys that the dataclasses of this type do not have, at any depth."""
-    inner = get_args(hint)
-    if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
-        hints = _hints(hint)  # type: ignore[arg-type]
-        return {name: _without_unknown(hints[name], one) for name, one in value.items() if name in hints}
-    if isinstance(value, Mapping) and get_origin(hint) in (dict, Mapping):
-        return {key: _without_unknown(inner[-1], one) for key, one in value.items()}
-    if isinstance(value, list | tuple) and get_origin(hint) in (list, tuple):
-        return [_without_unknown(inner[0], one) for one in value]
-    either = next((one for one in inner if dataclasses.is_dataclass(one)), None)  # X | None
-    return value if either is None else _without_unknown(either, value)
-
-
-_hints = functools.cache(get_type_hints)
+def _without(value: Any, fields: list[tuple[int | str, ...]]) -> Any:
+    """Return a copy of plain values without these fields, at any depth."""
+    value = copy.deepcopy(value)
+    for *path, name in fields:
+        del functools.reduce(operator.getitem, path, value)[name]
+    return value
 
 
 def read_file(kind: type[T], path: Path) -> T:

@@ -2,57 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-import re
 import tempfile
-from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from kerv_cli.base.errors import StorageError, UsageError
 from kerv_cli.base.files import storage_errors
 from kerv_cli.base.limits import check_name
-
-RELEASED = {
-    "mt10-state": "074e70fddd4f9a41885d7af9e93d81c722b3e470e23a2f560facf1556442f050",
-    "mt10-vision": "d2bda555360bfcd04b9d3c77a665623b23c1c9fedff1229838ade1f5cfca47de",
-    "mt10-vision-parallel": "096ce2dae9793b7f2efa3fbf020bebaf9ec6b664e650ab8ef97efc503db1e7f4",
-    "mt50-plain": "c2455773de37ced5e7a6db9bfda64a36375c27a7c62a8c2b354a9af55e548f54",
-    "mt50-vision": "11cbcfd366f20df05355e5715afc4bb0d032547815b0e3821dd8ee66ea46727b",
-}
-"""Shipped policy -> SHA-256 of its target's weights. The wheel holds one of them, a checkout and a release all."""
-
-STORE = "KERV_STORE"
-"""Environment variable with the URL of the database; empty: SQLite in the results folder."""
-RESUME = "resume.safetensors"
-"""The file of a training's state in the folder of what it makes; nothing that is shipped has it."""
-
-
-@contextlib.contextmanager
-def store_of_words(words: Iterable[str]) -> Iterator[list[str]]:
-    """Use the database that `store=URL` names, in this process and its workers, until the block ends.
-
-    Without such a word `KERV_STORE` stays as it is.
-
-    Args:
-        words: Overrides of a command.
-
-    Yields:
-        The same words. The URL is quoted where Hydra needs that and has lost its password, so that none is stored.
-    """
-    words, before = list(words), os.environ.get(STORE)
-    for number, word in enumerate(words):
-        if word.startswith("store="):
-            os.environ[STORE] = url = word.removeprefix("store=").strip("'\"")
-            url = re.sub(r"(://[^/@:]*):[^/@]*@", r"\1@", url)
-            words[number] = f"store={url}" if re.fullmatch(r"[\w:/@.%+-]*", url) else f"store='{url}'"
-    try:
-        yield words
-    finally:
-        if before is None:
-            os.environ.pop(STORE, None)
-        else:
-            os.environ[STORE] = before
 
 
 def results_dir(results: str) -> Path:
@@ -104,64 +59,3 @@ def as_path(text: str) -> Path:
     if "\0" in text or any(len(part.encode()) > 255 for part in text.split("/")) or len(text) > 4000:
         raise UsageError(f"'{text[:80]}…' is no path")
     return Path(text).expanduser()
-
-
-def shipped_dir() -> Path:
-    """`results/pretrained` of the checkout that the package runs from, else the `pretrained` inside the installed
-    package (`mt10-vision` alone)."""
-    package = Path(__file__).resolve().parents[1]
-    checkout = package.parent / "results" / "pretrained"
-    return checkout if checkout.is_dir() else package / "pretrained"
-
-
-def find_target(results: str, name: str) -> Path:
-    """Folder of the target `name`: `name` itself if it is a path, else an artifact, else a shipped policy.
-
-    Raises:
-        UsageError: nothing of that name; the line lists what there is.
-    """
-    if "/" in name:
-        folders = [as_path(name)]
-    else:
-        policies = results_dir(results) / "pretrained" / name, shipped_dir() / name
-        folders = [artifact(results, "target", name), *(policy / "target" for policy in policies)]
-    for folder in folders:
-        if (folder / "target.json").is_file():
-            return folder
-    if name in RELEASED:
-        raise UsageError(
-            f"policy '{name}' is not in this wheel: fetch {name}.tar.gz of the release, then 'kerv build policy "
-            f"source={name}.tar.gz', or source= its URL"
-        )
-    names = target_names(results)
-    raise UsageError(
-        f"no target '{name}' in {', '.join(map(str, folders))}: train it with 'kerv train target name={name}'"
-        + (f", or take one of {', '.join(names)}" if names else "")
-    )
-
-
-def check_not_shipped(path: Path, word: str) -> None:
-    """Refuses to replace an artifact of a shipped policy. path: where it is to be written. word: the setting that names
-    another place, e.g. `policy.artifacts.scout`.
-
-    Raises:
-        UsageError: there is one beside the shipped target, and no training of the user's made it.
-    """
-    made_here = (path / RESUME).is_file()
-    if path.exists() and (path.parent / "target" / "target.json").is_file() and not made_here:
-        raise UsageError(f"{path} is there, as a part of a shipped policy: {word}=NAME makes one of yours")
-
-
-def target_names(results: str) -> list[str]:
-    """Names of the targets that are there: shipped ones, then those of the results folder."""
-    shipped = sorted(path.parent.parent.name for path in shipped_dir().glob("[!.]*/target/target.json"))
-    stored = sorted(path.parent.name for path in (results_dir(results) / "artifacts/target").glob("[!.]*/target.json"))
-    return list(dict.fromkeys([*shipped, *stored]))
-
-
-def beside(target: Path, kind: str) -> Path:
-    """Folder of the artifact `kind` of a target: its sibling in a shipped policy (pretrained/<name>/{target,<kind>}),
-    artifacts/<kind>/<name> for a trained one (artifacts/target/<name>), else a subfolder."""
-    if target.name == "target":
-        return target.parent / kind
-    return target.parent.parent / kind / target.name if target.parent.name == "target" else target / kind

@@ -14,12 +14,13 @@ from __future__ import annotations
 import functools
 import importlib
 import os
+import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from typing import Any
 
-from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.limits import check_settings
 
 PLUGINS = "KERV_PLUGINS"
@@ -225,10 +226,10 @@ def kinds() -> tuple[str, ...]:
 
 @functools.cache
 def load_plugins() -> None:
-    """Registers kerv's own parts, then those of installed packages and of `KERV_PLUGINS`.
+    """Register kerv's own parts, then those of installed packages and of `KERV_PLUGINS`.
 
     Raises:
-        UsageError: a plugin that cannot be imported.
+        UsageError: A plugin cannot be imported. The message names file and line.
     """
     for name in MODULES:
         importlib.import_module(name)
@@ -236,7 +237,15 @@ def load_plugins() -> None:
     for name in [*(entry.value for entry in entry_points(group="kerv.parts")), *files]:
         try:
             importlib.import_module(name)
-        except ImportError as error:
-            raise UsageError(
-                f"plugin {name} cannot be imported ({error}): mend it, or leave it out of {PLUGINS}"
-            ) from None
+        except Exception as error:
+            what = error if isinstance(error, KervError) else f"{type(error).__name__}: {getattr(error, 'msg', error)}"
+            raise UsageError(f"plugin {name}: {_place_of(error)}{what}; or leave it out of {PLUGINS}") from error
+
+
+def _place_of(error: Exception) -> str:
+    """Return `FILE:LINE: ` of an error in a plugin; empty if the plugin was not found."""
+    if isinstance(error, SyntaxError):
+        return f"{error.filename}:{error.lineno}: "
+    frames = traceback.extract_tb(error.__traceback__)[2:]
+    places = [f"{frame.filename}:{frame.lineno}: " for frame in frames if frame.filename[0] != "<"]
+    return next((place for place in reversed(places) if not place.startswith(__file__)), "")

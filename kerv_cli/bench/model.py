@@ -14,7 +14,6 @@ from torch import Tensor
 
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.places import target_names
 from kerv_cli.base.runtime import DTYPES, set_up
 from kerv_cli.base.spaces import Observation
 from kerv_cli.bench.machine import REPEATS, product_with, timed
@@ -30,6 +29,7 @@ from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_b
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import Layer
+from kerv_cli.targets.folders import target_names
 from kerv_cli.training.imitation import vocabulary
 from kerv_cli.training.settings import TrainTargetSettings
 from kerv_cli.worlds.metaworld.spec import SPEC

@@ -9,7 +9,6 @@ import torch
 
 from kerv_cli.base.files import write_json
 from kerv_cli.base.places import results_dir
-from kerv_cli.base.provenance import stamp
 from kerv_cli.bench.ceilings import MethodCeiling, ceilings
 from kerv_cli.bench.machine import Machine
 from kerv_cli.bench.model import Model
@@ -17,6 +16,7 @@ from kerv_cli.bench.phases import Phase, measure
 from kerv_cli.bench.profile import Document, profile_of, projections
 from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.engine.cost import Profile
+from kerv_cli.targets.provenance import stamp
 
 
 @dataclass(frozen=True)

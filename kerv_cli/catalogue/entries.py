@@ -21,12 +21,12 @@ from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.files import read_mapping, read_text, sha256_of, storage_errors, sync, visible
 from kerv_cli.base.leftovers import clean, temporary_beside
 from kerv_cli.base.manifests import content_of
-from kerv_cli.base.places import shipped_dir
 from kerv_cli.base.registry import parts
 from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.lab.database import EPISODES, SETTINGS, STUDIES, WANTED, Database
 from kerv_cli.lab.runs import COMPLETE, RUNNING, RunRow, forget, run_rows
 from kerv_cli.lab.store import IMPORT, ROLLOUT, SWEEP, StudyStore
+from kerv_cli.targets.folders import shipped_dir
 
 LOG, WEIGHTS = "log.csv", "model.safetensors"
 """Files of a training."""

@@ -12,8 +12,7 @@ from typing import Any
 import pyarrow as pa
 
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
-from kerv_cli.base.files import read_mapping, read_yaml_file, sha256_of, visible
-from kerv_cli.base.foreign import foreign_table
+from kerv_cli.base.files import read_mapping, read_yaml, sha256_of, visible
 from kerv_cli.base.limits import check_label
 from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import SETTINGS_GROUPS, part_of
@@ -25,6 +24,7 @@ from kerv_cli.lab.database import Database
 from kerv_cli.lab.plan import Episode, Setting, Study, plain_settings
 from kerv_cli.lab.store import ROLLOUT, SWEEP, ImportedEpisode, StudyStore
 from kerv_cli.methods.settings import with_artifacts
+from kerv_cli.worlds.demos.parquet import foreign_table
 
 _FOLDERS = {"studies": SWEEP, "rollouts": ROLLOUT}
 _ROW = (*EPISODE_SCHEMA.names, "order", "started", "worker_pid")
@@ -77,7 +77,7 @@ def _left_out(folder: Path, error: BaseException) -> str:
 
 def _study_of(folder: Path, name: str, kind: str) -> tuple[Study, Cells]:
     """Return the study of a plan.yaml and its cells."""
-    plan = read_yaml_file(folder / "plan.yaml")
+    plan = read_yaml(folder / "plan.yaml")
     settings = {
         str(label): Setting(
             check_label(str(label)), str(one["overrides"]), completed(one["settings"]), dict(one["identity"])

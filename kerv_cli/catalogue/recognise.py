@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.foreign import foreign_sqlite
 from kerv_cli.catalogue import lerobot, vla_eval
 from kerv_cli.catalogue.older import import_older, older_studies
+from kerv_cli.catalogue.sqlite import foreign_sqlite
 from kerv_cli.catalogue.stored import Imported, import_database
 from kerv_cli.lab.database import ABOUT, FILE, Database
 

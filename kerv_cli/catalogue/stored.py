@@ -13,7 +13,7 @@ import sqlalchemy as sa
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import write_folder
-from kerv_cli.base.foreign import connect_foreign, foreign_table
+from kerv_cli.catalogue.sqlite import connect_foreign
 from kerv_cli.episodes.rows import DECODE_SCHEMA
 from kerv_cli.lab.database import (
     ABOUT,
@@ -31,6 +31,7 @@ from kerv_cli.lab.database import (
 )
 from kerv_cli.lab.plan import Episode, Setting, Study
 from kerv_cli.lab.store import ImportedEpisode, StudyStore, stored_study
+from kerv_cli.worlds.demos.parquet import foreign_table
 
 _DAMAGE = (sa.exc.SQLAlchemyError, sqlite3.Error, pa.ArrowException, OSError, ValueError, KeyError, TypeError)
 _ROW = (*(column.name for column in MEASURES), "order", "started", "worker_pid")

@@ -22,8 +22,8 @@ import pyarrow as pa
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import visible
-from kerv_cli.base.foreign import foreign_sqlite
 from kerv_cli.catalogue.served import path_of, read_served
+from kerv_cli.catalogue.sqlite import foreign_sqlite
 from kerv_cli.episodes.identity import ENGINE, OBSERVATION
 from kerv_cli.episodes.rows import DECODE_SCHEMA, EPISODE_SCHEMA, INT
 from kerv_cli.episodes.settings import RolloutSettings, settings_from

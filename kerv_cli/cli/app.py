@@ -103,7 +103,7 @@ app = typer.Typer(
 
 def _version(chosen: bool) -> None:
     if chosen:
-        from kerv_cli.base.provenance import git_commit, versions
+        from kerv_cli.targets.provenance import git_commit, versions
 
         names = ", ".join(f"{name} {number}" for name, number in versions().items())
         typer.echo(f"{names}, commit {git_commit()}")

@@ -20,9 +20,9 @@ from typer.core import TyperCommand
 
 from kerv_cli.base.config import compose, conf_dir, groups
 from kerv_cli.base.errors import UnknownName
-from kerv_cli.base.files import read_yaml_file
+from kerv_cli.base.files import read_yaml
 from kerv_cli.base.limits import field_of
-from kerv_cli.base.places import check_writable, store_of_words
+from kerv_cli.base.places import check_writable
 from kerv_cli.base.registry import NoSettings, Part, add, find, load, parts
 from kerv_cli.base.settings import CommandSettings, choices_of
 from kerv_cli.cli.common import settings_yaml
@@ -75,7 +75,9 @@ def typer_command(part: Part) -> TyperCommand:
 
     def callback(overrides: list[str] | None = None, cfg: bool = False, **options: object) -> None:
         words, names = _split(part, overrides or [], "names" in parameters)
-        with store_of_words(words) as words:
+        from kerv_cli.lab.database import chosen_store
+
+        with chosen_store(words) as words:
             arguments = {"words": words, "names": names, "cfg": cfg}
             if "settings" in parameters or (cfg and "cfg" not in parameters):
                 arguments["settings"] = _settings(part, words, cfg)
@@ -229,7 +231,7 @@ def _of_file(schema: type, key: str, default: object) -> object:
     """The value of a dotted key in the file of conf/ that its group chooses; `default` where that does not say."""
     group, *path = key.split(".")
     file = conf_dir() / group / f"{choices_of(schema).get(group)}.yaml"
-    value = read_yaml_file(file) if path and file.is_file() else {}
+    value = read_yaml(file) if path and file.is_file() else {}
     for name in path:
         value = value.get(name, {}) if isinstance(value, dict) else {}
     return default if value == {} else value

@@ -17,7 +17,6 @@ import typer
 
 from kerv_cli.base.durations import left
 from kerv_cli.base.errors import Interrupted, KervError, UsageError
-from kerv_cli.base.files import to_yaml
 from kerv_cli.base.limits import description
 
 if TYPE_CHECKING:
@@ -50,6 +49,8 @@ def _plain(value: object) -> object:
 
 def settings_yaml(settings: Any, indent: str = "") -> str:
     """Return a dataclass of settings as YAML, for `--cfg`; a comment says what each setting is."""
+    import yaml
+
     lines = []
     for setting in fields(settings):
         value = getattr(settings, setting.name)
@@ -57,7 +58,7 @@ def settings_yaml(settings: Any, indent: str = "") -> str:
             lines += [f"{setting.name}:", *settings_yaml(value, "  ").splitlines()]
             continue
         # without a maximum width, so that a string without line breaks is one line
-        text = to_yaml({setting.name: value}, width=2**30, default_flow_style=False, allow_unicode=True)
+        text = yaml.safe_dump({setting.name: value}, width=2**30, sort_keys=False, allow_unicode=True)
         first, *rest = text.splitlines()
         comment = description(setting) if not rest or not isinstance(value, str) else ""
         lines += [f"{first}  # {comment}" if comment else first, *rest]

@@ -12,14 +12,15 @@ import typer
 
 from kerv_cli.base.errors import StorageError, UnknownName
 from kerv_cli.base.files import visible
-from kerv_cli.base.findings import Finding, find, need
 from kerv_cli.base.leftovers import left_over, remove
 from kerv_cli.base.limits import number, setting
-from kerv_cli.base.places import check_writable, find_target, results_dir, shipped_dir
+from kerv_cli.base.places import check_writable, results_dir
 from kerv_cli.base.settings import RunSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, print_json, print_table
 from kerv_cli.methods.settings import PolicySettings
+from kerv_cli.targets.folders import find_target, shipped_dir
+from kerv_cli.worlds.findings import Finding, find, need
 from kerv_cli.worlds.settings import EVALUATION_SEED, WorldSettings
 
 if TYPE_CHECKING:
@@ -71,8 +72,8 @@ def doctor(settings: DoctorSettings, repair: Repair = False, as_json: AsJson = F
 
 
 def _machine(settings: DoctorSettings) -> list[Finding]:
-    from kerv_cli.base.provenance import versions
     from kerv_cli.report.viewing.viewer import has_display
+    from kerv_cli.targets.provenance import versions
     from kerv_cli.worlds import specs
 
     display = "a display is there: kerv view opens a window" if has_display() else "none: kerv view prints the command"
@@ -99,9 +100,9 @@ def _target(settings: DoctorSettings) -> list[Finding]:
 
     from kerv_cli.base.runtime import set_up
     from kerv_cli.base.spaces import Observation
-    from kerv_cli.base.views import frame_shape
     from kerv_cli.methods.artifacts import Artifacts
     from kerv_cli.targets.conformance import check_target
+    from kerv_cli.worlds.views import frame_shape
 
     device, _ = set_up(settings.runtime)
     artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
@@ -146,8 +147,8 @@ def _rendering(spec: EnvironmentSpec, settings: DoctorSettings) -> str:
 def _torch(settings: DoctorSettings) -> str:
     import torch
 
-    from kerv_cli.base.provenance import device_name
     from kerv_cli.base.runtime import set_up
+    from kerv_cli.targets.provenance import device_name
 
     device, _ = set_up(settings.runtime)
     cuda = "CUDA available" if torch.cuda.is_available() else "no CUDA device"

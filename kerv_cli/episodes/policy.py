@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.places import find_target
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.spaces import Observation, ObservationSpace
-from kerv_cli.base.views import frame_shape
 from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.episodes import clock
@@ -26,8 +24,10 @@ from kerv_cli.methods.artifacts import Artifacts, Use
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.settings import EXPERT, MethodSettings
 from kerv_cli.targets.checkpoint import TargetDescription, described
+from kerv_cli.targets.folders import find_target
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.spec import EnvironmentSpec
+from kerv_cli.worlds.views import frame_shape
 
 PRIVILEGED = "state (privileged)"
 WARM_UP_DECODES = 6

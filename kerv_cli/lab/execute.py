@@ -29,7 +29,6 @@ import sqlalchemy as sa
 from kerv_cli.base.errors import KervError, StorageError
 from kerv_cli.base.files import storage_errors, visible
 from kerv_cli.base.leftovers import clean, temporary_beside
-from kerv_cli.base.provenance import stamp
 from kerv_cli.base.registry import find
 from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.episodes.code import code_hash
@@ -50,6 +49,7 @@ from kerv_cli.lab.executors import Executor, WorkerLost, check_executor
 from kerv_cli.lab.plan import Block, Episode, Setting, seeds_text, split
 from kerv_cli.lab.runs import Run, is_running
 from kerv_cli.lab.store import Plan, insert_episode, stored_episodes
+from kerv_cli.targets.provenance import stamp
 
 _POLL_SECONDS = 0.2
 

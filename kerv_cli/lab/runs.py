@@ -18,8 +18,8 @@ import sqlalchemy as sa
 from kerv_cli.base.errors import Interrupted, StorageError, UsageError
 from kerv_cli.base.leftovers import is_alive
 from kerv_cli.base.places import results_dir
-from kerv_cli.base.provenance import git_commit
 from kerv_cli.lab.database import METRICS, RUNS, Database, new_id, now
+from kerv_cli.targets.provenance import git_commit
 
 RUNNING, COMPLETE, FAILED, INTERRUPTED = "running", "complete", "failed", "interrupted"
 

@@ -13,7 +13,7 @@ from torch import nn
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import sha256_of
 from kerv_cli.base.manifests import check_files, read_file
-from kerv_cli.base.places import artifact, beside, find_target
+from kerv_cli.base.places import artifact
 from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import DTYPES
 from kerv_cli.base.spaces import ActionSpace
@@ -22,6 +22,7 @@ from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets import checkpoint
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.packed import load_packed
+from kerv_cli.targets.folders import beside, find_target
 
 TARGET = "target"
 

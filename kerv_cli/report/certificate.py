@@ -16,8 +16,6 @@ import pandas as pd
 from kerv_cli.base.config import as_overrides, compose
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_json
-from kerv_cli.base.places import check_not_shipped
-from kerv_cli.base.provenance import provenance
 from kerv_cli.base.registry import METHOD_KINDS, part_of
 from kerv_cli.episodes.identity import ENGINE
 from kerv_cli.episodes.policy import artifacts_of
@@ -31,6 +29,8 @@ from kerv_cli.methods.compose import Method
 from kerv_cli.report.measures import paired
 from kerv_cli.report.statistics import MOST_PAIRS
 from kerv_cli.report.tables import load_study
+from kerv_cli.targets.folders import check_not_shipped
+from kerv_cli.targets.provenance import provenance
 from kerv_cli.worlds import resolve_tasks, spec_of
 
 POINTS = 100.0

@@ -14,13 +14,14 @@ import pandas as pd
 import pyarrow.compute as pc
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.places import as_path, shipped_dir
+from kerv_cli.base.places import as_path
 from kerv_cli.engine.cost import READ_PHASES, Profile, Work, prices, read_profile, work_of
 from kerv_cli.episodes.identity import batch_of
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MICRO, Row, decodes, measure
 from kerv_cli.report.summary import SPEEDS, intervals
 from kerv_cli.report.tables import StudyData, rows_of
+from kerv_cli.targets.folders import shipped_dir
 
 ASSUMES = (
     "Speed against the baseline by the cost model: the recorded decodes at a profile's costs, as if the other machine "

@@ -15,11 +15,11 @@ import pandas as pd
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_text
-from kerv_cli.base.provenance import PACKAGES
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, flat, stress_of, without
 from kerv_cli.lab.plan import Episode, Setting, Study, seeds_text
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MACRO, MICRO, Row, measure
+from kerv_cli.targets.provenance import PACKAGES
 from kerv_cli.worlds import specs
 
 CSV_COLUMNS = (

@@ -8,8 +8,8 @@ import numpy as np
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
-from kerv_cli.base.views import frame_shape
 from kerv_cli.serve.wire import Message
+from kerv_cli.worlds.views import frame_shape
 
 LARGEST = 4096
 """Pixels of an image's longest side, for a policy that resizes images itself."""

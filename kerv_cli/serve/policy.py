@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.provenance import stamp
 from kerv_cli.base.registry import find
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.batched import BatchDecoder
@@ -26,6 +25,7 @@ from kerv_cli.methods.settings import MethodSettings
 from kerv_cli.serve.guard import Finite, StateRange
 from kerv_cli.serve.interface import Interface
 from kerv_cli.serve.settings import ServeSettings
+from kerv_cli.targets.provenance import stamp
 from kerv_cli.worlds import specs
 
 VLA_EVAL = "vla_eval"

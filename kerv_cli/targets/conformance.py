@@ -14,11 +14,11 @@ from collections.abc import Callable, Iterable, Sequence
 import torch
 from torch import Tensor
 
-from kerv_cli.base.findings import Finding, find, need
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.protocol import Cache, Target
+from kerv_cli.worlds.findings import Finding, find, need
 
 TOLERANCE = {torch.float64: 1e-6, torch.float32: 2e-4, torch.bfloat16: 0.2, torch.float16: 0.05}
 """Largest difference of logits relative to their spread, by number format. Sums in another order round differently."""

@@ -11,8 +11,9 @@ from pathlib import Path
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import sha256_of, write_folder
-from kerv_cli.base.places import RELEASED, as_path, results_dir
+from kerv_cli.base.places import as_path, results_dir
 from kerv_cli.targets.checkpoint import read_target
+from kerv_cli.targets.folders import RELEASED
 from kerv_cli.targets.settings import BuildPolicySettings
 
 TIMEOUT = 60.0  # seconds without an answer

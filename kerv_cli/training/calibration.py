@@ -16,8 +16,7 @@ import numpy as np
 
 from kerv_cli.base.errors import CheckpointError, KervError
 from kerv_cli.base.files import read_mapping, write_json
-from kerv_cli.base.places import artifact, check_not_shipped
-from kerv_cli.base.provenance import provenance_of
+from kerv_cli.base.places import artifact
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
@@ -31,7 +30,9 @@ from kerv_cli.methods.calibration import (
 )
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.heisd.rules import BoundaryRanges
+from kerv_cli.targets.folders import check_not_shipped
 from kerv_cli.targets.observations import observations_of
+from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import demos_for
 from kerv_cli.training.predictor_fit import choose_episodes, fit_filters, prediction_errors, read_windows
 from kerv_cli.training.settings import CalibrateSettings

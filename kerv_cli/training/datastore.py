@@ -15,8 +15,7 @@ import torch
 
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.files import read_mapping, sha256_of, visible, write_folder, write_json
-from kerv_cli.base.places import artifact, check_not_shipped
-from kerv_cli.base.provenance import provenance_of
+from kerv_cli.base.places import artifact
 from kerv_cli.base.runtime import set_up
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.heisd.datastore import (
@@ -30,7 +29,9 @@ from kerv_cli.methods.heisd.datastore import (
     projected,
     prompt_key,
 )
+from kerv_cli.targets.folders import check_not_shipped
 from kerv_cli.targets.observations import observations_of, prompts_of, read_chunks, steps_of
+from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import demos_for
 from kerv_cli.training.settings import BuildDatastoreSettings
 from kerv_cli.worlds import resolve_tasks

@@ -9,15 +9,16 @@ from pathlib import Path
 from typing import TypeVar
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.places import artifact, find_target, results_dir
+from kerv_cli.base.places import artifact, results_dir
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
-from kerv_cli.base.views import views_of
 from kerv_cli.episodes.settings import DEFAULT_TASKS
 from kerv_cli.lab.runs import command_to_go_on
 from kerv_cli.targets.checkpoint import TargetDescription, described
+from kerv_cli.targets.folders import find_target
 from kerv_cli.training.settings import DemonstrationSettings
 from kerv_cli.worlds import resolve_tasks, specs, stands_for_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.views import views_of
 
 S = TypeVar("S", bound=DemonstrationSettings)
 

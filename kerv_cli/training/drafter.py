@@ -9,12 +9,12 @@ from torch import nn
 
 from kerv_cli.base.durations import about
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.places import check_not_shipped, find_target
 from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import set_up
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.drafters import TrainableDrafter
 from kerv_cli.targets.checkpoint import load_target, read_target
+from kerv_cli.targets.folders import check_not_shipped, find_target
 from kerv_cli.training.demonstrations import demos_for, subset
 from kerv_cli.training.run import TrainingRun, refuse_unused
 from kerv_cli.training.settings import TrainDrafterSettings

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError, Interrupted, KervError
 from kerv_cli.base.files import write_text
-from kerv_cli.base.places import RESUME
+from kerv_cli.targets.folders import RESUME
 from kerv_cli.training.interruption import until_interrupted
 from kerv_cli.training.resume import Metrics, Progress, check_same_run, read_state, write_state
 from kerv_cli.training.settings import TrainSettings

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.manifests import read
-from kerv_cli.base.places import RESUME
 from kerv_cli.targets.checkpoint import load_tensors, save_tensors
+from kerv_cli.targets.folders import RESUME
 
 Metrics = dict[str, float]
 

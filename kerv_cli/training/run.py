@@ -13,9 +13,9 @@ from typing import Any
 from torch import nn
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.provenance import provenance_of
 from kerv_cli.lab.runs import Curve
 from kerv_cli.methods.artifacts import removal
+from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.loop import Loop, Metrics, Objective
 from kerv_cli.training.resume import check_same_run, stored_identity
 from kerv_cli.training.settings import TrainDrafterSettings, TrainSettings, TrainTargetSettings

@@ -13,13 +13,13 @@ from torch import nn
 
 from kerv_cli.base.durations import about
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.places import artifact, find_target
+from kerv_cli.base.places import artifact
 from kerv_cli.base.runtime import set_up
-from kerv_cli.base.views import views_of
 from kerv_cli.episodes.runner import success_of
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.targets.folders import find_target
 from kerv_cli.training.demonstrations import check_spaces, check_tasks, name_of, open_demos, seen_by
 from kerv_cli.training.imitation import (
     Imitation,
@@ -32,6 +32,7 @@ from kerv_cli.training.run import TrainingRun, refuse_unused
 from kerv_cli.training.settings import TrainTargetSettings
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
 from kerv_cli.worlds.demos.dataset import OnProgress
+from kerv_cli.worlds.views import views_of
 
 STATE_EPISODES = 200
 """Episodes from which the range of states is taken, at most."""

@@ -6,7 +6,7 @@ import functools
 
 import numpy as np
 
-from kerv_cli.base.findings import Finding, find, need
+from kerv_cli.worlds.findings import Finding, find, need
 from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import EnvironmentSpec, World
 

@@ -14,10 +14,10 @@ from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.limits import check_settings
 from kerv_cli.base.registry import find, load
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
-from kerv_cli.base.views import views_of
 from kerv_cli.worlds.settings import CameraSettings, StressSettings
 from kerv_cli.worlds.stress.base import NO_STRESS, Stress
 from kerv_cli.worlds.task import Task
+from kerv_cli.worlds.views import views_of
 
 Expert: TypeAlias = Callable[[Observation], NDArray[np.float64]]
 """Scripted controller of one task: observation to action (D,) within the limits. It keeps no memory."""

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.processes import guard
 from kerv_cli.lab.executors import THREAD_VARIABLES, Executor, SlurmOptions, WorkerLost
+from kerv_cli.lab.executors.guard import guard
 
 T = TypeVar("T")
 

@@ -18,7 +18,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.provenance import provenance_of
 from kerv_cli.base.runtime import set_up
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
@@ -37,6 +36,7 @@ from kerv_cli.methods.eagle.public import Convention, PublicDrafter, PublicShape
 from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.compact.trunk import LayerStack
+from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
 VALIDATED = 60

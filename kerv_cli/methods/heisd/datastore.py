@@ -24,7 +24,6 @@ from torch import Tensor
 
 from kerv_cli.base import registry
 from kerv_cli.base.errors import CheckpointError, UnknownName
-from kerv_cli.base.files import read_table
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.protocol import ReadableTarget
@@ -302,7 +301,11 @@ def _arrays(folder: Path, manifest: Manifest) -> dict[str, Any]:
 
 
 def _read_payload(path: Path) -> dict[str, np.ndarray]:
-    table = read_table(path)
+    import pyarrow.parquet as pq
+
+    # without pyarrow's dataset machinery, which takes several times as long for a small file
+    with pq.ParquetFile(path) as file:
+        table = file.read(use_threads=False)
     columns = {name: table[column].to_numpy() for name, column in COLUMNS.items()}
     flat = table["tokens"].combine_chunks().flatten().to_numpy()
     return {"tokens": flat.reshape(len(table), -1), **columns}

@@ -21,7 +21,6 @@ from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
-from kerv_cli.base.views import frame_shape, views_of
 from kerv_cli.engine.transfer import upload
 from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.compact.features import (
@@ -38,6 +37,7 @@ from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Trunk
 from kerv_cli.targets.compact.vision import VisionEncoder
+from kerv_cli.worlds.views import frame_shape, views_of
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from typing import Any
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_json
 from kerv_cli.base.places import artifact
-from kerv_cli.base.provenance import provenance
 from kerv_cli.base.registry import find, load
 from kerv_cli.base.spaces import ObservationSpace
 from kerv_cli.targets.checkpoint import FORMAT, target_fields
@@ -18,6 +17,7 @@ from kerv_cli.targets.openvla.image import read_normalisations
 from kerv_cli.targets.openvla.loading import check_finite, digest_of, open_checked
 from kerv_cli.targets.openvla.prompt import Prompter
 from kerv_cli.targets.openvla.target import OpenVLASettings
+from kerv_cli.targets.provenance import provenance
 from kerv_cli.targets.settings import BuildTargetSettings
 
 NO_STATE = ObservationSpace(proprioception=(), state=0, places=(), centre=(0.0, 0.0, 0.0))

@@ -19,12 +19,12 @@ import pyarrow.parquet as pq
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import atomic_path, visible, write_folder, write_json
-from kerv_cli.base.views import VIEWS
 from kerv_cli.worlds import instruction_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.demos.frames import encode_png
 from kerv_cli.worlds.demos.lerobot import layout
+from kerv_cli.worlds.views import VIEWS
 
 PICTURE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 

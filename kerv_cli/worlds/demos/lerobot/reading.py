@@ -16,12 +16,12 @@ from PIL import Image, UnidentifiedImageError
 
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
 from kerv_cli.base.files import read_mapping, regular, write_folder, write_json
-from kerv_cli.base.foreign import foreign_table
 from kerv_cli.base.places import as_path
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, action_limits
 from kerv_cli.worlds.demos.dataset import FORMAT, DemoDataset, EpisodeEntry, OnProgress, episode_path, totals
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, save_episode
 from kerv_cli.worlds.demos.lerobot import layout
+from kerv_cli.worlds.demos.parquet import foreign_table
 from kerv_cli.worlds.settings import DemosImportSettings
 
 Row: TypeAlias = Mapping[str, Any]

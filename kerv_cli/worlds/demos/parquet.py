@@ -1,10 +1,8 @@
-"""Reads SQLite and Parquet files that other programs wrote, with limits: a small file can stand for a huge result."""
+"""Read Parquet files that other programs wrote, with limits: a small file can stand for a huge table."""
 
 from __future__ import annotations
 
-import contextlib
 import io
-import sqlite3
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,61 +13,9 @@ if TYPE_CHECKING:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-MOST_STEPS = 20_000_000
-"""Steps of SQLite's virtual machine that a connection may take, besides STEPS_PER_BYTE. They take about a second."""
-STEPS_PER_BYTE = 20
-MOST_VALUE = 2**28
-"""Bytes of one value of a SQLite file."""
 MOST_EXPANDED = 2**30
 """Bytes of a Parquet file's table in memory."""
 _BATCH = 2**28
-_EVERY = 10_000
-
-
-@contextlib.contextmanager
-def foreign_sqlite(path: Path) -> Iterator[sqlite3.Connection]:
-    """Yield a read-only connection to a SQLite file, which is closed afterwards.
-
-    Queries end in an error after a number of steps that depends on the size of the file.
-
-    Raises:
-        OSError: The file is missing or not a regular one. ValueError: It is cut short, or has views.
-    """
-    connection = connect_foreign(path)
-    try:
-        yield connection
-    finally:
-        connection.close()
-
-
-def connect_foreign(path: Path, **options: Any) -> sqlite3.Connection:
-    """Return the connection of `foreign_sqlite`, to be closed by the caller; raises as that. options: of `connect`."""
-    size = regular(path).stat().st_size
-    log = path.with_name(f"{path.name}-wal")
-    # a file whose writer was killed has its last rows in the log, which an immutable connection does not read
-    immutable = "" if log.is_file() and log.stat().st_size else "&immutable=1"
-    connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro{immutable}", uri=True, **options)
-    try:
-        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_VALUE)
-        left = (MOST_STEPS + STEPS_PER_BYTE * size) // _EVERY
-
-        def count() -> bool:
-            nonlocal left
-            left -= 1
-            return left < 0
-
-        connection.set_progress_handler(count, _EVERY)
-        connection.execute("PRAGMA trusted_schema=OFF")
-        pages = connection.execute("PRAGMA page_count").fetchone()[0]
-        if immutable and size < pages * connection.execute("PRAGMA page_size").fetchone()[0]:
-            raise ValueError(f"only {size} bytes are there")
-        views = [name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'view'")]
-        if views:
-            raise ValueError(f"it has the view {views[0][:40]}, which could compute anything")
-    except BaseException:
-        connection.close()
-        raise
-    return connection
 
 
 def foreign_table(
