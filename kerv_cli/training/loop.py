@@ -67,7 +67,7 @@ class Loop:
     ) -> None:
         self.objective, self.module, self.save, self.settings = objective, objective.module, save, settings
         self.folder, self.identity, self.keep = folder, identity, keep
-        self.step, self.best = 0, -math.inf
+        self.step = 0
         self.history: list[Metrics] = []
         matrices = [p for p in self.module.parameters() if p.dim() >= 2]
         vectors = [p for p in self.module.parameters() if p.dim() < 2]
@@ -147,8 +147,7 @@ class Loop:
             if not math.isfinite(value):
                 raise KervError(f"training diverged: {name} is {value} at step {self.step}: lower train.lr")
         self.history.append(metrics)
-        if metrics["score"] >= self.best:
-            self.best = metrics["score"]
+        if metrics["score"] >= max(one["score"] for one in self.history):
             self.save(module, metrics)
         module.load_state_dict(live)
         module.train()
@@ -160,8 +159,7 @@ class Loop:
         tensors |= {f"ema.{k}": v for k, v in self.ema.items()}
         for i, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{i}.{k}": v for k, v in moments.items()}
-        best = self.best if self.history else None
-        write_state(self.folder / RESUME, tensors, Progress(self.identity, self.step, best, self.history))
+        write_state(self.folder / RESUME, tensors, Progress(self.identity, self.step, self.history))
         self.log()
 
     def log(self) -> None:
@@ -194,7 +192,6 @@ class Loop:
         groups = self.optimiser.state_dict()["param_groups"]
         self.optimiser.load_state_dict({"state": state, "param_groups": groups})
         self.step, self.history = progress.step, progress.history
-        self.best = -math.inf if progress.best is None else progress.best
         self.log()  # the run may have ended before it wrote the log
 
 

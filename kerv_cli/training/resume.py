@@ -29,13 +29,11 @@ class Progress:
     Attributes:
         identity: Hash of everything that determines the run.
         step: Steps done.
-        best: Highest score so far; None before the first validation.
         history: Metrics of every validation.
     """
 
     identity: str
     step: int
-    best: float | None
     history: list[Metrics]
 
 
@@ -71,7 +69,7 @@ def read_state(path: Path) -> tuple[dict[str, Tensor], Progress]:
         tensors, text = load_tensors(path, "training state"), state["progress"]
         if state["sha256"] != digest(tensors, text):
             raise ValueError("its hash does not fit")
-        return tensors, read(Progress, json.loads(text), str(path))
+        return tensors, read(Progress, json.loads(text), str(path), tolerant=True)
     except _UNREADABLE as error:
         remedy = f"move {path.parent} aside to begin again"
         raise CheckpointError(f"training state at {path} is damaged ({error}): {remedy}") from error
