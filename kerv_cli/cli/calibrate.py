@@ -109,7 +109,7 @@ def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json
     from kerv_cli.cli.episodes import planned_study, print_settings, print_study_plan, run_study
     from kerv_cli.episodes.resolve import resolve
     from kerv_cli.lab.runs import making
-    from kerv_cli.report.certificate import candidate_rows, certify, deployment_note, folder_of, write
+    from kerv_cli.report.certificate import candidate_rows, certify, folder_of, write
 
     of_test = [word for word in words if word.split("=")[0] in OF_TEST]
     of_study = [word for word in words if word not in of_test]
@@ -124,9 +124,6 @@ def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json
         print_settings(resolved)
         return
     folder = folder_of(resolved)
-    note = deployment_note(resolved)
-    if note:
-        typer.echo(f"note: {note}", err=True)
     planned = planned_study(resolved, ["calibrate", "success", *words])
     if plan:
         print_study_plan(planned, as_json)

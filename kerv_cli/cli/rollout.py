@@ -106,7 +106,7 @@ def _print_setting(data: StudyData, per_task: list[Row], whole: Row) -> None:
     figures = [(task, by_task[task]) for task in dict.fromkeys(episodes["task"])]
     if len(figures) > 1:
         figures.append(("all", whole))
-    headers = ("task", "success", "steps", "forwards/step", "AL", "accepted/round", "ms/step")
+    headers = ("task", "success", "steps", "forwards/step", "tokens/verification", "drafts accepted", "ms/step")
     seeds = f"{episodes['seed'].min()}…{episodes['seed'].max()}"
     observation = setting.identity.get("observation", "")
     title = f"{setting.label}, observation {observation}{_stressed(setting.settings)}, seeds {seeds}"

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from kerv_cli.catalogue.entries import RunEntry
     from kerv_cli.cli.command import F
-    from kerv_cli.report.compare import Comparison, Difference
+    from kerv_cli.report.measures import Row
 
 
 @dataclass(kw_only=True)
@@ -133,27 +133,27 @@ def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False
     runs = _run_names(names, 2, 2, "two runs, ID or ID:SETTING")
     comparisons = [comparing.compare(a, b) for a, b in comparing.pairs_to_compare(settings.results, *runs)]
     if as_json:
-        print_json([asdict(comparison) for comparison in comparisons])
+        print_json(comparisons)
         return
     for comparison in comparisons:
-        typer.echo(f"\n{comparison.first}  →  {comparison.second}")
-        _print_differences(comparison.settings)
-        _print_results(comparison)
+        typer.echo(f"\n{comparison['first']}  →  {comparison['second']}")
+        _print_differences(comparison["settings"])
+        _print_results(comparison["results"])
 
 
-def _print_differences(rows: list[Difference]) -> None:
+def _print_differences(rows: list[Row]) -> None:
     if not rows:
         typer.echo("no difference in settings, weights, machine or versions")
         return
-    cells = (("–" if value is None else value for value in (row.key, row.first, row.second)) for row in rows)
+    cells = (("–" if value is None else value for value in row.values()) for row in rows)
     print_table(("setting", "first", "second"), cells)
 
 
-def _print_results(comparison: Comparison) -> None:
+def _print_results(results: list[Row]) -> None:
     from kerv_cli.report.tables import is_number
 
     rows = []
-    for row in comparison.results:
+    for row in results:
         interval = f"{row['low']:.3g} to {row['high']:.3g}" if is_number(row.get("low")) else ""
         numbers = (f"{row[name]:.4g}" for name in ("first", "second", "change"))
         rows.append((row["measure"], *numbers, interval, row.get("what", "")))

@@ -8,15 +8,13 @@ import math
 from collections.abc import Sequence
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from kerv_cli.base.config import as_overrides, compose
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_json
-from kerv_cli.base.registry import METHOD_KINDS, part_of
+from kerv_cli.base.registry import METHOD_KINDS
 from kerv_cli.episodes.identity import ENGINE
 from kerv_cli.episodes.policy import artifacts_of
 from kerv_cli.episodes.resolve import ResolvedStudy
@@ -87,24 +85,6 @@ def _check_conditions(resolved: ResolvedStudy) -> None:
         raise UsageError("world.stress: a certificate says nothing of a stressed world, leave it out")
     if first.rollout.clock != WAITS:
         raise UsageError(f"rollout.clock={first.rollout.clock}: a certificate is of a world that waits, leave it out")
-
-
-def deployment_note(resolved: ResolvedStudy) -> str:
-    """Return what to add to method=one_pass_certified so that it decodes as the study does; empty if nothing."""
-    preset, study = compose("rollout", ["method=one_pass_certified"], RolloutSettings).parts(), _settings(resolved)[1]
-    kinds = [kind for kind, part in study.parts().items() if kind not in _VARIED and part != preset[kind]]
-    was = " ".join(word for kind in kinds for word in _overrides(kind, preset[kind], getattr(study, kind)))
-    overrides = " ".join(word for kind in kinds for word in _overrides(kind, getattr(study, kind), preset[kind]))
-    note = f"method=one_pass_certified has {was}, this study {overrides}: to deploy its certificate add '{overrides}'"
-    return note if overrides else ""
-
-
-def _overrides(kind: str, part: Any, other: Any) -> list[str]:
-    """Return the overrides that replace the part `other` by `part`."""
-    chosen = [] if part.kind == other.kind else [f"{kind}={part.kind}"]
-    base = dataclasses.asdict(part_of(kind, part.kind).default if chosen else other)
-    changed = {f"{kind}.{name}": value for name, value in dataclasses.asdict(part).items() if value != base[name]}
-    return as_overrides(*chosen, **changed)
 
 
 def certify(
@@ -187,17 +167,12 @@ def candidate_rows(certificate: Certificate) -> list[dict[str, str]]:
             "success": f"{one.successes}/{one.pairs}",
             "success of AR": f"{one.ar}/{one.pairs}",
             "lost / won": f"{one.lost} / {one.won}",
-            "p": _p_text(one.p, certificate.delta),
+            "p": "not tested" if one.p is None else f"{one.p:.3g}",
+            "certified": "" if one.p is None else "yes" if one.p <= certificate.delta else "no",
             "more pairs needed": _needed_text(one.needed),
         }
         for one in certificate.candidates
     ]
-
-
-def _p_text(p: float | None, delta: float) -> str:
-    if p is None:
-        return "not tested"
-    return f"{p:.3g}" + (", certified" if p <= delta else "")
 
 
 def _needed_text(pairs: int) -> str:

@@ -41,32 +41,6 @@ class Side:
     data: StudyData | None = None
 
 
-@dataclass(frozen=True)
-class Difference:
-    """A setting, weight, machine or version in which the two sides differ; None if a side lacks it."""
-
-    key: str
-    first: object
-    second: object
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """The comparison of two sides.
-
-    Attributes:
-        first: Name of the first side.
-        second: Name of the second side.
-        settings: In what they differ.
-        results: A row per measure: both values, their difference or ratio, and its 95 % interval if it has one.
-    """
-
-    first: str
-    second: str
-    settings: list[Difference]
-    results: list[Row]
-
-
 def sides(results: str, name: str) -> list[Side]:
     """Return the sides that a name stands for: `ID` is every setting of a run, `ID:LABEL` one of them.
 
@@ -106,21 +80,25 @@ def pairs_to_compare(results: str, first: str, second: str) -> list[tuple[Side, 
     return [(replace(a, data=data.get(a.run.id)), replace(b, data=data.get(b.run.id))) for a, b in pairs]
 
 
-def compare(first: Side, second: Side) -> Comparison:
-    """Return the differences between two sides.
+def compare(first: Side, second: Side) -> Row:
+    """Return the differences between two sides, as JSON values.
+
+    Returns:
+        `first` and `second` (names), `settings` (key and both values, for every key in which they differ; None if a
+        side lacks it), `results` (a row per measure: both values, the change, its 95 % interval if it has one).
 
     Raises:
         UsageError: A setting without episodes.
     """
     ours, theirs = _settings_of(first), _settings_of(second)
-    keys = dict.fromkeys([*ours, *theirs])
-    differing = [Difference(key, ours.get(key), theirs.get(key)) for key in keys if ours.get(key) != theirs.get(key)]
+    pairs = {key: (ours.get(key), theirs.get(key)) for key in [*ours, *theirs]}
+    settings = [{"key": key, "first": a, "second": b} for key, (a, b) in pairs.items() if a != b]
     if first.data is None or second.data is None:
-        a, b = first.run.figures, second.run.figures
-        rows = [_plain(name, a[name], b[name]) for name in a if name in b]
+        figures = first.run.figures, second.run.figures
+        results = [_change(name, *(side[name] for side in figures)) for name in figures[0] if name in figures[1]]
     else:
-        rows = _episode_results(_episodes(first.data, first.label), _episodes(second.data, second.label))
-    return Comparison(first.name, second.name, differing, rows)
+        results = _episode_results(_episodes(first.data, first.label), _episodes(second.data, second.label))
+    return {"first": first.name, "second": second.name, "settings": settings, "results": results}
 
 
 def _settings_of(side: Side) -> Row:
@@ -152,23 +130,22 @@ def _episode_results(first: pd.DataFrame, second: pd.DataFrame) -> list[Row]:
     if first.empty or second.empty:
         raise UsageError("one of the two settings has no episode yet: run it first")
     a, b = measure(first, first, MICRO), measure(second, first, MICRO, all_pairs=True)
-    rows = [_measured("success", a["success"], b["success"], b, "difference", DIFFERENCE)]
-    rows += [_measured(heading, 1.0, b[name], b, name, "ratio of times") for name, heading in SPEEDS.items()]
+    rows = [_change("success", a["success"], b["success"]) | _interval(b, "difference", DIFFERENCE)]
+    rows += [_change(head, 1.0, b[name]) | _interval(b, name, "ratio of times") for name, head in SPEEDS.items()]
     rows += [
-        _plain(heading, a[name], b[name])
+        _change(heading, a[name], b[name])
         for name, heading in _MEASURES.items()
         if is_number(a[name]) and is_number(b[name]) and (a[name] or b[name])
     ]
     return [*rows, {"measure": "pairs", "first": len(first), "second": len(second), "change": b["pairs"]}]
 
 
-def _plain(name: str, first: float, second: float) -> Row:
+def _change(name: str, first: float, second: float) -> Row:
     return {"measure": name, "first": first, "second": second, "change": second - first}
 
 
-def _measured(name: str, first: float, second: float, values: Row, column: str, what: str) -> Row:
-    ends = {end: values[f"{column}_{end}"] for end in ("low", "high")}
-    return {"measure": name, "first": first, "second": second, "change": values[column], **ends, "what": what}
+def _interval(values: Row, name: str, what: str) -> Row:
+    return {"change": values[name], "low": values[f"{name}_low"], "high": values[f"{name}_high"], "what": what}
 
 
 def same_tokens(first: RunEntry, second: RunEntry) -> tuple[int, int]:

@@ -13,8 +13,6 @@ from kerv_cli.base.files import write_bytes
 from kerv_cli.lab.runs import Curve
 from kerv_cli.report.plots import COLOURS, MUTED, STYLE, new_figure, png
 
-_ACROSS = 3  # panels beside one another
-
 
 def read_log(folder: Path) -> pd.DataFrame:
     """Return the validations of a training, one row each.
@@ -35,21 +33,17 @@ def read_log(folder: Path) -> pd.DataFrame:
     return log
 
 
+@mpl.rc_context(STYLE)
 def curves_figure(log: pd.DataFrame, title: str) -> Figure:
     """Draw one panel per measure over steps and mark the best validation."""
     best = float(log["step"].to_numpy()[int(log["score"].to_numpy().argmax())])
     names = [str(name) for name in log.columns if name != "step"]
-    down = -(-len(names) // _ACROSS)
-    with mpl.rc_context(STYLE):
-        about = f"{len(log)} validations of the averaged weights; dotted: the saved ones, step {best:.0f}"
-        figure = new_figure(11.0, 1.0 + 2.3 * down, f"{title}\n{about}")
-        panels = figure.subplots(down, _ACROSS, squeeze=False).ravel()
-        for panel, name in zip(panels, names, strict=False):
-            panel.plot(log["step"], log[name], color=COLOURS[0], marker="o", markersize=3)
-            panel.axvline(best, color=MUTED, linewidth=1.0, linestyle=":")
-            panel.set(title=name, xlabel="step")
-        for panel in panels[len(names) :]:
-            panel.set_visible(False)
+    about = f"{len(log)} validations of the averaged weights; dotted: the saved ones, step {best:.0f}"
+    figure = new_figure(3.5 * len(names), 3.6, f"{title}\n{about}")
+    for panel, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
+        panel.plot(log["step"], log[name], color=COLOURS[0], marker="o", markersize=3)
+        panel.axvline(best, color=MUTED, linewidth=1.0, linestyle=":")
+        panel.set(title=name, xlabel="step")
     return figure
 
 

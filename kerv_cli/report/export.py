@@ -12,14 +12,14 @@ from pathlib import Path
 import pandas as pd
 
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.files import atomic_path
+from kerv_cli.base.files import atomic_path, write_text
 from kerv_cli.catalogue.entries import RunEntry, description_of, store_of
 from kerv_cli.catalogue.stored import export_database
 from kerv_cli.episodes.rows import DECODE_SCHEMA
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.curves import read_log
 from kerv_cli.report.measures import MICRO
-from kerv_cli.report.tables import flatten, is_number, load_study, rows_of, write_csv
+from kerv_cli.report.tables import csv_text, flatten, is_number, load_study, rows_of
 
 PROJECT = "kerv"
 FILES = ("csv", "parquet", "db")
@@ -114,7 +114,9 @@ def _numbers(row: Mapping[str, object]) -> dict[str, float]:
 
 def _to_csv(tracked: Tracked, folder: Path) -> str:
     rows = [{"step": step, **numbers} for step, numbers in tracked.history]
-    return str(write_csv(pd.DataFrame(rows), folder / f"{tracked.name.replace('/', '-').replace(' ', '_')}.csv"))
+    path = folder / f"{tracked.name.replace('/', '-').replace(' ', '_')}.csv"
+    write_text(path, csv_text(pd.DataFrame(rows)))
+    return str(path)
 
 
 def _to_trackio(tracked: Tracked, folder: Path) -> str:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import os
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
@@ -16,27 +16,18 @@ from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.decide import read_decisions, verdict_of
 from kerv_cli.report.measures import MACRO, MICRO, Row
 from kerv_cli.report.plots import about
+from kerv_cli.report.reprice import ASSUMES, repriced_summary
 from kerv_cli.report.summary import NOTE, SPEEDS, summary_frame
 from kerv_cli.report.tables import StudyData, is_baseline, is_number, rows_of
 from kerv_cli.report.verdict import caution
 
 
-@dataclass(frozen=True)
-class Section:
-    """An extra section of the page: other machines, latency, stress."""
-
-    title: str
-    note: str
-    figure: str  # an HTML element
-    table: pd.DataFrame | None = None  # of text
-
-
 def render(
     store: StudyStore,
     data: StudyData,
-    figures: Sequence[str],
-    sections: Sequence[Section],
-    files: Sequence[Path],
+    figures: Sequence[bytes],
+    tables: Sequence[Path],
+    priced: pd.DataFrame | None,
     loss: float,
 ) -> str:
     """Return the page.
@@ -44,9 +35,9 @@ def render(
     Args:
         store: The study's files and recordings.
         data: The study's episodes and tables.
-        figures: HTML elements.
-        sections: Extra sections.
-        files: The study's tables and plots; the page links the tables.
+        figures: PNG files.
+        tables: The study's CSV files, which the page links.
+        priced: The study's decodes at the costs of other machines, from `repriced_table`.
         loss: Points of success that the verdict allows to lose.
     """
     template = Environment(
@@ -70,11 +61,12 @@ def render(
         how_to_run=_how_to_run(store),
         suite=_suite(data.table),
         decisions=read_decisions(store.root),
-        figures=figures,
-        sections=sections,
+        figures=[base64.b64encode(figure).decode() for figure in figures],
+        machines=None if priced is None else repriced_summary(priced),
+        assumes=ASSUMES,
         tasks=_by_task(data.per_task),
         recordings=[(path.stem, _href(path, store.root)) for path in store.recordings],
-        files=[(path.name, _href(path, store.root)) for path in files if path.suffix == ".csv"],
+        files=[(path.name, _href(path, store.root)) for path in tables],
         commands=[(setting.label, setting.overrides) for setting in data.study.settings],
     )
 

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
-from matplotlib.figure import Figure
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_bytes, write_json, write_text
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.store import ROLLOUT, StudyStore, studies
 from kerv_cli.report.latency import latency_table
-from kerv_cli.report.page import Section, render
+from kerv_cli.report.page import render
 from kerv_cli.report.plots import about, latency_figure, png, study_figures
 from kerv_cli.report.publish import check_publishable
-from kerv_cli.report.reprice import ASSUMES, open_profiles, repriced_summary, repriced_table
+from kerv_cli.report.reprice import open_profiles, repriced_table
 from kerv_cli.report.stressed import is_stressed, summed_table
-from kerv_cli.report.tables import CSV_COLUMNS, StudyData, further_of, load_study, write_csv
+from kerv_cli.report.tables import CSV_COLUMNS, StudyData, csv_text, further_of, load_study
 
 LOSS = 3.0
 """Points of success that the page's verdict allows to lose by default."""
@@ -106,54 +104,28 @@ def write_study(
     Raises:
         Unpublishable, StorageError: As `report`.
     """
-    results = store.database.results
+    results, name, title = store.database.results, store.name, data.study.title or store.name
     if publish:
         check_publishable(data)
-    files, name, title = _Files(results if publish else results / "report"), store.name, data.study.title or store.name
-    files.add_table(data.table[list(CSV_COLUMNS)], name)
-    files.add_table(data.per_task[list(CSV_COLUMNS)], f"{name}_per_task")
-    files.paths.append(files.folder / "tables" / f"{name}.json")
-    write_json(files.paths[-1], further_of(data))
+    tables = {"": data.table[list(CSV_COLUMNS)], "_per_task": data.per_task[list(CSV_COLUMNS)]}
     figures = study_figures(data.table, data.study.axis, title)
-    plots = [files.add_plot(figure, f"{name}{suffix}") for suffix, figure in figures.items()]
-    sections = _sections(data, priced, files)
-    page = store.root / "report.html"
-    write_text(page, render(store, data, plots, sections, files.paths, loss))
-    return [*files.paths, page]
-
-
-class _Files:
-    """The tables and plots of a study below a folder; `paths` in the order of writing."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.paths: list[Path] = []
-
-    def add_table(self, table: pd.DataFrame, name: str) -> None:
-        """Write tables/<name>.csv."""
-        self.paths.append(write_csv(table, self.folder / "tables" / f"{name}.csv"))
-
-    def add_plot(self, figure: Figure, name: str) -> str:
-        """Write plots/<name>.png and return an HTML element that holds the figure itself."""
-        self.paths.append(self.folder / "plots" / f"{name}.png")
-        content = png(figure)
-        write_bytes(self.paths[-1], content)
-        return f'<img alt="" src="data:image/png;base64,{base64.b64encode(content).decode()}">'
-
-
-def _sections(data: StudyData, priced: pd.DataFrame | None, files: _Files) -> list[Section]:
-    """Write the tables and plots of the page's extra sections and return the sections."""
-    sections, study = [], data.study.name
     if priced is not None:
-        files.add_table(priced, f"{study}_on")
-        sections.append(Section("On other machines", f"{ASSUMES}.", "", repriced_summary(priced)))
+        tables["_on"] = priced
     latencies = latency_table(data.table)
     if len(latencies):
-        title, name = "Success against the time that AR takes", f"{study}_latency"
-        files.add_table(latencies, name)
-        figure = files.add_plot(latency_figure(latencies, f"{title}\n{about(data.table)}"), name)
-        note = "Every setting beside AR at the same latency and compensation, same episodes."
-        sections.append(Section(title, note, figure))
+        tables["_latency"] = latencies
+        heading = f"Success against the time that AR takes\n{about(data.table)}"
+        figures["_latency"] = latency_figure(latencies, heading)
     if is_stressed(data.table):
-        files.add_table(summed_table(data.table), f"{study}_summed")
-    return sections
+        tables["_summed"] = summed_table(data.table)
+    folder, page = results if publish else results / "report", store.root / "report.html"
+    pictures = {folder / "plots" / f"{name}{suffix}.png": png(figure) for suffix, figure in figures.items()}
+    texts = {folder / "tables" / f"{name}{suffix}.csv": csv_text(table) for suffix, table in tables.items()}
+    for path, text in texts.items():
+        write_text(path, text)
+    document = folder / "tables" / f"{name}.json"
+    write_json(document, further_of(data))
+    for path, picture in pictures.items():
+        write_bytes(path, picture)
+    write_text(page, render(store, data, list(pictures.values()), list(texts), priced, loss))
+    return [*texts, document, *pictures, page]

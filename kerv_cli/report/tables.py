@@ -8,13 +8,11 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from numbers import Real
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.files import write_text
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, flat, stress_of, without
 from kerv_cli.lab.plan import Episode, Setting, Study, seeds_text
 from kerv_cli.lab.store import StudyStore
@@ -241,16 +239,6 @@ def _json(value: Any) -> Any:
 def csv_text(table: pd.DataFrame) -> str:
     """Return CSV with six significant digits; a cell is empty if its value does not exist."""
     return table.to_csv(index=False, float_format="%.6g", lineterminator="\n")
-
-
-def write_csv(table: pd.DataFrame, path: Path) -> Path:
-    """Write `csv_text` atomically and return the path.
-
-    Raises:
-        StorageError: The disk is full or read-only.
-    """
-    write_text(path, csv_text(table))
-    return path
 
 
 def is_number(value: Any) -> bool:
