@@ -18,11 +18,11 @@ from studies_synthetic import IDENTITY, part, settings_of, study_of, swept, thre
 import kerv_cli
 from kerv_cli.base.errors import UsageError
 from kerv_cli.episodes import identity
-from kerv_cli.episodes.code import _meaning, code_hash
+from kerv_cli.episodes.code import code_hash
 from kerv_cli.episodes.identity import ENGINE, hash_of, work_of
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database
-from kerv_cli.lab.plan import Block, Setting, Study, all_episodes, blocks_of, plain_settings, seeds_text
+from kerv_cli.lab.plan import Block, Setting, Study, all_episodes, blocks_of, plain_settings
 from kerv_cli.lab.runs import interrupted_since
 from kerv_cli.lab.store import Plan, StudyStore, plan_study
 from kerv_cli.report.summary import not_in_turn
@@ -109,14 +109,6 @@ def test_the_code_below_the_commands_counts_and_nothing_else(tmp_path: Path, mon
     assert hash_after("base/settings.py", '# a comment\n"""and a string that stands alone"""\n') == before
     computing = [hash_after(file, "x = 1") for file in ("engine/decoder.py", "base/settings.py", "episodes/runner.py")]
     assert len({before, *computing}) == 4
-    first = b'def f(x):\n    """Doubles."""\n    return 2*x\n'
-    assert _meaning(first) == _meaning(b"# doubles\ndef f( x ):\n\n    return (2 * x)\n")
-    assert _meaning(first) != _meaning(b'def f(x):\n    return "Doubles."\n')
-
-
-@pytest.mark.parametrize(("seeds", "text"), [((5, 6, 7, 9), "5-7;9"), ((3,), "3"), ((2, 1), "1-2")])
-def test_seeds_as_ranges(seeds: tuple[int, ...], text: str) -> None:
-    assert seeds_text(seeds) == text
 
 
 def test_blocks_go_by_repeat_task_and_seeds() -> None:

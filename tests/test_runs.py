@@ -70,14 +70,6 @@ def test_a_grid_keeps_every_episode_and_prints_one_table(policies: Path, tmp_pat
     assert (run["episodes"], run["methods"]) == (4, ["ar", "spec_vla"])
 
 
-def test_recordings_of_a_grid_have_names_of_their_own(policies: Path, tmp_path: Path) -> None:
-    shutil.copytree(policies / "artifacts", tmp_path / "results" / "artifacts")
-    words = ["policy=vision", "policy.target=nano-vision", "task=reach-v3", "world.horizon=3", "record_size=32"]
-    works("rollout", "-m", "method=spec_vla", "threshold.r=5,9", "episodes=1", *words, f"results={tmp_path}/results")
-    (folder,) = (tmp_path / "results/rollouts").iterdir()
-    assert len(list((folder / "rollouts").glob("*.rrd"))) == 2
-
-
 def test_runs_are_viewed_by_their_ids_and_last_is_the_newest_with_recordings(policies: Path, tmp_path: Path) -> None:
     results, other = f"results={tmp_path}/results", f"results={tmp_path}/other"
     words = ["policy=vision", "policy.target=nano-vision", "task=reach-v3", "world.horizon=3", "record_size=32"]
@@ -294,15 +286,6 @@ def test_csv_and_a_missing_package(results: Path, tmp_path: Path) -> None:
             refused = kerv("runs", "export", "target/nano-state", "--to", name, f"results={results}")
             assert refused.exit_code == 2
             assert f"pip install 'kerv[{name}]'" in refused.stderr
-
-
-def test_curves_are_drawn_beside_the_log(results: Path, tmp_path: Path) -> None:
-    from kerv_cli.report.curves import save_curves
-
-    folder = tmp_path / "target" / "mine"
-    folder.mkdir(parents=True)
-    shutil.copy(results / "artifacts/target/nano-state/log.csv", folder)
-    assert save_curves(folder).read_bytes().startswith(b"\x89PNG")
 
 
 # --- removal ---

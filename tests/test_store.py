@@ -14,7 +14,7 @@ from test_calibration import write_dataset
 from test_training import quadratic
 from typer.testing import CliRunner
 
-from kerv_cli.base.errors import CheckpointError, Interrupted, UsageError
+from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.cli.app import app
 from kerv_cli.engine.cost import read_profile
 from kerv_cli.lab.database import STORE, Database
@@ -71,14 +71,6 @@ def test_a_name_in_use_is_refused_and_a_killed_command_is_listed_with_how_to_go_
         open_demos(str(tmp_path), "mine")
     kerv("runs", "rm", "demos/mine", "--yes", f"results={tmp_path}")
     assert listed(tmp_path) == []
-
-
-def test_a_command_that_failed_or_was_interrupted_is_listed(policies: Path, tmp_path: Path) -> None:
-    (tmp_path / "artifacts").symlink_to(policies / "artifacts")
-    for error, state in ((Interrupted("stopped"), "interrupted"), (ValueError("broken"), "failed")):
-        with pytest.raises(type(error)), making(tmp_path, "early", tmp_path / "artifacts/early/mine", ["train"]):
-            raise error
-        assert {row["id"]: row["state"] for row in listed(tmp_path)}["early/mine"] == state
 
 
 @pytest.mark.usefixtures("few_validations")

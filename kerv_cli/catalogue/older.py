@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -142,7 +141,7 @@ def _of_cell(cell: Path, episodes: list[Episode]) -> Iterator[ImportedEpisode]:
     run, code = str(status.get("run", "")), str(status.get("code", ""))
     for one in episodes:
         row = rows[one.seed]
-        values = {name: None if _is_nan(row.get(name)) else row.get(name) for name in _ROW}
+        known = {name: row[name] for name in _ROW if name in row and row[name] == row[name]}  # without NaN
         mine = decodes.filter(pa.compute.equal(decodes["seed"], one.seed))
         columns = [
             mine[column.name].cast(column.type)
@@ -151,8 +150,4 @@ def _of_cell(cell: Path, episodes: list[Episode]) -> Iterator[ImportedEpisode]:
             for column in DECODE_SCHEMA
         ]
         table = pa.table(columns, schema=DECODE_SCHEMA)
-        yield ImportedEpisode(one, values, table, str(row["block"]), about, run, code=code)
-
-
-def _is_nan(value: Any) -> bool:
-    return isinstance(value, float) and math.isnan(value)
+        yield ImportedEpisode(one, known, table, str(row["block"]), about, run, code=code)

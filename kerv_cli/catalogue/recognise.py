@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
-import sqlite3
 from collections.abc import Sequence
 from pathlib import Path
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.catalogue import lerobot, vla_eval
 from kerv_cli.catalogue.older import import_older, older_studies
-from kerv_cli.catalogue.sqlite import foreign_sqlite
 from kerv_cli.catalogue.stored import Imported, import_database
-from kerv_cli.lab.database import ABOUT, FILE, Database
+from kerv_cli.lab.database import FILE, Database
 
 
 def is_results(path: Path) -> bool:
@@ -29,16 +26,9 @@ def is_results(path: Path) -> bool:
 
 
 def _database_of(path: Path) -> Path | None:
-    """Return the kerv.db that a path is or holds."""
+    """Return the database that a path is or holds. Its name ends with .db."""
     file = path / FILE if path.is_dir() else path
-    if not file.is_file() or file.suffix == ".json":
-        return None
-    if file.name == FILE:
-        return file
-    with contextlib.suppress(sqlite3.Error, OSError, ValueError), foreign_sqlite(file) as connection:
-        query = "SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?"
-        return file if connection.execute(query, (ABOUT.name,)).fetchone() else None
-    return None
+    return file if file.is_file() and file.suffix == Path(FILE).suffix else None
 
 
 def import_results(results: Database, paths: Sequence[Path], name: str = "") -> Imported:

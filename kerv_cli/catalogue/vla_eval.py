@@ -137,9 +137,7 @@ def _evaluation(file: sqlite3.Connection, path: Path, name: str, metadata: str) 
     )
     episodes = tuple(_episode(*row) for row in rows)
     (queued,) = file.execute("SELECT COUNT(*) FROM work_queue WHERE eval_id = ?", (name,)).fetchone()
-    each = int(config.get("episodes_per_task") or 0)
-    planned = queued or each * len({one.task for one in episodes})
-    return Evaluation(path, name, str(about["benchmark"]), config, server, episodes, planned)
+    return Evaluation(path, name, str(about["benchmark"]), config, server, episodes, queued)
 
 
 def _episode(
@@ -166,14 +164,6 @@ class Server:
     label: str
     evaluations: list[Evaluation]
 
-    def ran(self, one: Evaluation) -> bool:
-        """Return whether the same server ran this evaluation of another benchmark."""
-        first = self.evaluations[0]
-        is_same = all(getattr(first, name) == getattr(one, name) for name in ("name", "facts")) and first.server.get(
-            "action_spec"
-        ) == one.server.get("action_spec")
-        return is_same and one.benchmark not in {other.benchmark for other in self.evaluations}
-
 
 def by_server(recordings: Sequence[Sequence[Evaluation]], labels: Sequence[str] = ()) -> list[Server]:
     """Group evaluations by their model server.
@@ -193,13 +183,16 @@ def by_server(recordings: Sequence[Sequence[Evaluation]], labels: Sequence[str] 
     for number, evaluations in enumerate(recordings):
         for one in evaluations:
             name = labels[number] if labels else one.name
-            server = next((s for s in servers if (s.label == name if labels else s.ran(one))), None)
-            if server is None:
-                taken = {other.label for other in servers}
+            for server in servers:
+                first, benchmarks = server.evaluations[0], {other.benchmark for other in server.evaluations}
+                is_same = first.server == one.server and one.benchmark not in benchmarks
+                if server.label == name if labels else is_same:
+                    server.evaluations.append(one)
+                    break
+            else:
+                taken = {server.label for server in servers}
                 label = next(n for n in (name, *(f"{name}-{i}" for i in range(2, 10_000))) if n not in taken)
                 servers.append(Server(label, [one]))
-            else:
-                server.evaluations.append(one)
     for server in servers[1:]:
         _check_same_episodes(servers[0], server)
     return servers

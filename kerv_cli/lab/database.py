@@ -10,7 +10,6 @@ import contextlib
 import functools
 import os
 import re
-import secrets
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -158,11 +157,6 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def new_id() -> str:
-    """Return an id for a run that begins now, e.g. `20260301T142530Z-0f1e2d`."""
-    return f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
-
-
 @contextlib.contextmanager
 def chosen_store(overrides: Iterable[str]) -> Iterator[list[str]]:
     """Use the database that `store=URL` names, in this process and its workers, until the block ends.
@@ -188,11 +182,6 @@ def chosen_store(overrides: Iterable[str]) -> Iterator[list[str]]:
             os.environ[STORE] = before
 
 
-def url_of(results: str | Path) -> str:
-    """Return the URL of the results folder's database."""
-    return os.environ.get(STORE) or f"sqlite:///{results_dir(str(results)).absolute() / FILE}"
-
-
 class Database:
     """The tables of one results folder.
 
@@ -200,7 +189,7 @@ class Database:
 
     Args:
         results: The results folder.
-        url: URL of the tables. Default: `url_of(results)`.
+        url: URL of the tables. Default: that of the variable KERV_STORE, else the file in the results folder.
 
     Raises:
         UsageError: The URL cannot be used.
@@ -210,7 +199,7 @@ class Database:
 
     def __init__(self, results: str | Path, url: str = "") -> None:
         self.results = results_dir(str(results))
-        self.url = url or url_of(results)
+        self.url = url or os.environ.get(STORE) or f"sqlite:///{self.results.absolute() / FILE}"
         try:
             parsed = sa.make_url(self.url)
         except (sa.exc.ArgumentError, ValueError) as error:

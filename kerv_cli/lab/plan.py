@@ -125,10 +125,6 @@ class Study:
         """Names of the tasks, in order."""
         return list(dict.fromkeys(one.task for one in self.episodes))
 
-    def setting(self, label: str) -> Setting:
-        """Return the setting with this label."""
-        return next(setting for setting in self.settings if setting.label == label)
-
 
 def all_episodes(
     settings: Sequence[Setting], tasks: Iterable[str], block: int = 5, repeats: int = 1

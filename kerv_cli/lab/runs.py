@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import os
+import secrets
 import socket
 import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import sqlalchemy as sa
 
-from kerv_cli.base.errors import Interrupted, StorageError, UsageError
+from kerv_cli.base.errors import Interrupted, KervError, StorageError, UsageError
 from kerv_cli.base.leftovers import is_alive
 from kerv_cli.base.places import results_dir
-from kerv_cli.lab.database import METRICS, RUNS, Database, new_id, now
+from kerv_cli.lab.database import METRICS, RUNS, Database, now
 from kerv_cli.targets.provenance import git_commit
 
 RUNNING, COMPLETE, FAILED, INTERRUPTED = "running", "complete", "failed", "interrupted"
@@ -119,7 +121,8 @@ class Run:
     ) -> None:
         self.database, self.kind, self.name, self.alone = database, kind, name, alone
         self.command = list(command or _command)
-        self.id, self.total, self.done = new_id(), total, 0
+        self.id = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
+        self.total, self.done = total, 0
         self._ended = threading.Event()
         self._heart = threading.Thread(target=self._keep_beating, daemon=True)
 
@@ -155,7 +158,7 @@ class Run:
 
     def _keep_beating(self) -> None:
         while not self._ended.wait(BEAT_SECONDS):
-            with contextlib.suppress(StorageError):  # the command itself meets the same error and shows it
+            with contextlib.suppress(KervError):  # the command itself meets the same error and shows it
                 self._update()
 
     def _update(self, **values: Any) -> None:
