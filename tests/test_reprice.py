@@ -14,7 +14,7 @@ from studies_synthetic import episode, still_episode, swept, threshold_study
 from typer.testing import CliRunner
 
 from kerv_cli.cli.app import app
-from kerv_cli.engine.cost import Profile, predicted, work_of_record
+from kerv_cli.engine.cost import Profile, prices, work_of_record
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.reprice import NamedProfile, open_profiles, repriced_table
 from kerv_cli.report.tables import StudyData, load_study
@@ -61,7 +61,7 @@ def test_an_episode_costs_its_decodes_at_the_profiles_costs(results: Path, data:
     steps: dict[str, list[int]] = {}
     for one in data.study.episodes:
         record = episode(one.setting, one.task, one.seed)
-        priced = [predicted(work_of_record(decode), PROFILE) for decode in record.decodes]
+        priced = [prices(work_of_record(decode), PROFILE)[0] for decode in record.decodes]
         seconds.setdefault(one.setting.label, []).append(sum(priced))
         steps.setdefault(one.setting.label, []).append(record.steps)
     for label in ("naive_sd", "spec_vla r=9"):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from kerv_cli.base.registry import find
 from kerv_cli.base.spaces import ActionSpace, Group
-from kerv_cli.engine.acceptance import Acceptance, accept_by_group
+from kerv_cli.engine.acceptance import DistanceRule, accept_by_group
 from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.methods.context import Context
 from kerv_cli.worlds.metaworld.spec import SPEC
@@ -116,11 +116,11 @@ def test_a_rejected_group_is_shown_by_its_first_token() -> None:
     assert found.rejected == 7  # nearer to the target's token than node 4, which began a group that failed
 
 
-def rule(kind: str, space: ActionSpace = POSITION_GRIPPER, **values: object) -> Acceptance:
+def rule(kind: str, space: ActionSpace = POSITION_GRIPPER, **values: object) -> DistanceRule:
     """As a method's part."""
     part = find("acceptance", kind)
     target = MockTarget(space)
-    built: Acceptance = part.built(part.settings(kind=kind, **values), Context(target, lambda kind: None))
+    built: DistanceRule = part.built(part.settings(kind=kind, **values), Context(target, lambda kind: None))
     return built
 
 

@@ -52,5 +52,6 @@ def _ceiling(name: str, profile: Profile, tokens: int) -> MethodCeiling | None:
         return MethodCeiling(name, "one verification", free, free)
     depth = min(int(getattr(settings.proposer, "depth", tokens)), tokens - 2)
     rounds = math.ceil((tokens - 1) / (depth + 1))  # of chains that are always accepted whole
-    decode = prefill + rounds * (profile.seconds("verify", 1 + depth) + profile.drafting(depth))
+    drafting = profile.seconds(DRAFTING, depth) if depth else 0.0
+    decode = prefill + rounds * (profile.seconds("verify", 1 + depth) + drafting)
     return MethodCeiling(name, f"{rounds} × {depth} drafted", free, autoregressive / decode)

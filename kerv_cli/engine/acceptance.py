@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 from kerv_cli.engine.tree import ROOT, TokenTree
 
@@ -93,26 +93,13 @@ def nearest_child(tree: TokenTree, node: int, target_tokens: Sequence[int]) -> i
     return min(children, key=lambda i: abs(tree.tokens[i] - target_tokens[node + 1]), default=None)
 
 
-class Acceptance(Protocol):
-    """An acceptance rule: which nodes of a draft are as good as the target's tokens."""
-
-    def of_drafts_from(self, proposer: str) -> Acceptance:
-        """Return the rule for drafts of `proposer`."""
-
-    def limits(self, r: int) -> tuple[int, ...]:
-        """Return the largest accepted distance per DoF at radius r, in bins (D,)."""
-
-    def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
-        """Return the longest accepted path at radius r. The other arguments are those of `accept_by_distance`."""
-
-
 @dataclass(frozen=True)
 class DistanceRule:
     """Base of acceptance rules: accepts a draft token within its DoF's largest distance to the target's token."""
 
     space: ActionSpace
 
-    def of_drafts_from(self, proposer: str) -> Acceptance:
+    def of_drafts_from(self, proposer: str) -> DistanceRule:
         """Return the rule for drafts of `proposer`: this one."""
         return self
 
@@ -121,7 +108,7 @@ class DistanceRule:
         raise NotImplementedError
 
     def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
-        """Return the longest path within the limits. The arguments are those of `accept_by_distance`."""
+        """Return the longest accepted path at radius r. The other arguments are those of `accept_by_distance`."""
         return accept_by_distance(tree, target_tokens, start, self.limits(r))
 
 

@@ -78,10 +78,6 @@ class Profile:
         first = self.seconds("encode", 1) + self.seconds("prefill", self.prompt)
         return first + (tokens - 1) * self.seconds("verify", 1)
 
-    def drafting(self, depth: int) -> float:
-        """Return the seconds of a chain of `depth` tokens from the drafter."""
-        return self.seconds(DRAFTING, depth) if depth else 0.0
-
     def as_dict(self) -> dict[str, Any]:
         """Return the profile as JSON values."""
         phases = {kind: {"rows": list(rows), "seconds": list(seconds)} for kind, (rows, seconds) in self.phases.items()}
@@ -215,11 +211,6 @@ def work_of_record(decode: DecodeRecord) -> Work:
         np.array([decode.similarity is not None]),
         decode.size or len(decode.tokens),
     )
-
-
-def predicted(work: Work, profile: Profile) -> float:
-    """Return the summed `prices` of all decodes."""
-    return float(prices(work, profile).sum())
 
 
 def prices(work: Work, profile: Profile) -> np.ndarray:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.acceptance import Acceptance, Accepted, StrictRule
+from kerv_cli.engine.acceptance import Accepted, DistanceRule, StrictRule
 from kerv_cli.engine.chunk import Chunk, EpisodeState, Rejection, deviation, steps_of
 from kerv_cli.engine.draft import EMPTY, Draft
 from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold
@@ -28,7 +28,7 @@ from kerv_cli.engine.tree import TokenTree
 class Parts:
     """The parts of a method. The defaults are autoregressive decoding."""
 
-    acceptance: Acceptance | None = None  # None: strict
+    acceptance: DistanceRule | None = None  # None: strict
     threshold: Threshold | None = None  # None: r = 0
     prefill_draft: Proposer | None = None  # drafts before the prefill, which verifies the draft (§5)
     proposer: Proposer | None = None  # drafts after committed tokens
@@ -72,7 +72,7 @@ class Decoder(EpisodeState):
         super().__init__(target.actions, target.cameras)
         self.target, self.parts = target, parts or Parts()
         self.steps = steps_of(chunk, target.chunk)
-        self.acceptance: Acceptance = self.parts.acceptance or StrictRule(target.actions)
+        self.acceptance: DistanceRule = self.parts.acceptance or StrictRule(target.actions)
         self.threshold: Threshold = self.parts.threshold or Fixed(0)
         size = self.steps * target.actions.dofs
         nodes = max(p.nodes if p is not None else 0 for p in (self.parts.prefill_draft, self.parts.proposer))

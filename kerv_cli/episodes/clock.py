@@ -12,7 +12,7 @@ from kerv_cli.base.files import sha256_of
 from kerv_cli.base.places import results_dir
 from kerv_cli.base.registry import DRAFTING
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.engine.cost import Profile, predicted, read_profile, work_of_record
+from kerv_cli.engine.cost import Profile, prices, read_profile, work_of_record
 from kerv_cli.engine.record import DecodeRecord, Delay
 from kerv_cli.episodes.settings import CONSTANT, MEASURED, PROFILE, REAL, RolloutSettings
 from kerv_cli.methods.compose import Method
@@ -148,7 +148,7 @@ def latency_of(settings: RolloutSettings, target: TargetDescription | None, meas
 
 def profiled(profile: Profile, scale: float = 1.0) -> Latency:
     """Return a source of latencies by the cost model, all times `scale`."""
-    return lambda decode: scale * predicted(work_of_record(decode), profile)
+    return lambda decode: scale * float(prices(work_of_record(decode), profile)[0])
 
 
 def _profile_path(settings: RolloutSettings) -> Path:

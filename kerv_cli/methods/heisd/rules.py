@@ -21,7 +21,7 @@ from torch import Tensor
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.engine.acceptance import Acceptance, Accepted, DistanceRule, accept_by_group
+from kerv_cli.engine.acceptance import Accepted, DistanceRule, accept_by_group
 from kerv_cli.engine.chunk import Choice, Chunk
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.parts import Skip
@@ -266,7 +266,7 @@ class HybridRule(RelaxedRule):
 
     retrieved: GroupRule
 
-    def of_drafts_from(self, proposer: str) -> Acceptance:
+    def of_drafts_from(self, proposer: str) -> DistanceRule:
         """Return the rule for drafts of `proposer`."""
         return self.retrieved if proposer == "retrieval" else self
 
