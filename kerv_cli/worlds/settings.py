@@ -10,20 +10,20 @@ from kerv_cli.base.registry import find
 from kerv_cli.base.settings import CommandSettings
 
 EVALUATION_SEED = 100_000
-"""First evaluation seed. Demonstrations use seeds below it, so training and evaluation never share a world."""
+"""First evaluation seed. Demonstrations use smaller seeds: training and evaluation never share an initial state."""
 
 MOST_STRESS = 4
-"""The highest level of every kind of stress."""
+"""Highest level of every kind of stress."""
 
 
-@dataclass(unsafe_hash=True)  # worlds keep cameras by it; Hydra could not override a frozen one
+@dataclass(unsafe_hash=True)  # a key of dictionaries; Hydra could not override a frozen one
 class CameraSettings:
     """The policy's view: a camera of the environment, or several side by side (`views.views_of`)."""
 
-    name: str = setting("", "empty: the environment's first camera; joined names are several views side by side")
+    name: str = setting("", "camera, or several joined by + for views side by side; empty: the environment's first")
     fovy: float = number(45.0, above=0, most=179, help="vertical field of view, degrees")
     size: int = number(96, 8, 4096, help="pixels of a view, square")
-    supersample: int = number(2, 1, 16, help="pixels that are drawn per side of one that is shown")
+    supersample: int = number(2, 1, 16, help="drawn pixels per shown pixel and side")
 
 
 @dataclass
@@ -31,15 +31,15 @@ class WorldSettings:
     """The simulated world of an episode."""
 
     camera: CameraSettings = setting(CameraSettings, "the policy's view")
-    horizon: int = number(0, 0, 1_000_000, help="control steps of an episode; 0: the environment's")
+    horizon: int = number(0, 0, 1_000_000, help="control steps of an episode; 0: the environment's own")
 
 
 @dataclass
 class StressSettings:
     """A shift of a stated size, drawn per episode from task, seed, kind and level (docs/stress.md)."""
 
-    kind: str = setting("none", "what is shifted: push, actuation, sensor, light, colour, camera, object")
-    level: int = number(0, 0, MOST_STRESS, help="how far; 0: not at all")
+    kind: str = setting("none", "what is shifted: push, actuation, sensor, light, colour, camera or object")
+    level: int = number(0, 0, MOST_STRESS, help="size of the shift; 0: none")
 
     @property
     def active(self) -> bool:
@@ -47,7 +47,7 @@ class StressSettings:
         return self.kind != "none" and self.level > 0
 
     def check_together(self, prefix: str) -> None:
-        """Raises UnknownName for a kind that is not registered, UsageError for a level without a kind."""
+        """Refuse an unknown kind (UnknownName) and a level without a kind (UsageError)."""
         find("stress", self.kind, f"{prefix}kind")
         if self.kind == "none" and self.level:
             raise UsageError(f"{prefix}level={self.level} without {prefix}kind: name what is shifted")
@@ -55,20 +55,22 @@ class StressSettings:
 
 @dataclass
 class RolloutWorldSettings(WorldSettings):
-    """The world of a rollout, which may be shifted from the one that the policy was trained in."""
+    """The world of a rollout. It may be shifted from the one of the training."""
 
-    stress: StressSettings = setting(StressSettings, "a shift of the world")
+    stress: StressSettings = setting(StressSettings, "shift of the world")
 
 
 @dataclass
 class DemosImportSettings(CommandSettings):
-    """`kerv demos import`: recorded episodes of another tool as demonstrations (docs/data.md)."""
+    """Settings of `kerv demos import` (docs/data.md)."""
 
     format: str = choice("lerobot", "lerobot", help="a LeRobot dataset")
     source: str = setting("", "folder of the dataset")
-    name: str | None = setting(None, "default: the folder's")
-    camera: str = setting("", "which of its images; empty: the first")
-    episodes: int = number(0, 0, 1_000_000, help="the first ones; 0: all")
+    name: str | None = setting(None, "name of the demonstrations; null: the folder's")
+    camera: str = setting("", "camera whose images are read; empty: the first")
+    episodes: int = number(0, 0, 1_000_000, help="number of episodes, from the first; 0: all")
     dofs: str = choice("own", "own", "openvla", help="names of the DoFs")
-    strict: list[str] | None = setting(None, "DoFs that are never relaxed; null: those with gripper in their name")
-    tail: int = number(8, 0, 1024, help="copies of the last action behind an episode, for chunks at its end")
+    strict: list[str] | None = setting(None, "strict DoFs, never relaxed; null: those with gripper in their name")
+    tail: int = number(
+        8, 0, 1024, help="copies of the last action after an episode, for chunks that begin near its end"
+    )
