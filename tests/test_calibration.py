@@ -121,7 +121,7 @@ def settings(results: Path, *overrides: str, target: str = "nano-state") -> Cali
     return compose("calibrate", [*words, f"results={results}", *overrides], CalibrateSettings)
 
 
-def test_windows_lie_where_they_should_and_are_normalised_as_the_target_does() -> None:
+def test_windows_hold_the_normalised_labels_before_and_after_each_moment() -> None:
     episode = made_up_episode("reach-v3", 0)
     past, future = episode_windows(episode, SPACE, 10, 4)
     assert past.shape == (STEPS - 10, 10, 4)

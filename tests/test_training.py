@@ -119,8 +119,8 @@ def test_a_damaged_or_senseless_resume_file_is_one_line(tmp_path: Path) -> None:
     quadratic(tmp_path).run()
     path = tmp_path / "resume.safetensors"
     whole = path.read_bytes()
-    for at in (len(whole) - 1, len(whole) // 2, 40):
-        path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+    for index in (len(whole) - 1, len(whole) // 2, 40):
+        path.write_bytes(whole[:index] + bytes([whole[index] ^ 1]) + whole[index + 1 :])
         with pytest.raises(CheckpointError, match=r"training state at .* damaged") as caught:
             quadratic(tmp_path).run()
         assert "\n" not in str(caught.value)
@@ -229,7 +229,7 @@ def test_soft_labels_are_distributions_that_fall_off_with_distance() -> None:
     assert torch.allclose(token_loss(logits, tokens, soft_labels(255, 0.0)), plain)
 
 
-def test_light_is_of_the_sample_and_the_step_alone_and_moves_nothing() -> None:
+def test_random_light_depends_only_on_sample_and_step_and_moves_nothing() -> None:
     images = torch.randint(30, 60, (4, 3, 16, 32), dtype=torch.uint8)
     images[:, :, 5, 7] = 200  # a marker
     indices = torch.arange(4)
@@ -241,7 +241,7 @@ def test_light_is_of_the_sample_and_the_step_alone_and_moves_nothing() -> None:
     assert torch.equal(lit(images, indices, 3, 0.0), images)
 
 
-def test_waypoints_are_the_hands_at_the_next_change_of_the_gripper_and_at_the_end() -> None:
+def test_waypoints_are_where_the_gripper_changes_next_and_where_the_episode_ends() -> None:
     states = np.zeros((10, 39), np.float32)
     states[:, :3] = np.arange(10)[:, None] + np.array([0, 0.1, 0.2])
     labels = np.zeros((13, 4), np.float32)

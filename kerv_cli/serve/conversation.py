@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -37,6 +38,7 @@ class Conversation(abc.ABC):
         ping_s: Seconds without an answer to a ping after which a client is gone; None sends no pings.
         idle_s: Seconds without a message after which it is gone.
         decoder: None before the first episode if it depends on the task.
+        last_ms: Milliseconds from the last decoded frame's arrival to the answer's end.
     """
 
     seats: int
@@ -45,7 +47,7 @@ class Conversation(abc.ABC):
 
     def __init__(self, policy: Policy, log: Log = lambda line: None) -> None:
         self.policy, self.interface, self.log = policy, policy.interface, log
-        self.task = policy.task
+        self.task, self.last_ms = policy.task, math.nan
         self.decoder: Any = None if policy.by_task else policy.lend_decoder(self.task)
 
     def close(self) -> None:
@@ -90,6 +92,3 @@ class Conversation(abc.ABC):
     @abc.abstractmethod
     def fault(self, line: str) -> bytes | str:
         """Return the frame that tells the client what was wrong with its last one."""
-
-    def note_latency(self, milliseconds: float) -> None:  # noqa: B027 - not every protocol tells it
-        """Note how long the last decode took, from the frame's arrival to the answer's end."""

@@ -6,6 +6,7 @@ actions, or by a text frame that says what was wrong with it.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -64,7 +65,6 @@ class OpenPi(Conversation):
     Attributes:
         last: (H, D) actions of the last decode, environment units.
         last_hand: (3,) position of the end effector at that decode, metres.
-        last_ms: Milliseconds that the whole last answer took; the client is told with the next one.
     """
 
     seats, ping_s, idle_s = 1, 10.0, 120.0
@@ -72,7 +72,6 @@ class OpenPi(Conversation):
     def __init__(self, policy: Policy, log: Log = lambda line: None) -> None:
         super().__init__(policy, log)
         self.last, self.last_hand = np.zeros((0, 0)), np.zeros(3)
-        self.last_ms: float | None = None
         self.decodes = 0
 
     def greeting(self) -> bytes:
@@ -111,12 +110,8 @@ class OpenPi(Conversation):
             "actions": self.interface.converted(record.actions),
             "policy_timing": timing,
             "decode": {"forwards": record.forwards, "tokens": len(record.tokens), "mode": record.mode},
-            "server_timing": timing | ({"prev_total_ms": self.last_ms} if self.last_ms is not None else {}),
+            "server_timing": timing | ({} if math.isnan(self.last_ms) else {"prev_total_ms": self.last_ms}),
         }
-
-    def note_latency(self, milliseconds: float) -> None:
-        """Note how long the last answer took."""
-        self.last_ms = milliseconds
 
     def fault(self, line: str) -> str:
         """Return the frame that says what was wrong."""

@@ -81,12 +81,12 @@ def demos_for(settings: S) -> tuple[S, DemoDataset]:
         CheckpointError: As `open_demos`, or they are of another environment, or show a compact target other views.
     """
     target = described(find_target(settings.results, settings.policy.target), "target", TargetDescription)
-    origin = target.provenance.get("demos") if not settings.demos else None
-    config = origin.get("config") if isinstance(origin, dict) else None
-    episodes = config.get("episodes", 0) if isinstance(config, dict) else 0
     name, tasks = settings.demos or target.demos or name_of(()), settings.task
-    asked = tasks if settings.demos else ()  # the target's own are recorded whole
-    dataset = open_demos(settings.results, name, asked or target.tasks, episodes)
+    if settings.demos:
+        dataset = open_demos(settings.results, name, tasks or target.tasks)
+    else:  # the target's own are recorded whole
+        config = target.provenance.get("demos", {}).get("config", {})
+        dataset = open_demos(settings.results, name, target.tasks, config.get("episodes", 0))
     check_spaces(dataset, target.actions, target.observation, "the target")
     if target.family == "compact" and target.cameras:
         camera = specs()[dataset.manifest.environment].camera_name(target.cameras[0])

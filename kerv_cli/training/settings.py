@@ -96,7 +96,7 @@ class DemonstrationSettings(TaskSettings):
 class TrainDrafterSettings(DemonstrationSettings):
     """`kerv train drafter`: policy.target is imitated; policy.artifacts.KIND: name of the new one."""
 
-    # drafter=early has optimisation settings of its own, so that it comes behind train
+    # after train, because drafter=early has optimisation settings of its own
     groups: ClassVar = {"policy": "vision", "train": "drafter", "drafter": "eagle", "runtime": "auto"}
 
     log: str = choice("none", *TRACKERS, help=LOG)
