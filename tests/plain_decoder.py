@@ -80,15 +80,13 @@ def main(name: str, repeats: int) -> bool:
     folder = Path(name) if Path(name).is_dir() else Path("results/pretrained") / name / "target"
     target, _ = load_target(folder, "cpu", torch.float32)
     decoder, plain = Decoder(target), PlainStep(target)
-    half = plain.channels // 2
     seconds, same = [], True
     for seed in range(repeats):
         prompt = torch.randn(1, target.max_prompt, target.width, generator=torch.Generator().manual_seed(seed))
         stopwatch = Stopwatch(target.device)
         chunk = decoder.decode_prompt(prompt, stopwatch)
         cached = decoder.cache.buffer[:, :, 0, :, : target.max_prompt].numpy()
-        order = np.arange(plain.channels).reshape(half, 2).T.ravel()  # packed keys have their halves side by side
-        plain.begin(cached[:, 0][..., order], cached[:, 1], chunk.size)
+        plain.begin(cached[:, 0], cached[:, 1], chunk.size)
         begun, tokens = time.perf_counter(), chunk.tokens[:1]
         for _ in range(chunk.size - 1):
             tokens.append(plain(tokens[-1]))

@@ -44,7 +44,7 @@ from kerv_cli.report.plots import study_figures
 from kerv_cli.report.reprice import NamedProfile, repriced_table
 from kerv_cli.report.summary import summary_frame
 from kerv_cli.report.tables import load_study
-from kerv_cli.targets.compact.packed import pack
+from kerv_cli.targets.compact.packable import pack
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 HOME = np.zeros(3)

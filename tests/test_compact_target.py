@@ -161,13 +161,13 @@ def test_a_padded_bucket_computes_its_tokens(tokens: int) -> None:
     trunk = Trunk(32, 2, 2, 48).eval()
     x, positions = torch.randn(1, 20 + tokens, 32), torch.arange(20 + tokens)
     with torch.inference_mode():
-        uncached = trunk.run_layers(x, positions, None, None)[:, 20:]
+        uncached = trunk.run_layers(x, positions, None, None, None)[:, 20:]
         cache = trunk.new_cache(1, 60, fixed=True)
         assert isinstance(cache, CapturedCache)
         for first, last in ((0, 20), (20, 20 + tokens)):
             mask = attention_mask(None, last - first, cache, x)
             assert mask is not None
-            in_buckets = cache.run(trunk.compute, x[:, first:last], positions[first:last], mask)
+            in_buckets = cache.run(trunk.run_layers, x[:, first:last], positions[first:last], mask)
             cache.length = last
     assert cache.steps.keys() == {32, bucket(tokens)}
     assert torch.allclose(in_buckets, uncached, atol=1e-5)

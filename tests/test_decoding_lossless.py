@@ -24,7 +24,7 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter, EagleNetwork
 from kerv_cli.methods.jacobi import JacobiProposer
 from kerv_cli.targets.checkpoint import load_target, save_module, target_fields
-from kerv_cli.targets.compact.packed import pack
+from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer

@@ -28,7 +28,7 @@ from kerv_cli.methods.early.drafter import (
     measure,
 )
 from kerv_cli.targets.checkpoint import load_target
-from kerv_cli.targets.compact.packed import pack
+from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer

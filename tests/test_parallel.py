@@ -16,7 +16,7 @@ from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.parallel import ParallelPass
 from kerv_cli.targets.compact.folder import save_target
-from kerv_cli.targets.compact.packed import pack
+from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.text import WordTokenizer

@@ -30,7 +30,7 @@ from kerv_cli.methods.streak import StreakSkip, StreakSkipSettings
 from kerv_cli.methods.unverified import AlwaysSkip
 from kerv_cli.report.certificate import folder_of
 from kerv_cli.targets.checkpoint import load_target
-from kerv_cli.targets.compact.packed import pack
+from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.settings import CameraSettings

@@ -17,7 +17,7 @@ from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.files import sha256_of
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
-from kerv_cli.targets.compact.packed import pack
+from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.imitation import check_init, continued_target, vocabulary

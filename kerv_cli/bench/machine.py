@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from kerv_cli.targets.compact.kernels import FastLinear
-from kerv_cli.targets.compact.packed_bfloat16 import BlockedLinear, multiplies_bfloat16
+from kerv_cli.targets.compact.bfloat16 import BlockedLinear, multiplies_bfloat16
+from kerv_cli.targets.compact.program import Program
 
 _BUFFER = 64 * 2**20  # float32 numbers, 256 MiB: a server's caches hold 100 MB and more
 _ROWS, _WIDTH = 256, 4096
@@ -68,6 +69,7 @@ def product_with(weight: Tensor, dtype: torch.dtype) -> Callable[[Tensor], Tenso
     if weight.device.type == "cpu" and dtype == torch.bfloat16 and multiplies_bfloat16():
         return BlockedLinear(weight)
     if weight.device.type == "cpu" and dtype == torch.float32:
-        return FastLinear(weight)
+        compiled = Program(lambda rows: F.linear(rows, weight), (1, weight.shape[1]))
+        return lambda rows: compiled(rows)[0]
     plain = weight.to(dtype)
     return lambda rows: rows @ plain

@@ -24,8 +24,8 @@ from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import EagleDrafter, EagleNetwork
 from kerv_cli.methods.settings import PolicySettings
-from kerv_cli.targets.compact.packed import pack
-from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
+from kerv_cli.targets.compact.bfloat16 import Bfloat16Layers, multiplies_bfloat16
+from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import Layer
@@ -111,20 +111,22 @@ class ShapeTarget(CompactTarget):
     def __init__(self, settings: TargetSettings, device: torch.device, dtype: torch.dtype) -> None:
         super().__init__(replace(settings, layers=0), SPEC.actions, SPEC.observation, vocabulary(SPEC.name), "corner4")
         self.requires_grad_(False).eval()
-        if device.type == "cuda":
-            self.to(device=device, dtype=dtype)
-        else:
+        layers, compiled = shifted_layers(settings, device, dtype), device.type == "cpu" and dtype == torch.float32
+        if device.type == "cpu" and not compiled:
             pack(self)
+            self.packed = self.packed and self.packed._replace(step=None)
         self.settings, self.trunk.depth = settings, settings.layers
-        layers = shifted_layers(settings, device, dtype)
         if device.type == "cpu" and dtype == torch.bfloat16 and multiplies_bfloat16():
-            self.trunk.packed = BlockedLayers(self.trunk.rotary, layers, self.trunk.norm)
+            self.trunk.packed = Bfloat16Layers(self.trunk.rotary(slice(None)), layers)
         else:
             self.trunk.layers = torch.nn.ModuleList(layers)
             self.trunk.to(dtype=dtype)
-            pack(self.trunk)
         for part in (self.embedding, self.head, self.trunk.norm):
             part.to(device=device, dtype=dtype)
+        if device.type == "cuda":
+            self.to(device=device, dtype=dtype)
+        elif compiled:
+            pack(self)
 
     def encode(self, observation: Observation) -> Tensor:
         """The prompt (1, P, E) of an observation, in the trunk's number format."""

@@ -17,7 +17,7 @@ from kerv_cli.engine.chunk import Chunk, EpisodeState, Rejection, deviation, ste
 from kerv_cli.engine.draft import EMPTY, Draft
 from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold
 from kerv_cli.engine.proposer import Proposer
-from kerv_cli.engine.protocol import Target
+from kerv_cli.engine.protocol import ContinuesGreedily, Target
 from kerv_cli.engine.record import DecodeRecord, Round
 from kerv_cli.engine.stopwatch import Stopwatch
 from kerv_cli.engine.transfer import read, upload
@@ -204,7 +204,18 @@ class Decoder(EpisodeState):
             stopwatch.lap("propose")
 
     def decode_plainly(self, chunk: Chunk, stopwatch: Stopwatch) -> None:
-        """Decode the remaining tokens without a proposer, one forward each.
+        """Decode the remaining tokens without a proposer: in one call if the target can, else by one forward each."""
+        tokens = None
+        if isinstance(self.target, ContinuesGreedily):
+            tokens = self.target.continue_greedily(chunk.tokens[-1], chunk.remaining, chunk.cache)
+        tokens = self.forward_singly(chunk, stopwatch) if tokens is None else tokens
+        stopwatch.lap("verify")
+        for token in tokens:
+            chunk.commit_token(token)
+        stopwatch.lap("accept")
+
+    def forward_singly(self, chunk: Chunk, stopwatch: Stopwatch) -> list[int]:
+        """Return the remaining tokens, decoded by one forward each.
 
         Each token goes from the device into the next forward. The CPU reads all of them after the last one.
         """
@@ -215,11 +226,7 @@ class Decoder(EpisodeState):
             hidden = target.forward(target.embed(tokens[-1][None]), position, chunk.cache)
             tokens.append(target.head(hidden)[0].argmax(-1))
             stopwatch.lap("verify")
-        numbers = torch.cat(tokens[1:]).tolist()
-        stopwatch.lap("verify")
-        for token in numbers:
-            chunk.commit_token(token)
-        stopwatch.lap("accept")
+        return torch.cat(tokens[1:]).tolist()
 
     def propose(self, chunk: Chunk, proposer: Proposer | None, stopwatch: Stopwatch) -> Draft:
         """Return a draft at most one token shorter than what is missing: the bonus is always the chunk's last token.

@@ -97,6 +97,18 @@ class EncodesMany(Protocol):
         """Return the prompts (B, P, E) of B observations."""
 
 
+@runtime_checkable
+class ContinuesGreedily(Protocol):
+    """A target that can decode several tokens in one call."""
+
+    def continue_greedily(self, token: int, count: int, cache: Any) -> list[int] | None:
+        """Decode `count` tokens after `token`, and append to the cache what single forwards would.
+
+        Returns:
+            The tokens; None if the target, as it is loaded, must forward one token after the other.
+        """
+
+
 class ReadableTarget(Target, Protocol):
     """A target whose prompt has named parts and whose layers have known shapes, for drafters and the datastore."""
 

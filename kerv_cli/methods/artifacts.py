@@ -21,7 +21,7 @@ from kerv_cli.engine.protocol import ReadableTarget, Target
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets import checkpoint
 from kerv_cli.targets.checkpoint import TargetDescription
-from kerv_cli.targets.compact.packed import load_packed
+from kerv_cli.targets.compact.packable import load_packed
 from kerv_cli.targets.folders import beside, find_target
 
 TARGET = "target"

@@ -21,8 +21,8 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import TargetDescription
+from kerv_cli.targets.compact.bfloat16 import has_tiles
 from kerv_cli.targets.compact.features import places_of
-from kerv_cli.targets.compact.packed_bfloat16 import has_tiles
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer

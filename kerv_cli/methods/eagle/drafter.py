@@ -35,6 +35,8 @@ from kerv_cli.methods.eagle.examples import StatesByLength, TeacherStates, decod
 from kerv_cli.methods.eagle.public import Convention, PublicDrafter, PublicShape, load_public, read_public
 from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.targets.attention import Cache
+from kerv_cli.targets.compact.program import Program
+from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import LayerStack
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
@@ -46,10 +48,16 @@ VALIDATED = 60
 class EagleNetwork(LayerStack):
     """Decoder layers of the target's shape. Head and token embeddings are the target's own."""
 
+    inputs = 2
+
     def __init__(self, settings: DrafterSettings, width: int, heads: int, feed_forward: int) -> None:
         super().__init__(width, settings.layers, heads, feed_forward)
         self.settings = settings
         self.fuse = nn.Linear(2 * width, width)
+
+    def enter(self, *inputs: Tensor) -> Tensor:
+        """following, hidden (B, T, E) -> what the first layer reads."""
+        return self.fuse(torch.cat(inputs, -1))
 
     def draft_position(self, index: int) -> int:
         """Return the rotary position of the drafted token at `index` of the sequence."""
@@ -72,8 +80,21 @@ class EagleNetwork(LayerStack):
             cache: Keys and values before these positions.
             seen: Which keys each query sees, (T, M) bool, as in `attention_mask`.
         """
-        x = self.fuse(torch.cat([following, hidden], -1))
-        return self.norm(self.run_layers(x, positions, cache, seen))
+        return self.run((following, hidden), positions, cache, seen)
+
+    def compiled_chain(self, target: Any) -> Program | None:
+        """Return what drafts a token and the state after it, by the target's embeddings and head.
+
+        Returns:
+            The program; None if this drafter or the target is not compiled.
+        """
+
+        def step(hidden: Tensor) -> Tensor:
+            token = target.head(hidden).argmax(-1)
+            return self.compute([target.embedding(token)[None], hidden])
+
+        compiled = isinstance(target, CompactTarget) and target.packed is not None and self.packed is not None
+        return Program(step, (1, 1, self.width), repeats=True) if compiled else None
 
 
 class DrafterProposer(Proposer):
@@ -97,6 +118,7 @@ class DrafterProposer(Proposer):
         self.depth, self.top_k, self.nodes = depth, top_k, nodes
         capacity = target.max_prompt + target.chunk * target.actions.dofs + top_k * depth
         self.cache, self.hidden = drafter.new_cache(1, capacity), torch.empty(0)
+        self.compiled = drafter.compiled_chain(target) if isinstance(drafter, EagleNetwork) else None
 
     def begin(self, chunk: Chunk) -> None:
         """Feed the drafter the prompt's states and embeddings."""
@@ -130,6 +152,8 @@ class DrafterProposer(Proposer):
     def chain(self, depth: int) -> Tensor:
         """Return the greedy draft tokens (depth,)."""
         base = self.cache.length
+        if self.compiled is not None:
+            return torch.from_numpy(self.compiled.repeat(depth, self.hidden, cache=self.cache)[:, 0]).long()
         first = self.drafter.draft_position(base)
         positions = torch.arange(first, first + depth, device=self.hidden.device).split(1)
         hidden = self.hidden[None, None]

@@ -10,7 +10,7 @@ import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,13 +29,11 @@ from kerv_cli.methods.context import Context
 from kerv_cli.methods.drafters import Lesson, Metrics, TrainableDrafter
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.targets.compact.packable import Packable
+from kerv_cli.targets.compact.program import Program
 from kerv_cli.targets.losses import soft_labels, token_loss
 from kerv_cli.targets.observations import Rows, observations_of, prompts_of, split, steps_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
-
-if TYPE_CHECKING:
-    from kerv_cli.methods.early.packed import PackedEarly
 
 SURE = 0.05
 """Estimate from which fallback sources do not draft: 89 % of such chunks were accepted whole (mt10-vision, r = 9)."""
@@ -63,7 +61,7 @@ class EarlyNetwork(Packable):
     mean: Tensor
     scale: Tensor
     strict: Tensor
-    packed: PackedEarly | None
+    packed: Program | None
 
     def __init__(self, settings: EarlySettings, actions: ActionSpace, chunk: int, features: int) -> None:
         super().__init__()
@@ -79,11 +77,9 @@ class EarlyNetwork(Packable):
         self.spread = nn.Linear(settings.width, self.tokens * settings.rank)
         self.head = nn.Linear(settings.rank, actions.tokens)
 
-    def pack_weights(self) -> PackedEarly | None:
-        """Return the packed weights of a float32 drafter; None in other number formats."""
-        from kerv_cli.methods.early.packed import PackedEarly  # ONNX Runtime, which a GPU does not need
-
-        return PackedEarly(self) if self.mean.dtype == torch.float32 else None
+    def pack_weights(self) -> Program | None:
+        """Return the compiled network; None in other formats than float32."""
+        return Program(self.logits, (1, len(self.mean))) if self.mean.dtype == torch.float32 else None
 
     def standardise(self, features: Tensor) -> None:
         """Take mean and spread from the training features (n, F)."""
@@ -92,8 +88,10 @@ class EarlyNetwork(Packable):
 
     def forward(self, features: Tensor) -> Tensor:
         """Return the logits (B, N, V) of pooled prompts (B, F)."""
-        if self.packed is not None and len(features) == 1:
-            return self.packed(features)
+        return self.packed(features)[0] if self.packed and self.is_packed(features) else self.logits(features)
+
+    def logits(self, features: Tensor) -> Tensor:
+        """Compute `forward` by the modules."""
         x = self.enter((features - self.mean) * self.scale)
         for block in self.blocks:
             x = block(x)

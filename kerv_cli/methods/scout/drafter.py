@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,15 +34,13 @@ from kerv_cli.methods.early.drafter import (
 )
 from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.targets.compact.features import hand_features, mlp, scene_features, scene_width
-from kerv_cli.targets.compact.packable import Packable
+from kerv_cli.targets.compact.packable import Packable, wants_gradient
+from kerv_cli.targets.compact.program import Program
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.vision import VisionEncoder
 from kerv_cli.targets.losses import position_loss
 from kerv_cli.targets.observations import BATCH, Observations, read_observations, split
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
-
-if TYPE_CHECKING:
-    from kerv_cli.methods.scout.packed import PackedScout
 
 
 class ScoutNetwork(Packable):
@@ -52,7 +50,7 @@ class ScoutNetwork(Packable):
     """
 
     centre: Tensor
-    packed: PackedScout | None
+    packed: Program | None
 
     def __init__(
         self,
@@ -89,30 +87,39 @@ class ScoutNetwork(Packable):
         of_views = (s.cell_width + s.grid**2 * s.cell_features) * views
         self.drafter = EarlyNetwork(s, actions, chunk, of_views + s.word_width + scene_width(observation))
 
-    def see(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
-        """Return what the drafter's network reads (B, F), and estimated positions of the places (B, K, 3), metres."""
+    def forward(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
+        """Return logits (B, N, V), and estimated positions of the places (B, K, 3), metres."""
+        given = self.views(inputs)
+        if self.packed is not None and not any(map(wants_gradient, given)):
+            logits, places = self.packed(*given)
+            return logits, places
+        return self.network(*given)
+
+    def views(self, inputs: Inputs) -> list[Tensor]:
+        """Return proprioception, the instruction's mean word, then the stems' tokens and points of each view."""
         assert inputs.images is not None
-        proprioception, words = inputs.proprioception, self.words(inputs.words).mean(1)
         views = [stem(image) for stem, image in zip(self.stems, inputs.images.split(self.size, -1), strict=True)]
-        cells = [part for grid, _ in views for part in (grid.mean(1), self.cells(grid).flatten(1))]
-        points = [points for _, points in views]
-        located = self.locate(torch.cat([*points, hand_features(proprioception, self.centre), words], -1))
+        return [inputs.proprioception, self.words(inputs.words).mean(1), *(part for view in views for part in view)]
+
+    def see(self, proprioception: Tensor, words: Tensor, *views: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what the drafter's network reads (B, F) and the places' positions, from the results of `views`."""
+        cells = [part for grid in views[::2] for part in (grid.mean(1), self.cells(grid).flatten(1))]
+        located = self.locate(torch.cat([*views[1::2], hand_features(proprioception, self.centre), words], -1))
         places = located.unflatten(-1, (-1, 3)) * 0.1 + self.centre
         scene = scene_features(proprioception, places, self.centre)
         return torch.cat([*cells, words, scene], -1), places
 
-    def forward(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
-        """Return logits (B, N, V) and positions (B, K, 3)."""
-        if self.packed is not None and len(inputs.proprioception) == 1:
-            return self.packed(inputs)
-        features, places = self.see(inputs)
-        return self.drafter(features.to(self.drafter.head.weight.dtype)), places
+    def network(self, *given: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute `forward` by the modules, from the results of `views`."""
+        features, places = self.see(*given)
+        return self.drafter.logits(features.to(self.drafter.head.weight.dtype)), places
 
-    def pack_weights(self) -> PackedScout | None:
-        """Return the packed weights of a float32 scout; None in other number formats."""
-        from kerv_cli.methods.scout.packed import PackedScout  # ONNX Runtime, which a GPU does not need
-
-        return PackedScout(self) if self.cells.weight.dtype == torch.float32 else None
+    def pack_weights(self) -> Program | None:
+        """Return all after the stems, compiled; None in other formats than float32."""
+        s = self.settings
+        of_view = (1, s.grid**2, s.cell_width), (1, 2 * s.keypoints)
+        shapes = [(1, len(self.observation.proprioception)), (1, s.word_width), *of_view * len(self.stems)]
+        return Program(self.network, *shapes) if self.cells.weight.dtype == torch.float32 else None
 
 
 class ScoutProposer(EarlyProposer):
@@ -199,7 +206,8 @@ class ScoutDrafter(EarlyDrafter):
         train, device = lesson.settings.train, lesson.target.device
         labels = lesson.examples.places[indices].to(device)
         if step < train.scene_steps:
-            loss = position_loss(lesson.module.see(lesson.examples.inputs(indices, device))[1], labels)
+            given = lesson.module.views(lesson.examples.inputs(indices, device))
+            loss = position_loss(lesson.module.see(*given)[1], labels)
             return loss, {"position_loss": float(loss.detach())}
         logits, places = self.outputs(lesson, lesson.module, lesson.examples, indices)
         token, position = self.token_loss(lesson, logits, indices), position_loss(places, labels)

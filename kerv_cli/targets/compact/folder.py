@@ -11,7 +11,7 @@ import torch
 
 from kerv_cli.base.manifests import read
 from kerv_cli.targets.checkpoint import FLOAT32, TargetDescription, save_module, target_fields
-from kerv_cli.targets.compact.packed import load_packed
+from kerv_cli.targets.compact.packable import load_packed
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer

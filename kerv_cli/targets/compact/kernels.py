@@ -1,77 +1,360 @@
-"""Products and norms of packed weights on a CPU: the same numbers in the layout that is fastest there;
-oneDNN's blocked one halves the time of 30 rows."""
+"""Execute the operations of a `Program` on one CPU core: `run`, compiled by numba.
+
+Each row of a batch has a frame of float32 numbers that operations read and write. Weights stay as they are stored (half
+precision, or int8 and a scale per output): registers expand them, sums are float32.
+
+A row has the same bits alone and among many rows: a product adds its terms in the order of the inputs, one output per
+vector lane, and a softmax does not depend on slots that a row does not see. So a verification of sixteen tokens gives
+the very logits of sixteen single forwards, and strict acceptance equals autoregressive decoding even if two logits are
+closer than float32 resolves. Processors may still differ from each other in the last bits.
+
+Measured on an AMD EPYC (Zen 5), 3.5 M weights with 192 inputs: 1 row 0.06 ms, 16 rows 0.42 ms, 31 rows 0.84 ms. oneDNN
+takes 0.78 ms and 1.21 ms for 16 and 31 rows, OpenBLAS 1.19 ms and 2.44 ms.
+"""
 
 from __future__ import annotations
 
 import math
+import platform
+from collections.abc import Callable
+from typing import Any
 
+import numba
 import numpy as np
-import torch
-from torch import Tensor, nn
+from llvmlite import ir
+from numba import types
+from numba.core.codegen import get_host_cpu_features
+from numba.extending import intrinsic
 
-BLOCKED_FROM = 600_000  # multiplications below which a plain product beats oneDNN's call overhead of 15 µs (measured)
+from kerv_cli.targets.compact import recording as op
+from kerv_cli.targets.compact.recording import FLOAT, HALF, INT8, PANEL
 
-
-def has_blocked_layouts() -> bool:
-    """Whether this build of torch carries oneDNN's fused products."""
-    names = ("_linear_pointwise", "_reorder_linear_weight")
-    return torch.backends.mkldnn.is_available() and all(hasattr(torch.ops.mkldnn, name) for name in names)
-
-
-def row_product(weight: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """weight (O, I), x (I,) -> (O,), by numpy's BLAS."""
-    return np.dot(weight, x)
-
-
-class FastLinear:
-    """x (n, I) -> (n, O) with a weight (O, I): as it is for a few rows, in oneDNN's blocks for many. A single row goes
-    through `row_product` of `array`: with MKL, which torch is built with, its products take twice as long on some CPUs
-    (measured on an AMD EPYC, one token of `small`: 1.7 ms against 0.8 ms)."""
-
-    def __init__(self, weight: Tensor) -> None:
-        self.weight = weight.contiguous()
-        self.array: np.ndarray = self.weight.numpy()
-        self.rows = -(-BLOCKED_FROM // weight.numel())
-        self.blocked: Tensor | None = None
-        if has_blocked_layouts():
-            self.blocked = torch.ops.mkldnn._reorder_linear_weight(self.weight, 32)
-
-    def __call__(self, x: Tensor) -> Tensor:
-        if self.blocked is not None and x.shape[0] >= self.rows:
-            return torch.ops.mkldnn._linear_pointwise(x, self.blocked, None, "none", [], "")
-        return torch.mm(x, self.weight.t())
-
-    def added_to(self, other: Tensor, x: Tensor) -> Tensor:
-        """other (n, O) + the product."""
-        if self.blocked is not None and x.shape[0] >= self.rows:
-            return torch.ops.mkldnn._linear_pointwise.binary(x, other, self.blocked, None, "add")
-        return torch.addmm(other, x, self.weight.t())
+FEATURES = (numba.config.CPU_FEATURES or get_host_cpu_features()).split(",")
+EXPANDS_HALF = "+f16c" in FEATURES or platform.machine() in ("aarch64", "arm64")
+"""Whether the CPU expands half precision in registers; else `Program` stores float32."""
+LANES = PANEL if "+avx512f" in FEATURES else 16
+"""Outputs that several rows compute at once: their sums must fit into the vector registers."""
+FAST = {"contract", "reassoc", "nsz"}
+compiled = numba.njit(error_model="numpy", fastmath=FAST)
+NUMBER, WORD, LANE = ir.FloatType(), ir.IntType(64), ir.IntType(32)
 
 
-class RowNorm:
-    """x / √(Σ x² + E ε): RMSNorm without its gain and √E, which are folded into the next weight."""
+def _tile(rows: int, kind: int, lanes: int) -> Callable[..., None]:
+    """Make the innermost loop: some rows times a panel of weights, all sums of `lanes` outputs in registers.
 
-    def __init__(self, norm: nn.RMSNorm) -> None:
-        self.width_eps = norm.weight.shape[0] * (norm.eps or 0.0)
-        self.floor = torch.tensor(math.sqrt(self.width_eps))
+    Its arguments are addresses: weights (inputs, PANEL); factors, a scale and a bias per output; x and y, the rows and
+    their results, `stride` and `step` bytes apart. y = (x · weights) · scale + bias.
+    """
+    stored, size = {HALF: (ir.HalfType(), 2), INT8: (ir.IntType(8), 1), FLOAT: (NUMBER, 4)}[kind]
+    vector, fused = ir.VectorType(NUMBER, lanes), ("contract",)
+    nothing, zeros = ir.Constant(vector, ir.Undefined), ir.Constant(ir.VectorType(LANE, lanes), [0] * lanes)
 
-    def __call__(self, x: Tensor) -> Tensor:
-        return x / torch.hypot(torch.linalg.vector_norm(x, 2, -1, True), self.floor)
+    def emit(builder: Any, weights: Any, factors: Any, inputs: Any, x: Any, stride: Any, y: Any, step: Any) -> None:
+        def pointer(base: Any, index: Any, distance: Any, kind: Any) -> Any:
+            return builder.inttoptr(builder.add(base, builder.mul(index, distance)), kind.as_pointer())
 
-    def of_vector(self, x: Tensor) -> float:
-        """The factor for a single row (E,)."""
-        return 1.0 / math.sqrt(float(torch.dot(x, x)) + self.width_eps)
+        def load(base: Any, index: Any, distance: int, kind: Any, align: int = 4) -> Any:
+            value = builder.load(pointer(base, index, WORD(distance), kind))
+            value.align = align
+            return value
+
+        x = [builder.add(x, builder.mul(stride, WORD(r))) for r in range(rows)]
+        before, loop, after = builder.block, builder.append_basic_block(), builder.append_basic_block()
+        builder.branch(loop)
+        builder.position_at_end(loop)
+        index, sums = builder.phi(WORD), [builder.phi(vector) for _ in range(rows)]
+        row = load(weights, index, PANEL * size, ir.VectorType(stored, lanes), size)
+        row = {HALF: builder.fpext, INT8: builder.sitofp, FLOAT: lambda value, _: value}[kind](row, vector)
+        totals, following = [], builder.add(index, WORD(1))
+        for r, total in enumerate(sums):
+            single = builder.insert_element(nothing, load(x[r], index, 4, NUMBER), LANE(0))
+            term = builder.fmul(row, builder.shuffle_vector(single, nothing, zeros), flags=fused)
+            totals.append(builder.fadd(total, term, flags=fused))
+        starts = [WORD(0), *[ir.Constant(vector, [0.0] * lanes)] * rows]
+        for value, start, change in zip([index, *sums], starts, [following, *totals], strict=True):
+            value.add_incoming(start, before)
+            value.add_incoming(change, loop)
+        builder.cbranch(builder.icmp_signed("<", following, inputs), loop, after)
+        builder.position_at_end(after)
+        scale, bias = (load(factors, WORD(i), 4 * PANEL, vector) for i in range(2))
+        for r, total in enumerate(totals):
+            result = builder.fadd(builder.fmul(total, scale, flags=fused), bias, flags=fused)
+            builder.store(result, pointer(y, WORD(r), step, vector)).align = 4
+
+    @intrinsic
+    def tile(typing: Any, weights: Any, factors: Any, inputs: Any, x: Any, stride: Any, y: Any, step: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            weights, factors, inputs, x, stride, y, step = arguments
+            for lane in range(0, PANEL, lanes):
+                w, f, to = (builder.add(a, WORD(b * lane)) for a, b in ((weights, size), (factors, 4), (y, 4)))
+                emit(builder, w, f, inputs, x, stride, to, step)
+            return context.get_dummy_value()
+
+        return types.void(*[types.intp] * 7), generate
+
+    return tile
 
 
-def gain_of(norm: nn.RMSNorm) -> Tensor:
-    """The factor (E,) that `RowNorm` leaves out, gain · √E, in float32."""
-    return norm.weight.float() * norm.weight.shape[0] ** 0.5
+def _product(kind: int, size: int) -> Callable[..., None]:
+    """Make the product of rows with a matrix of panels, whose weights have `size` bytes; arguments as of `_tile`."""
+    one, two, four = _tile(1, kind, PANEL), _tile(2, kind, LANES), _tile(4, kind, LANES)
+
+    @compiled
+    def product(weights, factors, inputs, panels, x, stride, rows, y, step):
+        for panel in range(panels):
+            w, f, r = weights + size * PANEL * inputs * panel, factors + 8 * PANEL * panel, 0
+            to = y + 4 * PANEL * panel
+            while r + 4 <= rows:
+                four(w, f, inputs, x + r * stride, stride, to + r * step, step)
+                r += 4
+            while r + 2 <= rows:
+                two(w, f, inputs, x + r * stride, stride, to + r * step, step)
+                r += 2
+            if r < rows:
+                one(w, f, inputs, x + r * stride, stride, to + r * step, step)
+
+    return product
 
 
-def with_pairs(qkv: Tensor, channels: int) -> Tensor:
-    """qkv (3 E, I), heads of C = `channels` -> the same with each two numbers that RoPE rotates, of queries and keys,
-    side by side."""
-    width = qkv.shape[0] // 3
-    pairs = torch.arange(channels).view(2, -1).t().flatten()
-    qk = qkv[: 2 * width].unflatten(0, (-1, channels))[:, pairs].flatten(0, 1)
-    return torch.cat([qk, qkv[2 * width :]])
+half_product = _product(HALF, 2) if EXPANDS_HALF else _product(FLOAT, 4)
+int8_product, product = _product(INT8, 1), _product(FLOAT, 4)
+
+
+@intrinsic
+def get(typing: Any, address: Any, index: Any) -> Any:
+    """Read the float32 number at an index after an address."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.load(builder.gep(builder.inttoptr(arguments[0], NUMBER.as_pointer()), [arguments[1]]))
+
+    return types.float32(types.intp, types.intp), generate
+
+
+@intrinsic
+def put(typing: Any, address: Any, index: Any, value: Any) -> Any:
+    """Write a float32 number to an index after an address."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        base = builder.inttoptr(arguments[0], NUMBER.as_pointer())
+        builder.store(arguments[2], builder.gep(base, [arguments[1]]))
+        return context.get_dummy_value()
+
+    return types.void(types.intp, types.intp, types.float32), generate
+
+
+@intrinsic
+def _times_two_to(typing: Any, x: Any, power: Any) -> Any:
+    """Multiply x by 2^power, both float32; power is whole, from −126 to 127."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        exponent = builder.shl(builder.add(builder.fptosi(arguments[1], LANE), LANE(127)), LANE(23))
+        return builder.fmul(arguments[0], builder.bitcast(exponent, NUMBER))
+
+    return types.float32(types.float32, types.float32), generate
+
+
+_LOG2_E, _LN_2, _LN_2_REST = np.float32(math.log2(math.e)), np.float32(0.693359375), np.float32(-2.12194440e-4)
+_T2, _T3, _T4, _T5, _T6, _T7 = (np.float32(1 / math.factorial(n)) for n in range(2, 8))
+_ZERO, _ONE, _TWO, _LOWEST = np.float32(0), np.float32(1), np.float32(2), np.float32(-1e30)
+
+
+@compiled
+def exponential(x):
+    """Return e^x with an error of two or three units in the last place. Loops over it become vectors."""
+    x = min(max(x, np.float32(-87)), np.float32(88))
+    power = np.rint(x * _LOG2_E)
+    x = (x - power * _LN_2) - power * _LN_2_REST
+    value = (((((_T7 * x + _T6) * x + _T5) * x + _T4) * x + _T3) * x + _T2) * x * x + x + _ONE
+    return _times_two_to(value, power)
+
+
+@compiled
+def copy(x, to, count):
+    """Copy numbers from one address to another."""
+    for i in range(count):
+        put(to, i, get(x, i))
+
+
+@compiled
+def rotate(x, to, cos, sin, channels):
+    """Rotate a head's channels; the sign of the swapped half is in the sines."""
+    half = channels // 2
+    for c in range(half):
+        first, second = get(x, c), get(x, c + half)
+        put(to, c, first * get(cos, c) + second * get(sin, c))
+        put(to, c + half, second * get(cos, c + half) + first * get(sin, c + half))
+
+
+@numba.njit(error_model="numpy", fastmath=FAST - {"reassoc"} | {"nnan"})
+def softmax(scores, slots, scale, mask, stop):
+    """Turn scores into weights; slots from `stop` on, and those whose mask is not 0, weigh exactly nothing.
+
+    The sum has 16 parts that hidden slots do not change. mask: an address, or 0: none.
+    """
+    for s in range(stop, slots):
+        put(scores, s, _LOWEST)
+    if mask:
+        for s in range(stop):
+            put(scores, s, get(scores, s) if get(mask, s) == 0 else _LOWEST)
+    most, total = _LOWEST, _ZERO
+    for s in range(slots):
+        most = max(most, get(scores, s))
+    for s in range(slots):
+        score = get(scores, s)
+        weight = exponential((score - most) * scale)
+        put(scores, s, weight if score > _LOWEST else _ZERO)
+    for i in range(16):
+        part = _ZERO
+        for s in range(i, slots, 16):
+            part += get(scores, s)
+        total += part
+    for s in range(stop):
+        put(scores, s, get(scores, s) / total)
+
+
+@compiled
+def attention(frames, out, qkv, tables, cache, start, filled, mask, keys, values):
+    """Rotate the queries and keys of all rows, append keys and values to a layer's cache, and attend.
+
+    Args:
+        frames: (B · T, size); `out` and `qkv` are places in a frame.
+        tables: (T, 2, C) cosines and sines of the rows' positions.
+        cache: (2, B, A, slots, C), of which `start` slots are valid. `filled` of them are in `keys` and `values`.
+        mask: (T, start + T), 0 for the slots that a row sees; (0, 1): all before it.
+        keys: (B · A, panels, C, PANEL) the cache's keys, a matrix with an output per slot.
+        values: (B · A, panels, slots, PANEL) the cache's values, a matrix with an output per channel.
+    """
+    tokens, heads, channels = tables.shape[0], cache.shape[2], tables.shape[2]
+    stop, size, panels, parts = start + tokens, 4 * frames.shape[1], keys.shape[1], values.shape[1]
+    queries, scores = np.empty((tokens, channels), np.float32), np.empty((tokens, panels * PANEL), np.float32)
+    result, factors = np.empty((tokens, parts * PANEL), np.float32), np.zeros((panels + parts, 2, PANEL), np.float32)
+    factors[:, 0] = _ONE
+    q, weights, mixed, one = queries.ctypes.data, scores.ctypes.data, result.ctypes.data, factors.ctypes.data
+    table, row, scale = 4 * channels, 4 * panels * PANEL, _ONE / np.sqrt(np.float32(channels))
+    for head in range(len(frames) // tokens * heads):
+        b, h = head // heads, head % heads
+        first = frames.ctypes.data + b * tokens * size + h * table
+        k, v = cache[0, b, h].ctypes.data, cache[1, b, h].ctypes.data
+        for t in range(tokens):
+            x, turn, slot = first + t * size + 4 * qkv, tables[t].ctypes.data, (start + t) * table
+            rotate(x, q + t * table, turn, turn + table, channels)
+            rotate(x + heads * table, k + slot, turn, turn + table, channels)
+            copy(x + 2 * heads * table, v + slot, channels)
+        for s in range(filled, stop):
+            panel = keys[head, s // PANEL].ctypes.data + 4 * (s % PANEL)
+            for c in range(channels):
+                put(panel, c * PANEL, get(k + s * table, c))
+            for part in range(parts):
+                to = values[head, part, s].ctypes.data
+                copy(v + s * table + 4 * PANEL * part, to, min(PANEL, channels - PANEL * part))
+        product(keys[head].ctypes.data, one, channels, panels, q, table, tokens, weights, row)
+        for t in range(tokens):
+            seen, last = (mask[t].ctypes.data, stop) if len(mask) else (0, start + t + 1)
+            softmax(weights + t * row, panels * PANEL, scale, seen, last)
+        for part in range(parts):
+            to = mixed + 4 * PANEL * part
+            product(values[head, part].ctypes.data, one, stop, 1, weights, row, tokens, to, 4 * parts * PANEL)
+        for t in range(tokens):
+            copy(mixed + 4 * t * parts * PANEL, first + t * size + 4 * out, channels)
+
+
+@compiled
+def elementwise(code, frame, columns, numbers, indices):
+    """Execute an operation other than LINEAR and ATTEND on one frame."""
+    out, a, b = columns[1], columns[2], columns[3]
+    rows, width, stride, first = columns[4], columns[5], columns[6], columns[7]
+    size = rows * width
+    y, x, z = frame[out : out + size], frame[a:], frame[b : b + size]
+    if code == op.GATHER:
+        for i in range(size):
+            y[i] = frame[indices[first + i]]
+    elif code == op.ADD:
+        for i in range(size):
+            y[i] = x[i] + z[i]
+    elif code == op.MULTIPLY:
+        for i in range(size):
+            y[i] = x[i] * z[i]
+    elif code == op.AFFINE:
+        factor, offset = numbers[first : first + size], numbers[first + size : first + 2 * size]
+        for i in range(size):
+            y[i] = x[i] * factor[i] + offset[i]
+    elif code == op.CLAMP:
+        for i in range(size):
+            y[i] = min(max(x[i], numbers[first]), numbers[first + 1])
+    elif code == op.SILU:
+        for i in range(size):
+            y[i] = x[i] / (_ONE + exponential(-x[i]))
+    elif code == op.TANH:
+        for i in range(size):
+            y[i] = _ONE - _TWO / (exponential(_TWO * x[i]) + _ONE)
+    elif code == op.EMBED:
+        for i in range(size):
+            begin, to, wide = first + columns[8] * int(x[i]), out + columns[8] * i, columns[8]
+            frame[to : to + wide] = numbers[begin : begin + wide]
+    elif code == op.ARGMAX:
+        y[0] = np.float32(np.argmax(x[:width]))
+    elif code == op.NORM:
+        gain, epsilon = numbers[first : first + width], numbers[first + width]
+        for r in range(rows):
+            row, total = x[r * stride : r * stride + width], _ZERO
+            for i in range(width):
+                total += row[i] * row[i]
+            factor = _ONE / np.sqrt(total / np.float32(width) + epsilon)
+            for i in range(width):
+                y[r * width + i] = row[i] * factor * gain[i]
+
+
+_F, _I = types.float32, types.int64
+_TABLES = _I[:, ::1], _I, _I, _I[::1], _F[::1]
+SIGNATURE = types.void(*_TABLES, _F[:, ::1], _I[::1], _I, _F[:, :, :, :, :, ::1], _F[:, ::1], _F[:, ::1])
+
+
+@numba.njit(SIGNATURE, error_model="numpy", fastmath=FAST, cache=True)
+def run(ops, times, last, indices, numbers, frames, positions, start, cache, mask, results):
+    """Execute the operations `times` times, the last time only the first `last` of them.
+
+    Args:
+        ops: (operations, columns) as in `recording.COLUMNS`.
+        indices, numbers: What the operations refer to.
+        frames: (B · T, size) memory, a frame per row.
+        positions: (T,) rotary positions; they and the cache move on by one each time.
+        start: Slots of the cache that are valid.
+        cache: (layers, 2, B, A, slots, C).
+        mask: (T, start + T), 0 for the slots that a row sees; (0, 1): all before it.
+        results: (times, B · T) what ARGMAX found, each time.
+    """
+    rows, size = frames.shape
+    tokens, memory, held = len(positions), frames.ctypes.data, cache.shape[0] if times > 1 else 1
+    slots, sequences, channels = start + tokens + times - 1, cache.shape[2] * cache.shape[3], cache.shape[5]
+    keys = np.empty((held, sequences, (slots + PANEL - 1) // PANEL, channels, PANEL), np.float32)
+    values = np.empty((held, sequences, (channels + PANEL - 1) // PANEL, slots, PANEL), np.float32)
+    tables = np.empty((tokens, 2, channels), np.float32)
+    for time in range(times):
+        for i in range(last if time == times - 1 else len(ops)):
+            columns = ops[i]
+            code, out, a, lines, width = columns[0], columns[1], columns[2], columns[4], columns[5]
+            if code == op.LINEAR:
+                weights, factors, panels, kind = columns[9], columns[10], columns[11], columns[12]
+                many, each, stride, step = lines, rows, 4 * columns[6], 4 * columns[8]
+                if lines == 1:  # the rows of all frames together
+                    many, each, stride, step = rows, 1, 4 * size, 4 * size
+                for r in range(each):
+                    x, y = memory + 4 * (r * size + a), memory + 4 * (r * size + out)
+                    if kind == HALF:
+                        half_product(weights, factors, width, panels, x, stride, many, y, step)
+                    elif kind == INT8:
+                        int8_product(weights, factors, width, panels, x, stride, many, y, step)
+                    else:
+                        product(weights, factors, width, panels, x, stride, many, y, step)
+            elif code == op.ATTEND:
+                for t in range(tokens):
+                    begin = columns[7] + 2 * channels * (positions[t] + time)
+                    tables[t] = numbers[begin : begin + 2 * channels].reshape(2, channels)
+                layer, now = columns[6], start + time
+                known, filled = layer if times > 1 else 0, now if time else 0
+                attention(frames, out, a, tables, cache[layer], now, filled, mask, keys[known], values[known])
+            else:
+                for r in range(rows):
+                    elementwise(code, frames[r], columns, numbers, indices)
+                    if code == op.ARGMAX:
+                        results[time, r] = frames[r, out]

@@ -12,8 +12,9 @@ privileged, to separate decoding from perception.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -32,7 +33,8 @@ from kerv_cli.targets.compact.features import (
     scene_features,
     scene_width,
 )
-from kerv_cli.targets.compact.packable import Packable
+from kerv_cli.targets.compact.packable import Packable, PackableLinear, wants_gradient
+from kerv_cli.targets.compact.program import Program
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Trunk
@@ -51,6 +53,16 @@ class Inputs:
     words: Tensor
 
 
+class Compiled(NamedTuple):
+    """The compiled forms of a target: what encodes a prompt, and what decodes one token after another."""
+
+    prompt: Program
+    step: Program | None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(None), ()
+
+
 class CompactTarget(Packable):
     """The compact policy: encoder, trunk and head; implements `ReadableTarget`. Parameters in float32.
 
@@ -62,7 +74,7 @@ class CompactTarget(Packable):
     """
 
     centre: Tensor
-    packed: Callable[[Inputs], tuple[Tensor, Tensor]] | None
+    packed: Compiled | None
 
     def __init__(
         self,
@@ -95,7 +107,7 @@ class CompactTarget(Packable):
             self.further_views = nn.ModuleList(VisionEncoder(*shapes) for _ in range(views - 1))
             self.locate = mlp(2 * s.keypoints * views + p + s.width, 256, 128, 3 * places)
         self.trunk = Trunk(s.width, s.layers, s.heads, s.feed_forward)
-        self.head = nn.Linear(s.width, actions.tokens, bias=False)
+        self.head = PackableLinear(s.width, actions.tokens, bias=False)
         nn.init.normal_(self.head.weight, std=0.02)
         if s.parallel:
             queries = self.embedding.weight.data.mean(0).repeat(s.chunk * actions.dofs, 1)
@@ -177,35 +189,57 @@ class CompactTarget(Packable):
     def encode_batch(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
         """Prompt embeddings (B, P, E), and the positions of the places (B, K, 3) in metres that their scene tokens
         carry."""
-        if self.packed is not None and len(inputs.proprioception) == 1:
-            return self.packed(inputs)
-        words = self.word_embedding(inputs.words)
-        hand = hand_features(inputs.proprioception, self.centre)
-        parts = []
+        given = [inputs.words, inputs.proprioception, inputs.states]
         if self.cameras:
-            tokens, places = self.see(inputs, words, hand)
-            parts.append(tokens)
-            features = scene_features(inputs.proprioception, places, self.centre)
-        else:
-            places = places_of(inputs.states, self.observation)
-            features = scene_features(inputs.proprioception, places, self.centre)
-            privileged = privileged_features(inputs.proprioception, inputs.states, self.observation)
-            features = torch.cat([features, privileged], -1)
-        scene = self.scene(features.to(self.head.weight.dtype)).unflatten(-1, (self.settings.scene_tokens, -1))
-        proprioception = self.proprioception(hand.to(self.head.weight.dtype))[:, None]
-        return torch.cat([*parts, words, scene, proprioception], 1), places
+            assert inputs.images is not None
+            images = inputs.images.split(self.settings.image_size, -1)
+            views = [encoder(image) for encoder, image in zip(self.encoders, images, strict=True)]
+            given[2:] = torch.cat([tokens for tokens, _ in views], 1), torch.cat([points for _, points in views], -1)
+        if self.packed is not None and not any(map(wants_gradient, given)):
+            prompt, places = self.packed.prompt(*given)
+            return prompt, places
+        return self.prompt(*given)
 
-    def see(self, inputs: Inputs, words: Tensor, hand: Tensor) -> tuple[Tensor, Tensor]:
-        """Vision tokens (B, grid² x views, E) and the places' estimated positions (B, K, 3), metres."""
-        assert inputs.images is not None
-        images = inputs.images.split(self.settings.image_size, -1)
-        views = [encoder(image) for encoder, image in zip(self.encoders, images, strict=True)]
-        tokens, points = torch.cat([one for one, _ in views], 1), torch.cat([one for _, one in views], -1)
+    def prompt(self, words: Tensor, proprioception: Tensor, *seen: Tensor) -> tuple[Tensor, Tensor]:
+        """What `encode_batch` returns. seen: states (B, s), or vision tokens and image points of all views."""
+        embedded, hand = self.word_embedding(words), hand_features(proprioception, self.centre)
+        if self.cameras:
+            tokens, points = seen
+            places = self.located(points, hand, embedded)
+            features, parts = scene_features(proprioception, places, self.centre), [tokens]
+        else:
+            places = places_of(seen[0], self.observation)
+            features = scene_features(proprioception, places, self.centre)
+            features = torch.cat([features, privileged_features(proprioception, seen[0], self.observation)], -1)
+            parts = []
+        scene = self.scene(features.to(self.head.weight.dtype)).unflatten(-1, (self.settings.scene_tokens, -1))
+        felt = self.proprioception(hand.to(self.head.weight.dtype))[:, None]
+        return torch.cat([*parts, embedded, scene, felt], 1), places
+
+    def located(self, points: Tensor, hand: Tensor, words: Tensor) -> Tensor:
+        """The places' estimated positions (B, K, 3), metres."""
         # bfloat16 would round image points to a fifth of a cell: millimetres matter here
         with torch.autocast(points.device.type, enabled=False):
             features = torch.cat([points, hand, words.mean(1)], -1).to(self.head.weight.dtype)
             located = self.locate(features)
-        return tokens, located.float().unflatten(-1, (-1, 3)) * 0.1 + self.centre
+        return located.to(torch.float32).unflatten(-1, (-1, 3)) * 0.1 + self.centre
+
+    def pack_weights(self) -> Compiled | None:
+        """Return what encodes a prompt and what decodes a token, compiled; None in other formats than float32."""
+        if self.dtype != torch.float32:
+            return None
+        s, space = self.settings, self.observation
+        shapes: list[tuple[int, ...]] = [(1, s.instruction_tokens), (1, len(space.proprioception))]
+        if self.cameras:
+            views = len(self.encoders)
+            shapes += [(1, s.grid**2 * views, s.width), (1, 2 * s.keypoints * views)]
+        else:
+            shapes += [(1, space.state)]
+
+        def step(token: Tensor) -> Tensor:
+            return self.head(self.trunk.compute([self.embedding(token)])).argmax(-1)
+
+        return Compiled(Program(self.prompt, *shapes), Program(step, (1, 1), repeats=True))
 
     def embed(self, tokens: Tensor) -> Tensor:
         """Action tokens (B, T) int64 -> (B, T, E)."""
@@ -220,6 +254,15 @@ class CompactTarget(Packable):
     ) -> Tensor:
         """Hidden states (B, T, E) of x (B, T, E) at `positions` (T,), behind the cached tokens."""
         return self.trunk(x, positions, cache, seen)
+
+    def continue_greedily(self, token: int, count: int, cache: Cache) -> list[int] | None:
+        """Decode `count` tokens after a token in one call; None if this target is not compiled."""
+        step = self.packed.step if self.packed else None
+        if step is None or cache.fixed:
+            return None
+        tokens = step.repeat(count, torch.tensor([[token]]), cache=cache)
+        cache.length += count
+        return [int(token) for token in tokens[:, 0]]
 
     def parallel_pass(self, prompt: Tensor, cache: Cache | None = None) -> Tensor:
         """prompt (B, P, E) -> hidden states (B, N, E) of all tokens, in one forward (docs/methods.md §6). No action

@@ -2,14 +2,14 @@
 
 Shapes: B batch, T new tokens, S cached tokens, E width, A heads, C = E / A.
 
-These implementations give the same numbers up to rounding. On CUDA a cache of fixed shapes is written at a
-tensor of slots and attended to over its whole capacity under a mask, so that one captured graph can serve every step.
-On a CPU slices are faster, and a frozen stack has packed weights (`packed.py`, `packed_bfloat16.py`).
+The implementations give the same numbers up to rounding. On CUDA a cache of fixed shapes is written at a tensor of
+slots and attended to over its whole capacity under a mask, so that one captured graph can serve every step. On a CPU a
+frozen float32 stack is compiled (`program.py`), one in bfloat16 has blocked weights (`bfloat16.py`).
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -17,8 +17,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kerv_cli.targets.attention import Cache, Slots, attention_mask, rotate, write
+from kerv_cli.targets.compact.bfloat16 import Bfloat16Layers, multiplies_bfloat16
 from kerv_cli.targets.compact.captured import CapturedCache
-from kerv_cli.targets.compact.packable import Packable, Packed, wants_gradient
+from kerv_cli.targets.compact.packable import Packable, wants_gradient
+from kerv_cli.targets.compact.program import Program
 
 POSITIONS, BASE = 1024, 10_000.0  # of the rotary embedding
 
@@ -37,7 +39,7 @@ class Rotary(nn.Module):
         # the sign of the swapped half is folded into the table: x·cos + swap(x)·sin
         self.register_buffer("sin", torch.cat([-angles.sin(), angles.sin()], -1), persistent=False)
 
-    def forward(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, positions: Tensor | slice) -> tuple[Tensor, Tensor]:
         """positions (T,) -> cos and sin (T, 1, C) for all layers."""
         return self.cos[positions][:, None], self.sin[positions][:, None]
 
@@ -63,10 +65,31 @@ class Layer(nn.Module):
         slots: Slots | None = None,
         mask: Tensor | None = None,
     ) -> Tensor:
-        """x (B, T, E) -> (B, T, E). cache: (2, B, A, capacity, C) of this layer, written at `slots`. mask: from
-        `attention_mask`; without one attention is causal."""
-        batch, tokens, width = x.shape
-        qkv = self.qkv(self.attention_norm(x)).view(batch, tokens, 3 * self.heads, self.channels)
+        """Compute x (B, T, E) -> (B, T, E).
+
+        Args:
+            cache: (2, B, A, capacity, C) of this layer, written at `slots`.
+            mask: From `attention_mask`; without one attention is causal.
+        """
+        qkv = self.qkv(self.attention_norm(x))
+        if isinstance(qkv, Tensor):
+            x = x + self.out(self.attend(qkv, rotary, cache, slots, mask))
+        else:
+            x = x + self.out(qkv.attend(self.heads, *rotary))
+        gate, up = self.gate_up(self.feed_norm(x)).chunk(2, -1)
+        return x + self.down(F.silu(gate) * up)
+
+    def attend(
+        self,
+        qkv: Tensor,
+        rotary: tuple[Tensor, Tensor],
+        cache: Tensor | None,
+        slots: Slots | None,
+        mask: Tensor | None,
+    ) -> Tensor:
+        """Attention of qkv (B, T, 3 E), not yet rotated -> (B, T, E)."""
+        batch, tokens, width = qkv.shape
+        qkv = qkv.view(batch, tokens, 3 * self.heads, self.channels)
         qk = rotate(qkv[:, :, : 2 * self.heads], *rotary)
         q = qk[:, :, : self.heads].transpose(1, 2)
         k = qk[:, :, self.heads :].transpose(1, 2)
@@ -75,31 +98,13 @@ class Layer(nn.Module):
             k, v = write(cache, slots, k, v)
         causal = mask is None and tokens > 1
         attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, is_causal=causal)
-        x = x + self.out(attended.transpose(1, 2).reshape(batch, tokens, width))
-        gate, up = self.gate_up(self.feed_norm(x)).chunk(2, -1)
-        return x + self.down(F.silu(gate) * up)
-
-
-class PackedStack(Packed, ABC):
-    """Packed weights of a stack's layers and its final norm. cache_dtype: number format of its caches, by default that
-    of the weights."""
-
-    cache_dtype: torch.dtype | None = None
-
-    @abstractmethod
-    def __call__(self, x: Tensor, positions: Tensor, cache: Cache | None, mask: Tensor | None) -> Tensor:
-        """x (B, T, E) -> hidden states (B, T, E) before the norm; the cache's length stays. mask: from
-        `attention_mask`."""
-
-    @abstractmethod
-    def norm(self, x: Tensor) -> Tensor:
-        """The final RMSNorm with its gain."""
+        return attended.transpose(1, 2).reshape(batch, tokens, width // 3)
 
 
 class LayerStack(Packable):
-    """Decoder layers and their rotary embedding, the base of the trunk and the drafter."""
+    """Decoder layers between an entry and a norm, the base of the trunk and the drafter."""
 
-    packed: PackedStack | None
+    inputs = 1  # tensors (B, T, E) that it takes
 
     def __init__(self, width: int, layers: int, heads: int, feed_forward: int) -> None:
         super().__init__()
@@ -108,46 +113,69 @@ class LayerStack(Packable):
         self.layers = nn.ModuleList(Layer(width, heads, feed_forward) for _ in range(layers))
         self.norm = nn.RMSNorm(width, eps=1e-5)
 
+    def enter(self, *inputs: Tensor) -> Tensor:
+        """The inputs (B, T, E) -> what the first layer reads (B, T, E)."""
+        return inputs[0]
+
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
-        """An empty cache. fixed: of fixed shapes; default: on CUDA."""
+        """Return an empty cache. fixed: of fixed shapes; default: on CUDA."""
         like: Tensor = self.norm.weight
-        if self.packed is not None and self.packed.cache_dtype is not None:
-            like = like.to(self.packed.cache_dtype)
+        if isinstance(self.packed, Bfloat16Layers):
+            like = like.float()
         sizes = self.depth, batch, self.heads, capacity, self.width // self.heads
         fixed = like.is_cuda if fixed is None else fixed
         return CapturedCache(*sizes, like) if fixed else Cache(*sizes, like)
 
-    def packed_for(self, x: Tensor, cache: Cache | None) -> PackedStack | None:
-        """The packed weights where they can compute x: without gradients, and with no cache of fixed shapes."""
-        return None if wants_gradient(x) or (cache is not None and cache.fixed) else self.packed
+    def pack_weights(self) -> Program | Bfloat16Layers | None:
+        """Return the compiled stack in float32, blocked layers in bfloat16 where the CPU multiplies that."""
+        if self.norm.weight.dtype == torch.float32:
+            return Program(lambda *inputs: self.compute(inputs), *[(1, 1, self.width)] * self.inputs)
+        if self.norm.weight.dtype == torch.bfloat16 and multiplies_bfloat16():
+            return Bfloat16Layers(self.rotary(slice(None)), self.layers)
+        return None
 
-    def captures(self, x: Tensor, cache: Cache | None) -> bool:
-        """Whether a captured graph computes x: one sequence on CUDA, without gradients, in a cache of fixed shapes."""
-        return x.is_cuda and x.shape[0] == 1 and cache is not None and cache.fixed and not wants_gradient(x)
+    def run(
+        self, inputs: Sequence[Tensor], positions: Tensor, cache: Cache | None, seen: np.ndarray | Tensor | None
+    ) -> Tensor:
+        """Return the hidden states (B, T, E) of new tokens behind the cached ones; the cache grows by T.
 
-    def run_layers(self, x: Tensor, positions: Tensor, cache: Cache | None, seen: np.ndarray | Tensor | None) -> Tensor:
-        """x (B, T, E) at `positions` (T,) -> output of the last layer (B, T, E); the cache grows by T. seen: as in
-        `attention_mask`."""
+        Args:
+            inputs: Tensors (B, T, E).
+            positions: (T,) rotary positions.
+            seen: As in `attention_mask`.
+        """
+        x = inputs[0]
         mask = attention_mask(seen, x.shape[1], cache, x)
-        packed = self.packed_for(x, cache)
-        if packed is not None:
-            x = packed(x, positions, cache, mask)
-        elif self.captures(x, cache):
-            assert isinstance(cache, CapturedCache)
+        slots = cache.next_slots(x.shape[1]) if cache is not None else None
+        packed = self.packed if self.is_packed(x) and (cache is None or not cache.fixed) else None
+        if isinstance(packed, Program):
+            hidden = packed(*inputs, positions=positions, cache=cache, mask=mask)[0].view(x.shape)
+        elif packed is not None:
+            hidden = self.norm(packed(self.enter(*inputs), positions, cache, slots, mask))
+        elif isinstance(cache, CapturedCache) and x.is_cuda and x.shape[0] == 1 and not wants_gradient(x):
             assert mask is not None
-            x = cache.run(self.compute, x, positions, mask)
+            hidden = self.norm(cache.run(self.run_layers, self.enter(*inputs), positions, mask))
         else:
-            slots = cache.next_slots(x.shape[1]) if cache is not None else None
-            x = self.compute(x, positions, cache, slots, mask)
+            hidden = self.compute(inputs, positions, cache, slots, mask)
         if cache is not None:
             cache.length += x.shape[1]
-        return x
+        return hidden
 
     def compute(
-        self, x: Tensor, positions: Tensor, cache: Cache | None, slots: Slots | None, mask: Tensor | None
+        self,
+        inputs: Sequence[Tensor],
+        positions: Tensor | slice = slice(None),
+        cache: Cache | None = None,
+        slots: Slots | None = None,
+        mask: Tensor | None = None,
     ) -> Tensor:
-        """Runs the modules of the layers; keys and values go to `slots` of the cache, whose length stays; mask: from
-        `attention_mask`."""
+        """Return the hidden states by the modules; the cache's length stays. Without positions: for a recording."""
+        return self.norm(self.run_layers(self.enter(*inputs), positions, cache, slots, mask))
+
+    def run_layers(
+        self, x: Tensor, positions: Tensor | slice, cache: Cache | None, slots: Slots | None, mask: Tensor | None
+    ) -> Tensor:
+        """Run the modules of the layers; keys and values go to `slots` of the cache."""
         rotary = self.rotary(positions)
         for i, layer in enumerate(self.layers):
             x = layer(x, rotary, cache.layers[i] if cache is not None else None, slots, mask)
@@ -155,7 +183,7 @@ class LayerStack(Packable):
 
 
 class Trunk(LayerStack):
-    """The stack and its final norm; its output is the hidden state that the head and the drafter read."""
+    """The stack whose hidden states the head and the drafter read."""
 
     def __init__(self, width: int, layers: int, heads: int, feed_forward: int) -> None:
         super().__init__(width, layers, heads, feed_forward)
@@ -169,6 +197,4 @@ class Trunk(LayerStack):
         self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
         """Hidden states (B, T, E) of the new tokens x (B, T, E) at rotary `positions` (T,), behind the cached ones."""
-        packed = self.packed_for(x, cache)
-        x = self.run_layers(x, positions, cache, seen)
-        return self.norm(x) if packed is None else packed.norm(x)
+        return self.run((x,), positions, cache, seen)

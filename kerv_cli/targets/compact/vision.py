@@ -35,7 +35,7 @@ class VisionEncoder(Packable):
     first stage. width: E. norm: of its residual blocks."""
 
     columns: Tensor
-    packed: Callable[[Tensor], tuple[Tensor, Tensor]] | None
+    packed: Callable[[Tensor], list[Tensor]] | None
 
     def __init__(self, size: int, grid: int, keypoints: int, channels: int, width: int, norm: str = "group") -> None:
         super().__init__()
@@ -51,10 +51,17 @@ class VisionEncoder(Packable):
         self.temperature = nn.Parameter(torch.ones(keypoints) * 2.0)
         self.register_buffer("columns", torch.linspace(-1, 1, size // 2), persistent=False)
 
+    def pack_weights(self) -> Callable[[Tensor], list[Tensor]] | None:
+        """Return the encoder of one frame as a graph of ONNX Runtime; None in other formats than float32."""
+        from kerv_cli.targets.compact.vision_graph import PackedVision  # ONNX Runtime, which a GPU does not need
+
+        return PackedVision(self, 2 * len(self.columns)) if self.columns.dtype == torch.float32 else None
+
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """images (B, 3, size, size) uint8 -> tokens (B, grid², E), points (B, 2K) in [-1, 1]."""
         if self.packed is not None and len(images) == 1:
-            return self.packed(images)
+            tokens, points = self.packed(images)
+            return tokens, points
         images = images.to(self.patch.weight.dtype) / 255.0 - 0.5
         fine = self.fine(images)
         middle = self.middle(fine)

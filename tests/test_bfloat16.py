@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from kerv_cli.engine.draft import Draft
-from kerv_cli.targets.compact.packed import pack
-from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
+from kerv_cli.targets.compact.bfloat16 import Bfloat16Layers, multiplies_bfloat16
+from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.trunk import Trunk
 
 pytestmark = [
@@ -29,7 +29,7 @@ def trunks() -> tuple[Trunk, Trunk]:
     packed = trunk.bfloat16()
     exact = copy.deepcopy(packed).float()
     pack(packed)
-    assert isinstance(packed.packed, BlockedLayers)
+    assert isinstance(packed.packed, Bfloat16Layers)
     return exact, packed
 
 

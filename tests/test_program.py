@@ -17,7 +17,7 @@ from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import EagleDrafter
-from kerv_cli.targets.compact.packed import pack
+from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.text import WordTokenizer

@@ -1,0 +1,187 @@
+"""Compiled networks: what a torch module computes, recorded once and executed by `kernels.run` in one call.
+
+numba compiles the kernels on their first use on a machine and keeps them in `__pycache__`, in a folder of the user's if
+that cannot be written, or in NUMBA_CACHE_DIR.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import functools
+import logging
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.utils.weak import WeakIdKeyDictionary
+
+from kerv_cli.targets.attention import Cache
+from kerv_cli.targets.compact.recording import ARGMAX, COLUMNS, FLOAT, HALF, INT8, PANEL, Tape
+
+_LOG = logging.getLogger("kerv")
+
+
+@functools.lru_cache(maxsize=1)
+def kernels() -> ModuleType:
+    """Return the compiled kernels. The first process on a machine compiles them and says so; others wait for it."""
+    import numba
+    from numba.core import event
+
+    class Told(event.Listener):
+        def on_start(self, event: Any) -> None:
+            if event.data["dispatcher"].py_func.__name__ == "run":
+                _LOG.warning("compiling for this CPU, once: about ten seconds …")
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    with _alone(), event.install_listener("numba:compile", Told()):
+        try:
+            from kerv_cli.targets.compact import kernels
+        except RuntimeError:  # numba finds no folder that it can write to
+            numba.config.CACHE_DIR = os.path.join(tempfile.gettempdir(), f"kerv-{os.getuid()}")
+            from kerv_cli.targets.compact import kernels
+    return kernels
+
+
+@contextlib.contextmanager
+def _alone() -> Iterator[None]:
+    """Wait until no other process of this user compiles."""
+    with open(os.path.join(tempfile.gettempdir(), f"kerv-{os.getuid()}.lock"), "w", encoding="ascii") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+class Matrix:
+    """A linear layer's weights in panels of 64 outputs, in the smallest format that holds them without loss.
+
+    Attributes:
+        columns: Its columns of an operation.
+        nbytes: Bytes of the weights.
+    """
+
+    def __init__(self, weight: Tensor, bias: Tensor | None) -> None:
+        outputs, inputs = weight.shape
+        steps = weight.abs().amax(1, keepdim=True).div(127).clamp_min(1e-30)  # as `checkpoint.compact` has them
+        whole, scale, panels = (weight / steps).round(), torch.ones(outputs), -(-outputs // PANEL)
+        if torch.equal(whole * steps, weight):
+            kind, values, scale = INT8, whole.to(torch.int8), steps[:, 0]
+        elif kernels().EXPANDS_HALF and torch.equal(weight.half().float(), weight):
+            kind, values = HALF, weight.half()
+        else:
+            kind, values = FLOAT, weight
+        rest, factors = panels * PANEL - outputs, torch.stack([scale, torch.zeros(outputs) if bias is None else bias])
+        self.values = F.pad(values, (0, 0, 0, rest)).view(panels, PANEL, inputs).transpose(1, 2).contiguous()
+        self.factors = F.pad(factors, (0, rest)).view(2, panels, PANEL).transpose(0, 1).contiguous()
+        places = {"weights": self.values.data_ptr(), "factors": self.factors.data_ptr()}
+        self.columns, self.nbytes = {"panels": panels, "kind": kind, **places}, self.values.nbytes
+
+
+_MATRICES = WeakIdKeyDictionary()
+"""The matrices of weights, so that programs with the same layer share them."""
+
+
+def matrix_of(weight: Tensor, bias: Tensor | None) -> Matrix:
+    """Return the matrix of a parameter."""
+    if weight not in _MATRICES:
+        _MATRICES[weight] = Matrix(weight.detach(), bias)
+    found: Matrix = _MATRICES[weight]
+    return found
+
+
+def forget(module: torch.nn.Module) -> None:
+    """Forget the matrices of a module, whose weights may have changed."""
+    for parameter in module.parameters():
+        _MATRICES.pop(parameter, None)
+
+
+class Program:
+    """A function of tensors, compiled. It copies and pickles as None, because its table holds addresses."""
+
+    def __init__(self, function: Callable[..., Any], *shapes: Sequence[int], repeats: bool = False) -> None:
+        """Record a function.
+
+        Args:
+            function: Takes float32 tensors and returns one or a tuple of them.
+            shapes: Of its inputs; the first dimension is 1 and stands for any number of rows.
+            repeats: Whether `repeat` is wanted: the outputs then become the next inputs.
+        """
+        tape = Tape()
+        with torch.no_grad():
+            inputs = [tape.register(*shape) for shape in shapes]
+            found = function(*inputs)
+        outputs = [tape.lined(x, x.shape[-1]) for x in (found if isinstance(found, tuple) else (found,))]
+        if repeats:
+            for given, (result, _, _) in zip(inputs, outputs, strict=True):
+                tape.copied(result, given)
+        self.size, self.cache = tape.arrange([*inputs, *(x for x, _, _ in outputs)]), tape.cache
+        self.places = [(int(x.place.flatten()[0]), x.place.numel()) for x in inputs]
+        self.results = [(int(x.place.flatten()[0]), rows, stride, x.shape[1:]) for x, rows, stride in outputs]
+        self.matrices = [matrix_of(*op["matrix"]) for op in tape.ops if "matrix" in op]
+        matrices = iter(self.matrices)
+        table = [op | next(matrices).columns if "matrix" in op else op for op in tape.ops]
+        self.ops = np.array([[row.get(name, 0) for name in COLUMNS] for row in table], np.int64)
+        self.indices = np.array(tape.indices, np.int64)
+        self.numbers = np.concatenate([*tape.numbers, np.zeros(1, np.float32)])
+        found = np.flatnonzero(self.ops[:, 0] == ARGMAX)
+        self.last = int(found[0]) + 1 if len(found) else len(self.ops)
+        self.run = kernels().run
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(None), ()
+
+    def __call__(
+        self, *inputs: Tensor, positions: Tensor | None = None, cache: Cache | None = None, mask: Tensor | None = None
+    ) -> list[Tensor]:
+        """Return the outputs, each with as many rows as the inputs have.
+
+        Args:
+            inputs: (B, …); B sequences of T tokens where the program attends, (B, T, …).
+            positions: (T,) rotary positions.
+            cache: The keys and values of earlier tokens; the new ones are written behind them.
+            mask: From `attention_mask`.
+        """
+        frames = self._filled(inputs)
+        where = _NOWHERE if positions is None else positions.numpy()
+        self._execute(frames, 1, where, cache, _CAUSAL if mask is None else mask.numpy())
+        found = []
+        for first, rows, stride, shape in self.results:
+            block = frames[:, first : first + rows * stride].reshape(len(frames), rows, stride)[:, :, : shape[-1]]
+            found.append(torch.from_numpy(np.ascontiguousarray(block)).view(-1, *shape))
+        return found
+
+    def repeat(self, times: int, *inputs: Tensor, cache: Cache) -> np.ndarray:
+        """Execute it `times` times, its outputs the next inputs -> (times, B) what ARGMAX gave each time."""
+        return self._execute(self._filled(inputs), times, np.array([cache.length]), cache, _CAUSAL)
+
+    def _filled(self, inputs: Sequence[Tensor]) -> np.ndarray:
+        """Frames with the inputs at their places."""
+        rows = inputs[0].numel() // self.places[0][1]
+        frames = np.empty((rows, self.size), np.float32)
+        for (first, size), value in zip(self.places, inputs, strict=True):
+            frames[:, first : first + size] = value.numpy().reshape(rows, size)
+        return frames
+
+    def _execute(
+        self, frames: np.ndarray, times: int, positions: np.ndarray, cache: Cache | None, mask: np.ndarray
+    ) -> np.ndarray:
+        if cache is None:
+            layers, *sizes = self.cache
+            shape = max(1, layers), 2, len(frames) // len(positions), sizes[0], len(positions), sizes[1]
+            start, buffer = 0, np.empty(shape, np.float32)
+        else:
+            start, buffer = cache.length, cache.buffer.numpy()
+        results = np.empty((times, len(frames)), np.float32)
+        tables = self.ops, times, self.last, self.indices, self.numbers
+        self.run(*tables, frames, positions, start, buffer, mask, results)
+        return results
+
+
+_NOWHERE, _CAUSAL = np.zeros(1, np.int64), np.zeros((0, 1), np.float32)
