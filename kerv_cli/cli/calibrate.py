@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import TYPE_CHECKING
 
 import typer
 
@@ -12,13 +11,6 @@ from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, print_json, print_plan, print_table, progress_bar, settings_yaml
 from kerv_cli.episodes.settings import SweepSettings
 from kerv_cli.training.settings import CalibrateSettings, CalibrateSuccessSettings
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import numpy as np
-
-    from kerv_cli.methods.calibration import Calibration
 
 
 @command(
@@ -38,55 +30,12 @@ def calibrate(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
 
     with making(settings.results, "calibration", run.path.parent) as record:
         calibration = run.run(lambda title: progress_bar(title, record))
-    _tasks(calibration, run.path)
-    _errors(calibration)
-    _skip(calibration)
+    from kerv_cli.report.calibration import tables
+
+    for table in tables(calibration, run.path):
+        print_table(*table)
     for line in run.notes:
         typer.echo(line)
-
-
-def _tasks(calibration: Calibration, path: Path) -> None:
-    columns = ("task", "fitted on", "tested on", "decodes", "K_S", "K p25", "K p75", "Kalman, h=1", "hold, h=1")
-    kalman, hold = (_moving_errors(calibration, kind)[:, 0] for kind in ("kalman", "hold"))
-    rows = []
-    for number, (name, counts) in enumerate(calibration.demos.tasks.items()):
-        row = calibration.variability.get(name)
-        levels = [row.decodes, *(f"{x:.3f}" for x in (row.k_s, row.p25, row.p75))] if row else ["-"] * 4
-        errors = (f"{kalman[number]:.4f}", f"{hold[number]:.4f}")
-        rows.append((name, counts["training"], counts["held_out"], *levels, *errors))
-    print_table(columns, rows, f"calibration in {path}")
-
-
-def _moving_errors(calibration: Calibration, kind: str) -> np.ndarray:
-    from kerv_cli.training.predictor_fit import moving_errors
-
-    return moving_errors(calibration.errors, kind, calibration.target.actions)
-
-
-def _errors(calibration: Calibration) -> None:
-    hold, rows = _moving_errors(calibration, "hold"), []
-    horizon = hold.shape[1]
-    for kind in calibration.errors:
-        error = _moving_errors(calibration, kind)
-        below = [int((error[:, h] < hold[:, h]).sum()) for h in (0, horizon - 1)]
-        wins = ["-" if kind == "hold" else f"{count}/{len(hold)} tasks" for count in below]
-        rows.append((kind, *(f"{e:.4f}" for e in error.mean(0)), *wins))
-    columns = ("predictor", *(f"h={h}" for h in range(1, horizon + 1)), "below hold at h=1", f"at h={horizon}")
-    print_table(columns, rows, "held-out error of the moving DoFs, mean of tasks, normalised action units")
-
-
-def _skip(calibration: Calibration) -> None:
-    if calibration.skip is None:
-        return
-    epsilon, confidence = calibration.skip.epsilon, calibration.skip.confidence
-    rows = []
-    for name, row in calibration.skip.tasks.items():
-        levels = [f"{x:.4f}" for x in (row.s_min, row.low, row.high)] if row.share else ["never", "-", "-"]
-        figures = [f"{row.within:.1%}", f"{row.error:.4f}"] if row.share else ["-", "-"]
-        rows.append((name, *levels, f"{row.share:.1%}", *figures, row.entries))
-    columns = ("task", "s_min", "low", "high", "would be skipped", f"error ≤ {epsilon:g}", "mean error", "entries")
-    title = f"verify-skip, best neighbour in another episode, {confidence:.0%} with an error of at most {epsilon:g}"
-    print_table(columns, rows, title)
 
 
 OF_TEST = {at.name for at in fields(CalibrateSuccessSettings)} - {at.name for at in fields(SweepSettings)}

@@ -52,7 +52,7 @@ def report(
     as_json: AsJson = False,
 ) -> None:
     """Write CSV tables (per task and aggregated), plots and an HTML page of the studies."""
-    from kerv_cli.cli.studies import print_study, print_verdict
+    from kerv_cli.cli.episodes import print_study, print_verdict
     from kerv_cli.episodes.resolve import study_name
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.report import report as write_report

@@ -16,8 +16,15 @@ from kerv_cli.cli.common import (
     print_json,
     print_table,
 )
-from kerv_cli.cli.episodes import count, planned_study, print_settings, print_study_plan, run_study
-from kerv_cli.cli.studies import print_study, print_verdict
+from kerv_cli.cli.episodes import (
+    count,
+    planned_study,
+    print_settings,
+    print_study,
+    print_study_plan,
+    print_verdict,
+    run_study,
+)
 from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 
 if TYPE_CHECKING:

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict
-from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.base.errors import UsageError
 from kerv_cli.cli.common import print_figures, print_json, print_plan, progress_bar
 
 if TYPE_CHECKING:
     from kerv_cli.lab.runs import Run
     from kerv_cli.training.run import TrainingRun
-
-MOST_POINTS = 1000
-"""Of a curve, so that a long run does not wait for its tracker; validations are all logged."""
-_MODULES = {"trackio": "trackio", "wandb": "wandb", "tensorboard": "torch.utils.tensorboard"}
 
 
 def run_training(
@@ -49,6 +41,7 @@ def run_training(
 
 def _train(run: TrainingRun, record: Run, as_json: bool, loading: str, training: str) -> None:
     from kerv_cli.training.loop import without_subnormals
+    from kerv_cli.training.trackers import tracked
 
     with without_subnormals(), progress_bar(loading, record) as advance:
         run.load(advance)
@@ -66,7 +59,7 @@ def _train(run: TrainingRun, record: Run, as_json: bool, loading: str, training:
     name = f"{run.kind}/{run.folder.name}"
     with (
         without_subnormals(),
-        _live(settings.log, name, run.folder, settings.train.steps, asdict(settings)) as log,
+        tracked(settings.log, name, run.folder, settings.train.steps, asdict(settings)) as log,
         progress_bar(training, record) as advance,
     ):
         metrics = run.train(on_step)
@@ -82,48 +75,3 @@ def _train(run: TrainingRun, record: Run, as_json: bool, loading: str, training:
 
 def _line(metrics: dict[str, float]) -> str:
     return " ".join(f"{k} {v:.4g}" for k, v in list(metrics.items())[:6] if k != "step")
-
-
-@contextmanager
-def _live(
-    tracker: str, name: str, folder: Path, steps: int, config: Mapping[str, object]
-) -> Iterator[Callable[[int, Mapping[str, float]], None]]:
-    """Yields the function that logs the numbers of a step: of an update, or of a validation, which has a `step` among
-    them.
-
-    Args:
-        tracker: trackio, wandb, tensorboard; none: nothing is logged.
-        folder: of the training; TensorBoard's files go there.
-        steps: of the whole run.
-
-    Raises:
-        UsageError: the tracker is not installed.
-    """
-    if tracker == "none":
-        yield lambda step, numbers: None
-        return
-    try:
-        module = import_module(_MODULES[tracker])
-    except ImportError as error:
-        raise UsageError(f"log={tracker}: pip install 'kerv[{tracker}]'") from error
-    if tracker == "tensorboard":
-        run = module.SummaryWriter(str(folder / "tensorboard"))
-    else:
-        run = module.init(project="kerv", name=name, config=dict(config))
-
-    def log(step: int, numbers: Mapping[str, float]) -> None:
-        validation = "step" in numbers
-        if not validation and step % max(1, steps // MOST_POINTS):
-            return
-        kind = "validation" if validation else "training"
-        named = {f"{kind}/{key}": value for key, value in numbers.items() if key != "step"}
-        if tracker == "tensorboard":
-            for key, value in named.items():
-                run.add_scalar(key, value, step)
-        else:
-            run.log(named, step=step)
-
-    try:
-        yield log
-    finally:
-        (run.close if tracker == "tensorboard" else run.finish)()

@@ -102,6 +102,12 @@ def stress_of(settings: Plain) -> dict[str, Any]:
     return {"kind": stress["kind"] if level else "none", "level": level}
 
 
+def stress_text(settings: Plain) -> str:
+    """Return a setting's stress as text after its label: `, stress push 2`; empty without stress."""
+    stress = stress_of(settings)
+    return f", stress {stress['kind']} {stress['level']}" if stress["level"] else ""
+
+
 def batch_of(settings: Plain) -> int:
     """Return how many episodes a setting runs at the same time. With more than one they have no times."""
     return int(settings["rollout"]["batch"])

@@ -1,0 +1,147 @@
+"""Checks of this machine, of a target and of an environment, for `kerv doctor`."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, ClassVar
+
+from kerv_cli.base.errors import UnknownName
+from kerv_cli.base.files import visible
+from kerv_cli.base.leftovers import left_over
+from kerv_cli.base.limits import number, setting
+from kerv_cli.base.places import check_writable, results_dir
+from kerv_cli.base.settings import RunSettings
+from kerv_cli.methods.settings import PolicySettings
+from kerv_cli.targets.folders import find_target, shipped_dir
+from kerv_cli.worlds.findings import Finding, find, need
+from kerv_cli.worlds.settings import EVALUATION_SEED, WorldSettings
+
+if TYPE_CHECKING:
+    from kerv_cli.worlds.spec import EnvironmentSpec
+
+
+@dataclass
+class DoctorSettings(RunSettings):
+    """`kerv doctor`. With a target or an environment it checks that alone."""
+
+    groups: ClassVar = {"world": "default", "runtime": "cpu"}
+
+    policy: PolicySettings = setting(lambda: PolicySettings(target=""), "the target to check")
+    environment: str | None = setting(None, "the environment to check")
+    seed: int = number(EVALUATION_SEED, 0, 2**31 - 1, help="of the world that is drawn")
+    world: WorldSettings = setting(WorldSettings, "camera and length of an episode")
+
+
+def check_machine(settings: DoctorSettings) -> list[Finding]:
+    from kerv_cli.report.viewing.viewer import has_display
+    from kerv_cli.targets.provenance import versions
+    from kerv_cli.worlds import specs
+
+    display = "a display is there: kerv view opens a window" if has_display() else "none: kerv view prints the command"
+    paths = list(left_over(results_dir(settings.results)))
+    says = f"{len(paths)} files of killed commands, kerv doctor --repair removes them" if paths else "nothing"
+    shipped = [path.name for path in visible(shipped_dir()) if path.is_dir()]
+    return [
+        Finding("versions", True, ", ".join(f"{name} {number}" for name, number in versions().items())),
+        *(find(f"rendering {spec.name}", partial(_rendering, spec, settings)) for spec in specs().values()),
+        find("torch", partial(_torch, settings)),
+        *(find(f"policy {name}", partial(_policy, name, settings)) for name in shipped),
+        find("results", partial(_disk, settings)),
+        find("database", partial(_database, settings)),
+        Finding("left over", True, says),
+        Finding("display", True, display),
+    ]
+
+
+def check_policy(settings: DoctorSettings) -> list[Finding]:
+    """Whether the target keeps the protocol, on an observation of noise."""
+    if not settings.policy.target:
+        return []
+    import numpy as np
+
+    from kerv_cli.base.runtime import set_up
+    from kerv_cli.base.spaces import Observation
+    from kerv_cli.methods.artifacts import Artifacts
+    from kerv_cli.targets.conformance import check_target
+    from kerv_cli.worlds.views import frame_shape
+
+    device, _ = set_up(settings.runtime)
+    artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
+    described, random = artifacts.description, np.random.default_rng(settings.seed)
+    size, space = int(described.settings.get("image_size", settings.world.camera.size)), described.observation
+    images = {name: random.integers(0, 256, frame_shape(name, size), dtype=np.uint8) for name in described.cameras}
+    state = random.normal(size=space.state)
+    words = " ".join(described.words[:3]) or "move"
+    return check_target(artifacts.target, Observation(state[: len(space.proprioception)], state, words, images))
+
+
+def check_environment_of(settings: DoctorSettings) -> list[Finding]:
+    """Whether the environment keeps the protocol, on its first task."""
+    if not settings.environment:
+        return []
+    from kerv_cli.worlds import specs
+    from kerv_cli.worlds.conformance import check_environment
+
+    environments = specs()
+    if settings.environment not in environments:
+        raise UnknownName("environment", settings.environment, environments)
+    return check_environment(environments[settings.environment], settings.seed)
+
+
+def _rendering(spec: EnvironmentSpec, settings: DoctorSettings) -> str:
+    """Draws frames of a world and times them: a backend can load and still draw nothing."""
+    from kerv_cli.worlds.camera import choose_backend
+
+    backend, first = choose_backend(), next(iter(spec.suites.values()), tuple(spec.tasks))[0]
+    with spec.open_world(first, replace(settings.world.camera, name="")) as world:
+        world.reset(settings.seed)
+        world.frame()
+        began = time.perf_counter()
+        spread = [int(world.frame().std()) for _ in range(20)][-1]
+        milliseconds = 1000 * (time.perf_counter() - began) / 20
+    need(spread, f"{backend} draws empty frames: set MUJOCO_GL=osmesa and run 'kerv doctor' again")
+    says = f"{backend}, {milliseconds:.1f} ms a frame at {settings.world.camera.size}x{settings.world.camera.size}"
+    need(milliseconds < 50, says)
+    return says
+
+
+def _torch(settings: DoctorSettings) -> str:
+    import torch
+
+    from kerv_cli.base.runtime import set_up
+    from kerv_cli.targets.provenance import device_name
+
+    device, _ = set_up(settings.runtime)
+    cuda = "CUDA available" if torch.cuda.is_available() else "no CUDA device"
+    return f"{device}: {device_name(device)}, {torch.get_num_threads()} thread(s), {cuda}"
+
+
+def _policy(name: str, settings: DoctorSettings) -> str:
+    from kerv_cli.targets.checkpoint import read_target
+
+    described = read_target(find_target(settings.results, name))
+    parameters = described.provenance.get("parameters")
+    size = f"{parameters / 1e6:.1f} M parameters, " if isinstance(parameters, int | float) else ""
+    return f"{size}{described.sha256[:12]}"
+
+
+def _disk(settings: DoctorSettings) -> str:
+    free = shutil.disk_usage(check_writable(settings.results)).free / 1e9
+    says = f"{results_dir(settings.results).resolve()} can be written, {free:.0f} GB free"
+    need(free > 2, says)
+    return says
+
+
+def _database(settings: DoctorSettings) -> str:
+    """Return which database is in use; raises KervError if it does not answer."""
+    from kerv_cli.lab.database import Database
+    from kerv_cli.lab.runs import run_rows
+
+    database = Database(settings.results)
+    rows = len(run_rows(database))
+    what = "PostgreSQL" if database.file is None else "SQLite"
+    says = f"{rows} commands in it" if database.exists else "made by the first command that needs it"
+    return f"{what}, {database.shown}: {says}"

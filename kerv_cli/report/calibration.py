@@ -1,0 +1,64 @@
+"""Tables of what `kerv calibrate` found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+from kerv_cli.methods.calibration import Calibration
+from kerv_cli.training.predictor_fit import moving_errors
+
+Table = tuple[tuple[str, ...], list[tuple[object, ...]], str]
+"""Columns, rows and title."""
+
+
+def tables(calibration: Calibration, path: Path) -> Iterator[Table]:
+    """Yield the tables of levels by task, of the predictors' errors and of verify-skip.
+
+    Args:
+        calibration: What was found.
+        path: Its file, for the title.
+    """
+    errors = partial(moving_errors, calibration.errors, space=calibration.target.actions)
+    kalman, hold = errors("kalman"), errors("hold")
+    columns: tuple[str, ...] = (
+        "task",
+        "fitted on",
+        "tested on",
+        "decodes",
+        "K_S",
+        "K p25",
+        "K p75",
+        "Kalman, h=1",
+        "hold, h=1",
+    )
+    rows: list[tuple[object, ...]] = []
+    for number, (name, counts) in enumerate(calibration.demos.tasks.items()):
+        row = calibration.variability.get(name)
+        levels = [row.decodes, *(f"{x:.3f}" for x in (row.k_s, row.p25, row.p75))] if row else ["-"] * 4
+        ahead = (f"{error[number, 0]:.4f}" for error in (kalman, hold))
+        rows.append((name, counts["training"], counts["held_out"], *levels, *ahead))
+    yield columns, rows, f"calibration in {path}"
+
+    rows, horizon = [], hold.shape[1]
+    for kind in calibration.errors:
+        error = errors(kind)
+        below = [int((error[:, h] < hold[:, h]).sum()) for h in (0, horizon - 1)]
+        wins = ["-" if kind == "hold" else f"{count}/{len(hold)} tasks" for count in below]
+        rows.append((kind, *(f"{e:.4f}" for e in error.mean(0)), *wins))
+    columns = ("predictor", *(f"h={h}" for h in range(1, horizon + 1)), "below hold at h=1", f"at h={horizon}")
+    yield columns, rows, "held-out error of the moving DoFs, mean of tasks, normalised action units"
+
+    skip = calibration.skip
+    if skip is None:
+        return
+    rows = []
+    for name, task in skip.tasks.items():
+        levels = [f"{x:.4f}" for x in (task.s_min, task.low, task.high)] if task.share else ["never", "-", "-"]
+        figures = [f"{task.within:.1%}", f"{task.error:.4f}"] if task.share else ["-", "-"]
+        rows.append((name, *levels, f"{task.share:.1%}", *figures, task.entries))
+    limit = f"error ≤ {skip.epsilon:g}"
+    columns = ("task", "s_min", "low", "high", "would be skipped", limit, "mean error", "entries")
+    best = f"best neighbour in another episode, {skip.confidence:.0%} with an error of at most {skip.epsilon:g}"
+    yield columns, rows, f"verify-skip, {best}"
