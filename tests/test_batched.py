@@ -356,7 +356,7 @@ def test_no_speedup_is_made_of_what_was_not_timed(tmp_path: Path, which: str) ->
     assert (methods["pairs"] > 0).all()
     assert methods["success"].notna().all()
     printed = summary_frame(table).set_index("setting")
-    assert (printed.loc[methods["label"], "speed, per step"] == "–").all()
+    assert (printed.loc[methods["label"], "speed, per episode"] == "–").all()
     assert printed.loc["ar", "speed, per episode"] == ("1" if which == "method" else "–")
     assert study_figures(table, "threshold.r", "threshold")
 

@@ -94,7 +94,7 @@ def test_its_recording_can_be_written_and_read(episode: EpisodeRecord, tmp_path:
     assert rows.get("/camera", 0) == len(drawn)
     assert found["blueprint"]
     assert found["episode"]["forwards"] == 0
-    assert f"| decodes | {episode.steps} expert |" in summary(shown, "expert")
+    assert f"| modes | {episode.steps} expert |" in summary(shown, "expert")
 
 
 def seen(state: np.ndarray) -> Observation:

@@ -104,7 +104,7 @@ def test_a_report_prices_the_study_on_several_machines(results: Path) -> None:
             {"without": "draft"},
             "no cost of 'draft', which setting 'naive_sd' needs. Measure it with 'kerv bench target=",
         ),
-        ({"tokens": 7}, "chunks of 7 tokens, setting 'ar' decodes 16. Measure them with 'kerv bench target=vla-150m"),
+        ({"tokens": 7}, "chunks of 7 tokens, setting 'ar' decodes 16. Measure it with 'kerv bench target=vla-150m"),
         ({"format": 9}, "has another format than 2: measure it with 'kerv bench target=vla-150m"),
         ({"prompt": "many"}, "holds no latency profile"),
     ],

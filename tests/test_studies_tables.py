@@ -237,7 +237,7 @@ def test_pairs_of_one_block_are_told_from_others(tmp_path: Path) -> None:
     assert (row["pairs"], row["same_run"], row["same_block"]) == (4, False, 0.5)
     assert row["speedup"] > 1
     alone = StudyData(store.load(), load_study(store).episodes.query("seed >= 100002"))
-    assert summary_frame(alone.table)["speed, per step"].tolist() == ["1", "–"]  # success is compared, times are not
+    assert summary_frame(alone.table)["speed, per episode"].tolist() == ["1", "–"]  # success is compared, times are not
     assert not_in_turn(alone.table) == ["kerv"]
     assert row_of(alone.table, label="kerv", averaging=MICRO)["pairs"] == 2
 
@@ -270,7 +270,7 @@ def test_without_the_baselines_episodes_there_is_a_row_but_no_speedup(data: Stud
     assert data.absent == [one for one in data.study.episodes if one.setting.label == "ar"]
     assert list(data.table["label"]) == ["kerv", "kerv"]
     assert data.table["speedup"].isna().all()
-    assert summary_frame(data.table)["speed, per step"].tolist() == ["–"]
+    assert summary_frame(data.table)["speed, per episode"].tolist() == ["–"]
 
 
 def test_csv_has_sensible_digits_and_empty_cells(data: StudyData) -> None:

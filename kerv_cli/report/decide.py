@@ -60,7 +60,7 @@ def choices(table: pd.DataFrame, per_task: pd.DataFrame, loss: float) -> list[Ch
 def _choice(where: str, rows: Sequence[Row], loss: float) -> Choice:
     success = next((float(row["success"]) for row in rows if is_baseline(row)), math.nan)
     order = [] if success < verdict.SOLVED else safest_first(rows)
-    best = _fastest(list(itertools.takewhile(lambda row: _loss_at_most(row) < loss, order)))
+    best = _fastest(list(itertools.takewhile(lambda row: -POINTS * row["difference_low"] < loss, order)))
     # a setting is shown only after all safer ones
     pairs = itertools.accumulate((_pairs_needed(row, loss) for row in order), max)
     reached = {str(row["label"]): least for row, least in zip(order, pairs, strict=True) if math.isfinite(least)}
@@ -72,7 +72,7 @@ def _choice(where: str, rows: Sequence[Row], loss: float) -> Choice:
         baseline_success=success,
         front=tuple(str(row["label"]) for row in pareto(rows)),
         chosen=str(best["label"]) if best else "",
-        loss_at_most=_loss_at_most(best) if best else math.nan,
+        loss_at_most=-POINTS * float(best["difference_low"]) if best else math.nan,
         candidate=label,
         candidate_pairs=reached.get(label, math.nan),
         tested=len(order),
@@ -86,13 +86,13 @@ def safest_first(rows: Sequence[Row]) -> list[Row]:
     First what executes less unverified (in whole per cent, and settings that decode nothing last), then what asks the
     target more often per step, then the study's order. Settings that were timed and not faster are left out.
     """
+
+    def order(row: Row) -> tuple[float, float]:
+        unverified = row["unverified_share"]
+        return (round(float(unverified), 2) if is_number(unverified) else 1.0, -row["forwards_per_step"])
+
     compared = [row for row in rows if not is_baseline(row) and row["pairs"]]
-    tested = [row for row in compared if not is_number(row[SPEED]) or row[SPEED] > 1]
-    return sorted(tested, key=lambda row: (_unverified(row), -row["forwards_per_step"]))
-
-
-def _unverified(row: Row) -> float:
-    return round(float(row["unverified_share"]), 2) if is_number(row["unverified_share"]) else 1.0
+    return sorted((row for row in compared if not is_number(row[SPEED]) or row[SPEED] > 1), key=order)
 
 
 def _fastest(rows: Sequence[Row]) -> Row | None:
@@ -102,10 +102,6 @@ def _fastest(rows: Sequence[Row]) -> Row | None:
         key=lambda row: (row[f"{SPEED}_low"] > 1, row[SPEED]) if is_number(row[SPEED]) else (False, -math.inf),
         default=None,
     )
-
-
-def _loss_at_most(row: Row) -> float:
-    return -POINTS * float(row["difference_low"])
 
 
 def _pairs_needed(row: Row, loss: float) -> float:
@@ -119,13 +115,12 @@ def pareto(rows: Sequence[Row]) -> list[Row]:
     def point(row: Row) -> tuple[float, float]:
         return (1.0 if is_baseline(row) else float(row[SPEED]), float(row["success"]))
 
-    def is_beaten(row: Row) -> bool:
-        speed, success = point(row)
-        others = (point(other) for other in timed)
-        return any(other != (speed, success) and other[0] >= speed and other[1] >= success for other in others)
-
     timed = [row for row in rows if is_baseline(row) or is_number(row[SPEED])]
-    return sorted((row for row in timed if not is_beaten(row)), key=point, reverse=True)
+    front: list[Row] = []
+    for row in sorted(timed, key=point, reverse=True):
+        if not front or row["success"] > front[-1]["success"] or point(row) == point(front[-1]):
+            front.append(row)
+    return front
 
 
 _CONSTANTS = (1.960, 2.178, 2.289, 2.361, 2.413, 2.453, 2.485, 2.512, 2.535, 2.555, 2.572, 2.588, 2.602, 2.614, 2.626,

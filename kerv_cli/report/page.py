@@ -44,7 +44,8 @@ def render(
         loader=PackageLoader("kerv_cli.report", "."), autoescape=True, undefined=StrictUndefined
     ).get_template("report.html.j2")
     answer, is_shown = verdict_of(data.table, loss)
-    first = data.table.iloc[0]
+    first, results = data.table.iloc[0], str(store.database.results)
+    where = "" if results == "results" else f" results={shlex.quote(results)}"
     return template.render(
         name=store.name,
         title=data.study.title or store.name,
@@ -58,7 +59,7 @@ def render(
         absent=list(dict.fromkeys(f"{one.setting.label} on {one.task}" for one in data.absent)),
         missing=len(data.absent),
         planned=len(data.study.episodes),
-        how_to_run=_how_to_run(store),
+        how_to_run=f"Run `kerv sweep study={store.name}{where}`",
         suite=_suite(data.table),
         decisions=read_decisions(store.root),
         figures=[base64.b64encode(figure).decode() for figure in figures],
@@ -77,15 +78,8 @@ def _suite(table: pd.DataFrame) -> pd.DataFrame:
     if table["difficulty"].str.contains(";").any():
         macro = summary_frame(table, MACRO)
         for name in ("success, %", *SPEEDS.values()):
-            frame[f"{name}, by difficulty"] = macro[name]
+            frame[f"{name}, by difficulty"] = macro.get(name, "–")
     return frame
-
-
-def _how_to_run(store: StudyStore) -> str:
-    """Return the command that completes the study."""
-    results = str(store.database.results)
-    where = "" if results == "results" else f" results={shlex.quote(results)}"
-    return f"Run `kerv sweep study={store.name}{where}`"
 
 
 def _by_task(per_task: pd.DataFrame) -> pd.DataFrame:

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from kerv_cli.report.measures import MICRO, Row
@@ -120,8 +119,6 @@ def lines_figure(panels: Sequence[Panel], heading: str) -> Figure:
                 x, y, low, high = zip(*points, strict=True)
                 handles[name] = axes.errorbar(x, y, yerr=(low, high), elinewidth=1.0, markersize=5, **look)
         axes.set(title=panel.title, xlabel=panel.xlabel, ylabel=UNITS[panel.y])
-        if panel.y == SUCCESS:
-            _limit_success(axes, [row for rows in panel.lines.values() for row in rows])
     columns = min(5, len(handles))
     figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=columns)
     return figure
@@ -142,7 +139,6 @@ def _tradeoff(rows: Sequence[Row], heading: str) -> Figure:
             axes.errorbar([x], [y], label=name, elinewidth=1.0, markersize=7, linestyle="", **look)
     axes.axvline(1.0, color=INK, linewidth=1.2, linestyle=":")
     axes.set(title="Success against speed per episode", xlabel=UNITS[SPEED], ylabel=UNITS[SUCCESS])
-    _limit_success(axes, rows)
     figure.legend(loc="outside right upper")
     return figure
 
@@ -172,12 +168,6 @@ def _bar(row: Row, column: str) -> tuple[float, float, float]:
 def _look(number: int, baseline: bool) -> dict[str, Any]:
     colour = INK if baseline else COLOURS[number % len(COLOURS)]
     return {"color": colour, "marker": MARKERS[number // len(COLOURS) % len(MARKERS)]}
-
-
-def _limit_success(axes: Axes, rows: Sequence[Row]) -> None:
-    """Limit the axis of success from a little below the lowest interval to 100 %."""
-    lowest = min((100 * row["success_low"] for row in rows if is_number(row["success_low"])), default=0.0)
-    axes.set_ylim(max(0.0, 5.0 * math.floor((lowest - 3.0) / 5.0)), 103)
 
 
 def new_figure(width: float, height: float, heading: str) -> Figure:

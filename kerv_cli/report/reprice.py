@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -118,8 +119,7 @@ def _speeds(values: Row, prefix: str) -> dict[str, float]:
     return {f"{prefix}{name}{end}": values[f"{name}{end}"] for name in SPEEDS for end in ("", "_low", "_high")}
 
 
-@dataclass(frozen=True)
-class _LabelWork:
+class _LabelWork(NamedTuple):
     """The work of a label's decodes.
 
     Attributes:
@@ -157,17 +157,13 @@ def _work_of_label(data: StudyData, label: str, store: StudyStore) -> _LabelWork
 
 def _check(named: NamedProfile, label: str, work: _LabelWork) -> None:
     """Refuse a profile that cannot price a setting."""
-    target = named.profile.about.get("target", "TARGET")
+    command, reason = f"kerv bench target={named.profile.about.get('target', 'TARGET')} tokens=[{work.size}]", ""
     if lacks := named.profile.lacks(work.work.needs):
-        raise UsageError(
-            f"on={named.name}: no cost of '{lacks[0]}', which setting '{label}' needs. Measure it with 'kerv bench "
-            f"target={target}'"
-        )
-    if named.profile.tokens < work.size:
-        raise UsageError(
-            f"on={named.name}: its costs are for chunks of {named.profile.tokens} tokens, setting '{label}' decodes "
-            f"{work.size}. Measure them with 'kerv bench target={target} tokens=[{work.size}]'"
-        )
+        reason = f"no cost of '{lacks[0]}', which setting '{label}' needs"
+    elif named.profile.tokens < work.size:
+        reason = f"its costs are for chunks of {named.profile.tokens} tokens, setting '{label}' decodes {work.size}"
+    if reason:
+        raise UsageError(f"on={named.name}: {reason}. Measure it with '{command}'")
 
 
 def _priced(episodes: pd.DataFrame, work: _LabelWork, profile: Profile) -> pd.DataFrame:
@@ -186,7 +182,6 @@ def repriced_summary(table: pd.DataFrame) -> pd.DataFrame:
         cells = rows.setdefault(row["label"], {"setting": row["label"]})
         for machine, prefix in ((f"measured, {row['measured_on']}", "measured_"), (row["machine"], "")):
             for name, heading in SPEEDS.items():
-                cells[f"{machine}: {heading.removeprefix('speed, ')}"] = intervals(f"{prefix}{name}", of_baseline="1")(
-                    row
-                )
+                text = intervals(f"{prefix}{name}", of_baseline="1")
+                cells[f"{machine}: {heading.removeprefix('speed, ')}"] = text(row)
     return pd.DataFrame(rows.values())

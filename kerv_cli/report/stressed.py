@@ -6,7 +6,7 @@ import pandas as pd
 
 from kerv_cli.report import statistics as stats
 from kerv_cli.report.measures import MICRO, Row, columns_of, paired_columns
-from kerv_cli.report.tables import rows_of
+from kerv_cli.report.tables import is_baseline, rows_of
 
 NONE = "none"
 
@@ -37,7 +37,8 @@ def summed_table(table: pd.DataFrame) -> pd.DataFrame:
         baseline, episodes, successes, success, pairs and their counts, mcnemar_p, difference, margin, non_inferior;
         intervals with the endings _low and _high.
     """
-    rows, reference = [row for row in rows_of(table, MICRO) if row["stress"] != NONE], reference_of(table)
+    rows = [row for row in rows_of(table, MICRO) if row["stress"] != NONE]
+    reference = next((str(row["unstressed"]) for row in rows if is_baseline(row)), "")
     kinds, levels = ({str(row[name]) for row in rows} for name in ("stress", "stress_level"))
     groups = {kind: [row for row in rows if row["stress"] == kind] for kind in sorted(kinds)}
     groups |= {f"level {level}": [r for r in rows if str(r["stress_level"]) == level] for level in sorted(levels)}
@@ -63,10 +64,3 @@ def _sum(rows: list[Row], method: str, name: str, reference: str) -> Row:
         **columns_of("success", stats.wilson(successes, episodes)),
         **paired_columns(counts, stats.paired_difference(counts)),
     }
-
-
-def reference_of(table: pd.DataFrame) -> str:
-    """Return what the baseline is called, whatever its stress."""
-    baseline = table["baseline"].iloc[0]
-    same = table.loc[table["label"] == baseline, "unstressed"]
-    return str(same.iloc[0] if len(same) else baseline)

@@ -33,21 +33,6 @@ _LABEL = 16
 """Letters of a label before it is wrapped."""
 
 
-@dataclass(frozen=True)
-class Column:
-    """A column of text.
-
-    Attributes:
-        title: Its heading.
-        text: A row's cell.
-        needs: A column of the row; the column of text is left out if all rows lack it or have 0.
-    """
-
-    title: str
-    text: TextOf
-    needs: str = ""
-
-
 def numbers(name: str) -> TextOf:
     """Return a column's value with three significant digits and no exponent; `–` if it is missing."""
 
@@ -100,30 +85,29 @@ def _speed(name: str) -> TextOf:
     return text
 
 
-def _columns() -> list[Column]:
-    """Return the columns, the most important first: a narrow terminal leaves out the last ones."""
-    episode, step = (Column(title, _speed(name)) for name, title in SPEEDS.items())
-    return [
-        Column("setting", lambda row: str(row["label"])),
-        Column("success, %", intervals("success", 100.0, 0)),
-        Column(DIFFERENCE, intervals("difference", 100.0, 0, " to ", of_baseline=" ")),
-        episode,
-        Column("slowest 5 %, ms", numbers("latency_p95_ms")),
-        Column("tokens unverified", shares("unverified_share"), needs="unverified_share"),
-        step,
-        Column("a decode takes, ms", numbers("felt_latency_ms"), needs="felt_latency_ms"),
-        Column("steps on a held action", shares("held_share"), needs="held_share"),
-        Column("tokens per verification", numbers("AL"), needs="AL"),
-        Column("forwards per step", numbers("forwards_per_step")),
-        Column("time per step, ms", numbers("time_per_step_ms")),
-        Column("steps per episode", lambda row: f"{row['steps'] / row['episodes']:.0f}"),
-        Column("decodes skipped", shares("skip_rate"), needs="skip_rate"),
-        Column("decodes compensated", shares("compensation_rate"), needs="compensation_rate"),
-        Column("decodes retrieved", shares("retrieval_share"), needs="retrieval_share"),
-        Column("deviation from AR", numbers("deviation"), needs="deviation"),
-        *(Column(name.replace("_", " "), numbers(name), needs=name) for name in registered_columns()),
-        Column("lost / won", lost_won),
-    ]
+def _columns() -> dict[str, TextOf]:
+    """Return heading -> cell, the most important first: a narrow terminal leaves out the last ones."""
+    return {
+        "setting": lambda row: str(row["label"]),
+        "success, %": intervals("success", 100.0, 0),
+        DIFFERENCE: intervals("difference", 100.0, 0, " to ", of_baseline=" "),
+        SPEEDS["episode_speedup"]: _speed("episode_speedup"),
+        "slowest 5 %, ms": numbers("latency_p95_ms"),
+        "tokens unverified": shares("unverified_share"),
+        SPEEDS["speedup"]: _speed("speedup"),
+        "a decode takes, ms": numbers("felt_latency_ms"),
+        "steps on a held action": shares("held_share"),
+        "tokens per verification": numbers("AL"),
+        "forwards per step": numbers("forwards_per_step"),
+        "time per step, ms": numbers("time_per_step_ms"),
+        "steps per episode": lambda row: f"{row['steps'] / row['episodes']:.0f}",
+        "decodes skipped": shares("skip_rate"),
+        "decodes compensated": shares("compensation_rate"),
+        "decodes retrieved": shares("retrieval_share"),
+        "deviation from AR": numbers("deviation"),
+        **{name.replace("_", " "): numbers(name) for name in registered_columns()},
+        "lost / won": lost_won,
+    }
 
 
 def lost_won(row: Row) -> str:
@@ -133,9 +117,10 @@ def lost_won(row: Row) -> str:
 
 def summary_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame:
     """Return the rows of one averaging as text; columns that no row uses are left out."""
-    rows = rows_of(table, averaging)
-    present = [c for c in _columns() if not c.needs or any(is_number(row[c.needs]) and row[c.needs] for row in rows)]
-    return pd.DataFrame([{column.title: column.text(row) for column in present} for row in rows])
+    rows, columns = rows_of(table, averaging), _columns()
+    frame = pd.DataFrame([{title: text(row) for title, text in columns.items()} for row in rows])
+    is_used = ~frame.isin(["–", "0 %", ""]).all() | frame.columns.isin(frame.columns[:4])
+    return frame.loc[:, is_used]
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ def readable(text: str) -> str:
 
 def facts_of(record: EpisodeRecord, method: str) -> dict[str, str | float]:
     """Return the episode's totals, which are stored as properties of the recording."""
-    rounds = [r for d in record.decodes for r in d.rounds if r.is_verification]
+    modes = [decode.mode for decode in record.decodes]
+    rounds = [r for decode in record.decodes for r in decode.rounds if r.is_verification]
     facts: dict[str, str | float] = {
         "environment": readable(record.environment),
         "task": readable(record.task),
@@ -26,7 +27,8 @@ def facts_of(record: EpisodeRecord, method: str) -> dict[str, str | float]:
         "seed": record.seed,
         "success": record.success,
         "steps": record.steps,
-        "decodes": len(record.decodes),
+        "decodes": len(modes),
+        "modes": ", ".join(f"{modes.count(mode)} {readable(mode)}" for mode in dict.fromkeys(modes)),
         "forwards": record.forwards,
         "forwards_per_step": record.forwards / record.steps,
         "ms_per_step": 1000 * record.seconds / record.steps,
@@ -42,22 +44,10 @@ def facts_of(record: EpisodeRecord, method: str) -> dict[str, str | float]:
 
 def summary(record: EpisodeRecord, method: str) -> str:
     """Return the episode as Markdown, with the key to the tokens' colours."""
-    facts, modes = facts_of(record, method), [d.mode for d in record.decodes]
-    rows = {
-        "instruction": facts["instruction"],
-        "method, seed": f"{facts['method']}, {record.seed}",
-        "control steps": f"{record.steps} ({record.steps / record.space.control_hz:.2f} s)",
-        "decodes": ", ".join(f"{modes.count(m)} {readable(m)}" for m in dict.fromkeys(modes)),
-        "forwards per step": f"{facts['forwards_per_step']:.2f}",
-        "inference per step": f"{facts['ms_per_step']:.2f} ms",
-        "compensated tokens": facts["compensated_tokens"],
-        "decodes without verification": facts["skipped_decodes"],
-    }
-    if "acceptance_length" in facts:
-        rows["tokens per verification (AL)"] = f"{facts['acceptance_length']:.2f}"
+    facts = facts_of(record, method).items()
+    rows = {name.replace("_", " "): f"{value:.4g}" if isinstance(value, float) else value for name, value in facts}
     key = {f"{style.symbol} {name}": style.meaning for name, style in OUTCOMES.items()}
-    head = (str(facts["task"]), "SUCCESS" if record.success else "FAILURE")
-    return "\n".join([*_table(head, rows), "", *_table(("token", "outcome"), key)])
+    return "\n".join([*_table(("episode", ""), rows), "", *_table(("token", "outcome"), key)])
 
 
 def _table(head: tuple[str, str], rows: Mapping[str, object]) -> list[str]:
@@ -76,9 +66,17 @@ def decode_table(
         outcomes: Of its tokens.
         names: Names of the D DoFs.
     """
+    counts = {
+        "forwards": decode.forwards,
+        "verifications": decode.verifications,
+        "tokens compensated": decode.compensated,
+        "steps": len(decode.actions),
+        "ms": f"{1000 * decode.seconds:.1f}",
+        "reason": decode.reason,
+    }
     lines = [
         f"**Decode {number} at step {step}: {decode.mode}**  ",
-        _decode_line(decode),
+        " · ".join(f"{name}: {value}" for name, value in counts.items() if value),
         "",
         "| token | step | DoF | draft | target | r | kept | outcome |",
         "|--:|--:|:--|--:|--:|--:|--:|:--|",
@@ -90,21 +88,3 @@ def decode_table(
         cells = (index, step, names[dof], *tokens, f"**{word}**" if outcome.kind == "rejected" else word)
         lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines)
-
-
-def _decode_line(decode: DecodeRecord) -> str:
-    """Return forwards, verifications, acceptance, compensation and time of a decode in one line."""
-    parts = [f"{decode.forwards} forward{'s' * (decode.forwards != 1)}"]
-    if decode.verifications:
-        length, accepted = acceptance(decode.rounds)
-        parts.append(
-            f"{decode.verifications} verified · per verification {length:.2f} committed, {accepted:.2f} accepted"
-        )
-    if decode.compensated:
-        parts.append(f"{decode.compensated} compensated")
-    if decode.skipped:
-        parts.append("verification skipped")
-    if decode.reason is not None:
-        parts.append(decode.reason)
-    parts.append(f"{len(decode.actions)} step{'s' * (len(decode.actions) != 1)} · {1000 * decode.seconds:.1f} ms")
-    return " · ".join(parts)

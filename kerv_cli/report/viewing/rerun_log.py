@@ -25,10 +25,10 @@ from kerv_cli.report.viewing.token_outcomes import OUTCOMES, acceptance, chunk_s
 
 JPEG_QUALITY = 85
 GREY, YELLOW = 0x8C99A6FF, 0xF0E442FF
-_MODE_COLORS = {"ar": 0x6E7B8BFF, "skip": YELLOW, "expert": 0x4E79A7FF}  # other modes are names of proposers
-_COLORS = (0xE15759FF, 0x59A14FFF, 0x4E79A7FF, 0xB6992DFF, 0x9D7660FF, 0x86BCB6FF, 0xB07AA1FF)
+COLORS = (0xE15759FF, 0x59A14FFF, 0x4E79A7FF, 0xB6992DFF, 0x9D7660FF, 0x86BCB6FF, 0xB07AA1FF)
 _OPEN, _CLOSED = np.array([86.0, 180.0, 233.0]), np.array([230.0, 120.0, 0.0])
 
+Colors = Sequence[int]
 Steps = NDArray[np.int64]
 """(rows,) control steps."""
 
@@ -63,15 +63,9 @@ class _Log:
         self.rows(path, steps, rr.StateChange.columns(state=list(values)))
 
     def numbers(
-        self,
-        path: str,
-        steps: Steps,
-        names: Sequence[str],
-        values: Sequence[Sequence[float]] | np.ndarray,
-        colors: Sequence[int] | None = None,
-        held: bool = True,
+        self, path: str, steps: Steps, names: Sequence[str], values: Iterable[Sequence[float]], colors: Colors = COLORS
     ) -> None:
-        """Log series of numbers.
+        """Log series of numbers, each held until the next one.
 
         Args:
             path: The entity.
@@ -79,16 +73,14 @@ class _Log:
             names: Name of each series.
             values: Per row a number per name, or nothing: then there is no row.
             colors: Of the series; repeated if they are fewer.
-            held: Whether a value lasts until the next one.
         """
-        present = [i for i, (_, value) in enumerate(zip(steps, values, strict=True)) if len(value)]
+        present = [(step, value) for step, value in zip(steps, values, strict=True) if len(value)]
         if present:
-            shades = None if colors is None else np.resize(np.array(colors, dtype=np.uint32), len(names))
-            mode = "StepAfter" if held else None
-            self.static(path, rr.SeriesLines(names=list(names), colors=shades, interpolation_mode=mode))
-            flat = np.array([values[i] for i in present], dtype=np.float64)
-            columns = rr.Scalars.columns(scalars=flat.ravel()).partition([len(names)] * len(present))
-            self.rows(path, steps[present], columns)
+            shades = np.resize(np.array(colors, dtype=np.uint32), len(names))
+            self.static(path, rr.SeriesLines(names=list(names), colors=shades, interpolation_mode="StepAfter"))
+            flat = np.array([value for _, value in present], dtype=np.float64).ravel()
+            columns = rr.Scalars.columns(scalars=flat).partition([len(names)] * len(present))
+            self.rows(path, np.array([step for step, _ in present]), columns)
 
 
 @catch_and_log_exceptions(strict=True)  # rerun would turn exceptions into warnings and missing views
@@ -135,7 +127,7 @@ def _log_world(log: _Log, record: EpisodeRecord) -> None:
     log.static("world/hand", rr.Points3D.from_fields(radii=0.009))
     log.rows("world/hand", steps, rr.Points3D.columns(positions=record.path, colors=colors))
     for number, (name, path) in enumerate(record.places.items()):
-        color, entity = _COLORS[number % len(_COLORS)], f"world/{_part(name)}"
+        color, entity = COLORS[number % len(COLORS)], f"world/{_part(name)}"
         log.static(entity, rr.Points3D.from_fields(radii=0.014, colors=[color], labels=[readable(name)]))
         log.rows(entity, steps, rr.Points3D.columns(positions=path))
 
@@ -143,11 +135,16 @@ def _log_world(log: _Log, record: EpisodeRecord) -> None:
 def _log_tokens(log: _Log, record: EpisodeRecord) -> None:
     """Log per decode its mode, a lane for each token of the chunk, and a table."""
     starts, names = np.asarray(record.decode_steps, dtype=np.int64), record.space.names
-    shades = [str(number % 2) for number in range(len(starts))]  # equal states would melt into one
-    log.states("decodes", starts, shades, {"0": ("·", 0x55606BFF), "1": ("·", GREY)})
+    turns = [str(number % 2) for number in range(len(starts))]  # equal states would melt into one
+    log.states("decodes", starts, turns, {"0": ("·", 0x55606BFF), "1": ("·", GREY)})
     modes = [decode.mode for decode in record.decodes]
     changes = [i for i in range(len(modes)) if i == 0 or modes[i] != modes[i - 1]]
-    looks = {mode: (readable(mode), _mode_color(mode, number)) for number, mode in enumerate(sorted(set(modes)))}
+    shades = {mode: part.colour << 8 | 0xFF for mode, part in parts("proposer").items() if part.colour is not None}
+    shades |= {"ar": GREY, "skip": YELLOW}
+    looks = {
+        mode: (readable(mode), shades.get(mode, COLORS[number % len(COLORS)]))
+        for number, mode in enumerate(sorted(set(modes)))
+    }
     log.states("mode", starts[changes], [modes[i] for i in changes], looks)
     size = chunk_size(record.decodes, len(names))
     chunks = [outcomes_of(decode, size, len(names)) for decode in record.decodes]
@@ -161,14 +158,6 @@ def _log_tokens(log: _Log, record: EpisodeRecord) -> None:
     log.rows("decode/table", starts, rr.TextDocument.columns(text=texts, media_type=media))
 
 
-def _mode_color(mode: str, number: int) -> int:
-    """Return 0xRRGGBBAA of a mode: from the table, of the proposer of that name, or the `number`-th colour."""
-    part = parts("proposer").get(mode)
-    if mode not in _MODE_COLORS and part is not None and part.colour is not None:
-        return part.colour << 8 | 0xFF
-    return _MODE_COLORS.get(mode, _COLORS[number % len(_COLORS)])
-
-
 def _part(name: str) -> str:
     """Return a name as a part of an entity's path."""
     return re.sub(r"\W+", "_", name, flags=re.ASCII)
@@ -178,8 +167,8 @@ def _log_numbers(log: _Log, record: EpisodeRecord) -> None:
     """Log numbers per control step and per decode. A series without values has no entity."""
     decodes, names = record.decodes, list(record.space.names)
     steps, starts = np.arange(record.steps + 1, dtype=np.int64), np.asarray(record.decode_steps, dtype=np.int64)
-    log.numbers("actions", steps[:-1], names, record.actions, _COLORS, held=False)
-    log.numbers("gripper", steps, ["gripper opening"], record.gripper[:, None], [YELLOW], held=False)
+    log.numbers("actions", steps[:-1], names, record.actions)
+    log.numbers("gripper", steps, ["gripper opening"], record.gripper[:, None], [YELLOW])
     log.numbers("decode/forwards", starts, ["forwards"], [(d.forwards,) for d in decodes], [GREY])
     per_verification = [acceptance(d.rounds) if d.verifications else () for d in decodes]
     titles = ["tokens committed per verification (AL)", "drafts accepted per verification"]
@@ -188,10 +177,10 @@ def _log_numbers(log: _Log, record: EpisodeRecord) -> None:
     if all(len(set(r)) <= 1 for r in limits):
         log.numbers("decode/threshold", starts, ["r"], [r[:1] for r in limits])
     else:
-        log.numbers("decode/threshold", starts, [f"r {name}" for name in names], limits, _COLORS)
+        log.numbers("decode/threshold", starts, [f"r {name}" for name in names], limits)
     phases = [phase for phase in PHASES if any(d.phases.get(phase) for d in decodes)]
     times = [(1000 * d.seconds, *(1000 * d.phases.get(phase, 0.0) for phase in phases)) for d in decodes]
-    log.numbers("decode/phases", starts, ["total", *phases], times, [GREY, *_COLORS])
+    log.numbers("decode/phases", starts, ["total", *phases], times, [GREY, *COLORS])
     for signal, title in SIGNALS.items():
         values = [getattr(d, signal) for d in decodes]
         log.numbers(f"signals/{signal}", starts, [title], [() if value is None else (value,) for value in values])

@@ -38,12 +38,10 @@ def find_recordings(paths: Sequence[Path]) -> list[Path]:
     for path in (Path(p).expanduser() for p in paths):
         if path.is_dir():
             found.update(recordings_below(path))
-        elif not path.exists():
-            raise UsageError(f"{path} does not exist: name a recording (.rrd) or a folder of them")
-        elif path.suffix != ".rrd":
-            raise UsageError(f"{path} is not a recording: its name does not end in .rrd")
-        else:
+        elif path.suffix == ".rrd" and path.exists():
             found.add(path)
+        else:
+            raise UsageError(f"{path} does not exist or is no recording: name a file that ends in .rrd, or a folder")
     if not found:
         where = ", ".join(map(str, paths))
         raise UsageError(f"no recordings in {where}: make some with 'kerv rollout method=ar task=reach-v3'")
@@ -71,7 +69,7 @@ def open_recording(paths: Sequence[Path]) -> str:
     """
     chosen = paths[:MOST_OPENED]
     for path in chosen:
-        _reader(path)
+        _read(path)
     more = f" (the newest {len(chosen)} of {len(paths)})" if len(paths) > len(chosen) else ""
     if not has_display():
         command = f"rerun {' '.join(shlex.quote(path.name) for path in chosen)}"
@@ -114,11 +112,11 @@ def read_recording(path: Path) -> dict[str, Any]:
     Raises:
         KervError: The file is missing or damaged.
     """
-    reader = _reader(path)
+    reader, chunks = _read(path)
     name, episode = "", {}
     entities: dict[str, int] = {}
     times: dict[str, list[int]] = {}
-    for chunk in _chunks(reader, path):
+    for chunk in chunks:
         batch = chunk.to_record_batch()
         if chunk.entity_path == "/__properties/episode":
             episode = {f.name: batch[f.name][0].as_py()[0] for f in batch.schema if not f.name.startswith("rerun.")}
@@ -151,40 +149,28 @@ def read_summary(path: Path) -> str:
     return "\n".join([*lines, f"  rows: {rows}"])
 
 
-def _reader(path: Path) -> RrdReader:
-    """Return a reader of a file that holds a recording and is complete."""
-    from rerun.chunk import RrdReader
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # rerun only warns of a missing end
-        try:
-            reader = RrdReader(regular(path))
-            recordings = reader.recordings()
-        except FileNotFoundError as error:
-            raise KervError(f"{path} is missing") from error
-        except (RuntimeError, OSError, ValueError, Warning) as error:
-            raise KervError(_damaged(path, error)) from error
-    if not recordings:
-        raise KervError(f"{path} holds no recording: record the episode again")
-    return reader
-
-
 def chunks_of(path: Path) -> list[Chunk]:
     """Return every chunk of a recording.
 
     Raises:
         KervError: The file is missing or damaged.
     """
-    return _chunks(_reader(path), path)
+    return _read(path)[1]
 
 
-def _chunks(reader: RrdReader, path: Path) -> list[Chunk]:
-    try:
-        return list(reader.stream())
-    except (RuntimeError, OSError, ValueError) as error:
-        raise KervError(_damaged(path, error)) from error
+def _read(path: Path) -> tuple[RrdReader, list[Chunk]]:
+    from rerun.chunk import RrdReader
 
-
-def _damaged(path: Path, error: Exception) -> str:
-    reason = "its end is missing" if isinstance(error, Warning) else str(error).splitlines()[0]
-    return f"{path} is damaged ({reason}): record the episode again"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # rerun only warns of a missing end
+        try:
+            reader = RrdReader(regular(path))
+            chunks = list(reader.stream())
+        except FileNotFoundError as error:
+            raise KervError(f"{path} is missing") from error
+        except (RuntimeError, OSError, ValueError, Warning) as error:
+            reason = "its end is missing" if isinstance(error, Warning) else str(error).splitlines()[0]
+            raise KervError(f"{path} is damaged ({reason}): record the episode again") from error
+    if not reader.recordings():
+        raise KervError(f"{path} holds no recording: record the episode again")
+    return reader, chunks
