@@ -43,21 +43,17 @@ class DrafterRun(TrainingRun):
             raise UsageError(f"drafter.kind={part.name}: choose drafter={part.name}, each has settings of its own")
         refuse_unused(settings.train, OF_TARGETS, ": only the training of a target has this setting")
         self.artifact: TrainableDrafter = part.built()
+        self.artifact_kind = self.artifact.kind
         self.target_folder = find_target(settings.results, settings.policy.target)
-        self.folder = Artifacts(settings.results, settings.policy).path(self.artifact.kind)
-        check_not_shipped(self.folder, f"policy.artifacts.{self.artifact.kind}")
+        self.folder = Artifacts(settings.results, settings.policy).path(self.artifact_kind)
+        check_not_shipped(self.folder, f"policy.artifacts.{self.artifact_kind}")
         self.settings, dataset = demos_for(settings)
         self.dataset = subset(dataset, self.settings.task)
         self.description = read_target(self.target_folder)
         self.description.check_autoregressive(
             f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
         )
-        self.check_folder(f"policy.artifacts.{self.artifact.kind}")
-
-    @property
-    def artifact_kind(self) -> str:
-        """Kind of the artifact that is made."""
-        return self.artifact.kind
+        self.check_folder(f"policy.artifacts.{self.artifact_kind}")
 
     def plan(self) -> str:
         """Return one line for --plan: target, observations, steps, time and folder."""

@@ -19,7 +19,7 @@ from kerv_cli.base.errors import CheckpointError, Interrupted, KervError
 from kerv_cli.base.files import write_text
 from kerv_cli.targets.folders import RESUME
 from kerv_cli.training.interruption import until_interrupted
-from kerv_cli.training.resume import Metrics, Progress, check_same_run, read_state, write_state
+from kerv_cli.training.resume import Metrics, Progress, read_state, write_state
 from kerv_cli.training.settings import TrainSettings
 
 
@@ -52,7 +52,7 @@ class Loop:
         save: Called with the module and its metrics when a validation is the best so far.
         settings: Optimisation settings.
         folder: Gets `resume.safetensors` and `log.csv`.
-        identity: Hash of everything that determines the run. Another run is never resumed.
+        identity: Hash of everything that determines the run, for the resume file.
         keep: Called with the metrics of all validations after each one, and when a run goes on.
     """
 
@@ -81,7 +81,7 @@ class Loop:
         """Train to `settings.steps`, from the resume file if there is one; return the metrics of the best checkpoint.
 
         Raises:
-            CheckpointError: The folder holds another or a damaged run, or no step is left and no validation was made.
+            CheckpointError: The folder holds a damaged run, or no step is left and no validation was made.
             KervError: The training diverged.
             StorageError: The disk refused.
             Interrupted: Ctrl-C. The step that ran was finished and the run's state is stored.
@@ -174,14 +174,13 @@ class Loop:
         """Go on from the folder's resume file, if there is one.
 
         Raises:
-            CheckpointError: It is damaged, or of a run with other settings or data.
+            CheckpointError: It is damaged.
         """
         path = self.folder / RESUME
         if not path.is_file():
             self.keep([])  # forget the curve of a run that was here before
             return
         tensors, progress = read_state(path)
-        check_same_run(self.folder, progress.identity, self.identity, "move it aside")
         self.module.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("model.")})
         self.ema = {k[4:]: v.to(self.ema[k[4:]].device) for k, v in tensors.items() if k.startswith("ema.")}
         state: dict[int, dict[str, Tensor]] = {}

@@ -37,12 +37,6 @@ class Progress:
     history: list[Metrics]
 
 
-def check_same_run(folder: Path, stored: str, identity: str, remedy: str) -> None:
-    """Raise CheckpointError if the run in the folder has another identity."""
-    if stored != identity:
-        raise CheckpointError(f"{folder} holds a run with other settings or data: {remedy}")
-
-
 def stored_identity(folder: Path) -> str | None:
     """Return the identity of the run in the folder without reading its tensors; None if there is none to read."""
     try:

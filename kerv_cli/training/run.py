@@ -12,12 +12,12 @@ from typing import Any
 
 from torch import nn
 
-from kerv_cli.base.errors import UsageError
+from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.lab.runs import Curve
 from kerv_cli.methods.artifacts import removal
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.loop import Loop, Metrics, Objective
-from kerv_cli.training.resume import check_same_run, stored_identity
+from kerv_cli.training.resume import stored_identity
 from kerv_cli.training.settings import TrainDrafterSettings, TrainSettings, TrainTargetSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
@@ -32,22 +32,19 @@ class TrainingRun(ABC):
 
     Attributes:
         kind: The word after `kerv train`.
+        artifact_kind: Kind of the artifact that is made.
         folder: Where the weights, their description and the resume file go.
         device: Set by `load`.
         objective: What is optimised; set by `load`.
     """
 
     kind: str
+    artifact_kind: str
     settings: TrainTargetSettings | TrainDrafterSettings
     dataset: DemoDataset
     folder: Path
     device: str
     objective: Objective
-
-    @property
-    def artifact_kind(self) -> str:
-        """Kind of the artifact that is made."""
-        return self.kind
 
     @abstractmethod
     def plan(self) -> str:
@@ -72,7 +69,7 @@ class TrainingRun(ABC):
             on_step: Called after each step and each validation with the number of steps done and the metrics.
 
         Raises:
-            CheckpointError: The folder holds another run.
+            CheckpointError: The folder holds a damaged run.
             KervError: The training diverged.
             StorageError: The disk refused.
         """
@@ -93,10 +90,11 @@ class TrainingRun(ABC):
         Raises:
             CheckpointError: It holds one.
         """
-        stored = stored_identity(self.folder)
-        if stored is not None:
-            remedy = f"choose another {setting}=, or {removal(self.artifact_kind, self.folder)}"
-            check_same_run(self.folder, stored, self.hash, remedy)
+        if stored_identity(self.folder) not in (None, self.hash):
+            raise CheckpointError(
+                f"{self.folder} holds a run with other settings or data: choose another {setting}=, or "
+                f"{removal(self.artifact_kind, self.folder)}"
+            )
 
     def save(self, module: nn.Module, metrics: Metrics) -> None:
         """Write the weights with their provenance and the metrics of their validation."""

@@ -47,7 +47,7 @@ class TargetRun(TrainingRun):
             tasks; or another run in the folder.
     """
 
-    kind = "target"
+    kind = artifact_kind = "target"
     settings: TrainTargetSettings
 
     def __init__(self, settings: TrainTargetSettings) -> None:
@@ -147,18 +147,14 @@ class TargetRun(TrainingRun):
             target = CompactTarget(replace(settings.target), actions, observation, words, camera)
         else:
             target = continued_target(settings.target, init, camera)
-        closed_loop = self.closed_loop if settings.train.closed_loop else None
-        self.objective = Imitation(target.to(self.device), samples, settings.train, closed_loop)
+        seeds = self.spec.seeds.selection[: settings.train.closed_loop]
+        success = functools.partial(success_of, tasks=self.tasks, seeds=seeds, settings=self.world) if seeds else None
+        self.objective = Imitation(target.to(self.device), samples, settings.train, success)
 
     def identity(self) -> dict[str, Any]:
         """Return shapes, tasks, views and the hash of the initial weights."""
         shapes = asdict(self.settings.target)
         return {"target": shapes, "tasks": self.tasks, "views": self.dataset.views, **self.init_hash}
-
-    def closed_loop(self, target: CompactTarget) -> float:
-        """Return the success rate in [0, 1] over the tasks, on selection seeds."""
-        seeds = self.spec.seeds.selection[: self.settings.train.closed_loop]
-        return success_of(target, self.tasks, seeds, self.world)
 
     def write(self, module: nn.Module, provenance: dict[str, Any]) -> None:
         """Write the target's folder."""
