@@ -189,9 +189,7 @@ def test_a_foreign_database_that_never_ends_is_refused(tmp_path: Path) -> None:
 
 def test_a_small_parquet_file_that_expands_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parquet, "MOST_EXPANDED", 2**24)
-    text = pa.DictionaryArray.from_arrays(pa.array(np.zeros(50_000, np.int32)), pa.array(["x" * 1000]))
-    texts = pa.ListArray.from_arrays(pa.array([0, 50_000], pa.int32()), text).cast(pa.list_(pa.string()))
-    for name, column in enumerate((text, texts, text.cast(pa.string()), np.zeros(2**22))):
+    for name, column in enumerate((pa.array(["x" * 1000] * 50_000), np.zeros(2**22))):
         path = tmp_path / f"{name}.parquet"
         pq.write_table(pa.table({"a": column}), path, compression="zstd")
         with pytest.raises(ValueError, match="expands to more than"):

@@ -11,9 +11,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from examples.tiny_openvla import write_checkpoint
+from examples.tiny_openvla import TINY, write_checkpoint
 from test_openvla import imported, kerv
 
+from kerv_cli.targets.openvla.config import Bounds, action_space
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.settings import CameraSettings
@@ -83,9 +84,8 @@ def test_what_was_written_is_read_back(results: Path) -> None:
         assert len(theirs.labels) == theirs.steps + 3
         np.testing.assert_array_equal(theirs.labels[-1], theirs.labels[theirs.steps - 1])
     manifest = after.manifest
-    assert manifest.actions.names == ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
-    assert [group.size for group in manifest.actions.groups] == [3, 3, 1]
-    assert (manifest.actions.strict, manifest.actions.control_hz) == (("gripper",), 20.0)
+    openvla = action_space(TINY, Bounds((-1.0,) * 7, (1.0,) * 7), None, 20.0)
+    manifest.actions.check_same(openvla, "the import", "an OpenVLA checkpoint")
     text = "pick up the peg and put it into the slot"
     assert manifest.instructions[text.replace(" ", "-")] == text
 

@@ -18,13 +18,13 @@ class Finding:
 
 
 def need(holds: object, message: str) -> None:
-    """Raises KervError with the message where `holds` is false."""
+    """Raise KervError with the message if `holds` is false."""
     if not holds:
         raise KervError(message)
 
 
 def find(what: str, check: Callable[[], str]) -> Finding:
-    """Runs a check. It returns what it saw; any exception makes it fail."""
+    """Run a check, which returns what it saw. Any exception makes it fail."""
     try:
         return Finding(what, True, check())
     except KervError as error:

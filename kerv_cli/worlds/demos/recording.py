@@ -36,7 +36,7 @@ from kerv_cli.worlds.demos.perturbation import BURST_PROBABILITY, SIGMA, Perturb
 from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import EnvironmentSpec, World
 
-_SEEDS_PER_JOB = 5
+_SEEDS_PER_JOB = 10  # they share a simulator
 _EXTRA_SEEDS = 20
 """A task tries this many seeds beyond the requested range, and one more per requested episode."""
 
@@ -175,10 +175,7 @@ def record(
     choose_backend()
     identity = _identity(config)
     _check_same_recording(out, identity, config.spec.packages)
-    try:
-        entries, failed = _collect(config, out, on_progress, make_actor)
-    finally:
-        _release_world()
+    entries, failed = _collect(config, out, on_progress, make_actor)
     empty = [task for task, rows in entries.items() if not rows]
     if empty:
         raise KervError(f"no expert episode succeeded within {config.horizon} steps for {', '.join(empty)}")
@@ -273,43 +270,26 @@ def _run_jobs(
             raise KervError("a worker process was killed: run the same command again to go on") from error
 
 
-_world: World | None = None
-
-
 def _record_seeds(
     config: DemoConfig, out: Path, task: str, seeds: Sequence[int], make_actor: MakeActor | None
 ) -> tuple[str, _Outcomes]:
     """Record each seed that has no file yet. Runs in a worker."""
     actor = make_actor(config) if make_actor else None
-    return task, {seed: _record_seed(config, out, task, seed, actor) for seed in seeds}
+    with config.spec.open_world(task, config.camera) as world:
+        return task, {seed: _record_seed(config, out, world, seed, actor) for seed in seeds}
 
 
-def _record_seed(config: DemoConfig, out: Path, task: str, seed: int, actor: Actor | None) -> EpisodeEntry | None:
-    path, failure = episode_path(out, task, seed), out / "failed" / task / f"{seed:06d}.json"
+def _record_seed(config: DemoConfig, out: Path, world: World, seed: int, actor: Actor | None) -> EpisodeEntry | None:
+    path, failure = episode_path(out, world.task, seed), out / "failed" / world.task / f"{seed:06d}.json"
     if failure.exists():
         return None
-    episode = None
     with contextlib.suppress(CheckpointError):  # missing or damaged: record it again
-        episode = load_episode(path, config.spec.actions, config.spec.observation)
-    if episode is None or (episode.task, episode.seed) != (task, seed):
-        episode = run_expert(_world_for(task, config), seed, config, actor)
-        if episode is None:
-            write_json(failure, {"task": task, "seed": seed, "perturbed": is_perturbed(seed, config.perturbed)})
-            return None
-        save_episode(path, episode)
-    return EpisodeEntry.of(path, episode)
-
-
-def _world_for(task: str, config: DemoConfig) -> World:
-    global _world
-    if _world is None or (_world.task, _world.camera) != (task, config.camera):
-        _release_world()
-        _world = config.spec.open_world(task, config.camera)
-    return _world
-
-
-def _release_world() -> None:
-    global _world
-    if _world is not None:
-        _world.close()
-    _world = None
+        episode = load_episode(path, world.spec.actions, world.spec.observation)
+        return EpisodeEntry.of(path, episode)
+    recorded = run_expert(world, seed, config, actor)
+    if recorded is None:
+        perturbed = is_perturbed(seed, config.perturbed)
+        write_json(failure, {"task": world.task, "seed": seed, "perturbed": perturbed})
+        return None
+    save_episode(path, recorded)
+    return EpisodeEntry.of(path, recorded)
