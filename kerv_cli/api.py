@@ -22,7 +22,7 @@ from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.places import results_dir
 from kerv_cli.catalogue.entries import RunEntry, find_run, find_runs, matching, store_of
 from kerv_cli.episodes.resolve import resolve, resolve_rollout, study_name
-from kerv_cli.lab.database import chosen_store
+from kerv_cli.lab.command import chosen_store
 from kerv_cli.lab.store import ROLLOUT, StudyStore
 from kerv_cli.lab.study import plan, plan_rollout, run
 from kerv_cli.report import decide

@@ -19,7 +19,8 @@ import examples.insertion  # noqa: F401 - registers the environment with seven d
 import pytest
 
 from kerv_cli.base import registry
-from kerv_cli.lab.database import STORE, Database
+from kerv_cli.lab.command import STORE
+from kerv_cli.lab.database import Database
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 

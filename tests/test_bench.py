@@ -222,8 +222,11 @@ def test_what_cannot_be_measured_is_refused(
     assert done.stderr.count("\n") == 1
 
 
-def test_a_file_without_a_profile_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "content", ["{}", '{"profile": {"prompt": 1, "tokens": 1, "phases": {"verify": {"rows": 1}}}}']
+)
+def test_a_file_without_a_profile_is_refused(content: str, tmp_path: Path) -> None:
     path = tmp_path / "other.json"
-    path.write_text("{}")
+    path.write_text(content)
     with pytest.raises(CheckpointError, match="no latency profile"):
         read_profile(path)

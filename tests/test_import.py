@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import sqlite3
@@ -19,7 +20,7 @@ from studies_synthetic import swept, threshold_study
 from typer.testing import CliRunner
 
 from kerv_cli.catalogue.lerobot import read_info
-from kerv_cli.catalogue.sqlite import foreign_sqlite
+from kerv_cli.catalogue.sqlite import connect_foreign
 from kerv_cli.cli.app import app
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MACRO
@@ -177,7 +178,7 @@ def test_a_foreign_database_that_never_ends_is_refused(tmp_path: Path) -> None:
     with sqlite3.connect(path) as file:
         file.execute("CREATE TABLE t (x)")
     begun = time.monotonic()
-    with foreign_sqlite(path) as file, pytest.raises(sqlite3.OperationalError):
+    with contextlib.closing(connect_foreign(path)) as file, pytest.raises(sqlite3.OperationalError):
         file.execute(f"{endless} SELECT MAX(i) FROM n").fetchone()
     for name in ("eval_metadata", "kerv"):
         with sqlite3.connect(path) as file:

@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.cli.app import app
-from kerv_cli.engine.cost import read_profile
-from kerv_cli.lab.database import STORE, Database
+from kerv_cli.lab.command import STORE
+from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import Curve, making, run_rows
 from kerv_cli.report.curves import read_log
 from kerv_cli.training.demonstrations import open_demos
@@ -25,7 +25,8 @@ from kerv_cli.training.demonstrations import open_demos
 HOLD = """
 import sys
 from pathlib import Path
-from kerv_cli.lab.runs import making, set_command
+from kerv_cli.lab.command import set_command
+from kerv_cli.lab.runs import making
 results = Path(sys.argv[1])
 set_command(["demos", "name=mine", "episodes=7", f"results={results}"])
 with making(results, "demos", results / "artifacts/demos/mine") as record:
@@ -124,13 +125,3 @@ def test_a_store_is_used_by_one_command_and_no_password_is_kept(
     assert "secret" not in line
     for url in ("nonsense", "mysql://server/kerv"):
         assert "postgresql://USER@HOST/DB" in kerv("runs", "list", f"store={url}", where, code=2)
-
-
-@pytest.mark.parametrize("rows", [[[1]], "nonsense"])
-def test_a_profile_of_something_else_is_one_line(rows: object, tmp_path: Path) -> None:
-    path = tmp_path / "profile.json"
-    path.write_text(
-        json.dumps({"profile": {"prompt": 1, "tokens": 1, "phases": {"verify": {"rows": rows, "seconds": [1]}}}})
-    )
-    with pytest.raises(CheckpointError, match="holds no latency profile"):
-        read_profile(path)

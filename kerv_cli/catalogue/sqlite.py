@@ -2,49 +2,33 @@
 
 from __future__ import annotations
 
-import contextlib
 import sqlite3
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from kerv_cli.base.files import regular
 
-if TYPE_CHECKING:
-    pass
-
 MOST_STEPS = 20_000_000
 """Steps of SQLite's virtual machine that a connection may take, besides STEPS_PER_BYTE. They take about a second."""
-
-
 STEPS_PER_BYTE = 20
-
-
 MOST_VALUE = 2**28
 """Bytes of one value of a SQLite file."""
-
-
 _EVERY = 10_000
 
 
-@contextlib.contextmanager
-def foreign_sqlite(path: Path) -> Iterator[sqlite3.Connection]:
-    """Yield a read-only connection to a SQLite file, which is closed afterwards.
+def connect_foreign(path: Path, **options: Any) -> sqlite3.Connection:
+    """Return a read-only connection to a SQLite file.
 
     Queries end in an error after a number of steps that depends on the size of the file.
 
+    Args:
+        path: The file.
+        options: Options of `sqlite3.connect`.
+
     Raises:
-        OSError: The file is missing or not a regular one. ValueError: It is cut short, or has views.
+        OSError: The file is missing or is not a regular file.
+        ValueError: The file is cut short, or has views.
     """
-    connection = connect_foreign(path)
-    try:
-        yield connection
-    finally:
-        connection.close()
-
-
-def connect_foreign(path: Path, **options: Any) -> sqlite3.Connection:
-    """Return the connection of `foreign_sqlite`, to be closed by the caller; raises as that. options: of `connect`."""
     size = regular(path).stat().st_size
     log = path.with_name(f"{path.name}-wal")
     # a file whose writer was killed has its last rows in the log, which an immutable connection does not read

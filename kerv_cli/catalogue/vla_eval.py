@@ -23,7 +23,7 @@ import pyarrow as pa
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import visible
 from kerv_cli.catalogue.served import path_of, read_served
-from kerv_cli.catalogue.sqlite import foreign_sqlite
+from kerv_cli.catalogue.sqlite import connect_foreign
 from kerv_cli.episodes.identity import ENGINE, OBSERVATION
 from kerv_cli.episodes.rows import DECODE_SCHEMA, EPISODE_SCHEMA, INT
 from kerv_cli.episodes.settings import RolloutSettings, settings_from
@@ -116,7 +116,7 @@ def read_evaluations(path: Path) -> list[Evaluation]:
 
 def _read(path: Path) -> list[Evaluation]:
     try:
-        with foreign_sqlite(path) as file:
+        with contextlib.closing(connect_foreign(path)) as file:
             return [
                 _evaluation(file, path, *row) for row in file.execute("SELECT eval_id, metadata FROM eval_metadata")
             ]

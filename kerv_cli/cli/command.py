@@ -75,7 +75,7 @@ def typer_command(part: Part) -> TyperCommand:
 
     def callback(overrides: list[str] | None = None, cfg: bool = False, **options: object) -> None:
         words, names = _split(part, overrides or [], "names" in parameters)
-        from kerv_cli.lab.database import chosen_store
+        from kerv_cli.lab.command import chosen_store
 
         with chosen_store(words) as words:
             arguments = {"words": words, "names": names, "cfg": cfg}
@@ -97,7 +97,7 @@ def typer_command(part: Part) -> TyperCommand:
 @contextlib.contextmanager
 def _noted(words: list[str]) -> Iterator[None]:
     """Note the command for the rows of what it begins; `kerv prepare` runs commands within its own."""
-    from kerv_cli.lab.runs import set_command
+    from kerv_cli.lab.command import set_command
 
     before = set_command(words)
     try:

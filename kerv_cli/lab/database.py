@@ -9,8 +9,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
-import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -20,9 +19,8 @@ import sqlalchemy as sa
 from kerv_cli.base.errors import CheckpointError, KervError, StorageError, UsageError
 from kerv_cli.base.files import storage_errors
 from kerv_cli.base.places import results_dir
+from kerv_cli.lab.command import STORE
 
-STORE = "KERV_STORE"
-"""Environment variable with the URL of the database; empty: SQLite in the results folder."""
 FILE = "kerv.db"
 SCHEMA = 1
 """Version of the tables. Raise it with every change of them, and add the statements to MIGRATIONS."""
@@ -155,31 +153,6 @@ METRICS = _table(
 def now() -> str:
     """Return the time in UTC, ISO 8601 with seconds."""
     return datetime.now(UTC).isoformat(timespec="seconds")
-
-
-@contextlib.contextmanager
-def chosen_store(overrides: Iterable[str]) -> Iterator[list[str]]:
-    """Use the database that `store=URL` names, in this process and its workers, until the block ends.
-
-    Args:
-        overrides: Overrides of a command. Without a `store=` the variable KERV_STORE stays as it is.
-
-    Yields:
-        The same overrides. A URL has lost its password, so that none is stored, and is quoted if Hydra needs that.
-    """
-    overrides, before = list(overrides), os.environ.get(STORE)
-    for number, override in enumerate(overrides):
-        if override.startswith("store="):
-            os.environ[STORE] = url = override.removeprefix("store=").strip("'\"")
-            url = re.sub(r"(://[^/@:]*):[^/@]*@", r"\1@", url)
-            overrides[number] = f"store={url}" if re.fullmatch(r"[\w:/@.%+-]*", url) else f"store='{url}'"
-    try:
-        yield overrides
-    finally:
-        if before is None:
-            os.environ.pop(STORE, None)
-        else:
-            os.environ[STORE] = before
 
 
 class Database:

@@ -20,6 +20,7 @@ import sqlalchemy as sa
 from kerv_cli.base.errors import Interrupted, KervError, StorageError, UsageError
 from kerv_cli.base.leftovers import is_alive
 from kerv_cli.base.places import results_dir
+from kerv_cli.lab.command import current_command
 from kerv_cli.lab.database import METRICS, RUNS, Database, now
 from kerv_cli.targets.provenance import git_commit
 
@@ -30,16 +31,8 @@ BEAT_SECONDS = 5.0
 STALE_SECONDS = 900.0
 """A run on another machine counts as dead after this time without a heartbeat."""
 
-_command: list[str] = []
 _open: set[str] = set()
 """Ids of this process's runs that have not ended. A full disk can refuse to write the end of one."""
-
-
-def set_command(words: Sequence[str]) -> list[str]:
-    """Set the words after `kerv` of this process's command, and return those set before."""
-    before = list(_command)
-    _command[:] = words
-    return before
 
 
 @dataclass(frozen=True)
@@ -101,7 +94,7 @@ class Run:
         database: Where the row is written.
         kind: sweep, rollout, import, or the kind of artifact that is made.
         name: Name of the study or the artifact.
-        command: Words after `kerv` that go on with it. Default: those of `set_command`.
+        command: Words after `kerv` that go on with it. Default: those of `current_command`.
         total: Number of steps or episodes.
         alone: Refuse to begin while another process makes the same.
 
@@ -120,7 +113,7 @@ class Run:
         alone: bool = True,
     ) -> None:
         self.database, self.kind, self.name, self.alone = database, kind, name, alone
-        self.command = list(command or _command)
+        self.command = list(command) or current_command()
         self.id = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
         self.total, self.done = total, 0
         self._ended = threading.Event()

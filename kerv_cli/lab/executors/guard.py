@@ -10,8 +10,6 @@ import sys
 from collections.abc import Iterator
 
 _MARK = "KERV_GUARD"
-
-
 _GUARD = """
 import os, select, signal, sys
 def status(process):
@@ -54,8 +52,10 @@ for process, start in below.items():
 
 @contextlib.contextmanager
 def guard() -> Iterator[None]:
-    """What is started within the block, and what that starts, ends with the block or with this process: another process
-    sees to that. For servers that a library starts. Needs /proc."""
+    """End the processes that the block starts, and their children, with the block or with this process.
+
+    Another process does so, even if this one is killed. It needs /proc.
+    """
     mark = secrets.token_hex(8)
     command = [sys.executable, "-S", "-c", _GUARD, str(os.getpid()), mark]
     with subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True):  # either end closes the pipe
