@@ -36,22 +36,17 @@ def count(database: Database, table: sa.Table) -> int:
 
 
 BEGUN = """
-import os, signal, sys, time
-from kerv_cli.lab.database import STUDIES, Database
-
-def begun(database, name):
-    with database.writing() as connection:
-        if connection.execute(STUDIES.select().where(STUDIES.c.name == name)).first() is None:
-            connection.execute(STUDIES.insert().values(name=name, kind="sweep", created="", about={}))
-
+import os, signal, sys
+from test_database import STUDIES, Database, begun
 database = Database(sys.argv[1])
 """
 
 
 def begun(database: Database, name: str) -> None:
-    """Write the row of a study."""
+    """Write the row of a study if there is none."""
     with database.writing() as connection:
-        connection.execute(STUDIES.insert().values(name=name, kind="sweep", created="", about={}))
+        if connection.execute(STUDIES.select().where(STUDIES.c.name == name)).first() is None:
+            connection.execute(STUDIES.insert().values(name=name, kind="sweep", created="", about={}))
 
 
 def told(error: pytest.ExceptionInfo[KervError]) -> str:

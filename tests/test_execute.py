@@ -282,14 +282,6 @@ def killed_at_the_third(setting: Setting, task: str) -> RunEpisode:
     return run
 
 
-def test_episodes_whose_order_counts_run_in_one_process(database: Database) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        swept(database.results, in_order(), raising(KeyboardInterrupt(), "ar", [100_002]))
-    store, _ = swept(database.results, in_order())
-    assert store.frame().query("label == 'heisd'")["block"].nunique() == 1
-    assert not plan_study(database, in_order()).missing
-
-
 def test_episodes_whose_order_counts_run_whole_again_when_their_process_dies(tmp_path: Path) -> None:
     store, outcome = swept(tmp_path, in_order(), killed_at_the_third, runtime=RuntimeSettings(workers=2))
     assert [one.setting.label for failure in outcome.failed for one in failure.episodes] == ["ar", "ar"]

@@ -335,10 +335,6 @@ def test_removal_refuses_links_and_parts_of_names(results: Path, tmp_path: Path)
     elsewhere.mkdir()
     (copy / "rollouts").mkdir(exist_ok=True)
     (copy / "rollouts" / name).symlink_to(elsewhere)
-    refused = kerv("runs", "rm", "-y", name, f"results={copy}")
-    assert refused.exit_code == 2
-    assert "is a link to" in refused.stderr
-    for part in (name[:8], "last"):
+    for part, said in ((name, "is a link to"), (name[:8], "unknown run"), ("last", "unknown run")):
         refused = kerv("runs", "rm", "-y", part, f"results={copy}")
-        assert refused.exit_code == 2
-        assert "unknown run" in refused.stderr
+        assert (refused.exit_code, said in refused.stderr) == (2, True)
