@@ -16,7 +16,7 @@ from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.cli.app import app
 from kerv_cli.methods.artifacts import MadeFor, Request
-from kerv_cli.methods.drafters import Lesson
+from kerv_cli.methods.drafters import Training
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import (
     EarlyDrafter,
@@ -203,7 +203,7 @@ def test_the_network_learns_what_the_teacher_says() -> None:
     torch.manual_seed(0)
     early = EarlyNetwork(SMALL, ACTIONS, 2, FEATURES)
     settings = TrainDrafterSettings(train=TrainSettings(label_sigma=1.0))
-    run = Lesson(EarlyDrafter(), early, shaped(), samples, samples, settings)
+    run = Training(EarlyDrafter(), early, shaped(), samples, samples, settings)
     before = run.validate(early)["score"]
     optimiser = torch.optim.AdamW(early.parameters(), lr=5e-3)
     for step in range(350):

@@ -67,7 +67,7 @@ def modules(parts: Parts) -> list[torch.nn.Module]:
     """The networks of a method."""
     found: list[Any] = [parts.prefill_draft, parts.proposer]
     for part in found:
-        found += [*getattr(part, "sources", ()), *getattr(part, "sides", {}).values()]
+        found += [*getattr(part, "sources", ()), *getattr(part, "proposers", {}).values()]
     networks = [getattr(part, name, None) for part in found for name in ("drafter", "early")]
     return [network for network in networks if isinstance(network, torch.nn.Module)]
 
@@ -125,7 +125,7 @@ def parts_of_device(parts: Parts) -> Parts:
     """The parts, told that their target is there."""
     known: list[Any] = [parts.prefill_draft, parts.proposer]
     for part in known:
-        known += [*getattr(part, "sources", ()), *getattr(part, "sides", {}).values()]
+        known += [*getattr(part, "sources", ()), *getattr(part, "proposers", {}).values()]
         if hasattr(part, "waits"):
             part.waits = False
         if isinstance(part, DrafterProposer):

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
-
-from torch import nn
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import sha256_of
@@ -17,18 +15,18 @@ from kerv_cli.base.places import artifact
 from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import DTYPES
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.engine.protocol import ReadableTarget, Target
+from kerv_cli.engine.protocol import Target
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets import checkpoint
 from kerv_cli.targets.checkpoint import TargetDescription
-from kerv_cli.targets.compact.packable import load_packed
 from kerv_cli.targets.folders import beside, find_target
 
 TARGET = "target"
 
 
 T = TypeVar("T")
-W = TypeVar("W", bound="WeightsDescription")
+_LOADED: dict[tuple[Any, ...], Any] = {}
+"""Artifacts of this process by everything that they depend on."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +120,7 @@ def removal(kind: str, path: Path) -> str:
 class Artifact(Generic[T]):
     """A kind of artifact: one JSON of the dataclass `schema`, perhaps with other files beside it, made for one target.
 
-    `Weights` is the base of those that are a network.
+    `TrainableDrafter` (`drafters.py`) is the base of those with weights.
 
     Attributes:
         kind: Its name among the parts.
@@ -229,78 +227,6 @@ class Artifact(Generic[T]):
         return description
 
 
-@dataclass(frozen=True, kw_only=True)
-class WeightsDescription(checkpoint.Description):
-    """The JSON of an artifact with weights; a kind may add fields.
-
-    Attributes:
-        target: Hash of the target's weights.
-        actions: The target's action space.
-        chunk: The target's H; 0 if it does not matter.
-        provenance: How it was made.
-    """
-
-    target: str
-    actions: ActionSpace
-    chunk: int = 0
-    provenance: dict[str, Any] = field(default_factory=dict)
-
-
-class Weights(Artifact[W]):
-    """Base of kinds that are a network: safetensors and `<kind>.json`."""
-
-    any_chunk = False  # whether the target's H does not matter
-    step_seconds = 0.05  # a guess of how long a training step takes on one core
-
-    def anew(self, path: Path) -> str:
-        """Return how to replace one of another target: a training goes on only with its own."""
-        return f"{removal(self.kind, path)}, then {self.again}"
-
-    def module(self, description: W, target: ReadableTarget) -> nn.Module:
-        """Return a fresh network of this description."""
-        raise NotImplementedError
-
-    def load(self, path: Path, request: Request) -> Any:
-        """Return the network with its weights, frozen, on the target's device in its number format."""
-        target = request.target
-        module = self.module(self.checked(path, request.description), target)
-        return load_packed(module, path, self.kind, target.device, target.dtype)
-
-    def digest(self, path: Path, description: W) -> str:
-        """Return the hash of the weights."""
-        return description.sha256
-
-    def described(self, file: Path) -> W:
-        """Return the description in a file, after checking the weights beside it."""
-        return checkpoint.read_description(file.parent, self.kind, self.schema)
-
-    def save(
-        self,
-        path: Path,
-        module: nn.Module,
-        made_for: MadeFor,
-        provenance: Mapping[str, Any],
-        stored: str = checkpoint.FLOAT32,
-        **fields: Any,
-    ) -> str:
-        """Write weights and description.
-
-        Args:
-            path: The folder.
-            module: The network.
-            made_for: Its target.
-            provenance: How it was made.
-            stored: Number format on disk, as `train.stored`.
-            fields: Further fields of this kind's description.
-
-        Returns:
-            The hash of the weights.
-        """
-        shared = {"target": made_for.sha256, "actions": made_for.actions.as_dict(), "provenance": dict(provenance)}
-        chunk = {} if self.any_chunk else {"chunk": made_for.chunk}
-        return checkpoint.save_module(path, self.kind, module, {**fields, **shared, **chunk}, stored)
-
-
 class Artifacts:
     """The artifacts of one policy, checked and loaded on demand."""
 
@@ -370,21 +296,11 @@ class Artifacts:
         Raises:
             CheckpointError: As `check`.
         """
-        digest = self.check([kind])[kind]
-        return _artifact(kind, self.path(kind), digest, _Key(self.folder, self.device, self.dtype, self.search))
-
-
-@dataclass(frozen=True)
-class _Key:
-    """What a loaded artifact depends on besides its files. `search` has no hash and is compared by its text."""
-
-    folder: Path
-    device: str
-    dtype: str
-    search: Any
-
-    def __hash__(self) -> int:
-        return hash((self.folder, self.device, self.dtype, repr(self.search)))
+        path, digest = self.path(kind), self.check([kind])[kind]
+        key = kind, path, digest, self.folder, self.device, self.dtype, repr(self.search)
+        if key not in _LOADED:
+            _LOADED[key] = kind_of(kind).load(path, Request(self.description, self.target, self.search))
+        return _LOADED[key]
 
 
 def kind_of(name: str) -> Artifact[Any]:
@@ -399,10 +315,3 @@ def kind_of(name: str) -> Artifact[Any]:
 @functools.lru_cache(maxsize=16)
 def _target(folder: Path, sha256: str, device: str, dtype: str) -> Target:
     return checkpoint.load_target(folder, device, DTYPES[dtype])[0]
-
-
-@functools.lru_cache(maxsize=64)
-def _artifact(kind: str, path: Path, digest: str, key: _Key) -> Any:
-    description = checkpoint.read_target(key.folder)
-    target = _target(key.folder, description.sha256, key.device, key.dtype)
-    return kind_of(kind).load(path, Request(description, target, key.search))

@@ -87,10 +87,10 @@ class Method:
     def _check_drafts(self) -> None:
         """Check that a boundary has two drafters to choose from, and that an in-prefill draft needs no states."""
         proposer, boundary, draft = (self.parts[kind] for kind in ("proposer", "boundary", "prefill_draft"))
-        if bool(proposer.traits.get("sides")) != bool(boundary.traits.get("chooses")):
+        if bool(proposer.traits.get("has_boundary")) != bool(boundary.traits.get("chooses")):
             raise UsageError(
                 f"proposer={proposer.name} with boundary={boundary.name}: "
-                + ("name a boundary that chooses" if proposer.traits.get("sides") else "nothing to choose from")
+                + ("name a boundary that chooses" if proposer.traits.get("has_boundary") else "nothing to choose from")
             )
         if draft.traits["when"] != PREFILL:
             raise UsageError(

@@ -3,32 +3,47 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sized
+from collections.abc import Mapping, Sized
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from kerv_cli.base.manifests import read
+from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.proposer import Proposer
-from kerv_cli.engine.protocol import ReadableTarget
-from kerv_cli.methods.artifacts import Weights, WeightsDescription
+from kerv_cli.methods.artifacts import Artifact, MadeFor, Request, removal
 from kerv_cli.methods.context import Context
+from kerv_cli.targets import checkpoint
+from kerv_cli.targets.compact.packable import load_packed
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
 Metrics = dict[str, float]
 
 
 @dataclass(frozen=True, kw_only=True)
-class DrafterDescription(WeightsDescription):
-    """The JSON of a drafter: `settings` are its shapes and those of its training."""
+class DrafterDescription(checkpoint.Description):
+    """The JSON of a drafter; a kind may add fields.
 
+    Attributes:
+        target: Hash of the target's weights.
+        actions: The target's action space.
+        chunk: The target's H; 0 if it does not matter.
+        settings: Its shapes and those of its training.
+        provenance: How it was made.
+    """
+
+    target: str
+    actions: ActionSpace
+    chunk: int = 0
     settings: dict[str, Any] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
-class Lesson:
+class Training:
     """One training of a drafter, as the optimisation loop sees it.
 
     Attributes:
@@ -61,15 +76,19 @@ class Lesson:
         return self.drafter.validate(self, module)
 
 
-class TrainableDrafter(Weights[DrafterDescription]):
-    """Base of drafters with weights. `registry.add_drafter` registers one.
+class TrainableDrafter(Artifact[DrafterDescription]):
+    """Base of drafters with weights, in safetensors and `<kind>.json`. `registry.add_drafter` registers one.
 
     Attributes:
         settings: Dataclass of its shapes and training.
+        any_chunk: Whether it drafts for any H.
+        step_seconds: A guess of how long a training step takes on one core.
     """
 
     schema = DrafterDescription
     settings: type[Any]
+    any_chunk = False
+    step_seconds = 0.05
 
     @property
     def command(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -103,11 +122,11 @@ class TrainableDrafter(Weights[DrafterDescription]):
         """Set what a fresh network takes from its examples."""
 
     @abstractmethod
-    def loss(self, lesson: Lesson, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
+    def loss(self, training: Training, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
         """Return the loss of the examples `indices` (B,), and numbers to log."""
 
     @abstractmethod
-    def validate(self, lesson: Lesson, module: Any) -> Metrics:
+    def validate(self, training: Training, module: Any) -> Metrics:
         """Return metrics of a module on the held-out examples, among them a `score`: higher is better."""
 
     @classmethod
@@ -115,16 +134,55 @@ class TrainableDrafter(Weights[DrafterDescription]):
     def proposer(cls, settings: Any, context: Context) -> Proposer:
         """Return what drafts with the weights in `context.artifact(kind)`."""
 
-    def module(self, description: DrafterDescription, target: ReadableTarget) -> nn.Module:
-        """Return a fresh network of this description."""
-        settings = read(self.settings, description.settings, f"the {self.noun}'s settings", tolerant=True)
-        return self.network(settings, target)
-
-    def objective(self, target: Any, dataset: DemoDataset, settings: Any, progress: OnProgress) -> Lesson:
+    def objective(self, target: Any, dataset: DemoDataset, settings: Any, progress: OnProgress) -> Training:
         """Read the demonstrations through the target; return what the optimisation loop trains."""
         share = settings.train.held_out
         examples, held_out = self.examples(target, dataset, settings.drafter, share, progress)
         torch.manual_seed(settings.train.seed)
         network = self.network(settings.drafter, target)
         self.prepare(network, examples)
-        return Lesson(self, network.to(target.device), target, examples, held_out, settings)
+        return Training(self, network.to(target.device), target, examples, held_out, settings)
+
+    def anew(self, path: Path) -> str:
+        """Return how to replace one of another target: a training goes on only with its own."""
+        return f"{removal(self.kind, path)}, then {self.again}"
+
+    def load(self, path: Path, request: Request) -> Any:
+        """Return the network with its weights, frozen, on the target's device in its number format."""
+        target, description = request.target, self.checked(path, request.description)
+        settings = read(self.settings, description.settings, f"the {self.noun}'s settings", tolerant=True)
+        return load_packed(self.network(settings, target), path, self.kind, target.device, target.dtype)
+
+    def digest(self, path: Path, description: DrafterDescription) -> str:
+        """Return the hash of the weights."""
+        return description.sha256
+
+    def described(self, file: Path) -> DrafterDescription:
+        """Return the description in a file, after checking the weights beside it."""
+        return checkpoint.read_description(file.parent, self.kind, self.schema)
+
+    def save(
+        self,
+        path: Path,
+        module: nn.Module,
+        made_for: MadeFor,
+        provenance: Mapping[str, Any],
+        stored: str = checkpoint.FLOAT32,
+        **fields: Any,
+    ) -> str:
+        """Write weights and description.
+
+        Args:
+            path: The folder.
+            module: The network.
+            made_for: Its target.
+            provenance: How it was made.
+            stored: Number format on disk, as `train.stored`.
+            fields: Further fields of this kind's description.
+
+        Returns:
+            The hash of the weights.
+        """
+        shared = {"target": made_for.sha256, "actions": made_for.actions.as_dict(), "provenance": dict(provenance)}
+        chunk = {} if self.any_chunk else {"chunk": made_for.chunk}
+        return checkpoint.save_module(path, self.kind, module, {**fields, **shared, **chunk}, stored)

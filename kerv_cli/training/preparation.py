@@ -13,8 +13,9 @@ from kerv_cli.catalogue.entries import state_of
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.runs import command_to_go_on
-from kerv_cli.methods.artifacts import Artifacts, Weights, kind_of, removal
+from kerv_cli.methods.artifacts import Artifacts, kind_of, removal
 from kerv_cli.methods.compose import Method
+from kerv_cli.methods.drafters import TrainableDrafter
 from kerv_cli.training.demonstrations import demos_for
 from kerv_cli.training.settings import PrepareSettings, TrainDrafterSettings
 from kerv_cli.worlds import specs
@@ -56,7 +57,7 @@ def plan(settings: PrepareSettings) -> list[Step]:
     for kind in kinds:
         files = kind_of(kind)
         command, seconds = list(files.command_beside(kinds)), files.seconds
-        if isinstance(files, Weights):
+        if isinstance(files, TrainableDrafter):
             if settings.steps:
                 command.append(f"train.steps={settings.steps}")
             train = compose("train_drafter", command[2:], TrainDrafterSettings).train
@@ -120,12 +121,12 @@ def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
         present = [one for one in kinds if kind_of(one).json(artifacts.path(one)).is_file()]
         artifacts.check(present[: present.index(kind) + 1])
     except CheckpointError as error:
-        if isinstance(files, Weights):
+        if isinstance(files, TrainableDrafter):
             raise CheckpointError(f"{str(error).split(': ')[0]}: {removal(kind, path)}") from error
         return "of other artifacts"
     if not files.is_complete(described, kinds):
         return MISSING
-    state = state_of(path, kind) if isinstance(files, Weights) else THERE
+    state = state_of(path, kind) if isinstance(files, TrainableDrafter) else THERE
     if state == "complete" and command_to_go_on(artifacts.results, kind, path):
         return "unfinished"  # e.g. the disk was full before the last files were written
     return THERE if state == "complete" else state

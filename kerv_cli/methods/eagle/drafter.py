@@ -29,7 +29,7 @@ from kerv_cli.engine.transfer import upload
 from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.artifacts import Artifacts, MadeFor, Request
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.drafters import DrafterDescription, Lesson, Metrics, TrainableDrafter
+from kerv_cli.methods.drafters import DrafterDescription, Metrics, TrainableDrafter, Training
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.examples import StatesByLength, TeacherStates, decode_demonstrations
 from kerv_cli.methods.eagle.public import Convention, PublicDrafter, PublicShape, load_public, read_public
@@ -258,44 +258,44 @@ class EagleDrafter(TrainableDrafter):
         """Return the target's states and tokens, for training and validation."""
         return decode_demonstrations(target, dataset, settings.samples, held_out, progress)
 
-    def loss(self, lesson: Lesson, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
+    def loss(self, training: Training, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
         """Return the mean loss over the unrolled passes, and the token loss of each pass."""
         losses: list[Tensor] = []
         metrics: Metrics = {}
-        for states in lesson.examples.parts(indices):
-            loss, measured = self.unrolled(lesson, states)
+        for states in training.examples.parts(indices):
+            loss, measured = self.unrolled(training, states)
             losses.append(loss * len(states) / len(indices))
             metrics |= measured
         return torch.stack(losses).sum(), metrics
 
-    def unrolled(self, lesson: Lesson, states: TeacherStates) -> tuple[Tensor, Metrics]:
+    def unrolled(self, training: Training, states: TeacherStates) -> tuple[Tensor, Metrics]:
         """Return the loss of states of one prompt length."""
-        settings, device = lesson.settings.drafter, lesson.target.device
+        settings, device = training.settings.drafter, training.target.device
         prompt, hidden = states.prompt.to(device).float(), states.hidden.to(device).float()
         tokens, start = states.tokens.to(device), prompt.shape[1]
-        following = torch.cat([prompt[:, 1:], lesson.target.embed(tokens[:, :-1])], 1)
+        following = torch.cat([prompt[:, 1:], training.target.embed(tokens[:, :-1])], 1)
         positions = torch.arange(hidden.shape[1] - 1, device=device)
         total, metrics = hidden.new_zeros(()), {}
         inputs = hidden[:, :-1]
         for number in range(settings.unroll):
-            predicted = lesson.module(following, inputs, positions)
-            state_loss, token_loss = self.compare(lesson, predicted[:, start - 1 :], hidden[:, start:])
+            predicted = training.module(following, inputs, positions)
+            state_loss, token_loss = self.compare(training, predicted[:, start - 1 :], hidden[:, start:])
             total = total + settings.state_weight * state_loss + settings.token_weight * token_loss
             metrics[f"token_loss_{number}"] = float(token_loss.detach())
             # after the first drafted position the next pass sees its own predictions, as in drafting
             inputs = torch.cat([inputs[:, :start], predicted[:, start - 1 : -1]], 1)
         return total / settings.unroll, metrics
 
-    def compare(self, lesson: Lesson, predicted: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+    def compare(self, training: Training, predicted: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
         """Return the smooth L1 loss of states (B, N − 1, E) and the soft cross-entropy of their tokens 1 … N − 1."""
-        teacher = lesson.target.head(hidden).softmax(-1)
-        cross_entropy = -(teacher * F.log_softmax(lesson.target.head(predicted), -1)).sum(-1).mean()
+        teacher = training.target.head(hidden).softmax(-1)
+        cross_entropy = -(teacher * F.log_softmax(training.target.head(predicted), -1)).sum(-1).mean()
         return F.smooth_l1_loss(predicted, hidden), cross_entropy
 
-    def validate(self, lesson: Lesson, module: EagleNetwork) -> Metrics:
+    def validate(self, training: Training, module: EagleNetwork) -> Metrics:
         """Decode held-out observations: tokens committed per verification, strict and at r = 9."""
-        target = lesson.target
-        prompts = [prompt.to(target.device).float() for prompt in lesson.held_out.prompts(VALIDATED)]
+        target = training.target
+        prompts = [prompt.to(target.device).float() for prompt in training.held_out.prompts(VALIDATED)]
         strict, relaxed = (acceptance_length(target, module, prompts, r) for r in (0, 9))
         return {"score": relaxed + strict, "acceptance_length_strict": strict, "acceptance_length_r9": relaxed}
 

@@ -26,7 +26,7 @@ from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.engine.transfer import read
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.drafters import Lesson, Metrics, TrainableDrafter
+from kerv_cli.methods.drafters import Metrics, TrainableDrafter, Training
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.targets.compact.packable import Packable
 from kerv_cli.targets.compact.program import Program
@@ -276,32 +276,32 @@ class EarlyDrafter(TrainableDrafter):
         """Take mean and spread of the features."""
         network.standardise(examples.features)
 
-    def outputs(self, lesson: Lesson, module: Any, examples: Any, indices: Tensor) -> tuple[Tensor, ...]:
+    def outputs(self, training: Training, module: Any, examples: Any, indices: Tensor) -> tuple[Tensor, ...]:
         """Return the module's outputs for the examples `indices` (B,): first of all its logits (B, N, V)."""
-        return (module(examples.features[indices].to(lesson.target.device).float()),)
+        return (module(examples.features[indices].to(training.target.device).float()),)
 
-    def token_loss(self, lesson: Lesson, logits: Tensor, indices: Tensor) -> Tensor:
+    def token_loss(self, training: Training, logits: Tensor, indices: Tensor) -> Tensor:
         """Return the cross-entropy of logits (B, N, V) with the target's softened tokens."""
-        device = lesson.target.device
-        labels = _labels(lesson.target.actions.tokens, lesson.settings.train.label_sigma, device)
-        return token_loss(logits, lesson.examples.tokens[indices].to(device), labels)
+        device = training.target.device
+        labels = _labels(training.target.actions.tokens, training.settings.train.label_sigma, device)
+        return token_loss(logits, training.examples.tokens[indices].to(device), labels)
 
-    def loss(self, lesson: Lesson, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
+    def loss(self, training: Training, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
         """Return the token loss."""
-        logits = self.outputs(lesson, lesson.module, lesson.examples, indices)[0]
-        loss = self.token_loss(lesson, logits, indices)
+        logits = self.outputs(training, training.module, training.examples, indices)[0]
+        loss = self.token_loss(training, logits, indices)
         return loss, {"token_loss": float(loss.detach())}
 
-    def validate(self, lesson: Lesson, module: Any) -> Metrics:
+    def validate(self, training: Training, module: Any) -> Metrics:
         """Compare drafts of held-out observations with the target; plain and perturbed episodes count alike."""
-        held_out, actions = lesson.held_out, lesson.target.actions
-        batches = (self.outputs(lesson, module, held_out, i) for i in torch.arange(len(held_out)).split(256))
+        held_out, actions = training.held_out, training.target.actions
+        batches = (self.outputs(training, module, held_out, i) for i in torch.arange(len(held_out)).split(256))
         logits, *rest = (torch.cat(parts).cpu() for parts in zip(*batches, strict=True))
         metrics = measure(logits, held_out, torch.from_numpy(actions.strict_tokens(logits.shape[1])))
         score = metrics["accepted_r9"] + metrics["accepted_strict"]
-        return {"score": score, **metrics, **self.further_metrics(lesson, *rest)}
+        return {"score": score, **metrics, **self.further_metrics(training, *rest)}
 
-    def further_metrics(self, lesson: Lesson, *outputs: Tensor) -> Metrics:
+    def further_metrics(self, training: Training, *outputs: Tensor) -> Metrics:
         """Return metrics of the outputs after the logits."""
         return {}
 

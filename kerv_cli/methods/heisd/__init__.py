@@ -51,7 +51,7 @@ add(
     measured_by="retrieval_unverified",
 )
 add("datastore", "exact", _DATASTORE + "ExactIndex")
-add("datastore", "qdrant", "kerv_cli.methods.heisd.qdrant:QdrantIndex", QdrantSearchSettings)
+add("datastore", "qdrant", _DATASTORE + "QdrantIndex", QdrantSearchSettings)
 
 
 @dataclass
@@ -64,12 +64,12 @@ class HybridProposerSettings:
     kind: str = "hybrid"
     depth: int = number(15, 1, MOST_TOKENS)  # the drafter's, tokens
     top_k: int = number(1, 1, MOST_TOKENS)
-    nodes: int = number(24, 1, MOST_TOKENS)  # of either side's tree
+    nodes: int = number(24, 1, MOST_TOKENS)  # of a tree
     neighbours: int = number(3, 1, MOST_TOKENS)
 
 
 _hybrid = (_RULES + "HybridProposer.build", HybridProposerSettings, ("drafter", "datastore"))
-add("proposer", "hybrid", *_hybrid, when=STATES, sides=True, cost=DRAFTING)
+add("proposer", "hybrid", *_hybrid, when=STATES, has_boundary=True, cost=DRAFTING)
 
 
 # --- which drafts are good enough (§2.1)
@@ -98,7 +98,7 @@ add("acceptance", "sequence", _RULES + "GroupRule.build", SequenceAcceptanceSett
 add("acceptance", "hybrid", _RULES + "by_proposer", HybridAcceptanceSettings)
 
 
-# --- which side of the hybrid proposer drafts (§4.4)
+# --- who drafts for the hybrid proposer (§4.4)
 
 
 @dataclass

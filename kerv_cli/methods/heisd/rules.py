@@ -204,9 +204,9 @@ class HybridProposer(Proposer):
     needs_states = True
 
     def __init__(self, drafter: Proposer, retrieval: Proposer) -> None:
-        self.sides: dict[str, Proposer] = {"drafter": drafter, "retrieval": retrieval}
+        self.proposers: dict[str, Proposer] = {"drafter": drafter, "retrieval": retrieval}
         self.nodes = max(drafter.nodes, retrieval.nodes)
-        self.side, self.name = drafter, drafter.name
+        self.chosen, self.name = drafter, drafter.name
 
     @classmethod
     def build(cls, settings: HybridProposerSettings, context: Context) -> HybridProposer:
@@ -216,21 +216,21 @@ class HybridProposer(Proposer):
     def prepare(self, chunk: Chunk) -> None:
         """Take the proposer that the boundary chose for this chunk."""
         assert chunk.choice is not None, "a hybrid proposer needs a boundary"
-        self.side = self.sides[chunk.choice.mode]
-        self.name = self.side.name
-        self.side.prepare(chunk)
+        self.chosen = self.proposers[chunk.choice.mode]
+        self.name = self.chosen.name
+        self.chosen.prepare(chunk)
 
     def begin(self, chunk: Chunk) -> None:
         """Tell the chosen proposer."""
-        self.side.begin(chunk)
+        self.chosen.begin(chunk)
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
         """Return the draft of the chosen proposer."""
-        return self.side.propose(chunk, depth)
+        return self.chosen.propose(chunk, depth)
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
         """Tell the chosen proposer."""
-        self.side.committed(chunk, first, hidden, target_tokens)
+        self.chosen.committed(chunk, first, hidden, target_tokens)
 
 
 @dataclass(frozen=True)
@@ -306,7 +306,7 @@ class VerifySkip(Skip):
     def build(cls, settings: SimilaritySkipSettings, context: Context) -> VerifySkip:
         """Build skip=similarity. It shares the retrieval of the method's proposer, if that retrieves."""
         proposer: Proposer | None = context.built["proposer"]
-        retrieval = proposer.sides["retrieval"] if isinstance(proposer, HybridProposer) else proposer
+        retrieval = proposer.proposers["retrieval"] if isinstance(proposer, HybridProposer) else proposer
         if not isinstance(retrieval, RetrievalProposer):
             retrieval = RetrievalProposer(context.artifact("datastore"), context.target, neighbours=1, nodes=1)
         if settings.s_min is not None:

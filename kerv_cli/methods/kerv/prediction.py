@@ -44,21 +44,16 @@ class Noise:
         return cls((q,) * dofs, (1.0,) * dofs, (1.0,) * dofs)
 
 
-def transition_of(damping: float) -> np.ndarray:
-    """Return F of the state [a, ȧ], discrete white noise, dt = 1."""
-    return np.array([[1.0, damping], [0.0, damping]])
-
-
 @functools.lru_cache(maxsize=64)
-def filter_state(ratio: float, window: int, damping: float) -> np.ndarray:
-    """Return the filter's state after `window` actions, (2, window): column i is what action i contributes.
+def filter_state(ratio: float, window: int, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the filter's state after `window` actions, and the transition F of the state [a, ȧ] in one step.
 
-    The filter begins on the first action with state [a₀, 0] and covariance r · I. It predicts and updates once per
-    further action. `ratio` is q / r.
+    Column i of the state (2, window) is what action i contributes. The filter begins on the first action with state
+    [a₀, 0] and covariance r · I. It predicts and updates once per further action. `ratio` is q / r.
     """
     from filterpy.kalman import KalmanFilter
 
-    transition = transition_of(damping)
+    transition = np.array([[1.0, damping], [0.0, damping]])
     model = KalmanFilter(dim_x=2, dim_z=1)
     model.F, model.H = transition, np.eye(1, 2)
     model.P, model.Q, model.R = np.eye(2), ratio * np.outer([0.5, 1.0], [0.5, 1.0]), np.eye(1)  # in units of r
@@ -70,13 +65,12 @@ def filter_state(ratio: float, window: int, damping: float) -> np.ndarray:
         innovation = -state[0]
         innovation[i] += 1.0
         state = state + model.K @ innovation[None]
-    return state
+    return state, transition
 
 
 def kalman_weights(q: float, r: float, window: int, horizon: int, damping: float = 1.0) -> np.ndarray:
     """Return (horizon, window): row h − 1 times the window, oldest first, is the prediction h steps ahead."""
-    transition = transition_of(damping)
-    state = filter_state(q / r, window, damping)
+    state, transition = filter_state(q / r, window, damping)
     return np.stack([(np.linalg.matrix_power(transition, h) @ state)[0] for h in range(1, horizon + 1)])
 
 

@@ -21,7 +21,7 @@ from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.drafters import Lesson, Metrics
+from kerv_cli.methods.drafters import Metrics, Training
 from kerv_cli.methods.early.drafter import (
     Decodes,
     EarlyDrafter,
@@ -197,27 +197,27 @@ class ScoutDrafter(EarlyDrafter):
     def prepare(self, network: Any, examples: Any) -> None:
         """Nothing: what the stem sees is not known before it is trained."""
 
-    def outputs(self, lesson: Lesson, module: Any, examples: Any, indices: Tensor) -> tuple[Tensor, ...]:
+    def outputs(self, training: Training, module: Any, examples: Any, indices: Tensor) -> tuple[Tensor, ...]:
         """Return logits (B, N, V) and positions (B, K, 3)."""
-        return module(examples.inputs(indices, lesson.target.device))
+        return module(examples.inputs(indices, training.target.device))
 
-    def loss(self, lesson: Lesson, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
+    def loss(self, training: Training, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
         """Return the token loss plus the weighted position loss."""
-        train, device = lesson.settings.train, lesson.target.device
-        labels = lesson.examples.places[indices].to(device)
+        train, device = training.settings.train, training.target.device
+        labels = training.examples.places[indices].to(device)
         if step < train.scene_steps:
-            given = lesson.module.views(lesson.examples.inputs(indices, device))
-            loss = position_loss(lesson.module.see(*given)[1], labels)
+            given = training.module.views(training.examples.inputs(indices, device))
+            loss = position_loss(training.module.see(*given)[1], labels)
             return loss, {"position_loss": float(loss.detach())}
-        logits, places = self.outputs(lesson, lesson.module, lesson.examples, indices)
-        token, position = self.token_loss(lesson, logits, indices), position_loss(places, labels)
+        logits, places = self.outputs(training, training.module, training.examples, indices)
+        token, position = self.token_loss(training, logits, indices), position_loss(places, labels)
         metrics = {"token_loss": float(token.detach()), "position_loss": float(position.detach())}
         return token + train.scene_weight * position, metrics
 
-    def further_metrics(self, lesson: Lesson, *outputs: Tensor) -> Metrics:
+    def further_metrics(self, training: Training, *outputs: Tensor) -> Metrics:
         """Return the median errors of the positions."""
-        error = (outputs[0] - lesson.held_out.places).norm(dim=-1).median(0).values
-        names = [place.name.replace(" ", "_") for place in lesson.target.observation.places]
+        error = (outputs[0] - training.held_out.places).norm(dim=-1).median(0).values
+        names = [place.name.replace(" ", "_") for place in training.target.observation.places]
         return {f"{name}_error_cm": 100 * float(e) for name, e in zip(names, error, strict=True)}
 
 
