@@ -17,7 +17,7 @@ from test_calibration import TASKS, write_dataset
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName
-from kerv_cli.episodes.policy import check, decoder_for, unseen_tasks
+from kerv_cli.episodes.policy import check, decoder_for
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.eagle.drafter import EagleDrafter
@@ -147,28 +147,6 @@ def test_names_of_artifacts_in_stored_settings_of_0_1_0_are_kept() -> None:
     policy = {"kind": "model", "target": "mine", "artifacts": {"drafter": "a", "follow": "b"}}
     assert with_artifacts({"policy": older, "seed": 1}) == {"policy": policy, "seed": 1}
     assert with_artifacts({"policy": policy}) == {"policy": policy}
-
-
-@pytest.mark.parametrize("settings", [[], [[]], {"task": 3}, {"task": [1]}, None])
-def test_a_provenance_that_says_nothing_of_tasks_is_no_warning(results: Path, settings: object) -> None:
-    path = results / "artifacts/target/nano-state/target.json"
-    described = json.loads(path.read_text())
-    described["provenance"]["settings"] = settings
-    path.write_text(json.dumps(described))
-    asked = RolloutSettings(results=str(results), policy=PolicySettings(target="nano-state"))
-    assert unseen_tasks(asked, ["reach-v3"]) == []
-
-
-# --- one rule for every artifact that names a source
-
-OTHER = "f" * 64
-
-FILES = {
-    "drafter": "drafter.json",
-    "early": "early.json",
-    "datastore": "manifest.json",
-    "calibration": "calibration.json",
-}
 
 
 @pytest.fixture(scope="module")
