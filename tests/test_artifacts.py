@@ -160,6 +160,16 @@ def complete(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return results
 
 
+# --- one rule for every artifact that names a source
+
+OTHER = "f" * 64
+
+FILES = {
+    "drafter": "drafter.json",
+    "early": "early.json",
+    "datastore": "manifest.json",
+    "calibration": "calibration.json",
+}
 MESSAGE = rf"was \w+ for [a-z ]+ {OTHER[:12]}, not for [0-9a-f]{{12}}: (run|build|remove)"
 
 

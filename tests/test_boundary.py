@@ -66,16 +66,6 @@ def test_the_radius_is_exact_on_arcs(seed: int, radius: float, angle: float, n: 
 
 
 @settings(deadline=None)
-@given(seeds, st.floats(0.01, 1.0), st.floats(0.5, 6.0))
-def test_uneven_speed_along_an_arc_changes_nothing(seed: int, radius: float, angle: float) -> None:
-    rng = np.random.default_rng(seed)
-    angles = np.sort(rng.uniform(0, angle, WINDOW))
-    angles[0], angles[-1] = 0, angle
-    flat = radius * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(WINDOW)])
-    assert radius_of_curvature(flat @ rotation(rng).T) == pytest.approx(radius, rel=1e-6)
-
-
-@settings(deadline=None)
 @given(seeds, st.floats(0.01, 0.5), st.integers(3, 30))
 def test_a_line_has_no_finite_radius(seed: int, length: float, n: int) -> None:
     points = line(np.random.default_rng(seed), length, n)
@@ -95,24 +85,6 @@ def test_a_line_has_no_finite_radius(seed: int, length: float, n: int) -> None:
 )
 def test_where_there_is_no_circle_the_radius_is_infinite(points: np.ndarray) -> None:
     assert radius_of_curvature(points) == math.inf
-
-
-@settings(deadline=None)
-@given(seeds)
-def test_both_measures_survive_rigid_motion_and_reversal(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    points = np.cumsum(rng.normal(size=(WINDOW, 3)) * 0.01, 0)
-    moved = points @ rotation(rng).T + rng.uniform(-1, 1, 3)
-    radius, length = radius_of_curvature(points), path_length(points)
-    for other in (moved, moved[::-1]):
-        assert radius_of_curvature(other) == pytest.approx(radius, rel=1e-6)
-        assert path_length(other) == pytest.approx(length, rel=1e-9)
-    assert radius_of_curvature(3 * points) == pytest.approx(3 * radius, rel=1e-6)
-
-
-def test_the_path_length_is_the_way_travelled() -> None:
-    assert path_length(np.array([[0, 0, 0], [0.3, 0.4, 0], [0, 0, 0]])) == pytest.approx(1.0)
-    assert path_length(np.zeros((1, 3))) == path_length(np.zeros((0, 3))) == 0.0
 
 
 def test_ranges_are_the_minimum_and_the_95th_percentile_of_finite_values() -> None:
@@ -199,7 +171,3 @@ def test_random_keeps_its_share_and_repeats_itself() -> None:
     assert modes("reach-v3", 100_000) != modes("push-v3", 100_000)
     assert modes("reach-v3", 100_000) != modes("reach-v3", 100_000, other)
     assert np.mean([m == "retrieval" for m in modes("reach-v3", 100_000)]) == pytest.approx(0.3, abs=0.05)
-
-
-def test_always_chooses_nothing() -> None:
-    assert boundary_of("always") is None

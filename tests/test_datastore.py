@@ -18,8 +18,7 @@ from hypothesis import strategies as st
 from test_calibration import write_dataset
 from typer.testing import CliRunner
 
-from kerv_cli.base.errors import CheckpointError, KervError, StorageError, UnknownName, UsageError
-from kerv_cli.base.files import read_json
+from kerv_cli.base.errors import CheckpointError, StorageError, UnknownName, UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.tree import ROOT, TokenTree
@@ -165,13 +164,6 @@ def test_the_search_is_exact_near_a_subspace(seed: int, size: tuple[int, int], r
             assert store.query(key, "a", k, without).steps.tolist() == ranked[:k]
 
 
-def test_a_task_that_is_not_there_gets_one_line(results: Path) -> None:
-    store, _, _ = opened(results)
-    with pytest.raises(UnknownName, match="unknown task of the datastore 'reach': did you mean reach-v3") as caught:
-        store.query(store.vectors[0], "reach", 1)
-    assert isinstance(caught.value, KervError)
-
-
 def entries(store: Datastore) -> list[tuple[str, int, int]]:
     tasks = [task for task, shard in store.shards.items() for _ in range(shard.start, shard.stop)]
     return list(zip(tasks, store.seeds.tolist(), store.steps.tolist(), strict=True))
@@ -272,17 +264,6 @@ def test_projected_keys_find_nearly_always_the_same_neighbour_in_a_smaller_file(
     neighbours = short.query(short.key_of(short.pooled(prompt, target).numpy()), "reach-v3", 1)
     assert (neighbours.seeds[0], neighbours.steps[0]) == (1, 2)
     assert neighbours.similarity[0] == pytest.approx(1.0, abs=1e-5)
-
-
-def test_the_manifest_says_where_everything_comes_from(results: Path) -> None:
-    store, _, description = opened(results)
-    demos = read_json(results / "artifacts/demos/few/manifest.json")
-    manifest = store.manifest
-    assert (manifest.target, manifest.demos) == (description.sha256, demos["sha256"])
-    assert (manifest.chunk, manifest.actions, manifest.rows) == (4, description.actions, 52)
-    assert {shard.seeds for shard in manifest.tasks.values()} == {tuple(LENGTHS)}
-    assert {"versions", "git_commit", "settings"} <= set(manifest.provenance)
-    assert sorted(p.name for p in folder_of(results).iterdir()) == ["manifest.json", "payload.parquet", "vectors.npy"]
 
 
 def test_training_and_evaluation_seeds_are_proved_disjoint(results: Path, tmp_path: Path) -> None:

@@ -99,10 +99,6 @@ def test_schedule_is_the_public_codes_and_open_loop() -> None:
     assert chosen.radius() == 15
 
 
-def test_fixed_ignores_what_happens() -> None:
-    assert radius_after(threshold("fixed", r=9), 0.0, 9.0, None) == 9
-
-
 @pytest.mark.parametrize("kind", CLOSED_LOOP)
 def test_the_reference_level_is_the_tasks_where_none_is_given(kind: str) -> None:
     asked = find("threshold", kind).settings(kind=kind)

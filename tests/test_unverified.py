@@ -101,9 +101,6 @@ def test_a_target_that_sleeps_is_in_the_clock_in_its_phase(slow: str, phase: str
     assert all(min(r.phases[name] for r in records) < PAUSE for name in others)
 
 
-# --- K
-
-
 # --- skip=always
 
 
@@ -118,20 +115,6 @@ def test_always_skip_executes_the_sources_tokens_without_a_forward() -> None:
         assert (record.forwards, record.skipped, record.mode) == (0, True, "skip")
         assert [(r.mode, r.proposer) for r in record.rounds] == [("skip", "near")]
         assert record.unverified == record.actions.size == len(record.tokens)
-
-
-@pytest.mark.parametrize("chunk", [1, 2, 4])
-def test_always_skip_executes_the_nearest_stored_chunk(chunk: int) -> None:
-    target = random_target(2, 1, 1, 4)
-    prompt = random_prompt(target, 2)
-    rows = np.arange(3 * 16).reshape(3, 16)
-    source = RetrievalProposer(stored(target, prompt, rows), target, 3, 48)
-    decoder = Decoder(target, Parts(prefill_draft=source, skip=AlwaysSkip(source)), chunk=chunk)
-    decoder.reset("t", 0, HOME)
-    found = decoder.decode_prompt(prompt)
-    nearest = source.neighbours(found).chunks[0]
-    assert found.tokens == nearest[: 4 * chunk].tolist()
-    assert found.forwards == 0
 
 
 def test_always_skip_without_a_history_lets_the_target_decode() -> None:
