@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.limits import check_settings
 from kerv_cli.base.registry import find
 from kerv_cli.engine.chunk import Choice
 from kerv_cli.engine.parts import Boundary
@@ -28,7 +29,7 @@ def boundary_of(kind: str, **values: Any) -> Boundary:
     """As a method's part: its numbers are checked, then it is built; the calibration has `RANGES` for 10 and 15."""
     part = find("boundary", kind)
     chosen = part.settings(kind=kind, **values)
-    part.check_settings(chosen, "boundary")
+    check_settings(chosen, "boundary")
     calibration = SimpleNamespace(ranges={10: RANGES, WINDOW: RANGES}.__getitem__)
 
     def artifact(kind: str) -> Any:

@@ -11,7 +11,7 @@ from examples.own_target import MockTarget
 from test_decoding_lossless import plain_greedy
 
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.registry import find
+from kerv_cli.base.limits import check_settings
 from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
@@ -198,6 +198,6 @@ def test_without_a_gripper_to_hold_the_drafts_is_taken(wrong: int) -> None:
 )
 def test_what_cannot_compensate_is_refused(values: dict[str, Any], error: type[Exception], says: str) -> None:
     with pytest.raises(error) as caught:
-        find("rectifier", "compensate").check_settings(CompensateSettings(**values), "rectifier")
+        check_settings(CompensateSettings(**values), "rectifier")
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)

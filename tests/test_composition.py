@@ -172,7 +172,7 @@ def test_only_what_needs_no_states_can_be_chosen_before_the_prefill() -> None:
     [
         ("policy=expert skip=similarity", "policy=expert with skip=similarity: the expert decodes nothing"),
         ("policy=expert threshold.r=3", "policy=expert with threshold=fixed: the expert"),
-        ("policy=expert deviation_every=5", "deviation_every=5: the expert has no AR"),
+        ("policy=expert deviation_every=5", "deviation_every=5: the expert decodes nothing"),
         ("policy.kind=exprt", "unknown policy.kind 'exprt': did you mean expert"),
         ("episodes=0", "episodes=0"),
         ("seed=7", "seed=7 is a training seed: evaluation begins at 100000"),

@@ -13,6 +13,7 @@ import pytest
 
 from kerv_cli.base import registry
 from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.limits import check_settings
 from kerv_cli.base.registry import METHOD_KINDS, PREFILL, STATES, Part, find, kinds, load, parts, register
 
 PLUGIN = """
@@ -81,7 +82,7 @@ def test_what_a_part_names_is_there(kind: str, name: str) -> None:
         assert chosen.kind == name
         assert isinstance(part.needs(chosen), tuple)
         assert set(part.needs(chosen)) <= set(parts("artifact"))
-        part.check_settings(chosen, kind)  # defaults are in range
+        check_settings(chosen, kind)  # defaults are in range
 
 
 def test_every_proposer_says_when_it_can_draft() -> None:

@@ -11,10 +11,11 @@ from examples.own_target import MockTarget
 from test_unverified import HOME, SHOWN
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.limits import check_settings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.record import DecodeRecord
-from kerv_cli.methods.sp_vla import SpeedSkipSettings, check_speeds
+from kerv_cli.methods.sp_vla import SpeedSkipSettings
 from kerv_cli.methods.sp_vla.schedule import Ridge, SpeedSkip
 from kerv_cli.worlds.metaworld.spec import SPEC
 
@@ -116,4 +117,4 @@ def test_an_intuitive_decode_runs_nothing_of_the_target() -> None:
 
 def test_speeds_that_are_not_in_order_are_refused() -> None:
     with pytest.raises(UsageError, match=r"skip\.v_min=2 skip\.v_max=1"):
-        check_speeds(SpeedSkipSettings(v_min=2, v_max=1))
+        check_settings(SpeedSkipSettings(v_min=2, v_max=1))

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.limits import check_settings
 from kerv_cli.base.registry import find
 from kerv_cli.engine.parts import Threshold
 from kerv_cli.episodes.settings import RolloutSettings
@@ -33,7 +34,7 @@ def artifact(kind: str) -> Any:
 def built(chosen: Any, task: str = "reach-v3") -> Threshold:
     """As a method's part: its numbers are checked, then it is built."""
     part = find("threshold", chosen.kind)
-    part.check_settings(chosen, "threshold")
+    check_settings(chosen, "threshold")
     found: Threshold = part.built(chosen, Context(SimpleNamespace(actions=SPEC.actions), artifact, task))  # type: ignore[arg-type]
     return found
 

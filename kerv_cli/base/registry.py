@@ -21,7 +21,6 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
-from kerv_cli.base.limits import check_settings
 
 PLUGINS = "KERV_PLUGINS"
 
@@ -78,8 +77,7 @@ class Part:
     target, environment, stress, executor, column or command. build: `module:function` or `module:Class.method`; its
     arguments are documented where the kind is used, of a method's parts in `methods/context.py`.
     settings: dataclass of its settings, with defaults; limits by `limits.number`. needs: artifact kinds that these
-    settings need, of an artifact those that it is made from. check: raises UsageError for settings that do not fit
-    together. colour: 0xRRGGBB of its rows, lines and timeline.
+    settings need, of an artifact those that it is made from. colour: 0xRRGGBB of its rows, lines and timeline.
     traits: what others need to know of the part. Their names are in `docs/extending.md`.
     """
 
@@ -88,7 +86,6 @@ class Part:
     build: str = ""
     settings: type = NoSettings
     needs: Callable[[Any], tuple[str, ...]] = lambda settings: ()
-    check: Callable[[Any], None] | None = None
     colour: int | None = None
     traits: Mapping[str, Any] = field(default_factory=dict)
 
@@ -105,16 +102,6 @@ class Part:
     def built(self, *arguments: Any, **keywords: Any) -> Any:
         """Import and call `build`; None for an absent part."""
         return load(self.build)(*arguments, **keywords) if self.build else None
-
-    def check_settings(self, settings: Any, what: str) -> None:
-        """Checks these settings as `limits.check_settings`, then by `check`. what: how messages call the settings.
-
-        Raises:
-            UsageError: a number out of range, or settings that do not fit together.
-        """
-        check_settings(settings, what)
-        if self.check is not None:
-            self.check(settings)
 
 
 _PARTS: dict[str, dict[str, Part]] = {}
@@ -139,12 +126,11 @@ def add(
     build: str = "",
     settings: type = NoSettings,
     needs: tuple[str, ...] | Callable[[Any], tuple[str, ...]] = (),
-    check: Callable[[Any], None] | None = None,
     colour: int | None = None,
     **traits: Any,
 ) -> None:
     """Registers a part of these fields. needs: a tuple where the settings do not matter."""
-    register(Part(kind, name, build, settings, needs if callable(needs) else lambda _: needs, check, colour, traits))
+    register(Part(kind, name, build, settings, needs if callable(needs) else lambda _: needs, colour, traits))
 
 
 def add_drafter(

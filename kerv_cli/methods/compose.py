@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.limits import check_settings
 from kerv_cli.base.registry import METHOD_KINDS, PREFILL, Part, part_of
 from kerv_cli.engine.chunk import steps_of
 from kerv_cli.engine.decoder import Decoder, Parts
@@ -77,7 +78,7 @@ class Method:
         for kind, part in self.parts.items():
             if not isinstance(self.settings[kind], part.settings):
                 raise UsageError(f"{kind}.kind={part.name}: choose {kind}={part.name}, each has settings of its own")
-            part.check_settings(self.settings[kind], kind)
+            check_settings(self.settings[kind], kind)
         steps_of(self.chunk, target.chunk)
         self._check_drafts()
         self._check_parallel(is_parallel(target))

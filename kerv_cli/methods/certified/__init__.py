@@ -24,19 +24,14 @@ class ScopedSettings:
     kind: str = "scoped"
     outside: str = "merged"
 
-
-def check_scoped(settings: ScopedSettings) -> None:
-    """Refuse a draft for other tasks that cannot draft whole chunks before the prefill.
-
-    Raises:
-        UsageError: It cannot.
-    """
-    outside = find("proposer", settings.outside, "prefill_draft.outside")
-    if not (outside.traits.get("merged") or outside.traits.get("chains")):
-        raise UsageError(
-            f"prefill_draft.outside={outside.name}: it does not draft whole chunks from the prompt; set "
-            "prefill_draft.outside=merged, or a source of merged drafts, e.g. early"
-        )
+    def check_together(self, prefix: str) -> None:
+        """Refuse a draft for other tasks that cannot draft whole chunks before the prefill."""
+        outside = find("proposer", self.outside, "prefill_draft.outside")
+        if not (outside.traits.get("merged") or outside.traits.get("chains")):
+            raise UsageError(
+                f"prefill_draft.outside={outside.name}: it does not draft whole chunks from the prompt; set "
+                "prefill_draft.outside=merged, or a source of merged drafts, e.g. early"
+            )
 
 
 def _needs(settings: ScopedSettings) -> tuple[str, ...]:
@@ -56,7 +51,7 @@ add(
     names_more=True,
     study="certify",
 )
-add("proposer", "scoped", _CERTIFICATE + "scoped", ScopedSettings, _needs, check_scoped, when=PREFILL, chains=True)
+add("proposer", "scoped", _CERTIFICATE + "scoped", ScopedSettings, _needs, when=PREFILL, chains=True)
 add(
     "skip",
     "certified",

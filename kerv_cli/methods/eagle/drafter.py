@@ -41,9 +41,6 @@ from kerv_cli.targets.compact.trunk import LayerStack
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
-VALIDATED = 60
-"""Held-out observations that a validation decodes."""
-
 
 class EagleNetwork(LayerStack):
     """Decoder layers of the target's shape. Head and token embeddings are the target's own."""
@@ -295,7 +292,7 @@ class EagleDrafter(TrainableDrafter):
     def validate(self, training: Training, module: EagleNetwork) -> Metrics:
         """Decode held-out observations: tokens committed per verification, strict and at r = 9."""
         target = training.target
-        prompts = [prompt.to(target.device).float() for prompt in training.held_out.prompts(VALIDATED)]
+        prompts = [prompt.to(target.device).float() for prompt in training.held_out.prompts()]
         strict, relaxed = (acceptance_length(target, module, prompts, r) for r in (0, 9))
         return {"score": relaxed + strict, "acceptance_length_strict": strict, "acceptance_length_r9": relaxed}
 

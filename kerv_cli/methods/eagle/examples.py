@@ -21,6 +21,9 @@ from kerv_cli.engine.protocol import Target
 from kerv_cli.targets.observations import Rows, held_out_every, observations_of, prompts_of, steps_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
+VALIDATED = 60
+"""Held-out observations that a validation decodes."""
+
 
 @dataclass(frozen=True)
 class TeacherStates(Rows):
@@ -29,10 +32,6 @@ class TeacherStates(Rows):
     prompt: Tensor  # (n, P, E) float16
     hidden: Tensor  # (n, P + N − 1, E) float16
     tokens: Tensor  # (n, N) int64
-
-    def prompts(self, count: int) -> list[Tensor]:
-        """Return at most `count` prompts (1, P, E), evenly spread."""
-        return [self.prompt[i : i + 1] for i in spread(len(self), count)]
 
 
 @dataclass(frozen=True)
@@ -54,15 +53,9 @@ class StatesByLength:
             first += len(group)
         return batches
 
-    def prompts(self, count: int) -> list[Tensor]:
-        """Return about `count` prompts (1, P, E), from every group in proportion to its rows."""
-        return [x for group in self.groups for x in group.prompts(max(1, round(count * len(group) / len(self))))]
-
-
-def spread(rows: int, count: int) -> list[int]:
-    """Return at most `count` row numbers, evenly spread."""
-    chosen: list[int] = torch.linspace(0, rows - 1, min(count, rows)).long().tolist()
-    return chosen
+    def prompts(self) -> list[Tensor]:
+        """Return all prompts (1, P, E)."""
+        return [prompt for group in self.groups for prompt in group.prompt.split(1)]
 
 
 @torch.inference_mode()
@@ -80,7 +73,7 @@ def decode_demonstrations(
         steps = steps_of(dataset.load(index), bool(target.cameras))
         rows[index % every == every - 1].extend((index, int(t)) for t in steps)
     states = _decodes(target, dataset, rows[0], limit, on_progress)
-    return states, _decodes(target, dataset, rows[1], max(60, limit // 50), lambda done, total: None)
+    return states, _decodes(target, dataset, rows[1], VALIDATED, lambda done, total: None)
 
 
 def _decodes(
@@ -91,7 +84,7 @@ def _decodes(
     on_progress: OnProgress,
 ) -> StatesByLength:
     """Return the decodes of at most `limit` of the rows (episode, control step), evenly spread."""
-    chosen = [rows[i] for i in spread(len(rows), limit)]
+    chosen = [rows[i] for i in torch.linspace(0, len(rows) - 1, min(limit, len(rows))).long().tolist()]
     groups, done = defaultdict[int, list[TeacherStates]](list), 0
 
     def observations() -> Iterator[Observation]:

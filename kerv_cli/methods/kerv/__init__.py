@@ -68,20 +68,14 @@ class CompensateSettings:
     rest: int = number(0, 0, MOST_DECODES)  # decodes without compensation after one (KERV: 4)
     max_dropped: int = number(-1, -1, MOST_TOKENS)  # control steps that a compensation may drop; -1: any (KERV)
 
-
-def check_compensate(settings: CompensateSettings) -> None:
-    """Refuse a predictor that does not exist or that would lack the target's token.
-
-    Raises:
-        UnknownName: There is no such predictor.
-        UsageError: It needs the target's token.
-    """
-    if settings.predictor != DRAFT:
-        find_predictor(settings.predictor)
-    elif not settings.use_target_token:
-        raise UsageError(
-            "rectifier.predictor=draft goes on behind the target's token: leave rectifier.use_target_token=true"
-        )
+    def check_together(self, prefix: str) -> None:
+        """Refuse a predictor that does not exist, and a draft without the target's token before it."""
+        if self.predictor != DRAFT:
+            find_predictor(self.predictor)
+        elif not self.use_target_token:
+            raise UsageError(
+                "rectifier.predictor=draft goes on after the target's token: leave rectifier.use_target_token=true"
+            )
 
 
 def needs_of_compensation(settings: CompensateSettings) -> tuple[str, ...]:
@@ -90,14 +84,28 @@ def needs_of_compensation(settings: CompensateSettings) -> tuple[str, ...]:
 
 
 _compensation = (_PREDICTION + "Compensation.build", CompensateSettings)
-add("rectifier", "compensate", *_compensation, needs_of_compensation, check_compensate)
+add("rectifier", "compensate", *_compensation, needs_of_compensation)
 
 
 # --- thresholds: the acceptance radius r, in bins (§3.2), kept as a real number and rounded for use
 
 
+class RadiusRange:
+    """Settings with a smallest and a largest radius."""
+
+    r_min: int
+    r_max: int
+
+    def check_together(self, prefix: str) -> None:
+        """Refuse radii that are not in order."""
+        if self.r_min > self.r_max:
+            raise UsageError(
+                f"threshold.r_min={self.r_min} threshold.r_max={self.r_max}: r_min must not be above r_max"
+            )
+
+
 @dataclass
-class KinematicThresholdSettings:
+class KinematicThresholdSettings(RadiusRange):
     """KERV: the radius follows the kinematic variability K of the decode before.
 
     `change` is an ablation: the radius moves against the change of K.
@@ -111,7 +119,7 @@ class KinematicThresholdSettings:
 
 
 @dataclass
-class ScheduleThresholdSettings:
+class ScheduleThresholdSettings(RadiusRange):
     """KERV's public code, r = 3 + 12 exp(−(t / τ)³) in decode t: open loop, K is not used."""
 
     kind: str = "schedule"
@@ -119,18 +127,6 @@ class ScheduleThresholdSettings:
     r_max: int = number(15, 0, MOST_BINS)
     phi: float = number(3.0, above=0, most=50)
     tau: float = number(20.0, above=0, most=1e9)  # decodes
-
-
-def check_radii(settings: KinematicThresholdSettings | ScheduleThresholdSettings) -> None:
-    """Refuse radii that are negative or not in order.
-
-    Raises:
-        UsageError: They are.
-    """
-    if not 0 <= settings.r_min <= settings.r_max:
-        raise UsageError(
-            f"threshold.r_min={settings.r_min} threshold.r_max={settings.r_max}: bins from 0 on, r_min not above r_max"
-        )
 
 
 def needs_of_variability(settings: KinematicThresholdSettings) -> tuple[str, ...]:
@@ -242,6 +238,6 @@ def nearest(r: float) -> int:
 
 
 for _name, _class in (("kinematic", "Kinematic"), ("change", "Change")):
-    _kinematic = (f"{__name__}:{_class}.build", KinematicThresholdSettings, needs_of_variability, check_radii)
+    _kinematic = (f"{__name__}:{_class}.build", KinematicThresholdSettings, needs_of_variability)
     add("threshold", _name, *_kinematic)
-add("threshold", "schedule", f"{__name__}:Schedule.build", ScheduleThresholdSettings, check=check_radii)
+add("threshold", "schedule", f"{__name__}:Schedule.build", ScheduleThresholdSettings)

@@ -22,18 +22,13 @@ class MergedProposerSettings:
     nodes: int = number(48, 1, MOST_TOKENS)  # the last sources' chains are dropped first
     neighbours: int = number(1, 1, MOST_TOKENS)  # retrieval: stored chunks
 
-
-def check_merged(settings: MergedProposerSettings) -> None:
-    """Refuse settings without a source, or with one that cannot draft whole chains before the prefill.
-
-    Raises:
-        UsageError: One of these.
-    """
-    if not settings.sources:
-        raise UsageError("merged: name at least one of sources")
-    for name in (*settings.sources, *settings.fallback):
-        if not find("proposer", name, "source of a merged draft").traits.get("chains"):
-            raise UsageError(f"source '{name}' of a merged draft: it does not draft whole chunks from the prompt")
+    def check_together(self, prefix: str) -> None:
+        """Refuse settings without a source, or with one that cannot draft whole chains before the prefill."""
+        if not self.sources:
+            raise UsageError("merged: name at least one of sources")
+        for name in (*self.sources, *self.fallback):
+            if not find("proposer", name, "source of a merged draft").traits.get("chains"):
+                raise UsageError(f"source '{name}' of a merged draft: it does not draft whole chunks from the prompt")
 
 
 def needs_of_sources(settings: MergedProposerSettings) -> tuple[str, ...]:
@@ -43,5 +38,5 @@ def needs_of_sources(settings: MergedProposerSettings) -> tuple[str, ...]:
 
 
 _BUILD = "kerv_cli.methods.merged.proposer:MergedProposer.build"
-_parts = (_BUILD, MergedProposerSettings, needs_of_sources, check_merged)
+_parts = (_BUILD, MergedProposerSettings, needs_of_sources)
 add("proposer", "merged", *_parts, colour=0xCC79A7, when=PREFILL, merged=True, cost="early")

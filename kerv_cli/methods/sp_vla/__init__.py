@@ -20,16 +20,11 @@ class SpeedSkipSettings:
     share: float = number(0.5, 0, 1)  # τ, share of these above which the target must have decoded
     penalty: float = number(1e-4, 0, 1e6)  # λ of the regression
 
-
-def check_speeds(settings: SpeedSkipSettings) -> None:
-    """Refuse speeds that are not in order.
-
-    Raises:
-        UsageError: They are not.
-    """
-    if settings.v_min > settings.v_max:
-        raise UsageError(f"skip.v_min={settings.v_min:g} skip.v_max={settings.v_max:g}: v_min not above v_max")
+    def check_together(self, prefix: str) -> None:
+        """Refuse speeds that are not in order."""
+        if self.v_min > self.v_max:
+            raise UsageError(f"skip.v_min={self.v_min:g} skip.v_max={self.v_max:g}: v_min must not be above v_max")
 
 
 _BUILD = "kerv_cli.methods.sp_vla.schedule:SpeedSkip.build"
-add("skip", "speed", _BUILD, SpeedSkipSettings, check=check_speeds, colour=0x8C6D31)
+add("skip", "speed", _BUILD, SpeedSkipSettings, colour=0x8C6D31)
