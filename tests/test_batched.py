@@ -101,16 +101,12 @@ def test_autoregressive_tokens_of_a_batch_are_those_of_its_rows(packed: bool, ba
 
 
 @pytest.mark.bits
-def test_a_shorter_chunk_and_a_smaller_batch_after_a_larger_one() -> None:
-    policy = target()
-    for count in (3, 1, 2):
-        same(*decoded(Decoder(policy, chunk=1), shown(count)))
-
-
-@pytest.mark.bits
-def test_parallel_passes_of_a_batch_are_those_of_its_rows() -> None:
-    policy = target("target.parallel=true")
-    same(*decoded(Decoder(policy, Parts(skip=ParallelPass(policy))), shown(5)))
+@pytest.mark.parametrize("parallel", [False, True])
+def test_a_smaller_batch_after_a_larger_one(parallel: bool) -> None:
+    policy = target(f"target.parallel={str(parallel).lower()}")
+    decoder = Decoder(policy, Parts(skip=ParallelPass(policy))) if parallel else Decoder(policy, chunk=1)
+    for count in (5, 1, 2):
+        same(*decoded(decoder, shown(count)))
 
 
 @pytest.mark.bits
@@ -247,17 +243,18 @@ def test_a_batch_of_real_episodes_is_what_they_are_one_by_one(policies: Path, po
         assert (record.initial_state == one.initial_state).all()
 
 
-def test_what_cannot_be_batched_is_refused(policies: Path) -> None:
-    target, batch = "policy.target=nano-state", "rollout.batch=8"
-    with pytest.raises(UsageError, match="method=spec_vla"):
-        policies_of.check(settings(policies, target, batch, "method=spec_vla"))
-    with pytest.raises(UsageError, match="threshold=schedule"):
-        policies_of.check(settings(policies, target, batch, "method=early_unverified", "threshold=schedule"))
-    with pytest.raises(UsageError, match="policy=expert with rollout"):
-        policies_of.check(settings(policies, batch, "policy=expert"))
-    with pytest.raises(UsageError, match="clock=real: decodes of a batch have no times"):
-        settings(policies, target, batch, "rollout.clock=real")
-    policies_of.check(settings(policies, target, batch, "threshold=schedule"))  # nothing is drafted
+@pytest.mark.parametrize(
+    "words",
+    [["method=spec_vla"], ["method=early_unverified", "threshold=schedule"], ["policy=expert"], ["rollout.clock=real"]],
+)
+def test_what_cannot_be_batched_is_refused(policies: Path, words: list[str]) -> None:
+    target = [] if words == ["policy=expert"] else ["policy.target=nano-state"]
+    with pytest.raises(UsageError, match=words[-1]):
+        policies_of.check(settings(policies, *target, "rollout.batch=8", *words))
+
+
+def test_a_threshold_that_nothing_reads_may_be_batched(policies: Path) -> None:
+    policies_of.check(settings(policies, "policy.target=nano-state", "rollout.batch=8", "threshold=schedule"))
 
 
 # --- studies

@@ -149,9 +149,9 @@ class Decoder(EpisodeState):
         if self._skips(chunk, stopwatch):
             return chunk
         self.prefill(chunk, stopwatch)
-        go_on = self.decode_plainly if self.parts.proposer is None else self.round
+        step = self.decode_plainly if self.parts.proposer is None else self.round
         while chunk.remaining:
-            go_on(chunk, stopwatch)
+            step(chunk, stopwatch)
         return chunk
 
     def _new_chunk(self, prompt: Tensor | Callable[[], Tensor], observation: Observation | None) -> Chunk:
@@ -280,7 +280,7 @@ class Decoder(EpisodeState):
         tree, target_tokens, (path, rejected) = verified.tree, verified.target_tokens, accepted
         if proposer is None or not len(tree):
             chunk.commit_token(target_tokens[0])
-            return verified.hidden
+            return self._keep(chunk, verified, [])
         start, nodes = len(chunk.tokens), path if rejected is None else (*path, rejected)
         after_rejection = [] if rejected is None else tree.down_from(rejected)
         bonus = [target_tokens[path[-1] + 1 if path else 0]] if start + len(path) < chunk.size else []
