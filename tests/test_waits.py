@@ -89,7 +89,7 @@ def test_a_round_waits_once(family: str, captured: bool, monkeypatch: pytest.Mon
     wanted = on_host.decode_prompt(prompt)
     assert wanted.tokens == truth
     if captured:
-        monkeypatch.setattr(LayerStack, "captures", lambda self, x, cache: cache is not None and cache.fixed)
+        monkeypatch.setattr(LayerStack, "captures", lambda self, x: True)
     parts = parts_of(family, target, prompt, truth)
     monkeypatch.setattr(EagleNetwork, "new_cache", functools.partialmethod(LayerStack.new_cache, fixed=captured))
     target.new_cache = functools.partial(target.new_cache, fixed=captured)  # type: ignore[method-assign]

@@ -152,7 +152,7 @@ class LayerStack(Packable):
             hidden = packed(*inputs, positions=positions, cache=cache, mask=mask)[0].view(x.shape)
         elif packed is not None:
             hidden = self.norm(packed(self.enter(*inputs), positions, cache, slots, mask))
-        elif isinstance(cache, CapturedCache) and x.is_cuda and x.shape[0] == 1 and not wants_gradient(x):
+        elif isinstance(cache, CapturedCache) and self.captures(x):
             assert mask is not None
             hidden = self.norm(cache.run(self.run_layers, self.enter(*inputs), positions, mask))
         else:
@@ -160,6 +160,10 @@ class LayerStack(Packable):
         if cache is not None:
             cache.length += x.shape[1]
         return hidden
+
+    def captures(self, x: Tensor) -> bool:
+        """Return whether a forward of x (B, T, E) over a cache of fixed shapes runs in a captured graph."""
+        return x.is_cuda and x.shape[0] == 1 and not wants_gradient(x)
 
     def compute(
         self,
