@@ -14,26 +14,27 @@ RELEASED = {
     "mt50-plain": "c2455773de37ced5e7a6db9bfda64a36375c27a7c62a8c2b354a9af55e548f54",
     "mt50-vision": "11cbcfd366f20df05355e5715afc4bb0d032547815b0e3821dd8ee66ea46727b",
 }
-"""Shipped policy -> SHA-256 of its target's weights. The wheel holds one of them, a checkout and a release all."""
-
+"""Shipped policy to the SHA-256 of its target's weights. The wheel holds one of them, a checkout and a release all."""
 
 RESUME = "resume.safetensors"
-"""The file of a training's state in the folder of what it makes; nothing that is shipped has it."""
+"""File of a training's state in the folder of what it makes. No shipped artifact has it."""
 
 
 def shipped_dir() -> Path:
-    """`results/pretrained` of the checkout that the package runs from, else the `pretrained` inside the installed
-    package (`mt10-vision` alone)."""
+    """Return the folder of the shipped policies.
+
+    It is `results/pretrained` in a checkout, else `pretrained` inside the installed package (`mt10-vision` alone).
+    """
     package = Path(__file__).resolve().parents[1]
     checkout = package.parent / "results" / "pretrained"
     return checkout if checkout.is_dir() else package / "pretrained"
 
 
 def find_target(results: str, name: str) -> Path:
-    """Folder of the target `name`: `name` itself if it is a path, else an artifact, else a shipped policy.
+    """Return the folder of a target: `name` itself if it is a path, else an artifact, else a shipped policy.
 
     Raises:
-        UsageError: nothing of that name; the line lists what there is.
+        UsageError: There is none of that name. The message lists what there is.
     """
     if "/" in name:
         folders = [as_path(name)]
@@ -56,11 +57,14 @@ def find_target(results: str, name: str) -> Path:
 
 
 def check_not_shipped(path: Path, word: str) -> None:
-    """Refuses to replace an artifact of a shipped policy. path: where it is to be written. word: the setting that names
-    another place, e.g. `policy.artifacts.scout`.
+    """Refuse to replace an artifact of a shipped policy.
+
+    Args:
+        path: Folder to write to.
+        word: Setting that names another folder, e.g. `policy.artifacts.scout`.
 
     Raises:
-        UsageError: there is one beside the shipped target, and no training of the user's made it.
+        UsageError: The folder is beside the shipped target, and no training of the user's made it.
     """
     made_here = (path / RESUME).is_file()
     if path.exists() and (path.parent / "target" / "target.json").is_file() and not made_here:
@@ -68,15 +72,18 @@ def check_not_shipped(path: Path, word: str) -> None:
 
 
 def target_names(results: str) -> list[str]:
-    """Names of the targets that are there: shipped ones, then those of the results folder."""
+    """Return the names of all targets: shipped ones, then those of the results folder."""
     shipped = sorted(path.parent.parent.name for path in shipped_dir().glob("[!.]*/target/target.json"))
     stored = sorted(path.parent.name for path in (results_dir(results) / "artifacts/target").glob("[!.]*/target.json"))
     return list(dict.fromkeys([*shipped, *stored]))
 
 
 def beside(target: Path, kind: str) -> Path:
-    """Folder of the artifact `kind` of a target: its sibling in a shipped policy (pretrained/<name>/{target,<kind>}),
-    artifacts/<kind>/<name> for a trained one (artifacts/target/<name>), else a subfolder."""
+    """Return the folder of a target's artifact of a kind.
+
+    A shipped policy has both side by side (`pretrained/<name>/target` and `<kind>`), a trained one has
+    `artifacts/target/<name>` and `artifacts/<kind>/<name>`. Any other target has a subfolder.
+    """
     if target.name == "target":
         return target.parent / kind
     return target.parent.parent / kind / target.name if target.parent.name == "target" else target / kind

@@ -1,4 +1,4 @@
-"""Where a number or a file comes from: machine, versions, git commit."""
+"""Origin of a number or a file: machine, versions, git commit."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ _HERE = Path(__file__).resolve().parent
 
 
 def provenance(device: str) -> dict[str, Any]:
-    """For a checkpoint or a calibration: versions, commit, device."""
+    """Return versions, commit and device, for a checkpoint or a calibration."""
     return {"versions": versions(), "git_commit": git_commit(), "device": device, "device_name": device_name(device)}
 
 
 def provenance_of(command: str, settings: Any, device: str, **figures: Any) -> dict[str, Any]:
-    """`provenance`, behind the command that makes the artifact, its settings and figures of it."""
+    """Return the command that makes an artifact, its settings and figures, then `provenance`."""
     return {"command": command, "settings": asdict(settings), **figures, **provenance(device)}
 
 
 def stamp(device: str) -> dict[str, str]:
-    """Host, device, versions and commit for a table's row: flat, every value a string."""
+    """Return host, device, versions and commit for a table's row: flat, every value a string."""
     numbers = {f"{name}_version": number for name, number in versions().items()}
     return {"host": socket.gethostname(), "device_name": device_name(device), **numbers, "git_commit": git_commit()}
 
 
 @functools.cache
 def versions() -> dict[str, str]:
-    """python and PACKAGES; `absent` where one is not installed."""
+    """Return the versions of Python and PACKAGES. A package that is not installed is `absent`."""
     return {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}}
 
 
@@ -47,7 +47,7 @@ def _version(package: str) -> str:
 
 @functools.cache
 def device_name(device: str) -> str:
-    """The product's name: of the GPU for a CUDA device, of the processor otherwise."""
+    """Return the product name of the GPU for a CUDA device, else of the processor."""
     if device.startswith("cuda"):
         import torch
 
@@ -62,7 +62,7 @@ def device_name(device: str) -> str:
 
 @functools.cache
 def git_commit() -> str:
-    """The checkout's commit, with `+changes` where tracked files differ from it; `none` outside a checkout of kerv."""
+    """Return the checkout's commit, with `+changes` if tracked files differ. `none` outside a checkout of kerv."""
     if shutil.which("git") is None or not _git("ls-files", "--error-unmatch", "__init__.py"):
         return "none"  # an installed copy may lie inside somebody else's repository
     changes = _git("status", "--porcelain", "--untracked-files=no", "--", ".")
