@@ -142,18 +142,6 @@ def test_a_damaged_recording_gets_one_line(share: float, tmp_path: Path) -> None
     assert "record the episode again" in str(caught.value)
 
 
-def test_finding_and_opening(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(UsageError):
-        find_recordings([tmp_path])
-    path = saved(episode("ar"), tmp_path / "deep" / "er")
-    assert find_recordings([tmp_path]) == [path]
-    monkeypatch.setattr(viewer, "has_display", lambda: False)
-    told = open_recording([path])
-    assert "rerun episode.rrd" in told
-    assert path.name in told
-    assert "drawer-open-v3" in read_summary(path)
-
-
 @pytest.mark.parametrize("ending", ["gif", "mp4"])
 def test_a_film_shows_the_camera_and_below_it_the_tokens(tmp_path: Path, ending: str) -> None:
     place = save_film(saved(episode("drafter", frames=64), tmp_path), tmp_path / f"film.{ending}")
@@ -302,64 +290,43 @@ def test_texts_hold_only_what_the_viewers_font_has(tmp_path: Path) -> None:
     assert all(line == readable(line) for t in texts for line in t.splitlines())
 
 
-def test_time_is_simulated_time(tmp_path: Path) -> None:
-    record = episode("ar", horizon=5)
-    path = saved(replace(record, space=replace(record.space, control_hz=20.0)), tmp_path)
-    seconds = [t.total_seconds() for batch in batches(path, "/actions") for t in batch["time"].to_pylist()]
-    assert seconds == pytest.approx([0.0, 0.05, 0.1, 0.15, 0.2])
-    assert "/camera" not in read_recording(path)["entities"]
-
-
-def test_places_that_are_no_recordings(tmp_path: Path) -> None:
-    with pytest.raises(UsageError):
-        find_recordings([tmp_path / "nowhere.rrd"])
-    (tmp_path / "notes.txt").write_text("x")
-    with pytest.raises(UsageError):
-        find_recordings([tmp_path / "notes.txt"])
-    with pytest.raises(KervError):
-        read_recording(tmp_path / "gone.rrd")
-
-
 def test_the_newest_recordings_come_first_and_not_all_are_opened(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = saved(episode("ar", horizon=4), tmp_path)
+    first = saved(episode("ar", horizon=4), tmp_path / "deep")
     for i in range(MOST_OPENED + 3):
         copy = tmp_path / f"copy{i:02d}.rrd"
         copy.write_bytes(first.read_bytes())
         os.utime(copy, (1_000_000 + i, 1_000_000 + i))
     found = find_recordings([tmp_path, first])
-    assert found[0] == first
-    assert found[1].name == f"copy{MOST_OPENED + 2:02d}.rrd"
-    assert len(found) == MOST_OPENED + 4
+    assert (found[0], found[1].name, len(found)) == (first, f"copy{MOST_OPENED + 2:02d}.rrd", MOST_OPENED + 4)
     monkeypatch.setattr(viewer, "has_display", lambda: False)
     assert f"the newest {MOST_OPENED} of {MOST_OPENED + 4}" in open_recording(found)
+    assert "rerun episode.rrd" in open_recording([first])
+    assert "drawer-open-v3" in read_summary(first)
+
+
+@pytest.mark.parametrize("name", ["nowhere.rrd", "notes.txt", ""])
+def test_what_is_no_recording_is_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / "notes.txt").write_text("x")
+    with pytest.raises(UsageError):
+        find_recordings([tmp_path / name])
+    with pytest.raises(KervError):
+        read_recording(tmp_path / "gone.rrd")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the stand-in is a shell script")
-def test_the_viewer_is_started_and_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = saved(episode("ar", horizon=4), tmp_path)
-    asked = tmp_path / "asked"
-    viewer_stand_in(tmp_path, monkeypatch, f'echo "$@" > {asked}; sleep 0.6')
+def test_the_viewer_is_started_and_left_alone_or_says_why_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, asked, program = saved(episode("ar", horizon=4), tmp_path), tmp_path / "asked", tmp_path / "rerun"
+    monkeypatch.setattr(viewer, "has_display", lambda: True)
     monkeypatch.setattr(viewer, "_START_SECONDS", 0.3)
-    assert open_recording([path]) == "opened episode.rrd in the Rerun viewer"
-    assert asked.read_text().split() == ["--bind", "127.0.0.1", str(path)]
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="the stand-in is a shell script")
-def test_a_viewer_that_cannot_start_gets_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = saved(episode("ar", horizon=4), tmp_path)
-    viewer_stand_in(tmp_path, monkeypatch, "echo starting; echo 'no graphics here' >&2; exit 3")
-    with pytest.raises(KervError, match="no graphics here"):
-        open_recording([path])
-    monkeypatch.setattr(viewer, "viewer_command", lambda: [str(tmp_path / "absent")])
+    monkeypatch.setattr(viewer, "viewer_command", lambda: [str(program)])
     with pytest.raises(KervError):
         open_recording([path])
-
-
-def viewer_stand_in(folder: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None:
-    program = folder / "rerun"
-    program.write_text(f"#!/bin/sh\n{script}\n")
+    program.write_text("#!/bin/sh\necho starting; echo 'no graphics here' >&2; exit 3\n")
     program.chmod(0o755)
-    monkeypatch.setattr(viewer, "viewer_command", lambda: [str(program)])
-    monkeypatch.setattr(viewer, "has_display", lambda: True)
+    with pytest.raises(KervError, match="no graphics here"):
+        open_recording([path])
+    program.write_text(f'#!/bin/sh\necho "$@" > {asked}; sleep 0.6\n')
+    assert open_recording([path]) == "opened episode.rrd in the Rerun viewer"
+    assert asked.read_text().split() == ["--bind", "127.0.0.1", str(path)]

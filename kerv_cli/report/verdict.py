@@ -91,8 +91,8 @@ def sentence(choice: Choice, loss: float, baseline: str) -> str:
     """Return the choice for all tasks in one sentence, for a bound on the loss in points of success."""
     if choice.is_unsolved:
         return (
-            f"{baseline} does not solve these tasks ({_percent(choice.baseline_success)} of its episodes succeed), so "
-            "no setting is recommended"
+            f"{baseline} does not solve these tasks ({100 * choice.baseline_success:.0f} % of its episodes succeed), "
+            "so no setting is recommended"
         )
     bound = f"loses less than {loss:g} points of success against {baseline}"
     if choice.chosen:
@@ -105,7 +105,7 @@ def sentence(choice: Choice, loss: float, baseline: str) -> str:
 def short_sentence(choice: Choice) -> str:
     """Return the choice for one task in a few words."""
     if choice.is_unsolved:
-        return f"{choice.where}: the baseline does not solve it ({_percent(choice.baseline_success)})"
+        return f"{choice.where}: the baseline does not solve it ({100 * choice.baseline_success:.0f} %)"
     if choice.chosen:
         return f"{choice.where}: {choice.chosen}" + ("" if choice.is_shown else ", not shown to be faster")
     if not choice.tested:
@@ -116,12 +116,9 @@ def short_sentence(choice: Choice) -> str:
 def _speed(choice: Choice) -> str:
     if not is_number(choice.episode_speedup):
         return "; its speed was not measured"
-    if is_number(choice.episode_speedup_low):
-        interval = f" ({choice.episode_speedup_low:.2f}–{choice.episode_speedup_high:.2f})"
-    else:
-        interval = ""
     shown = "and is faster" if choice.is_shown else "but is not shown to be faster"
-    return f" {shown}: {choice.episode_speedup:.2f}{interval} times as fast per episode on this machine"
+    interval = f"({choice.episode_speedup_low:.2f}–{choice.episode_speedup_high:.2f})"
+    return f" {shown}: {choice.episode_speedup:.2f} {interval} times as fast per episode on this machine"
 
 
 def _missing(choice: Choice) -> str:
@@ -172,7 +169,3 @@ def progress_line(decisions: Sequence[Decision]) -> str:
     """Return decisions in one line, for progress."""
     clauses = [f"{one.label}: {one.verdict} after {one.pairs} pairs" for one in decisions if one.verdict != OPEN]
     return "; ".join([*clauses, f"{sum(one.verdict == OPEN for one in decisions)} open"])
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %"
