@@ -20,13 +20,17 @@ VARIABLES = (
     "ATEN_CPU_CAPABILITY",
     "ONEDNN_MAX_CPU_ISA",
     "MKL_CBWR",
+    "NUMBA_CPU_NAME",
+    "NUMBA_CPU_FEATURES",
 )
 _AVX512 = "X86_V4 AVX512_ICL AVX512_SPR"
+_AVX2 = "+avx2,+avx,+fma,+f16c,+sse4.2,+popcnt"
+_SKYLAKE = f"{_AVX2},+avx512f,+avx512bw,+avx512cd,+avx512dq,+avx512vl"
 KERNELS = {  # values of the variables; "" leaves the choice to the library
-    "avx512": ("SkylakeX", "", "avx512", "AVX512_CORE", ""),
-    "mixed": ("Zen", "", "avx512", "AVX512_CORE", ""),
-    "avx2": ("Haswell", _AVX512, "avx2", "AVX2", ""),
-    "sse4": ("Nehalem", f"X86_V3 {_AVX512}", "default", "SSE41", "COMPATIBLE"),
+    "avx512": ("SkylakeX", "", "avx512", "AVX512_CORE", "", "skylake-avx512", _SKYLAKE),
+    "mixed": ("Zen", "", "avx512", "AVX512_CORE", "", "", ""),
+    "avx2": ("Haswell", _AVX512, "avx2", "AVX2", "", "haswell", _AVX2),
+    "sse4": ("Nehalem", f"X86_V3 {_AVX512}", "default", "SSE41", "COMPATIBLE", "nehalem", "+sse4.2,+popcnt"),
 }
 
 

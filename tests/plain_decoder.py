@@ -1,16 +1,21 @@
-"""How fast is AR's token beside a plain numpy step with the same weights? A slow baseline makes every speedup false.
+"""How fast are AR's tokens beside a plain decoder with the same weights? A slow baseline makes every speedup false.
 
     python tests/plain_decoder.py [TARGET] [REPEATS]
 
-The reference shares nothing with the package but the weights: it is a plain decoder in numpy, one token at a time, as
-one would write it down. It also has to give the same tokens. Decodes of both take turns; times are per token."""
+The references share nothing with the package but the weights: a plain decoder in numpy, and one in C where there is a
+compiler, as one would write them down. They also have to give the same tokens. Decodes take turns."""
 
 from __future__ import annotations
 
+import ctypes
 import os
+import shutil
+import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -19,7 +24,6 @@ import numpy as np
 import torch
 
 from kerv_cli.engine.decoder import Decoder
-from kerv_cli.engine.stopwatch import Stopwatch
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.target import CompactTarget
 
@@ -73,34 +77,68 @@ class PlainStep:
         return x / np.sqrt(np.mean(x * x) + np.float32(1e-5)) * gain
 
 
+class PlainC:
+    """The same in C (`plain_decoder.c`), for weights in half precision."""
+
+    def __init__(self, plain: PlainStep, folder: Path) -> None:
+        """Compile it into a folder. Raises OSError without a compiler."""
+        library, source = folder / "plain_decoder.so", Path(__file__).with_suffix(".c")
+        flags = ["-O3", "-march=native", "-ffast-math", "-shared", "-fPIC"]
+        subprocess.run(["gcc", *flags, str(source), "-o", str(library), "-lm"], check=True)
+        self.decode, self.plain = ctypes.CDLL(str(library)).decode, plain
+        matrices = [w[name] for w, _ in plain.layers for name in ("qkv", "out", "gate_up", "down")] + [plain.head]
+        self.weights = np.concatenate([matrix.ravel() for matrix in matrices]).astype(np.float16)
+        self.gains = np.concatenate([*(gain for _, gains in plain.layers for gain in gains), plain.norm])
+
+    def __call__(self, token: int, count: int) -> list[int]:
+        """The `count` tokens after this one; the plain step's cache holds those before it."""
+        plain, tokens = self.plain, np.zeros(count + 1, np.int32)
+        tokens[0] = token
+        arrays = self.weights, self.gains, plain.embedding, plain.keys, plain.values, tokens
+        width, hidden = plain.head.shape[1], plain.layers[0][0]["down"].shape[1]
+        sizes = count, len(plain.layers), width, hidden, plain.heads, len(plain.head), plain.keys.shape[2], plain.length
+        self.decode(*(ctypes.c_void_p(array.ctypes.data) for array in arrays), *sizes)
+        return [int(token) for token in tokens[1:]]
+
+
 @torch.inference_mode()
-def main(name: str, repeats: int) -> bool:
-    """Prints the times -> whether all tokens are the same."""
+def main(name: str, repeats: int, folder: Path) -> bool:
+    """Print the thread's milliseconds of all tokens after the prefill -> whether all tokens are the same."""
     torch.set_num_threads(1)
-    folder = Path(name) if Path(name).is_dir() else Path("results/pretrained") / name / "target"
-    target, _ = load_target(folder, "cpu", torch.float32)
-    decoder, plain = Decoder(target), PlainStep(target)
-    seconds, same = [], True
+    found = Path(name) if Path(name).is_dir() else Path("results/pretrained") / name / "target"
+    target: Any = load_target(found, "cpu", torch.float32)[0]
+    decoder, plain, seconds, same = Decoder(target), PlainStep(target), dict[str, list[float]](), True
+    in_c = PlainC(plain, folder) if shutil.which("gcc") else None
     for seed in range(repeats):
         prompt = torch.randn(1, target.max_prompt, target.width, generator=torch.Generator().manual_seed(seed))
-        stopwatch = Stopwatch(target.device)
-        chunk = decoder.decode_prompt(prompt, stopwatch)
-        cached = decoder.cache.buffer[:, :, 0, :, : target.max_prompt].numpy()
+        chunk = decoder.decode_prompt(prompt)
+        first, count, length = chunk.tokens[0], chunk.size - 1, target.max_prompt
+        cached = decoder.cache.buffer[:, :, 0, :, :length].numpy()
         plain.begin(cached[:, 0], cached[:, 1], chunk.size)
-        begun, tokens = time.perf_counter(), chunk.tokens[:1]
-        for _ in range(chunk.size - 1):
-            tokens.append(plain(tokens[-1]))
-        seconds.append(
-            (stopwatch.phases["verify"] / (chunk.size - 1), (time.perf_counter() - begun) / (chunk.size - 1))
-        )
-        same &= tokens == chunk.tokens
-    ours, theirs = np.array(seconds).T * 1e3
-    print(
-        f"AR's token {np.median(ours):.3f} ms (best {ours.min():.3f}), a plain numpy step {np.median(theirs):.3f} ms "
-        f"(best {theirs.min():.3f}): ratio {np.median(ours / theirs):.2f}; the same tokens: {same}"
-    )
+
+        def compiled(first: int = first, count: int = count, length: int = length) -> list[int]:
+            decoder.cache.length = length
+            return target.continue_greedily(first, count, decoder.cache)
+
+        def numpy(first: int = first, count: int = count) -> list[int]:
+            tokens = [first]
+            for _ in range(count):
+                tokens.append(plain(tokens[-1]))
+            return tokens[1:]
+
+        decoders = {"kerv": compiled} | ({"C": lambda: in_c(first, count)} if in_c else {}) | {"numpy": numpy}  # noqa: B023
+        for label, decode in decoders.items():
+            begun = time.thread_time()
+            tokens = decode()
+            seconds.setdefault(label, []).append(1e3 * (time.thread_time() - begun))
+            same &= tokens == chunk.tokens[1:]
+    for label, times in seconds.items():
+        ratio = np.min(seconds["kerv"]) / np.min(times)
+        print(f"{label}: least {np.min(times):.2f} ms, median {np.median(times):.2f} ms; kerv takes {ratio:.2f} × it")
     return same
 
 
 if __name__ == "__main__":
-    main(sys.argv[1] if len(sys.argv) > 1 else "mt10-vision", int(sys.argv[2]) if len(sys.argv) > 2 else 100)
+    with tempfile.TemporaryDirectory() as scratch:
+        arguments = sys.argv[1] if len(sys.argv) > 1 else "mt10-vision", int(sys.argv[2]) if len(sys.argv) > 2 else 100
+        print("the same tokens:", main(*arguments, Path(scratch)))

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import copy
+import os
 import pickle
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import plain_decoder
@@ -17,7 +21,9 @@ from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import EagleDrafter
+from kerv_cli.targets.checkpoint import compact, expanded
 from kerv_cli.targets.compact.packable import pack
+from kerv_cli.targets.compact.program import kernels
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
@@ -239,6 +245,51 @@ def test_one_row_behind_a_mask_sees_what_the_modules_see() -> None:
     assert close(*outputs)
 
 
-def test_a_plain_decoder_in_numpy_gives_the_shipped_policys_tokens(capsys: pytest.CaptureFixture[str]) -> None:
-    assert plain_decoder.main("mt10-vision", 3)
-    assert "ratio" in capsys.readouterr().out
+def test_plain_decoders_in_numpy_and_c_give_the_shipped_policys_tokens(tmp_path: Path) -> None:
+    assert plain_decoder.main("mt10-vision", 100, tmp_path)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_row_has_the_same_bits_alone_and_among_many(seed: int) -> None:
+    """So a verification equals single forwards even where two logits tie but for the last bit."""
+    target = both_targets("vision", seed)[1]
+    x, positions, caches = torch.randn(1, 40, 32), torch.arange(40), [target.new_cache(1, 48) for _ in range(3)]
+    with torch.inference_mode():
+        together = target.head(target(x, positions, caches[0]))
+        singly = [target.head(target(x[:, i : i + 1], positions[i : i + 1], caches[1])) for i in range(40)]
+        begun = target.head(target(x[:, :20], positions[:20], caches[2]))
+        visible = np.tri(20, dtype=bool)
+        verified = target.head(target(x[:, 20:], positions[20:], caches[2], visible))
+        batch = target.head(target(torch.cat([x, x.flip(1)]), positions))
+    assert torch.equal(together, torch.cat(singly, 1))
+    assert torch.equal(together, torch.cat([begun, verified], 1))
+    assert torch.equal(together, batch[:1])
+    assert torch.equal(caches[0].buffer, caches[1].buffer)
+
+
+@pytest.mark.parametrize("stored", ["float16", "int8"])
+def test_weights_stay_as_they_are_stored(stored: str) -> None:
+    plain, _ = both_trunks(2, 1, 2, 32)
+    plain.load_state_dict(expanded(compact(plain.state_dict(), stored)))
+    packed = copy.deepcopy(plain)
+    pack(packed)
+    x, positions = torch.randn(1, 5, 64), torch.arange(5)
+    sizes = {matrix.values.dtype.itemsize for matrix in packed.packed.matrices}
+    assert sizes == ({1} if stored == "int8" else {2 if kernels().EXPANDS_HALF else 4})
+    with torch.inference_mode():
+        assert close(plain(x, positions), packed(x, positions))
+
+
+def test_processes_compile_once_and_say_so(tmp_path: Path) -> None:
+    """Of two at once one compiles and the other waits; a third has a cache folder that cannot be written."""
+    script = "from kerv_cli.targets.compact.program import kernels; kernels()"
+    variables = os.environ | {"TMPDIR": str(tmp_path), "PYTHONPATH": str(Path(__file__).parent.parent)}
+
+    def begun(cache: str) -> subprocess.Popen[bytes]:
+        environment = variables | {"NUMBA_CACHE_DIR": cache}
+        return subprocess.Popen([sys.executable, "-c", script], env=environment, stderr=subprocess.PIPE)
+
+    processes = [begun(str(tmp_path)), begun(str(tmp_path)), begun("/proc/none")]
+    told = [process.communicate()[1].decode() for process in processes]
+    assert [process.returncode for process in processes] == [0, 0, 0]
+    assert sorted("compiling for this CPU" in text for text in told[:2]) == [False, True]

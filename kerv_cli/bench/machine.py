@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,21 +16,37 @@ from kerv_cli.targets.compact.bfloat16 import BlockedLinear, multiplies_bfloat16
 from kerv_cli.targets.compact.program import Program
 
 _BUFFER = 64 * 2**20  # float32 numbers, 256 MiB: a server's caches hold 100 MB and more
+_LEVELS = (2**20, 4 * 2**20, 16 * 2**20, 32 * 2**20)  # bytes of the buffers that show what a CPU's caches can do
 _ROWS, _WIDTH = 256, 4096
 REPEATS = 7
 
 
 @dataclass(frozen=True)
 class Machine:
-    """bandwidth: bytes per second that one pass over a large buffer reads. flops: per second, of a product of 256 rows
-    with a matrix of 4096 × 4096 in the weights' number format. Both are the best of the repeats."""
+    """What a device can do, the best of several repeats.
+
+    Attributes:
+        bandwidth: Bytes per second that one pass over a buffer larger than all caches reads.
+        flops: Operations per second of a large product in the weights' number format.
+        caches: Bytes of a smaller buffer and the bandwidth of repeated passes over it, increasing.
+    """
 
     bandwidth: float
     flops: float
+    caches: tuple[tuple[float, float], ...] = ()
 
-    def floor(self, read: float, flops: float) -> float:
-        """Seconds below which a forward of so many bytes and operations cannot come."""
-        return max(read / self.bandwidth, flops / self.flops)
+    def bandwidth_of(self, read: float) -> float:
+        """Return the bandwidth of the smallest level that holds so many bytes."""
+        return next((rate for size, rate in self.caches if read <= size), self.bandwidth)
+
+    def bounds(self, read: float, flops: float) -> tuple[float, float]:
+        """Return the least seconds for reading so many bytes, and for so many operations."""
+        return read / self.bandwidth_of(read), flops / self.flops
+
+    def best_of(self, other: Machine) -> Machine:
+        """Return the better rates of two measurements: other programs slow a machine down, none speeds it up."""
+        caches = [(size, max(a, b)) for (size, a), (_, b) in zip(self.caches, other.caches, strict=True)]
+        return Machine(max(self.bandwidth, other.bandwidth), max(self.flops, other.flops), tuple(caches))
 
 
 def synchronise(device: torch.device) -> None:
@@ -54,14 +71,16 @@ def timed(work: Callable[[], object], device: torch.device, repeats: int) -> np.
 
 @torch.inference_mode()
 def measure_machine(device: torch.device, dtype: torch.dtype) -> Machine:
-    """The device's rates with this process's threads."""
-    buffer = torch.ones(_BUFFER, device=device)
-    seconds = timed(buffer.sum, device, REPEATS).min()
-    del buffer
-    x = torch.ones(_ROWS, _WIDTH, dtype=dtype, device=device)
-    product = product_with(torch.ones(_WIDTH, _WIDTH, device=device), dtype)
-    best = timed(lambda: product(x), device, REPEATS).min()
-    return Machine(4.0 * _BUFFER / float(seconds), 2.0 * _ROWS * _WIDTH**2 / float(best))
+    """Measure the device's rates with this process's threads."""
+
+    def rate(numbers: int) -> float:
+        return 4.0 * numbers / float(timed(buffer[:numbers].sum, device, REPEATS).min())
+
+    buffer, width = torch.ones(_BUFFER, device=device), _WIDTH if device.type == "cuda" else _WIDTH // 4
+    bandwidth, caches = rate(_BUFFER), [(size, rate(size // 4)) for size in _LEVELS if device.type == "cpu"]
+    x, product = torch.ones(_ROWS, width, dtype=dtype, device=device), torch.ones(width, width, device=device)
+    best = timed(functools.partial(product_with(product, dtype), x), device, REPEATS).min()
+    return Machine(bandwidth, 2.0 * _ROWS * width**2 / float(best), tuple(caches))
 
 
 def product_with(weight: Tensor, dtype: torch.dtype) -> Callable[[Tensor], Tensor]:

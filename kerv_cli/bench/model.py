@@ -26,6 +26,7 @@ from kerv_cli.methods.eagle.drafter import EagleDrafter, EagleNetwork
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.compact.bfloat16 import Bfloat16Layers, multiplies_bfloat16
 from kerv_cli.targets.compact.packable import pack
+from kerv_cli.targets.compact.program import Program, stored_bytes
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import Layer
@@ -43,7 +44,7 @@ class Sizes:
 
     settings: TargetSettings
     vocabulary: int
-    weight: int
+    weight: float
     slot: int
 
     @property
@@ -84,9 +85,12 @@ class Model:
 
     @property
     def sizes(self) -> Sizes:
-        """The target's shape; its caches are float32 on a CPU."""
-        size = 4 if self.target.device.type == "cpu" else self.dtype.itemsize
-        return Sizes(self.target.settings, self.target.actions.tokens, self.dtype.itemsize, size)
+        """The target's shape; its caches are float32 on a CPU, where compiled weights stay as they are stored."""
+        slot, trunk = 4 if self.target.device.type == "cpu" else self.dtype.itemsize, self.target.trunk
+        weight: float = self.dtype.itemsize
+        if isinstance(getattr(trunk, "packed", None), Program):
+            weight = stored_bytes(trunk) / sum(p.numel() for p in trunk.parameters())
+        return Sizes(self.target.settings, self.target.actions.tokens, weight, slot)
 
     @property
     def size(self) -> int:

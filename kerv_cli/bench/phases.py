@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.utils.flop_counter import FlopCounterMode
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import KervError
@@ -28,13 +30,18 @@ from kerv_cli.engine.tree import ROOT
 from kerv_cli.episodes.policy import decoder_for
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer
+from kerv_cli.methods.early.drafter import EarlyProposer
+from kerv_cli.methods.scout.drafter import ScoutProposer
 from kerv_cli.methods.spec_vla import RelaxedRule
+from kerv_cli.targets.compact.program import stored_bytes
 
 _WARM_UP = 2  # cycles that do not count
 _EVICTING = 16 * 2**20  # float32 numbers that are read between decodes: a simulator leaves nothing in the caches
 _TREE = (5, 8, 50)  # depth, children, nodes of EAGLE-2's tree
 _MERGED = 30  # nodes of a merged in-prefill draft
 _TASK = "reach-v3"
+SCOUT = "scout"
+"""A draft whose cost is measured here; prices of recorded decodes take the recorded seconds."""
 
 Key = tuple[str, int]
 """Kind of a cost, and its rows."""
@@ -174,21 +181,38 @@ def measure(model: Model, machine: Machine, settings: BenchSettings) -> tuple[Ma
             costs.append(((kind, 1), source.decode(blank(source.target)).phases["propose"]))
         for key, value in costs if turn >= _WARM_UP else ():
             seconds.setdefault(key, []).append(value)
-    again = measure_machine(device, model.dtype)  # another program slows a machine down, none speeds it up
-    machine = Machine(max(machine.bandwidth, again.bandwidth), max(machine.flops, again.flops))
-    return machine, phases_of(seconds, model.sizes, machine)
+    machine = machine.best_of(measure_machine(device, model.dtype))
+    drafts = {(kind, 1): needs_of_draft(source) for kind, source in sources.items()}
+    return machine, phases_of(seconds, model.sizes, machine, drafts)
 
 
-def phases_of(seconds: Mapping[Key, Sequence[float]], sizes: Sizes, machine: Machine) -> list[Phase]:
-    """The costs by kind and rows. seconds: of every repeat."""
-    order = (*FORWARDS, *source_methods())
+def phases_of(
+    seconds: Mapping[Key, Sequence[float]], sizes: Sizes, machine: Machine, drafts: Mapping[Key, tuple[float, float]]
+) -> list[Phase]:
+    """Return the costs by kind and rows. seconds: of every repeat. drafts: bytes and operations of the sources."""
+    order = (*FORWARDS, *source_methods(), SCOUT)
     phases, prompt = [], min(rows for kind, rows in seconds if kind == "prefill")
     for (kind, rows), times in sorted(seconds.items(), key=lambda item: (order.index(item[0][0]), item[0][1])):
-        read, flops = sizes.needs(kind, rows, prompt)
+        read, flops = drafts.get((kind, rows)) or sizes.needs(kind, rows, prompt)
         median, p95 = np.percentile(times, [50, 95])
-        floor = machine.floor(read, flops)
+        floor = max(machine.bounds(read, flops))
         phases.append(Phase(kind, rows, float(median), float(p95), float(min(times)), read, flops, floor))
     return phases
+
+
+@torch.inference_mode()
+def needs_of_draft(decoder: Any) -> tuple[float, float]:
+    """Return the bytes of the weights and the operations of a drafting network; zeros if it is none."""
+    draft, target = decoder.parts.prefill_draft, decoder.target
+    if not isinstance(draft, EarlyProposer):
+        return 0.0, 0.0
+    network: Any = draft.early
+    given: Any = torch.zeros(1, target.pooled_width)
+    if isinstance(draft, ScoutProposer):
+        network, given = draft.scout, draft.inputs(blank(target))
+    with FlopCounterMode(display=False) as counter:
+        copy.deepcopy(network)(given)  # a copy is not compiled
+    return stored_bytes(network), float(counter.get_total_flops())
 
 
 def source_methods() -> dict[str, str]:
@@ -204,7 +228,7 @@ def source_decoders(settings: BenchSettings) -> dict[str, Any]:
     try:
         return {
             kind: decoder_for(compose("rollout", [f"method={method}", *words], RolloutSettings), _TASK)
-            for kind, method in source_methods().items()
+            for kind, method in {**source_methods(), SCOUT: "scout_unverified"}.items()
         }
     except KervError:
         return {}

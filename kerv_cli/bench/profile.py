@@ -62,13 +62,12 @@ def projections(
 def shares(phases: Sequence[Phase], machine: Machine) -> tuple[float, float]:
     """Median share of the floor of the costs that are bound by memory, and of those bound by arithmetic; where there
     are none of one kind, that of all."""
-    counted = [p for p in phases if p.floor > 0]
-    by_memory = [p.read / machine.bandwidth >= p.flops / machine.flops for p in counted]
-    by_bound = [
-        [min(1.0, p.share) for p, bound in zip(counted, by_memory, strict=True) if bound == kind]
-        for kind in (True, False)
-    ]
-    memory, arithmetic = (statistics.median(part or [*by_bound[0], *by_bound[1]]) for part in by_bound)
+    by_bound: dict[bool, list[float]] = {True: [], False: []}
+    for p in phases:
+        if p.floor > 0 and p.kind in FORWARDS:
+            reading, computing = machine.bounds(p.read, p.flops)
+            by_bound[reading >= computing].append(min(1.0, p.share))
+    memory, arithmetic = (statistics.median(by_bound[kind] or by_bound[not kind]) for kind in (True, False))
     return memory, arithmetic
 
 
@@ -86,7 +85,7 @@ def projected(
             least = p.seconds * here.bandwidth / there.bandwidth
         elif p.kind not in FORWARDS:
             least = p.seconds
-        projections.append(replace(p, seconds=least, p95=least, least=least, floor=there.floor(p.read, p.flops)))
+        projections.append(replace(p, seconds=least, p95=least, least=least, floor=max(there.bounds(p.read, p.flops))))
     return projections
 
 

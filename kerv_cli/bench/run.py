@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -36,9 +37,9 @@ class Bench:
 
     @property
     def title(self) -> str:
-        """Target, number format, device and threads, in words."""
-        device = self.model.target.device
-        return f"{self.model.name}, {self.dtype}, {stamp(str(device))['device_name']}, {torch.get_num_threads()} thread"
+        """Target, number format, device, threads and the state of the caches, in words."""
+        where = stamp(str(self.model.target.device))["device_name"]
+        return f"{self.model.name}, {self.dtype}, {where}, {torch.get_num_threads()} thread, caches cold at first"
 
     def document(self) -> Document:
         """The whole result, for JSON."""
@@ -57,24 +58,29 @@ class Bench:
         }
 
 
-def card_of(model: Model, machine: Machine, tokens: int) -> dict[str, float]:
-    """Bytes, operations and floors of the model on this machine; needs no forward of the trunk."""
+def card_of(model: Model, machine: Machine, tokens: int) -> dict[str, Any]:
+    """Return bytes, operations and floors of the model on this machine; needs no forward of the trunk.
+
+    A floor is the larger of two times: reading the weights from the cache level that holds them, and the arithmetic.
+    """
     prompt, s, sizes = model.target.max_prompt, model.target.settings, model.sizes
-    floors = {
-        "floor_token": sizes.forward(1, prompt),
-        "floor_verify": sizes.forward(tokens, prompt),
-        "floor_prefill": sizes.forward(prompt, 0),
-        "floor_both": sizes.forward(prompt + tokens - 1, 0),
+    needs = {
+        "one token": sizes.forward(1, prompt),
+        f"verification of {tokens}": sizes.forward(tokens, prompt),
+        "prefill": sizes.forward(prompt, 0),
+        f"prefill and {tokens - 1} drafted": sizes.forward(prompt + tokens - 1, 0),
     }
+    weights = sizes.trunk_weights * sizes.weight
     return {
         "weights": sizes.trunk_weights,
-        "weight_bytes": sizes.trunk_weights * sizes.weight,
+        "weight_bytes": weights,
         "cache_bytes": 2.0 * s.layers * s.width * (prompt + tokens) * sizes.slot,
         "prompt": prompt,
         "tokens": tokens,
         "bandwidth": machine.bandwidth,
+        "bandwidth_of_weights": machine.bandwidth_of(weights),
         "flops": machine.flops,
-        **{name: machine.floor(*needs) for name, needs in floors.items()},
+        "floors": {name: machine.bounds(*need) for name, need in needs.items()},
     }
 
 

@@ -81,7 +81,8 @@ class Matrix:
         self.values = F.pad(values, (0, 0, 0, rest)).view(panels, PANEL, inputs).transpose(1, 2).contiguous()
         self.factors = F.pad(factors, (0, rest)).view(2, panels, PANEL).transpose(0, 1).contiguous()
         places = {"weights": self.values.data_ptr(), "factors": self.factors.data_ptr()}
-        self.columns, self.nbytes = {"panels": panels, "kind": kind, **places}, self.values.nbytes
+        self.columns = {"panels": panels, "kind": kind, **places}
+        self.nbytes = weight.numel() * self.values.element_size()
 
 
 _MATRICES = WeakIdKeyDictionary()
@@ -94,6 +95,11 @@ def matrix_of(weight: Tensor, bias: Tensor | None) -> Matrix:
         _MATRICES[weight] = Matrix(weight.detach(), bias)
     found: Matrix = _MATRICES[weight]
     return found
+
+
+def stored_bytes(module: torch.nn.Module) -> float:
+    """Return the bytes of a module's parameters: of its matrices as they are stored, four each of the others."""
+    return sum(_MATRICES[p].nbytes if p in _MATRICES else 4.0 * p.numel() for p in module.parameters())
 
 
 def forget(module: torch.nn.Module) -> None:
