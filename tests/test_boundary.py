@@ -103,9 +103,9 @@ def test_ranges_are_the_minimum_and_the_95th_percentile_of_finite_values() -> No
 
 
 def test_demonstrations_without_a_curved_path_have_no_ranges() -> None:
-    with pytest.raises(CheckpointError, match="no curved path"):
+    with pytest.raises(CheckpointError):
         BoundaryRanges.fit([line(np.random.default_rng(0), 0.2), np.zeros((9, 3))], WINDOW)
-    with pytest.raises(CheckpointError, match="is no range"):
+    with pytest.raises(CheckpointError):
         BoundaryRanges(0.1, 0.1, 0.0, 1.0)
 
 

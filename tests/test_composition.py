@@ -144,7 +144,7 @@ def test_a_damaged_stored_setting_gets_one_line(change: Any, error: type[Excepti
         ("proposer.kind=nope", "proposer.kind 'nope'"),
         ("proposer=drafter proposer.kind=hold", "choose proposer=hold"),
         ("rectifier=compensate rectifier.predictor=nope", "rectifier.predictor 'nope'"),
-        ("skip=always", "skip=always with prefill_draft=none: it executes what one source drafts before the prefill"),
+        ("skip=always", "skip=always with prefill_draft=none: it executes a draft from before the prefill"),
         ("method=spec_vla proposer.depth=0", "proposer.depth=0"),
     ],
 )

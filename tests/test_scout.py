@@ -145,7 +145,7 @@ def test_it_is_trained_from_the_command_line_for_its_target_alone(results: Path)
     files, folder = ScoutDrafter(), results / "artifacts/scout/mine"
     assert files.load(folder, Request(description, target)).settings.width == 24
     state = load_target(results / "artifacts/target/nano-state")[0]
-    with pytest.raises(CheckpointError, match="looks through the camera"):
+    with pytest.raises(CheckpointError):
         check_sees(state)
     rollout = ["rollout", "method=scout_unverified", f"task={TASK}", "episodes=1", "record=0", "world.horizon=12"]
     rollout += ["policy.target=nano-vision", f"results={results}"]

@@ -236,7 +236,9 @@ def _described(folder: Path, kind: str) -> dict[str, Any]:
 
 
 def _description(folder: Path, kind: str) -> Path:
-    return folder / ("manifest.json" if kind in ("demos", "datastore") else f"{kind}.json")
+    part = parts("artifact").get(kind)
+    own = part.traits.get("described_by") if part is not None else "manifest.json" if kind == "demos" else None
+    return folder / (own or f"{kind}.json")
 
 
 def _artifacts(folder: Path, kind: str) -> Iterator[RunEntry]:

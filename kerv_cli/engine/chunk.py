@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 import torch
@@ -17,7 +16,6 @@ from kerv_cli.engine.draft import check_tokens
 from kerv_cli.engine.protocol import Cache
 from kerv_cli.engine.record import PARALLEL, DecodeRecord, Round
 
-Mode = Literal["retrieval", "drafter"]
 WINDOW = 10  # KERV's action context AC, control steps
 
 
@@ -102,9 +100,9 @@ class Rejection:
 
 @dataclass(frozen=True)
 class Choice:
-    """A boundary's decision: which side of a hybrid proposer drafts."""
+    """A boundary's decision: the name of the proposer that drafts."""
 
-    mode: Mode
+    mode: str
     metric: float | None = None  # F (docs/methods.md §4.4), if the decision used it
 
 

@@ -20,7 +20,7 @@ from kerv_cli.episodes.episode import OnStep, run_episode
 from kerv_cli.episodes.policy import batch_decoder_for, clock_for, decoder_for
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.episodes.together import EpisodeEnd, Request, run_together
-from kerv_cli.methods.compose import native_decoder
+from kerv_cli.methods.parallel import native_decoder
 from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.settings import CameraSettings, WorldSettings
 from kerv_cli.worlds.spec import World

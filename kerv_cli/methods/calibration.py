@@ -125,7 +125,7 @@ class Calibration:
         """Return the ranges of R and D for a boundary that looks at `window` positions.
 
         Raises:
-            CheckpointError: None were measured, or none for so many positions.
+            CheckpointError: None were measured, or none for this window.
         """
         if self.boundary is None:
             raise CheckpointError(f"the calibration has no ranges for the boundary: {AGAIN}")

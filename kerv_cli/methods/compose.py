@@ -14,17 +14,9 @@ from kerv_cli.engine.chunk import steps_of
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.protocol import Target
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.parallel import ParallelPass
+from kerv_cli.methods.parallel import check_parallel, is_parallel
 from kerv_cli.methods.settings import MethodSettings
 from kerv_cli.targets.checkpoint import TargetDescription
-
-DRAFTS = ("prefill_draft", "proposer")
-"""Kinds of parts that draft."""
-
-
-def is_parallel(target: object) -> bool:
-    """Return whether a target decodes all tokens at once (`engine.protocol.ParallelTarget`)."""
-    return bool(getattr(target, "parallel", False))
 
 
 @dataclass(frozen=True)
@@ -81,7 +73,7 @@ class Method:
             check_settings(self.settings[kind], kind)
         steps_of(self.chunk, target.chunk)
         self._check_drafts()
-        self._check_parallel(is_parallel(target))
+        check_parallel(self.parts, is_parallel(target))
         self._check_skip()
         self._check_batch(batch, key)
 
@@ -99,28 +91,13 @@ class Method:
                 f"proposer={draft.name}"
             )
 
-    def _check_parallel(self, parallel: bool) -> None:
-        """Check that a parallel target decodes in its own way, without drafts, and no other target does."""
-        has_pass = bool(self.parts["skip"].traits.get("parallel"))
-        if has_pass and not parallel:
-            raise UsageError(
-                "skip=parallel: this target decodes token by token; policy=parallel is the shipped one that does not, "
-                "kerv train target target.parallel=true trains one"
-            )
-        if parallel and not has_pass:
-            raise UsageError("this target decodes all tokens at once and nothing else: use method=parallel")
-        idle = [f"{kind}={self.parts[kind].name}" for kind in DRAFTS if not self.parts[kind].absent]
-        if has_pass and idle:
-            raise UsageError(f"skip=parallel with {idle[0]}: nothing is drafted, leave it out")
-
     def _check_skip(self) -> None:
         """Check that a rule that executes drafts unverified has one source of whole chunks before the prefill."""
         skip, draft = self.parts["skip"], self.parts["prefill_draft"]
         joined = skip.traits.get("merges") and draft.traits.get("merged")
         if skip.traits.get("takes_draft") and not draft.traits.get("chains") and not joined:
             raise UsageError(
-                f"skip={skip.name} with prefill_draft={draft.name}: it executes what one source drafts before "
-                "the prefill, e.g. prefill_draft=early"
+                f"skip={skip.name} with prefill_draft={draft.name}: it executes a draft from before the prefill"
             )
 
     def _check_batch(self, batch: int, key: str) -> None:
@@ -136,7 +113,7 @@ class Method:
         ):
             raise UsageError(f"{key}={batch}: method={self.name} decodes one episode at a time. Leave {key} out")
         if not draft.absent and not threshold.traits.get("batchable"):
-            raise UsageError(f"{key}={batch}: threshold={threshold.name} follows one episode. Use threshold=fixed")
+            raise UsageError(f"{key}={batch}: threshold={threshold.name} follows one episode. Use another")
 
     def decoder(self, target: Target, artifact: Callable[[str], Any], task: str = "") -> Decoder:
         """Return the decoder of the method around a target.
@@ -155,8 +132,3 @@ class Method:
         for kind, part in self.parts.items():
             context.built[kind] = part.built(self.settings[kind], context)
         return Decoder(target, Parts(**context.built), self.chunk)
-
-
-def native_decoder(target: Any) -> Decoder:
-    """Return a decoder that decodes as the target was trained to: one token after the other, or all in one pass."""
-    return Decoder(target, Parts(skip=ParallelPass(target)) if is_parallel(target) else None)

@@ -61,6 +61,6 @@ class JacobiProposer(ChainProposer):
         self.guess = [*target_tokens[accepted + 1 :], *self.guess[len(target_tokens) - 1 :]]
 
 
-# without the trait `chains`: its first guess is made behind the prefill
+# without the trait `chains`: its first guess is made after the prefill
 _BUILD = "kerv_cli.methods.jacobi:JacobiProposer.build"
 add("proposer", "jacobi", _BUILD, JacobiProposerSettings, colour=0x8A7FD4, when=STATES)

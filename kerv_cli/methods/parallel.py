@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
-from kerv_cli.base.registry import NoSettings, add
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.registry import NoSettings, Part, add
 from kerv_cli.engine.parts import Skip
 
 if TYPE_CHECKING:
     from kerv_cli.engine.chunk import Chunk
+    from kerv_cli.engine.decoder import Decoder
     from kerv_cli.engine.protocol import Cache, ParallelTarget
     from kerv_cli.methods.context import Context
 
@@ -46,6 +48,41 @@ class ParallelPass(Skip):
         rows = self.target.head(hidden[:, : chunks[0].size]).argmax(-1).tolist()
         for chunk, tokens in zip(chunks, rows, strict=True):
             chunk.commit_at_once(tokens)
+
+
+def is_parallel(target: object) -> bool:
+    """Return whether a target decodes all tokens at once (`engine.protocol.ParallelTarget`)."""
+    return bool(getattr(target, "parallel", False))
+
+
+def check_parallel(parts: Mapping[str, Part], parallel: bool) -> None:
+    """Check that a parallel target decodes in its own way, without drafts, and no other target does.
+
+    Args:
+        parts: Kind -> part of a method.
+        parallel: Whether the target is parallel.
+
+    Raises:
+        UsageError: They do not fit.
+    """
+    has_pass = parts["skip"].name == "parallel"
+    if has_pass and not parallel:
+        raise UsageError(
+            "skip=parallel: this target decodes token by token. Use policy=parallel, or train a parallel target with "
+            "kerv train target target.parallel=true"
+        )
+    if parallel and not has_pass:
+        raise UsageError("this target decodes all tokens at once and nothing else: use method=parallel")
+    drafting = [f"{kind}={parts[kind].name}" for kind in ("prefill_draft", "proposer") if not parts[kind].absent]
+    if has_pass and drafting:
+        raise UsageError(f"skip=parallel with {drafting[0]}: nothing is drafted, leave it out")
+
+
+def native_decoder(target: Any) -> Decoder:
+    """Return a decoder that decodes as the target was trained to: one token after the other, or all in one pass."""
+    from kerv_cli.engine.decoder import Decoder, Parts
+
+    return Decoder(target, Parts(skip=ParallelPass(target)) if is_parallel(target) else None)
 
 
 _BUILD = "kerv_cli.methods.parallel:ParallelPass.build"

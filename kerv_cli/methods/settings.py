@@ -47,7 +47,7 @@ class MethodSettings(RunSettings):
     policy: PolicySettings = setting(PolicySettings, POLICY)
     method: str = setting("ar", "how it decodes: ar, spec_vla, kerv, heisd, one_pass, … (conf/method)")
     prefill_draft: Any = part("proposer", help="what drafts before the prefill")
-    proposer: Any = part("proposer", help="what drafts behind the prefill: none, drafter, retrieval, hold, …")
+    proposer: Any = part("proposer", help="what drafts after the prefill: none, drafter, retrieval, hold, …")
     acceptance: Any = part("acceptance", "strict", "which drafted tokens count as right: strict, relaxed, …")
     threshold: Any = part("threshold", "fixed", "how many bins a relaxed acceptance forgives: threshold.r")
     rectifier: Any = part("rectifier", "reinfer", "what becomes of rejected tokens")

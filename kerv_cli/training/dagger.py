@@ -19,7 +19,8 @@ from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.episodes.identity import hash_of
 from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.compose import Method, native_decoder
+from kerv_cli.methods.compose import Method
+from kerv_cli.methods.parallel import native_decoder
 from kerv_cli.training.settings import DemosSettings
 from kerv_cli.worlds.demos.recording import DemoConfig
 from kerv_cli.worlds.spec import EnvironmentSpec, World

@@ -122,7 +122,7 @@ class Certificate:
                 if certified.get(key) != used.get(key):
                     raise UsageError(
                         f"skip=certified with {kind}.{key}={used.get(key)}: the certificate is of "
-                        f"{certified.get(key)}; set that, or run 'kerv calibrate success' anew"
+                        f"{certified.get(key)}; set that, or run 'kerv calibrate success' again"
                     )
         if dtype != self.dtype:
             raise UsageError(f"skip=certified with runtime.dtype={dtype}: the certificate is of {self.dtype}")

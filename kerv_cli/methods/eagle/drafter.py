@@ -199,7 +199,7 @@ class DrafterProposer(Proposer):
 
 
 def _best(tokens: Tensor, parents: Tensor, scores: Tensor, nodes: int, depth: int) -> Draft:
-    # the sort is stable and children stand behind their parents: on equal scores the parent is kept first
+    # the sort is stable and children come after their parents: of equal scores the parent is kept
     best = scores.sort(descending=True, stable=True).indices[:nodes].sort().values
     index = torch.full((tokens.shape[0] + 1,), ROOT, device=tokens.device)  # its last entry is the root's
     index[best] = torch.arange(best.shape[0], device=tokens.device)

@@ -15,7 +15,7 @@ class EarlySettings:
     kind: str = "early"
     layers: int = number(2, 0, 1024)  # residual blocks
     width: int = number(384, 1, 65_536)  # hidden units
-    rank: int = number(32, 1, 65_536)  # features per token in front of the bins
+    rank: int = number(32, 1, 65_536)  # features per token before the bins
     samples: int = number(100_000, 1, 10**8)  # observations whose greedy decodes it is trained on, at most
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, number
 from kerv_cli.base.registry import DRAFTING, PREFILL, STATES, add
 
+MANIFEST = "manifest.json"
 _DATASTORE, _RULES = "kerv_cli.methods.heisd.datastore:", "kerv_cli.methods.heisd.rules:"
 
 
@@ -35,7 +36,7 @@ class QdrantSearchSettings:
     path: str | None = None  # a folder of qdrant-client's local mode, for one process at a time
 
 
-add("artifact", "datastore", _DATASTORE + "DatastoreArtifact", by_task=True, needs_task=True)
+add("artifact", "datastore", _DATASTORE + "DatastoreArtifact", by_task=True, needs_task=True, described_by=MANIFEST)
 add(
     "proposer",
     "retrieval",

@@ -30,7 +30,7 @@ from kerv_cli.base.manifests import content_of
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.methods.artifacts import Artifact, Request
-from kerv_cli.methods.heisd import QdrantSearchSettings
+from kerv_cli.methods.heisd import MANIFEST, QdrantSearchSettings
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.worlds import spec_of
 
@@ -131,7 +131,7 @@ def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
         if shared:
             raise CheckpointError(
                 f"{where} holds seed {shared[0]} of {task}: seeds from {training.stop} on are for selection and "
-                "evaluation, retrieval would have seen the episodes it is evaluated on; build it from training ones"
+                "evaluation. Retrieval would have seen the episodes of the evaluation. Build it from training seeds"
             )
 
 
@@ -397,7 +397,7 @@ class DatastoreArtifact(Artifact[Manifest]):
 
     def json(self, path: Path) -> Path:
         """Return the path of `manifest.json`."""
-        return path / "manifest.json"
+        return path / MANIFEST
 
     def read(self, path: Path) -> Manifest:
         """Return the manifest. Its seeds must be training seeds."""

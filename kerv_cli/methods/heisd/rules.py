@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import math
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from itertools import count
@@ -88,14 +88,16 @@ def neighbour_tree(
     offer(ROOT, 0, continuations.everyone, continuations.everyone, 0.0)
     while waiting and len(tokens) < nodes:
         cost, _, node, level, group, last, whole = heappop(waiting)
-        if len(tokens) + len(group) - _shared(children, node, group) > nodes:
+        known = 0  # leading tokens of the group that the tree already has
+        while known < len(group) and (node, group[known]) in children:
+            node, known = children[node, group[known]], known + 1
+        if len(tokens) + len(group) - known > nodes:
             continue  # a group is in the tree as a whole or not at all
-        for token in group:
-            if (node, token) not in children:
-                children[node, token] = len(tokens)
-                tokens.append(token)
-                parents.append(node)
-            node = children[node, token]
+        for token in group[known:]:
+            children[node, token] = len(tokens)
+            parents.append(node)
+            node = len(tokens)
+            tokens.append(token)
         offer(node, level + 1, last, whole, cost)
     return Draft.of(tokens, parents)
 
@@ -139,15 +141,6 @@ class _Continuations:
             probability = (1 - cross) * _weight(common) / of_whole + cross * _weight(members) / of_pool
             if probability > 0:
                 yield -math.log(probability), group, members, common or members
-
-
-def _shared(children: Mapping[tuple[int, int], int], node: int, group: Sequence[int]) -> int:
-    """Return how many of the group's leading tokens the tree already has below `node`."""
-    for depth, token in enumerate(group):
-        if (node, token) not in children:
-            return depth
-        node = children[node, token]
-    return len(group)
 
 
 class RetrievalProposer(ChainProposer):

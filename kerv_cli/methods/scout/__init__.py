@@ -16,7 +16,7 @@ class ScoutSettings(EarlySettings):
     kind: str = "scout"
     channels: int = number(8, 1, 4096, help="of the stem's first stage")
     keypoints: int = number(16, 1, 4096, help="image points of a view")
-    grid: int = number(4, 1, 512, help="cells per side of a view")
+    grid: int = number(4, 1, 512, help="rows and columns of cells of a view")
     cell_width: int = number(48, 1, 4096, help="numbers of a cell")
     cell_features: int = number(8, 1, 4096, help="of these, those that the network reads of each cell, beside the mean")
     word_width: int = number(32, 1, 4096, help="numbers of a word")
