@@ -224,7 +224,8 @@ def _row(part: Part, key: str) -> tuple[str, str]:
     assert at is not None
     default = choices_of(schema).get(name, _of_file(schema, name, value))
     kind = "name" if name in choices_of(schema) else _type_name(at)
-    return f"{key}={_plain(default)}", f"{kind}: {at.metadata.get('help', '')}"
+    shown = "{…}" if isinstance(default, dict) else _plain(default)
+    return f"{key}={shown}", f"{kind}: {at.metadata.get('help', '')}"
 
 
 def _of_file(schema: type, key: str, default: object) -> object:

@@ -23,7 +23,7 @@ class PolicySettings:
 
     kind: str = choice(MODEL, MODEL, EXPERT, help="expert: the environment's script, privileged, no decoding")
     target: str = setting("mt10-vision", "the policy's weights")
-    artifacts: dict[str, str | None] = setting(_unnamed, "name of each artifact; null: the one beside the target")
+    artifacts: dict[str, str | None] = setting(_unnamed, "artifacts.KIND=NAME; null: the one beside the target")
 
 
 def with_artifacts(settings: Mapping[str, Any]) -> dict[str, Any]:
