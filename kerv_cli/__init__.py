@@ -1,5 +1,7 @@
-"""kerv as a library: `import kerv_cli as kerv`. Its names are those of `kerv_cli.api`, which is imported when one is
-used first; this import loads nothing."""
+"""kerv as a library: `import kerv_cli as kerv`.
+
+Its names are those of `kerv_cli.api`, which is imported when one of them is first used. This import loads nothing.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ __all__ = ["KervError", "Policy", "Study", "load_policy", "load_study", "rollout
 
 
 def __getattr__(name: str) -> Any:
-    """A name of the API."""
+    """Return a name of the API."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module("kerv_cli.api"), name)

@@ -1,4 +1,4 @@
-"""The `kerv` command, also `python -m kerv_cli`: nothing is imported before Ctrl-C has its answer."""
+"""The `kerv` command, also `python -m kerv_cli`. Ctrl-C is handled before anything is imported."""
 
 import os
 import signal
@@ -8,7 +8,7 @@ from types import FrameType
 
 
 def main() -> None:
-    """Entry point of the `kerv` script. SIGTERM (schedulers, `timeout`) is Ctrl-C to every command."""
+    """Run the `kerv` script. SIGTERM, from schedulers and `timeout`, is Ctrl-C to every command."""
     # one that is ignored stays so: a job in the background of a shell, or behind nohup
     ours = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) is not signal.SIG_IGN]
     for number in ours:
@@ -22,7 +22,7 @@ def main() -> None:
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    """Ends the process while it only loads: an exception could surface anywhere in the middle of an import."""
+    """End the process while it loads. An exception could surface anywhere in the middle of an import."""
     os.write(2, b"kerv: interrupted\n")
     os._exit(130)
 
@@ -44,7 +44,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
-    """An interrupt that reached code which cannot raise (a finaliser, a library's callback) comes again."""
+    """Ask again for an interrupt that reached code which cannot raise, such as a finaliser or a library's callback."""
     if unraisable.exc_type is KeyboardInterrupt:
         _ask_again(signal.SIGTERM if signal.getsignal(signal.SIGINT) is signal.SIG_IGN else signal.SIGINT)
     else:
@@ -52,7 +52,7 @@ def _unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
 
 
 def _unraisable_at_the_end(unraisable: "sys.UnraisableHookArgs") -> None:
-    """After Ctrl-C, half-made objects of libraries may fail to clean up: no news to the user."""
+    """Ignore libraries' half-made objects that fail to clean up after Ctrl-C."""
     if unraisable.exc_type is KeyboardInterrupt:
         _unraisable(unraisable)
 

@@ -1,7 +1,7 @@
 """The commands as Python functions: `import kerv_cli as kerv`, then `kerv.rollout(method="one_pass", task="reach")`.
 
-Settings are those of the commands: words as they are typed (`"threshold.r=5"`) and keywords, in which a list is a list,
-a mapping sets what lies below its key (`threshold={"r": 5}`) and None is null. Nothing is printed. What kerv raises
+Settings are those of the commands. Write them as they are typed (`"threshold.r=5"`) or as keywords: a list is a list, a
+mapping sets what lies below its key (`threshold={"r": 5}`), None is null. Nothing is printed. What kerv raises
 deliberately is a KervError, whose message is one line.
 """
 
@@ -56,14 +56,15 @@ class Study:
         return self.store.root
 
     def to_pandas(self, table: str = "settings") -> pd.DataFrame:
-        """One of its tables; their columns: docs/methods.md, sections 7 and 8.
+        """Return one of its tables. Their columns are in docs/methods.md, sections 7 and 8.
 
         Args:
             table: settings: a row per setting, over all tasks. tasks: a row per task and setting. episodes: a row per
-                setting, task, seed and repeat: success, steps, forwards, seconds of inference, tokens, ….
+                setting, task, seed and repeat, with success, steps, forwards, seconds, tokens, ….
 
         Raises:
-            UsageError: no such table, or no complete episode. CheckpointError: the database is damaged.
+            UsageError: No such table, or no complete episode.
+            CheckpointError: The database is damaged.
         """
         if table not in TABLES:
             raise UnknownName("table", table, TABLES)
@@ -75,51 +76,59 @@ class Study:
         return data.table[data.table["averaging"] == MICRO].reset_index(drop=True)
 
     def episodes(self) -> list[Row]:
-        """The rows of the table of episodes; errors as `to_pandas`."""
+        """Return the rows of the table of episodes; errors as `to_pandas`."""
         return rows_of(self.to_pandas("episodes"))
 
     def report(self) -> list[Path]:
-        """Writes a sweep's tables, plots and page, as `kerv report` -> their files.
+        """Write a sweep's tables, plots and page, as `kerv report` does, and return their files.
 
         Raises:
-            UsageError: it is a rollout. KervError: as `kerv report`.
+            UsageError: It is a rollout.
+            KervError: As `kerv report`.
         """
         if self.store.kind == ROLLOUT:
             raise UsageError(f"{self.name} is a rollout: kerv reports sweeps")
         return write_report(self.store.database.results, self.name).files
 
 
-def rollout(*words: str, grid: bool = False, **settings: object) -> Study:
-    """Runs episodes of one method, as `kerv rollout`; goes on with the same rollout where one was interrupted.
+def rollout(*overrides: str, grid: bool = False, **settings: object) -> Study:
+    """Run episodes of one method, as `kerv rollout`. An interrupted rollout goes on.
 
     Args:
-        words, settings: of `kerv rollout`, e.g. `rollout("threshold.r=5", method="spec_vla", task="reach")`.
-        grid: texts with commas are grids, as with `-m`: `method="ar,one_pass"`.
+        *overrides: Settings as they are typed: `"threshold.r=5"`.
+        grid: Texts with commas are grids, as with `-m`: `method="ar,one_pass"`.
+        **settings: Settings as keywords: `method="spec_vla", task="reach"`.
 
     Raises:
-        UsageError: a setting that does not exist or cannot be. CheckpointError: no such policy, or a damaged one.
-        Interrupted: Ctrl-C; complete episodes are kept. KervError: an episode failed.
+        UsageError: A setting that does not exist or cannot be.
+        CheckpointError: No such policy, or a damaged one.
+        Interrupted: Ctrl-C; complete episodes are kept.
+        KervError: An episode failed.
     """
-    with chosen_store(as_overrides(*words, **settings)) as overrides:
-        resolved = resolve_rollout(overrides, grid)
-        planned = plan_rollout(resolved, ["rollout", *(["-m"] if grid else []), *overrides])
+    with chosen_store(as_overrides(*overrides, **settings)) as typed:
+        resolved = resolve_rollout(typed, grid)
+        planned = plan_rollout(resolved, ["rollout", *(["-m"] if grid else []), *typed])
         run(planned, save=save_recording)
     return Study(planned.store)
 
 
-def sweep(study: str | Path, *words: str, **settings: object) -> Study:
-    """Runs what a study lacks, as `kerv sweep`: every setting on every task with the same seeds, in turn.
+def sweep(study: str | Path, *overrides: str, **settings: object) -> Study:
+    """Run the missing episodes of a study, as `kerv sweep`: every setting on every task with the same seeds, in turn.
 
     Args:
-        study: a name in conf/study, or the path of such a file.
-        words, settings: of `kerv sweep`; they hold for each of the study's settings.
+        study: A name in conf/study, or the path of such a file.
+        *overrides: Settings as they are typed; they hold for each of the study's settings.
+        **settings: The same as keywords.
 
     Raises:
-        UsageError, CheckpointError, Interrupted: as `rollout`. KervError: episodes failed; the others are kept.
+        UsageError: As `rollout`.
+        CheckpointError: As `rollout`.
+        Interrupted: As `rollout`.
+        KervError: Episodes failed; the others are kept.
     """
-    with chosen_store(as_overrides(f"study={study}", *words, **settings)) as overrides:
-        resolved = resolve(overrides)
-        planned = plan(resolved, ["sweep", *overrides])
+    with chosen_store(as_overrides(f"study={study}", *overrides, **settings)) as typed:
+        resolved = resolve(typed)
+        planned = plan(resolved, ["sweep", *typed])
         analysis = decide.judge(resolved.sweep.loss, print) if resolved.sweep.until == "decided" else None
         failed = run(planned, save=save_recording, analysis=analysis).failed
     if failed:
@@ -130,30 +139,30 @@ def sweep(study: str | Path, *words: str, **settings: object) -> Study:
 
 
 def load_study(name: str, results: str | Path = "results", store: str = "") -> Study:
-    """A sweep or rollout of a results folder.
+    """Return a sweep or rollout of a results folder.
 
     Args:
-        name: as `kerv runs show` takes it: its name, a unique part of it, `last`, or a study's file.
+        name: As `kerv runs show` takes it: its name, a unique part of it, `last`, or a study's file.
         results: Folder that kerv writes to.
         store: URL of its database; empty: KERV_STORE, else SQLite in the folder.
 
     Raises:
-        UsageError: none or several have that name, or it has no episodes.
+        UsageError: None or several have that name, or it has no episodes.
     """
     with chosen_store([f"store={store}"] if store else []):
         return Study(store_of(find_run(results_dir(str(results)), study_name(name))))
 
 
 def runs(results: str | Path = "results", store: str = "", **filters: str) -> pd.DataFrame:
-    """What a results folder holds, as `kerv runs list`: a row per sweep, rollout, training, …, the newest first.
+    """Return what a results folder holds, as `kerv runs list`: a row per sweep, rollout, training, …, the newest first.
 
     Args:
         results: Folder that kerv writes to.
         store: As for `load_study`.
-        filters: kind, method, task (patterns such as `drawer*` too), state and since (ISO 8601, UTC).
+        **filters: kind, method, task (patterns such as `drawer*` too), state and since (ISO 8601, UTC).
 
     Raises:
-        UsageError: no such filter or kind.
+        UsageError: No such filter or kind.
     """
     with chosen_store([f"store={store}"] if store else []):
         there = matching(find_runs(results_dir(str(results))), filters)
@@ -163,9 +172,10 @@ def runs(results: str | Path = "results", store: str = "", **filters: str) -> pd
 class Policy:
     """A policy with a method, in this process. It answers what `kerv serve` answers (docs/serving.md).
 
-    info: its inputs and outputs: cameras, image_size (pixels), names of the numbers in the state, names and limits of
-    the D actions, control_hz, chunk (H control steps). last: the last answer whole, with `policy_timing`
-    (milliseconds) and `decode` (forwards, tokens, mode).
+    Attributes:
+        info: Its inputs and outputs: cameras, image_size (pixels), names of the numbers in the state, names and limits
+            of the D actions, control_hz, chunk (H control steps).
+        last: The whole last answer, with `policy_timing` (milliseconds) and `decode` (forwards, tokens, mode).
     """
 
     def __init__(self, served: Served) -> None:
@@ -175,20 +185,20 @@ class Policy:
         self._begins = True
 
     def reset(self) -> None:
-        """The next observation begins an episode: histories are forgotten."""
+        """Begin a new episode with the next observation: histories are forgotten."""
         self._begins = True
 
     def act(self, observation: Message, executed: int | None = None) -> np.ndarray:
-        """The actions (h, D) to execute from here, float64, environment units; h ≤ H.
+        """Return the actions (h, D) to execute now, float64, environment units; h ≤ H.
 
         Args:
-            observation: `observation/<camera>`: (size, size, 3) uint8, for several views side by side
-                (size, size × views, 3); `observation/image` where there is one camera. `observation/state`: the numbers
+            observation: `observation/<camera>`: (size, size, 3) uint8; for several views side by side
+                (size, size × views, 3); `observation/image` if there is one camera. `observation/state`: the numbers
                 that `info` names, or the whole state; positions in metres. `prompt`: the instruction.
-            executed: control steps of the last answer that were executed; None: all of them.
+            executed: Control steps of the last answer that were executed; None: all of them.
 
         Raises:
-            UsageError: something is missing, of another shape or type, or not finite; the message names it.
+            UsageError: Something is missing, of another shape or type, or not finite; the message names it.
         """
         extra = {} if executed is None else {EXECUTED: executed}
         self.last = self._client.act({**observation, **extra, RESET: self._begins})
@@ -198,19 +208,20 @@ class Policy:
 
 
 def load_policy(
-    target: str = "mt10-vision", *words: str, method: str = "one_pass", task: str = "", **settings: object
+    target: str = "mt10-vision", *overrides: str, method: str = "one_pass", task: str = "", **settings: object
 ) -> Policy:
-    """A policy that answers observations, warmed up.
+    """Return a policy that answers observations, warmed up.
 
     Args:
-        target: name of a policy of the results folder or of a shipped one, or the path of its folder.
-        method: name in conf/method, or the path of such a file.
-        task: name of the task, for parts whose levels differ between tasks.
-        words, settings: of `kerv serve`, e.g. `gripper="signed"` or `results="results"`.
+        target: Name of a policy of the results folder or of a shipped one, or the path of its folder.
+        *overrides: Settings of `kerv serve` as they are typed.
+        method: Name in conf/method, or the path of such a file.
+        task: Name of the task, for parts whose levels differ between tasks.
+        **settings: Settings of `kerv serve` as keywords: `gripper="signed"`, `results="results"`.
 
     Raises:
-        UsageError: a setting that does not exist or cannot be. CheckpointError: no such policy, or an artifact that the
-            method needs is missing or of another policy.
+        UsageError: A setting that does not exist or cannot be.
+        CheckpointError: No such policy, or an artifact that the method needs is missing or of another policy.
     """
-    typed = as_overrides(*words, **{"policy.target": target, "method": method, "task_name": task}, **settings)
+    typed = as_overrides(*overrides, **{"policy.target": target, "method": method, "task_name": task}, **settings)
     return Policy(Served(compose("serve", typed, ServeSettings)))

@@ -62,7 +62,7 @@ ANSWERS = [
     ("calibrate success margin=200", "margin=200.0: above 0, at most 99.9"),
     ("serve port=99999", "port=99999: from 0 to 65535"),
     ("demos episodes=10 seed=100000", "seed 100000 is for evaluation; seeds for training are 0 to 49999"),
-    ("runs list since=yesterday", "since=yesterday is no date: write 2026-11-23"),
+    ("runs list since=yesterday", "since=yesterday is not a date: write 2026-11-23"),
     ("rollout method=heisd boundary.f_star=25", "boundary.f_star=25.0: from 0 to 1"),
     ("rollout method=spec_vla boundary.f_star=0.3", "unknown key 'boundary.f_star'"),
     ("rollout episodes=3 episodes=4", "episodes is given twice"),

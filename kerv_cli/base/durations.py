@@ -1,18 +1,18 @@
-"""How long something takes, in the words of plans."""
+"""Durations as text, for plans and progress."""
 
 from __future__ import annotations
 
 
 def duration(seconds: float) -> str:
-    """Whole minutes; seconds below two of them."""
+    """Return whole minutes; below two minutes, seconds."""
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
 
 
 def left(seconds: float, done: float, total: float) -> str:
-    """The time left where `done` of `total` took so many seconds, e.g. `about 3 min left`."""
+    """Return the time left after `done` of `total` took so many seconds: `about 3 min left`."""
     return f"about {duration(seconds * (total / done - 1))} left"
 
 
 def about(seconds: float, source: str = "a guess") -> str:
-    """An estimate and where it comes from, e.g. `about 96 min (a guess)`."""
+    """Return an estimate and its source: `about 96 min (a guess)`."""
     return f"about {duration(seconds)} ({source})"

@@ -1,4 +1,4 @@
-"""The errors that kerv raises deliberately. The command line prints one line for each and exits with its code."""
+"""Errors that kerv raises deliberately. The command line prints each as one line and exits with its code."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 class KervError(Exception):
-    """A failure while a command ran. The message names cause, place and remedy in one line."""
+    """A failure while a command ran. The message is one line: what is wrong, where, what to type."""
 
     exit_code = 1
 
@@ -37,7 +37,7 @@ class UsageError(KervError):
 
 
 class UnknownName(UsageError):
-    """A name that no registry knows. The message names the nearest ones."""
+    """A name that nothing has. The message names the nearest ones."""
 
     def __init__(self, kind: str, name: str, names: Iterable[str]) -> None:
         names = list(names)
@@ -53,7 +53,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 
 class Interrupted(KervError):
-    """Ctrl-C. The message says what is kept and from where the same command goes on."""
+    """Ctrl-C. The message says what is kept and that the same command goes on."""
 
     exit_code = 130
 

@@ -19,9 +19,9 @@ from kerv_cli.base.errors import CheckpointError, StorageError, UsageError
 from kerv_cli.base.leftovers import clean, temporary_beside
 
 MOST_TEXT = 2**28
-"""Bytes of a JSON or YAML file; kerv's own are far smaller."""
+"""Maximum size of a JSON or YAML file in bytes; kerv's own are far smaller."""
 MOST_BYTES = 2**36
-"""Bytes of weights or of a table."""
+"""Maximum size of a file of weights or of a table, bytes."""
 
 _REFUSALS = {
     errno.ENOSPC: "the disk is full",
@@ -36,7 +36,7 @@ _REFUSALS = {
 
 @contextlib.contextmanager
 def storage_errors(path: Path) -> Iterator[None]:
-    """Turns OSErrors of a full, read-only or protected disk into a StorageError that names `path`."""
+    """Turn OSErrors of a full, read-only or protected disk into a StorageError that names `path`."""
     try:
         yield
     except OSError as error:
@@ -48,13 +48,13 @@ def storage_errors(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yields a temporary path beside `path`; when the block ends well it is synced and renamed to `path`.
+    """Yield a temporary path beside `path`. When the block ends well, it is synced and renamed to `path`.
 
-    A reader sees the old file or the new one, never a part. The parent folder is created. When the block raises,
-    the temporary file is removed and `path` stays as it was.
+    A reader sees the old file or the new one, never a part. The parent folder is created. When the block raises, the
+    temporary file is removed and `path` stays as it was.
 
     Raises:
-        StorageError: the disk is full or read-only, or the folder may not be written to.
+        StorageError: The disk is full or read-only, or the folder cannot be written.
     """
     path = Path(path)
     temporary: Path | None = None
@@ -75,13 +75,20 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def write_folder(folder: Path, fill: Callable[[Path], object], replace: bool = False) -> bool:
-    """Writes a folder atomically: `fill` gets a temporary one, which is synced and renamed -> whether it is in place.
+    """Write a folder atomically: `fill` gets a temporary one, which is synced and renamed.
 
-    replace: an older folder of that name is exchanged for the new one in one step; otherwise it stays and the new one
-    is discarded. When `fill` raises, everything stays as it was.
+    When `fill` raises, everything stays as it was.
+
+    Args:
+        folder: The folder.
+        fill: Writes the content into the folder that it is given.
+        replace: Exchange an older folder of that name for the new one in one step. Otherwise the new one is discarded.
+
+    Returns:
+        Whether the new folder is in place.
 
     Raises:
-        StorageError: the disk is full or read-only, or the folder may not be written to.
+        StorageError: The disk is full or read-only, or the folder cannot be written.
     """
     temporary = temporary_beside(folder)
     try:
@@ -102,7 +109,7 @@ def write_folder(folder: Path, fill: Callable[[Path], object], replace: bool = F
 
 
 def _rename_once(temporary: Path, folder: Path) -> bool:
-    """Renames a folder to `folder`; False if that exists already and is not empty."""
+    """Rename a folder to `folder`; return False if that exists already and is not empty."""
     try:
         os.rename(temporary, folder)
     except OSError as error:
@@ -113,7 +120,7 @@ def _rename_once(temporary: Path, folder: Path) -> bool:
 
 
 def _exchange(a: Path, b: Path) -> None:
-    """Puts folder `a` in the place of `b`: in one step, or where the file system cannot, after removing `b`."""
+    """Put folder `a` in the place of `b`: in one step, or after removing `b` if the file system cannot."""
     libc = ctypes.CDLL(None, use_errno=True)
     if hasattr(libc, "renameat2"):
         here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
@@ -124,8 +131,7 @@ def _exchange(a: Path, b: Path) -> None:
 
 
 def visible(folder: Path) -> list[Path]:
-    """Paths in a folder, by name, without hidden ones: temporaries and locks are no results. Empty where there is no
-    such folder."""
+    """Return the paths in a folder by name, without hidden ones; empty if there is no such folder."""
     try:
         return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     except OSError:
@@ -134,12 +140,12 @@ def visible(folder: Path) -> list[Path]:
 
 @functools.cache
 def _clean_once(folder: Path) -> None:
-    """Once per process and folder: a command that goes on removes what its killed predecessor left there."""
+    """Remove what a killed predecessor of this command left in a folder, once per process."""
     clean(folder)
 
 
 def sync(path: Path) -> None:
-    """fsync of a file, or of a folder's entries."""
+    """Sync a file, or the entries of a folder, to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -148,35 +154,35 @@ def sync(path: Path) -> None:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Writes a file, atomically.
+    """Write a file atomically.
 
     Raises:
-        StorageError: the disk is full or read-only, or the folder may not be written to.
+        StorageError: The disk is full or read-only, or the folder cannot be written.
     """
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes text in UTF-8, as `write_bytes`."""
+    """Write text in UTF-8 atomically; raises as `write_bytes`."""
     write_bytes(path, text.encode())
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes `value` as indented JSON, as `write_bytes`; refuses NaN and infinity, which JSON lacks.
+    """Write a value as indented JSON atomically; raises as `write_bytes`.
 
     Raises:
-        ValueError: NaN or infinity.
+        ValueError: NaN or infinity, which JSON lacks.
     """
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 def regular(path: Path, most: int = MOST_BYTES) -> Path:
-    """The path of a file that can be read to its end, for files that come from elsewhere.
+    """Return the path of a file that can be read to its end. Use it for files that come from elsewhere.
 
     Raises:
-        OSError: it is missing, or a folder, a pipe or a device, on which a reader would wait.
-        ValueError: it has more than `most` bytes.
+        OSError: It is missing, or a folder, a pipe or a device, on which a reader would wait.
+        ValueError: It has more than `most` bytes.
     """
     status = os.stat(path)
     if not stat.S_ISREG(status.st_mode):
@@ -187,15 +193,19 @@ def regular(path: Path, most: int = MOST_BYTES) -> Path:
 
 
 def read_text(path: Path) -> str:
-    """The text of a file of at most MOST_TEXT bytes; raises as `regular`, and ValueError: it is not UTF-8."""
+    """Return the text of a file of at most MOST_TEXT bytes; raises as `regular`.
+
+    Raises:
+        ValueError: It is not UTF-8.
+    """
     return regular(path, MOST_TEXT).read_text(encoding="utf-8")
 
 
 def read_json(path: Path) -> Any:
-    """The value in a JSON file.
+    """Return the value in a JSON file.
 
     Raises:
-        CheckpointError: the file is missing, no regular one, too large or not JSON.
+        CheckpointError: The file is missing, not a regular one, too large or not JSON.
     """
     try:
         return json.loads(read_text(path))
@@ -206,7 +216,11 @@ def read_json(path: Path) -> Any:
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
-    """The object in a JSON file; raises as `read_json`, and CheckpointError: it holds something else."""
+    """Return the object in a JSON file; raises as `read_json`.
+
+    Raises:
+        CheckpointError: It holds something else.
+    """
     value = read_json(path)
     if not isinstance(value, dict):
         raise CheckpointError(f"{path} cannot be read as JSON: it holds no object")
@@ -270,10 +284,10 @@ def read_yaml_lines(path: Path, what: str) -> tuple[dict[str, Any], dict[str, in
 
 
 def sha256_of(path: Path) -> str:
-    """Hex SHA-256 of a file's bytes; read once per process as long as inode, size and time of change stay the same.
+    """Return the hex SHA-256 of a file. It is read once per process while inode, size and time stay the same.
 
     Raises:
-        CheckpointError: the file is missing or unreadable.
+        CheckpointError: The file is missing or unreadable.
     """
     try:
         status = os.stat(path)

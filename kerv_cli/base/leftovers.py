@@ -1,7 +1,6 @@
-"""The hidden names that kerv writes, all of them: no catalogue lists a name that begins with a dot.
+"""Names of files and folders that are being written, and their removal after their process has died.
 
-.<name>.<host>.<process>-<8 digits>.tmp   a file or a folder that is being written, or removed; its process is named, so
-                                          that what a dead one left can be removed
+Such a name is hidden and names its process: `.<name>.<host>.<process>-<8 digits>.tmp`.
 """
 
 from __future__ import annotations
@@ -16,19 +15,19 @@ from collections.abc import Iterator
 from pathlib import Path
 
 OTHER_HOSTS_STALE_HOURS = 7 * 24.0
-"""Age from which a temporary of another machine is taken for one of a dead process, which cannot be known from here."""
+"""A temporary file of another machine is taken for a dead process's after this many hours."""
 
 _NAME = re.compile(r"\..+\.(?P<host>[^/]+?)\.(?P<pid>\d+)-[0-9a-f]{8}\.tmp")
 
 
 def temporary_beside(path: Path) -> Path:
-    """A new hidden name in the folder of `path` that names this machine and process: `.<name>.<host>.<pid>-<8>.tmp`."""
+    """Return a new hidden name beside `path` that names this machine and process."""
     mark = f"{socket.gethostname().replace('.', '-')}.{os.getpid()}-{secrets.token_hex(4)}"
     return path.with_name(f".{path.name[:150]}.{mark}.tmp")
 
 
 def is_left_over(path: Path) -> bool:
-    """Whether `path` is a temporary file or folder whose process has ended."""
+    """Return whether `path` is temporary and its process has ended."""
     match = _NAME.fullmatch(path.name)
     if match is None:
         return False
@@ -41,7 +40,7 @@ def is_left_over(path: Path) -> bool:
 
 
 def left_over(root: Path) -> Iterator[Path]:
-    """Paths that dead processes left anywhere below `root`; links are not followed."""
+    """Yield what dead processes left anywhere below `root`. Links are not followed."""
     for folder, folders, files in os.walk(root):
         paths = [Path(folder, name) for name in (*folders, *files) if is_left_over(Path(folder, name))]
         folders[:] = [name for name in folders if Path(folder, name) not in paths]
@@ -49,7 +48,7 @@ def left_over(root: Path) -> Iterator[Path]:
 
 
 def clean(folder: Path) -> list[Path]:
-    """Removes the files and folders that dead processes left in `folder` itself -> their paths."""
+    """Remove what dead processes left in `folder` itself, and return the paths."""
     paths = [path for path in folder.glob(".*.tmp") if is_left_over(path)]
     for path in paths:
         remove(path)
@@ -57,7 +56,7 @@ def clean(folder: Path) -> list[Path]:
 
 
 def remove(path: Path) -> None:
-    """Removes a file or a folder; what cannot be removed stays."""
+    """Remove a file or a folder. What cannot be removed stays."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -65,7 +64,7 @@ def remove(path: Path) -> None:
 
 
 def is_alive(pid: int) -> bool:
-    """Whether a process of this machine has that number."""
+    """Return whether a process of this machine has that number."""
     try:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):

@@ -1,4 +1,4 @@
-"""The range of every setting: stated beside its default, checked wherever settings are composed or read from disk."""
+"""The range of every setting. It is stated beside the default, and checked whenever settings are composed or read."""
 
 from __future__ import annotations
 
@@ -15,12 +15,17 @@ MOST_BINS = 65_536
 MOST_DECODES = 1_000_000  # of an episode, in which a setting may count
 
 PLAIN_NAME = re.compile(r"\w[\w.+-]{0,199}")
-"""Names of folders below `results`: no separators, not hidden, never `..`."""
+"""Names of folders in the results folder: no separators, not hidden, never `..`."""
 
 
 def setting(default: Any, help: str = "", **metadata: Any) -> Any:
-    """A field of a settings dataclass. default: a value, or what makes one: a dataclass, a function. help: what it is,
-    in one line without the default, for `--help` and `--cfg`."""
+    """Return a field of a settings dataclass.
+
+    Args:
+        default: A value, or a dataclass or function that makes one.
+        help: What the setting is, in one line without its default, for `--help` and `--cfg`.
+        **metadata: Further facts about the field.
+    """
     metadata |= {"help": help} if help else {}
     if callable(default):
         return field(default_factory=default, metadata=metadata)
@@ -30,25 +35,30 @@ def setting(default: Any, help: str = "", **metadata: Any) -> Any:
 
 
 def limits(least: float = -math.inf, most: float = math.inf, above: float = -math.inf) -> dict[str, Any]:
-    """Metadata of a field whose numbers lie in least ≤ value ≤ most and value > above: itself, or every element of a
-    list. None is let through, NaN never."""
+    """Return metadata for a field whose numbers lie in `least` ≤ value ≤ `most` and above `above`.
+
+    They hold for the value itself, or for each element of a list. None is allowed, NaN is not.
+    """
     return {"limits": (least, most, above)}
 
 
 def number(
     default: float | None, least: float = -math.inf, most: float = math.inf, above: float = -math.inf, help: str = ""
 ) -> Any:
-    """A `setting` with `limits`."""
+    """Return a `setting` with `limits`."""
     return setting(default, help, **limits(least, most, above))
 
 
 def choice(default: str, *names: str, help: str = "") -> Any:
-    """A `setting` that is one of `names`; the default among them."""
+    """Return a `setting` that is one of `names`. The default is one of them."""
     return setting(default, help, names=names)
 
 
 def field_of(schema: type, key: str) -> tuple[Field[Any] | None, Any]:
-    """The field of a dotted key of a settings class, and its default; None for what only a part that is chosen has."""
+    """Return the field of a dotted key of a settings class, and its default.
+
+    Both are None for a key that only a chosen part has.
+    """
     value, at = schema(), None
     for name in key.split("."):
         at = next((at for at in fields(value) if at.name == name), None) if is_dataclass(value) else None
@@ -57,15 +67,15 @@ def field_of(schema: type, key: str) -> tuple[Field[Any] | None, Any]:
 
 
 def description(at: Field[Any]) -> str:
-    """What a setting is: its `help`, behind the names of a `choice`."""
+    """Return what a setting is: its `help`, after the names that it can have."""
     return ": ".join(filter(None, (" | ".join(at.metadata.get("names", ())), at.metadata.get("help", ""))))
 
 
 def check_name(name: str, what: str) -> str:
-    """`name`, which must be a plain folder name.
+    """Return `name`, which must be a plain folder name.
 
     Raises:
-        UsageError: it is not.
+        UsageError: It is not.
     """
     if not PLAIN_NAME.fullmatch(name):
         raise UsageError(
@@ -75,10 +85,10 @@ def check_name(name: str, what: str) -> str:
 
 
 def check_label(label: str) -> str:
-    """The name of a setting: one printable line, which no spreadsheet takes for a formula.
+    """Return the label of a setting, which must be one printable line.
 
     Raises:
-        UsageError: it is not.
+        UsageError: It is not.
     """
     if not 0 < len(label) <= 1000 or not label.isprintable():
         raise UsageError(f"'{' '.join(label[:80].split())}' names no setting: write one line of text")
@@ -86,11 +96,16 @@ def check_label(label: str) -> str:
 
 
 def check_settings(settings: Any, what: str = "") -> None:
-    """Checks a dataclass and those within it: types of list elements, limits, choices, then what each says about its
-    fields together in a method `check_together`. what: the dotted key of `settings` in messages, empty for the root.
+    """Check a dataclass of settings and those inside it: types of elements, limits, choices.
+
+    A dataclass can check its fields together in a method `check_together`.
+
+    Args:
+        settings: The dataclass.
+        what: Its dotted key in messages; empty for the root.
 
     Raises:
-        UsageError: the first setting that is wrong.
+        UsageError: The first setting that is wrong.
     """
     prefix = f"{what}." if what else ""
     for at, element in _declared(type(settings)):  # type: ignore[arg-type]
@@ -111,7 +126,7 @@ def check_settings(settings: Any, what: str = "") -> None:
 
 @functools.cache
 def _declared(kind: type) -> tuple[tuple[Field[Any], type | None], ...]:
-    """A dataclass's fields, and the type of their elements where they are lists or dicts of plain ones."""
+    """Return the fields of a dataclass, each with the type of its elements if it is a list or dict of plain values."""
     hints = get_type_hints(kind)
 
     def element(name: str) -> type | None:

@@ -1,4 +1,4 @@
-"""Reads JSON that describes an artifact into a dataclass, checked field by field."""
+"""Read JSON that describes an artifact into a dataclass. Every field is checked."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from kerv_cli.base.limits import check_settings
 T = TypeVar("T")
 
 _UNKNOWN = "unexpected_keyword_argument"
-"""pydantic's name for a field that a dataclass does not have."""
+"""Pydantic's name for a field that a dataclass does not have."""
 
 
 @functools.cache
@@ -31,7 +31,7 @@ def _adapter(kind: Any) -> Any:
 
 
 def _forbid_unknown(kind: Any) -> None:
-    """Makes pydantic refuse unknown fields and NaN or infinity in a dataclass and in those that its fields hold."""
+    """Make pydantic refuse unknown fields, NaN and infinity, in a dataclass and in those that its fields hold."""
     if dataclasses.is_dataclass(kind) and not hasattr(kind, "__pydantic_config__"):
         setattr(kind, "__pydantic_config__", {"extra": "forbid", "allow_inf_nan": False})  # noqa: B010
         for hint in get_type_hints(kind).values():
@@ -41,11 +41,16 @@ def _forbid_unknown(kind: Any) -> None:
 
 
 def read(kind: type[T], value: Any, what: str, tolerant: bool = False) -> T:
-    """`value` (what JSON gives) as an instance of the dataclass `kind`, nested ones included. tolerant: fields that
-    this kerv does not know, e.g. of a newer one, are left out instead of refused.
+    """Return plain values as an instance of a dataclass, with the dataclasses inside it.
+
+    Args:
+        kind: The dataclass.
+        value: Plain values, as JSON has them.
+        what: How messages call them.
+        tolerant: Leave out unknown fields, such as those of a newer kerv, instead of refusing them.
 
     Raises:
-        CheckpointError: a field is missing, unknown or of another type; the line names the first one.
+        CheckpointError: A field is missing, unknown or of another type. The message names the first one.
     """
     from pydantic import ValidationError
 
@@ -73,25 +78,30 @@ def _without(value: Any, fields: list[tuple[int | str, ...]]) -> Any:
 
 
 def read_file(kind: type[T], path: Path) -> T:
-    """The JSON file at `path` as an instance of `kind`; unknown fields are left out.
+    """Return a JSON file as an instance of a dataclass. Unknown fields are left out.
 
     Raises:
-        CheckpointError: the file is missing, no JSON, or not of this kind.
+        CheckpointError: The file is missing, not JSON, or does not fit.
     """
     return read(kind, read_mapping(path), str(path), tolerant=True)
 
 
 def content_of(key: Sequence[str], chunk: int, target: str, files: Mapping[str, str]) -> str:
-    """Hash by which others name a datastore: over its keys, chunk and target (docs/formats.md)."""
+    """Return the hash by which others name a datastore, over its keys, chunk and target (docs/formats.md)."""
     text = json.dumps([key, chunk, target, sorted(files.items())])
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def check_files(folder: Path, files: Mapping[str, str], again: str) -> None:
-    """Checks that the files in `folder` are those that its manifest names. files: name -> SHA-256; again: the remedy.
+    """Check that the files in a folder are those that its manifest names.
+
+    Args:
+        folder: The folder.
+        files: Name -> SHA-256.
+        again: What to do if they are not.
 
     Raises:
-        CheckpointError: one is missing or changed.
+        CheckpointError: A file is missing or changed.
     """
     for name, digest in files.items():
         if sha256_of(folder / name) != digest:

@@ -1,4 +1,4 @@
-"""Paths below the results folder (docs/formats.md)."""
+"""Paths in the results folder (docs/formats.md)."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from kerv_cli.base.limits import check_name
 
 
 def results_dir(results: str) -> Path:
-    """The results folder.
+    """Return the results folder.
 
     Raises:
-        UsageError: it is a file, or no path.
+        UsageError: It is a file, or not a path.
     """
     path = as_path(results)
     if path.exists() and not path.is_dir():
@@ -23,12 +23,14 @@ def results_dir(results: str) -> Path:
 
 
 def check_writable(results: str) -> Path:
-    """Refuses a results folder that nothing could be stored in, before anything is computed for it -> the folder, or
-    the nearest of those above it that exists. Leaves no trace.
+    """Refuse a results folder that cannot be written, before anything is computed for it. Leaves no trace.
+
+    Returns:
+        The folder, or the nearest folder above it that exists.
 
     Raises:
-        UsageError: it is a file, or lies below one.
-        StorageError: the disk is full or read-only, or permission is missing.
+        UsageError: It is a file, or lies below one.
+        StorageError: The disk is full or read-only, or permission is missing.
     """
     folder = results_dir(results)
     parent = next(path for path in (folder, *folder.absolute().parents) if path.exists())
@@ -44,10 +46,10 @@ def check_writable(results: str) -> Path:
 
 
 def artifact(results: str, kind: str, name: str) -> Path:
-    """Folder of a trained or built artifact: results/artifacts/<kind>/<name>, or `name` itself with a slash in it.
+    """Return the folder of an artifact: results/artifacts/<kind>/<name>, or `name` itself if it has a slash.
 
     Raises:
-        UsageError: neither a plain folder name nor a path.
+        UsageError: Neither a plain folder name nor a path.
     """
     if "/" in name:
         return as_path(name)
@@ -55,7 +57,11 @@ def artifact(results: str, kind: str, name: str) -> Path:
 
 
 def as_path(text: str) -> Path:
-    """A path that a user wrote; raises UsageError for one that no file system takes."""
+    """Return a path that a user wrote.
+
+    Raises:
+        UsageError: No file system takes it.
+    """
     if "\0" in text or any(len(part.encode()) > 255 for part in text.split("/")) or len(text) > 4000:
         raise UsageError(f"'{text[:80]}…' is no path")
     return Path(text).expanduser()

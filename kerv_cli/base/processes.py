@@ -1,4 +1,4 @@
-"""Processes that kerv starts end with the one that started them, also where that is killed."""
+"""Let worker processes end together with the process that started them, even if that one is killed."""
 
 from __future__ import annotations
 
@@ -13,15 +13,18 @@ import time
 from kerv_cli.base.errors import KervError
 
 WATCH_SECONDS = 1.0
-"""Between two looks at whether the parent lives."""
+"""Seconds between two looks at whether the parent process lives."""
 
 _PR_SET_PDEATHSIG = 1
 
 
 def end_with(parent: int) -> None:
-    """End this process within seconds of its parent's end. parent: the parent's process number.
+    """End this process within seconds of its parent's end.
 
-    On Linux the kernel does so, also if this process is stopped.
+    On Linux the kernel does it, even if this process is stopped.
+
+    Args:
+        parent: Number of the parent process.
     """
     with contextlib.suppress(OSError, AttributeError):  # not Linux
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -35,10 +38,10 @@ def end_with(parent: int) -> None:
 
 
 def check_workers() -> None:
-    """Refuses worker processes where they could not wait for each other.
+    """Refuse worker processes on a machine where they could not wait for each other.
 
     Raises:
-        KervError: no semaphores, on Linux because of /dev/shm.
+        KervError: No semaphores; on Linux because of /dev/shm.
     """
     try:
         multiprocessing.get_context("fork").Lock()
@@ -47,6 +50,6 @@ def check_workers() -> None:
 
 
 def begin_worker(parent: int) -> None:
-    """Start-up of a worker process: it ends with its parent, which alone handles Ctrl-C."""
+    """Start a worker process: it ends with its parent, and only the parent handles Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with(parent)

@@ -1,11 +1,9 @@
-"""What kerv is put together from: parts of a method, artifacts, targets, environments and executors, by kind and name.
+"""The parts that kerv is put together from, by kind and name: proposers, artifacts, targets, environments, commands.
 
-Names, settings and needs are known without importing torch or MuJoCo. `build` names what makes the part,
-`module:function` or `module:Class.method`, whose module is imported when the part is built. Everything that depends on
-which parts there are derives from here: what a method loads, the identity of its results, which compositions are
-refused, completion, `--cfg`, colours.
+Names, settings and needs of a part are known without importing torch or MuJoCo. `build` names the code that makes the
+part, `module:function` or `module:Class.method`; the module is imported when the part is built.
 
-A package adds parts by an entry point of the group `kerv.parts`, a file by `KERV_PLUGINS=module,…`: the module is
+A package adds parts by an entry point of the group `kerv.parts`, a file by `KERV_PLUGINS=module,…`. Its module is
 imported and registers its parts.
 """
 
@@ -43,8 +41,9 @@ MODULES = (
     "kerv_cli.methods.certified",
     "kerv_cli.lab.executors",
 )
-"""Modules that register kerv's own parts when they are imported, as plugins do; none imports anything heavy. Messages
-list parts in this order."""
+"""Modules that register kerv's own parts when they are imported. None imports anything heavy. Messages list parts in
+this order.
+"""
 
 METHOD_KINDS = ("prefill_draft", "proposer", "acceptance", "threshold", "rectifier", "boundary", "skip")
 """The parts of a method, in the order in which a decode uses them."""
@@ -64,7 +63,7 @@ PREFILL, STATES = "prefill", "states"
 
 @dataclass
 class NoSettings:
-    """A part without settings but its name."""
+    """Settings of a part that has none but its name."""
 
     kind: str = "none"
 
@@ -73,12 +72,16 @@ class NoSettings:
 class Part:
     """One choice among the parts of a kind.
 
-    kind: proposer, acceptance, threshold, rectifier, boundary, skip, datastore, predictor, artifact, drafter,
-    target, environment, stress, executor, column or command. build: `module:function` or `module:Class.method`; its
-    arguments are documented where the kind is used, of a method's parts in `methods/context.py`.
-    settings: dataclass of its settings, with defaults; limits by `limits.number`. needs: artifact kinds that these
-    settings need, of an artifact those that it is made from. colour: 0xRRGGBB of its rows, lines and timeline.
-    traits: what others need to know of the part. Their names are in `docs/extending.md`.
+    Args:
+        kind: proposer, acceptance, threshold, rectifier, boundary, skip, datastore, predictor, artifact, drafter,
+            target, environment, stress, executor, column or command.
+        name: The name by which it is chosen.
+        build: `module:function` or `module:Class.method`. Its arguments are documented where the kind is used,
+            those of a method's parts in `methods/context.py`.
+        settings: Dataclass of its settings, with defaults and limits.
+        needs: Kinds of artifacts that these settings need; for an artifact, those that it is made from.
+        colour: 0xRRGGBB of its rows, lines and timeline.
+        traits: What others need to know of the part. docs/extending.md lists their names.
     """
 
     kind: str
@@ -91,16 +94,16 @@ class Part:
 
     @property
     def absent(self) -> bool:
-        """Whether it stands for the absence of a part, e.g. `proposer=none`."""
+        """Whether it stands for the absence of a part, such as `proposer=none`."""
         return not self.build
 
     @property
     def default(self) -> Any:
-        """Its settings where none are given."""
+        """Its default settings."""
         return self.settings(kind=self.name)
 
     def built(self, *arguments: Any, **keywords: Any) -> Any:
-        """Import and call `build`; None for an absent part."""
+        """Import and call `build`; return None for an absent part."""
         return load(self.build)(*arguments, **keywords) if self.build else None
 
 
@@ -108,10 +111,10 @@ _PARTS: dict[str, dict[str, Part]] = {}
 
 
 def register(part: Part) -> Part:
-    """Adds a part. The same code can register a name again, e.g. when a module is reloaded.
+    """Add a part. The same code can register a name again, for example when a module is reloaded.
 
     Raises:
-        UsageError: another part of that kind has the name.
+        UsageError: Another part of that kind has the name.
     """
     other = _PARTS.setdefault(part.kind, {}).get(part.name)
     if other is not None and other.build != part.build:
@@ -129,7 +132,17 @@ def add(
     colour: int | None = None,
     **traits: Any,
 ) -> None:
-    """Registers a part of these fields. needs: a tuple where the settings do not matter."""
+    """Register a part with these fields.
+
+    Args:
+        kind: Kind of part.
+        name: Its name.
+        build: `module:function` that makes it.
+        settings: Dataclass of its settings.
+        needs: Kinds of artifacts that it needs, or a function of its settings.
+        colour: 0xRRGGBB.
+        **traits: What others need to know of the part.
+    """
     register(Part(kind, name, build, settings, needs if callable(needs) else lambda _: needs, colour, traits))
 
 
@@ -161,10 +174,10 @@ def add_drafter(
 
 
 def load(name: str) -> Any:
-    """Imports the object that `module:attribute` or `module:attribute.attribute` names.
+    """Import the object that `module:attribute` or `module:attribute.attribute` names.
 
     Raises:
-        UsageError: no such module or attribute.
+        UsageError: No such module or attribute.
     """
     module, _, attribute = name.partition(":")
     try:
@@ -178,10 +191,15 @@ def load(name: str) -> Any:
 
 
 def find(kind: str, name: str, what: str = "") -> Part:
-    """The part of that kind and name. what: how the message calls the kind.
+    """Return the part of a kind and name.
+
+    Args:
+        kind: Kind of part.
+        name: Its name.
+        what: How the message calls the kind.
 
     Raises:
-        UnknownName: there is none; the message names the nearest ones.
+        UnknownName: There is none. The message names the nearest ones.
     """
     by_name = parts(kind)
     if not isinstance(name, str) or name not in by_name:  # a damaged file may hold anything
@@ -190,22 +208,22 @@ def find(kind: str, name: str, what: str = "") -> Part:
 
 
 def part_of(group: str, name: str) -> Part:
-    """The part that a group of settings chooses; an in-prefill draft's part is an ordinary proposer.
+    """Return the part that a group of settings chooses. The part of a prefill draft is an ordinary proposer.
 
     Raises:
-        UnknownName: there is none.
+        UnknownName: There is none.
     """
     return find("proposer" if group == "prefill_draft" else group, name, f"{group}.kind")
 
 
 def parts(kind: str) -> Mapping[str, Part]:
-    """All parts of a kind by name, in the order of registration."""
+    """Return all parts of a kind by name, in the order of registration."""
     load_plugins()
     return _PARTS.get(kind, {})
 
 
 def kinds() -> tuple[str, ...]:
-    """Every kind that has parts."""
+    """Return every kind that has parts."""
     load_plugins()
     return tuple(_PARTS)
 

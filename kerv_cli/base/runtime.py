@@ -1,4 +1,4 @@
-"""Device, dtype and threads of a process."""
+"""Device, number format and threads of a process."""
 
 from __future__ import annotations
 
@@ -14,10 +14,13 @@ DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch
 
 
 def set_up(settings: RuntimeSettings) -> tuple[str, torch.dtype]:
-    """Applies `settings` to this process -> (device, dtype).
+    """Apply runtime settings to this process.
+
+    Returns:
+        The device and the number format.
 
     Raises:
-        UsageError: no such device here, or a setting out of range.
+        UsageError: No such device here, or a setting out of range.
     """
     check_settings(settings, "runtime")
     device = settings.device

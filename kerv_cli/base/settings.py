@@ -1,7 +1,6 @@
-"""The settings of every command, as plain dataclasses: name, type, default, range and description of each, once.
+"""Settings that all commands share, as plain dataclasses. Each field states type, default, range and description once.
 
-`groups` names the folders of `conf/` that a command's settings choose from, and the choice without a word. Nothing
-heavy is imported here: a wrong override is answered before torch or MuJoCo load.
+Nothing heavy is imported here, so a wrong override is answered before torch or MuJoCo load.
 """
 
 from __future__ import annotations
@@ -18,12 +17,12 @@ S = TypeVar("S")
 
 
 def chosen(kind: str, name: str = "none") -> Callable[[], Any]:
-    """Makes the settings of the part `name`: the default of a group."""
+    """Return a function that makes the settings of a part: the default of a group."""
     return lambda: find(kind, name).default
 
 
 def part(kind: str, name: str = "none", help: str = "") -> Any:
-    """A field with the settings of one of the parts of a kind; the field's name is a group of conf/."""
+    """Return a field with the settings of a part of a kind. The field's name is a group of conf/."""
     return setting(chosen(kind, name), help, group=name)
 
 
@@ -44,7 +43,7 @@ class CommandSettings:
     """Settings of every command."""
 
     groups: ClassVar[Mapping[str, str]] = {}
-    """Groups of conf/ -> the choice without a word, in the order of composition: a later one outranks an earlier."""
+    """Groups of conf/ -> default choice, in the order of composition: a later one outranks an earlier one."""
 
     results: str = setting("results", "folder of everything that kerv makes")
     store: str = setting(
@@ -69,17 +68,17 @@ class TaskSettings(RunSettings):
 
 
 def choices_of(schema: type) -> dict[str, str]:
-    """The groups that these settings choose from -> the choice without a word, in the order of composition."""
+    """Return the groups that these settings choose from -> the default choice, in the order of composition."""
     parts = {at.name: str(at.metadata["group"]) for at in fields(schema) if "group" in at.metadata}
     return parts | dict(getattr(schema, "groups", {}))
 
 
 def read_settings(schema: type[S], plain: Mapping[str, Any]) -> S:
-    """Settings of the class `schema` from nested dicts and lists, the inverse of `asdict`. The settings of a part get
-    the class that its registration names.
+    """Return settings from nested dicts and lists, the inverse of `asdict`. Each part gets its own settings class.
 
     Raises:
-        CheckpointError: not such settings. UnknownName: a part that is not registered here.
+        CheckpointError: They are not such settings.
+        UnknownName: A part that is not registered here.
     """
     settings = manifests.read(schema, plain, "a stored setting")
     for group in SETTINGS_GROUPS:

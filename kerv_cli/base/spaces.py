@@ -1,10 +1,10 @@
-"""Action and observation spaces as data: constants of a robot or simulator stand in environments alone.
+"""Action and observation spaces as data. Numbers of a robot or simulator stand in environments only.
 
-An environment has an `ActionSpace` and an `ObservationSpace`, and every artifact made from it stores them: target,
-drafter, datastore, calibration. Artifacts of different action spaces are refused together (`check_same`).
+An environment has an `ActionSpace` and an `ObservationSpace`. Every artifact made from it stores them: target, drafter,
+datastore, calibration. Artifacts of different action spaces cannot be used together (`check_same`).
 
 Notation (docs/methods.md §0): D degrees of freedom (DoFs) per control step, H control steps per chunk, N = H · D
-tokens; token j is control step j // D, DoF j % D.
+tokens; token j belongs to control step j // D and DoF j % D.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from kerv_cli.base.errors import CheckpointError, KervError
 
 @dataclass(frozen=True)
 class Group:
-    """A kinematic group: neighbouring DoFs that are drafted and accepted together, e.g. position or rotation."""
+    """A kinematic group: neighbouring DoFs that are drafted and accepted together, such as position or rotation."""
 
     name: str
     size: int  # DoFs
@@ -31,16 +31,21 @@ class Group:
 class ActionSpace:
     """The actions of one control step, and their tokens.
 
-    names: of the D DoFs, in the tokens' order. groups: kinematic groups, in order; their sizes add up to D. strict: the
-    DoFs whose draft tokens must equal the target's and which are held, never extrapolated (a gripper opens or closes).
-    control_hz: control steps per second. low, high: (D,) in environment units, what -1 and 1 of the normalised range
-    mean; an environment gives its limits, a policy the 1st and 99th percentile of its demonstrations. bins: edges on
-    [-1, 1]; a token is the index of one of the bins - 1 intervals (OpenVLA: 256 edges, 255 centres). end_token: there
-    is one token more, for the upper end itself, which decodes like the last interval (published OpenVLA checkpoints
-    were trained with it: a value of exactly 1 has an id of its own).
+    Args:
+        names: Names of the D DoFs, in the order of the tokens.
+        groups: Kinematic groups in order. Their sizes add up to D.
+        strict: DoFs whose drafted tokens must equal the target's. They are held, never extrapolated: a gripper opens or
+            closes.
+        control_hz: Control steps per second.
+        low: (D,) environment units; the action that -1 of the normalised range means. An environment gives its limits,
+            a policy the 1st percentile of its demonstrations.
+        high: (D,) environment units; the action that 1 means, or the 99th percentile.
+        bins: Number of edges on [-1, 1]. A token is the index of one of the bins - 1 intervals (OpenVLA: 256 edges).
+        end_token: Whether the upper end has a token of its own, which decodes like the last interval. Published OpenVLA
+            checkpoints were trained with it.
 
     Raises:
-        ValueError: numbers that do not fit together.
+        ValueError: The numbers do not fit together.
     """
 
     names: tuple[str, ...]
@@ -67,7 +72,7 @@ class ActionSpace:
             raise ValueError(f"bins {self.bins} must be at least 3, control_hz {self.control_hz} above 0")
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON; `end_token` only where it is set, so that other spaces are written as ever."""
+        """Return plain values for JSON; `end_token` only if it is set."""
         plain = asdict(self)
         if not self.end_token:
             del plain["end_token"]
@@ -75,17 +80,17 @@ class ActionSpace:
 
     @property
     def dofs(self) -> int:
-        """D."""
+        """Number of degrees of freedom, D."""
         return len(self.names)
 
     @property
     def tokens(self) -> int:
-        """Size of the vocabulary: one token per bin, and the end token where there is one."""
+        """Size of the vocabulary."""
         return self.bins - 1 + self.end_token
 
     @cached_property
     def edges(self) -> np.ndarray:
-        """(bins,) on [-1, 1]."""
+        """(bins,) edges of the bins on [-1, 1]."""
         return np.linspace(-1.0, 1.0, self.bins)
 
     @cached_property
@@ -96,22 +101,22 @@ class ActionSpace:
 
     @cached_property
     def middle(self) -> np.ndarray:
-        """(D,) environment units, the middle of every DoF's limits."""
+        """(D,) middle of every DoF's limits, environment units."""
         return (np.asarray(self.high) + np.asarray(self.low)) / 2
 
     @cached_property
     def half(self) -> np.ndarray:
-        """(D,) environment units, half of every DoF's range."""
+        """(D,) half of every DoF's range, environment units."""
         return (np.asarray(self.high) - np.asarray(self.low)) / 2
 
     @cached_property
     def is_strict(self) -> np.ndarray:
-        """(D,) bool."""
+        """(D,) bool, which DoFs are strict."""
         return np.array([name in self.strict for name in self.names])
 
     @cached_property
     def bounds(self) -> tuple[tuple[int, int], ...]:
-        """Per DoF: the first DoF of its group, and one past the last."""
+        """For each DoF, the first DoF of its group and one past the last."""
         ranges, first = [], 0
         for group in self.groups:
             ranges += [(first, first + group.size)] * group.size
@@ -119,10 +124,10 @@ class ActionSpace:
         return tuple(ranges)
 
     def dofs_of(self, name: str) -> slice:
-        """The DoFs of a kinematic group.
+        """Return the DoFs of a kinematic group.
 
         Raises:
-            KervError: no such group.
+            KervError: No such group.
         """
         first = 0
         for group in self.groups:
@@ -132,8 +137,10 @@ class ActionSpace:
         raise KervError(f"the actions have no group '{name}'")
 
     def segments(self, start: int, stop: int) -> Iterator[tuple[int, int, bool]]:
-        """Chunk indices [first, last) of every group between `start` and `stop`, and whether all its DoFs are strict.
-        A group that lies partly outside is cut."""
+        """Yield the groups between two chunk indices: first index, one past the last, whether all are strict.
+
+        A group that lies partly outside is cut.
+        """
         while start < stop:
             step, dof = divmod(start, self.dofs)
             first, end = self.bounds[dof]
@@ -142,48 +149,51 @@ class ActionSpace:
             start = last
 
     def strict_tokens(self, size: int) -> np.ndarray:
-        """(size,) bool: which of a chunk's first `size` tokens belong to a strict DoF."""
+        """Return (size,) bool: which of a chunk's first `size` tokens belong to a strict DoF."""
         return np.resize(self.is_strict, size)
 
     def normalise(self, actions: np.ndarray) -> np.ndarray:
-        """(..., D) environment units -> [-1, 1], clipped."""
+        """Map (..., D) actions in environment units to [-1, 1], clipped."""
         low, high = np.asarray(self.low), np.asarray(self.high)
         return np.clip(2.0 * (actions - low) / (high - low) - 1.0, -1.0, 1.0)
 
     def unnormalise(self, values: np.ndarray) -> np.ndarray:
-        """(..., D) in [-1, 1] -> environment units."""
+        """Map (..., D) values in [-1, 1] to environment units."""
         low, high = np.asarray(self.low), np.asarray(self.high)
         return (values + 1.0) / 2.0 * (high - low) + low
 
     def bins_of(self, values: np.ndarray) -> np.ndarray:
-        """Normalised values -> int64 tokens of the same shape. Both ends belong to the outermost bins; with an end
-        token the upper end is that."""
+        """Return the int64 tokens of normalised values. Values at the ends belong to the outermost tokens."""
         return np.clip(np.digitize(values, self.edges) - 1, 0, self.tokens - 1).astype(np.int64)
 
     def values_of(self, tokens: np.ndarray) -> np.ndarray:
-        """Tokens -> normalised values of the same shape, the bins' centres."""
+        """Return the normalised values of tokens: the centres of their bins."""
         return self.centres[np.asarray(tokens)]
 
     def encode(self, actions: np.ndarray) -> np.ndarray:
-        """(..., D) environment units -> (..., D) int64 tokens."""
+        """Return the (..., D) int64 tokens of actions in environment units."""
         return self.bins_of(self.normalise(actions))
 
     def decode(self, tokens: np.ndarray) -> np.ndarray:
-        """(..., D) tokens -> (..., D) environment units; the centre of each bin."""
+        """Return the (..., D) actions of tokens in environment units: the centres of their bins."""
         return self.unnormalise(self.values_of(tokens))
 
     def fitted(self, actions: np.ndarray) -> ActionSpace:
-        """This space, normalised by the 1st and 99th percentile of actions (n, D) in environment units."""
+        """Return this space with the 1st and 99th percentile of actions (n, D) as its limits."""
         low, high = action_limits(*np.percentile(actions, [1, 99], axis=0))
         return replace(self, low=low, high=high)
 
     def check_same(self, other: ActionSpace, here: str, there: str, statistics: bool = False) -> None:
-        """Refuses another action space: names, groups, strict DoFs, bins and control rate; with `statistics` the
-        normalisation too, without which the same token is another action. here, there: names of the two owners for
-        the message.
+        """Refuse another action space: names, groups, strict DoFs, bins and control rate.
+
+        Args:
+            other: The other space.
+            here: Name of this space's owner in the message.
+            there: Name of the other's owner.
+            statistics: Compare the normalisation too. With another one, the same token is another action.
 
         Raises:
-            CheckpointError: they differ; the message names the first difference.
+            CheckpointError: They differ. The message names the first difference.
         """
         normalisation = ("low", "high", "end_token") if statistics else ()
         for name in ("names", "groups", "strict", "bins", "control_hz", *normalisation):
@@ -198,8 +208,10 @@ class ActionSpace:
 
 
 def action_limits(low: np.ndarray, high: np.ndarray) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """The limits of an ActionSpace from `low` and `high` (D,) of its actions: a DoF that never moves gets a unit to
-    either side of its value."""
+    """Return the limits of an ActionSpace from the lowest and highest actions, (D,) each.
+
+    A DoF that never moves gets one unit to either side of its value.
+    """
     still = high - low < 1e-6
     low, high = np.where(still, low - 1.0, low), np.where(still, high + 1.0, high)
     return tuple(low.tolist()), tuple(high.tolist())
@@ -223,11 +235,15 @@ class Place:
 class ObservationSpace:
     """The observations of an environment besides images.
 
-    proprioception: names of its numbers; the first three are the end effector's position in metres. state: how many
-    privileged numbers there are. places: positions in the state that a policy may estimate from images, e.g. object and
-    goal; all others are only for a policy that is given the state. extra: further indices of the state that such a
-    policy reads as they are. previous: (how many numbers, first index of the step before's copy of them), or None; such
-    a policy reads their differences. centre: metres, the middle of the workspace.
+    Args:
+        proprioception: Names of its numbers. The first three are the end effector's position in metres.
+        state: Number of privileged numbers.
+        places: Positions in the state that a policy can estimate from images, such as object and goal.
+        centre: Middle of the workspace, metres.
+        extra_places: Further positions, only for a policy that is given the state.
+        extra: Further indices of the state that such a policy reads as they are.
+        previous: (how many numbers, first index of their copy from the step before), or None. Such a policy reads the
+            differences.
     """
 
     proprioception: tuple[str, ...]
@@ -239,7 +255,7 @@ class ObservationSpace:
     previous: tuple[int, int] | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """Return plain values for JSON."""
         return asdict(self)
 
 
@@ -247,8 +263,11 @@ class ObservationSpace:
 class Observation:
     """One observation, the input of a decode.
 
-    proprioception: (p,) float64, the robot's own measurements. state: (s,) float64, privileged. instruction: the task
-    in words. images: camera name -> (h, w, 3) uint8, only those that were requested.
+    Args:
+        proprioception: (p,) float64, the robot's own measurements.
+        state: (s,) float64, privileged.
+        instruction: The task in words.
+        images: Camera name -> (h, w, 3) uint8, only those that were requested.
     """
 
     proprioception: np.ndarray
@@ -257,5 +276,5 @@ class Observation:
     images: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def with_images(self, images: Mapping[str, np.ndarray]) -> Observation:
-        """A copy of the observation with these images."""
+        """Return a copy with these images."""
         return replace(self, images=images)

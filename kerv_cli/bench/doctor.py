@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class DoctorSettings(RunSettings):
-    """`kerv doctor`. With a target or an environment it checks that alone."""
+    """`kerv doctor`. With a target or an environment it checks only that."""
 
     groups: ClassVar = {"world": "default", "runtime": "cpu"}
 
@@ -36,6 +36,7 @@ class DoctorSettings(RunSettings):
 
 
 def check_machine(settings: DoctorSettings) -> list[Finding]:
+    """Check rendering, torch, the shipped policies, disk, database and display."""
     from kerv_cli.report.viewing.viewer import has_display
     from kerv_cli.targets.provenance import versions
     from kerv_cli.worlds import specs
@@ -57,7 +58,7 @@ def check_machine(settings: DoctorSettings) -> list[Finding]:
 
 
 def check_policy(settings: DoctorSettings) -> list[Finding]:
-    """Whether the target keeps the protocol, on an observation of noise."""
+    """Check on an observation of noise whether the target keeps its protocol."""
     if not settings.policy.target:
         return []
     import numpy as np
@@ -79,7 +80,7 @@ def check_policy(settings: DoctorSettings) -> list[Finding]:
 
 
 def check_environment_of(settings: DoctorSettings) -> list[Finding]:
-    """Whether the environment keeps the protocol, on its first task."""
+    """Check on its first task whether the environment keeps its protocol."""
     if not settings.environment:
         return []
     from kerv_cli.worlds import specs
@@ -92,7 +93,7 @@ def check_environment_of(settings: DoctorSettings) -> list[Finding]:
 
 
 def _rendering(spec: EnvironmentSpec, settings: DoctorSettings) -> str:
-    """Draws frames of a world and times them: a backend can load and still draw nothing."""
+    """Draw frames of a world and time them. A backend can load and still draw nothing."""
     from kerv_cli.worlds.camera import choose_backend
 
     backend, first = choose_backend(), next(iter(spec.suites.values()), tuple(spec.tasks))[0]

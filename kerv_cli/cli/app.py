@@ -1,5 +1,7 @@
-"""The `kerv` command: every registered command under its name. Each of kerv's own is a file beside this one; nothing
-heavy is imported here."""
+"""The `kerv` command: every registered command under its name. Nothing heavy is imported here.
+
+Each of kerv's own commands is a file beside this one.
+"""
 
 from __future__ import annotations
 
@@ -28,21 +30,21 @@ FAMILIES = {
     "build": "Build artifacts that need no training.",
     "runs": "List, show, compare, repeat, export and remove runs: sweeps, rollouts, trainings, all that was made.",
 }
-"""First words that are no commands themselves."""
+"""First words that are not commands themselves."""
 
 
 class Commands(TyperGroup):
-    """The registered commands whose names begin with `prefix`, one word behind it: kerv itself, `kerv train`, …"""
+    """The registered commands whose names begin with `prefix`: kerv itself, `kerv train`, …."""
 
     prefix = ""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """The words that can follow."""
+        """Return the words that can follow."""
         names = (part.name.removeprefix(self.prefix) for part in commands_below(self.prefix))
         return list(dict.fromkeys(name.split()[0] for name in names))
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """The command, or the family of commands, of this word; None: neither."""
+        """Return the command, or the family of commands, of a word; None if there is neither."""
         name = self.prefix + cmd_name
         if name in parts("command"):
             return typer_command(parts("command")[name])
@@ -53,7 +55,7 @@ class Commands(TyperGroup):
         return family
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        """The command that the first words name: `demos export` is a command beside `demos`."""
+        """Return the command that the first words name: `demos export` is a command beside `demos`."""
         name = " ".join(args[:2])
         if self.prefix + name in parts("command"):
             return name, typer_command(parts("command")[self.prefix + name]), args[2:]
@@ -63,7 +65,7 @@ class Commands(TyperGroup):
         return args[0], command, args[1:]
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Lists the commands without importing what they run."""
+        """List the commands without importing what they run."""
         rows = []
         for word in self.list_commands(ctx):
             name = self.prefix + word
@@ -75,16 +77,16 @@ class Commands(TyperGroup):
 
 
 class Kerv(Commands):
-    """kerv itself, where every error becomes one line."""
+    """The command `kerv` itself. It prints every error as one line."""
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
-        """Reads kerv's own options, and prints the help."""
+        """Read kerv's own options, and print the help."""
         self.words = list(args)
         with one_line_errors(self.words):
             return super().make_context(info_name, args, parent, **extra)
 
     def invoke(self, ctx: Any) -> Any:
-        """Runs the command."""
+        """Run the command."""
         with one_line_errors(self.words):
             return super().invoke(ctx)
 
@@ -116,4 +118,4 @@ def kerv(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print versions and stop.")
     ] = False,
 ) -> None:
-    """Options of kerv itself."""
+    """Read the options of kerv itself."""

@@ -22,8 +22,11 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the whole result as 
     typed={"target": "model"},  # to Hydra target= would be a choice among the files of conf/target
 )
 def bench(settings: BenchSettings, as_json: AsJson = False) -> None:
-    """Measure what a target's decodes cost, against the device's limits; target= is a policy or a shape: vla-150m,
-    smolvla, openvla-7b. 'kerv report study=NAME on=PROFILE' prices a study's decodes with it."""
+    """Measure what a target's decodes cost, against the device's limits.
+
+    target= is a policy or a shape: vla-150m, smolvla, openvla-7b. 'kerv report study=NAME on=PROFILE' prices a study's
+    decodes with the profile.
+    """
     from kerv_cli.bench.machine import measure_machine
     from kerv_cli.bench.model import open_model
     from kerv_cli.bench.run import card_of, run, write

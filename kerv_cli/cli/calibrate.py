@@ -1,4 +1,4 @@
-"""`kerv calibrate`: predictors, reference levels, boundary ranges and skip levels, from the demonstrations."""
+"""`kerv calibrate`: predictors, reference levels, boundary ranges and skip levels from demonstrations."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def calibrate(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
 
 
 OF_TEST = {at.name for at in fields(CalibrateSuccessSettings)} - {at.name for at in fields(SweepSettings)}
-"""Settings of the test of `kerv calibrate success`; all others are the study's."""
+"""Settings of the test itself; all others are the study's."""
 
 
 @command(
@@ -52,16 +52,18 @@ OF_TEST = {at.name for at in fields(CalibrateSuccessSettings)} - {at.name for at
     ),
     each="rollout",
 )
-def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: AsJson = False) -> None:
+def success(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Run a study's settings on selection seeds, the most cautious first, and certify which of them keep AR's success.
-    Episodes that are there are reused; settle their number before you look."""
+
+    Existing episodes are reused. Settle the number of episodes before you look.
+    """
     from kerv_cli.cli.episodes import planned_study, print_settings, print_study_plan, run_study
     from kerv_cli.episodes.resolve import resolve
     from kerv_cli.lab.runs import making
     from kerv_cli.report.certificate import candidate_rows, certify, folder_of, write
 
-    of_test = [word for word in words if word.split("=")[0] in OF_TEST]
-    of_study = [word for word in words if word not in of_test]
+    of_test = [word for word in overrides if word.split("=")[0] in OF_TEST]
+    of_study = [word for word in overrides if word not in of_test]
     if not any(word.startswith("study=") for word in of_study):
         of_study = [f"study={CalibrateSuccessSettings.groups['study']}", *of_study]
     results = [word for word in of_study if word.startswith("results=")]
@@ -73,7 +75,7 @@ def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json
         print_settings(resolved)
         return
     folder = folder_of(resolved)
-    planned = planned_study(resolved, ["calibrate", "success", *words])
+    planned = planned_study(resolved, ["calibrate", "success", *overrides])
     if plan:
         print_study_plan(planned, as_json)
         return

@@ -1,8 +1,8 @@
-"""What a command is: a registered part of the kind `command`. Typer's command, the composition of its settings,
-`--cfg`, `--help` and completion derive from that one declaration.
+"""What a command is: a registered part of the kind `command`.
 
-The command's function takes what it names: `settings` (composed and checked), `words` (the overrides as typed), `names`
-(words that are no overrides), `cfg` (where it prints settings itself), and options of its own in typer's notation.
+Typer's command, the composition of its settings, `--cfg`, `--help` and completion derive from that declaration. The
+command's function takes what it names: `settings` (composed and checked), `overrides` (as typed), `names` (what
+is typed besides), `cfg` (if it prints settings itself), and options of its own in typer's notation.
 """
 
 from __future__ import annotations
@@ -31,15 +31,16 @@ F = TypeVar("F", bound=Callable[..., None])
 
 
 def command(name: str, settings: type = CommandSettings, keys: str = "", **traits: Any) -> Callable[[F], F]:
-    """Declares the function below as `kerv NAME`; its docstring is the help.
+    """Declare the function below as `kerv NAME`. Its docstring is the help.
 
     Args:
-        settings: dataclass of the settings; NoSettings: it takes none.
-        keys: the settings that people use, for the help.
-        traits: examples: command lines that work, for the help. names: help of words that are no overrides. lists:
-            settings whose lists need no brackets. typed: word on the command line -> the setting it sets, where the two
-            differ. writes: whether it stores results, so that a folder that cannot be written is refused first
-            (default: true). each: the command whose settings all other words go to.
+        name: Its name.
+        settings: Dataclass of its settings; NoSettings if it takes none.
+        keys: Settings that people use, for the help.
+        **traits: examples: command lines that work, for the help. names: help for what is typed besides overrides.
+            lists: settings whose lists need no brackets. typed: key on the command line -> the setting, if they differ.
+            writes: whether it stores results, so that a folder that cannot be written is refused first (default: true).
+            each: the command whose settings all other overrides go to.
     """
 
     def declare(run: F) -> F:
@@ -51,13 +52,13 @@ def command(name: str, settings: type = CommandSettings, keys: str = "", **trait
 
 
 def schemas_of(part: Part) -> list[type]:
-    """The class of the command's settings, then that of `each`."""
+    """Return the class of the command's settings, then that of `each`."""
     others = [find("command", part.traits["each"])] if "each" in part.traits else []
     return [one.settings for one in (part, *others)]
 
 
 def top_keys(part: Part) -> list[str]:
-    """The names that the command takes in front of `=` or a dot: typed words, groups of conf/, settings."""
+    """Return the names that the command takes before `=` or a dot."""
     if part.settings is NoSettings:
         return []
     schemas = schemas_of(part)
@@ -68,24 +69,25 @@ def top_keys(part: Part) -> list[str]:
 
 
 def typer_command(part: Part) -> TyperCommand:
-    """Makes typer's command from a registered one, whose module is imported now."""
+    """Make typer's command from a registered one. Its module is imported now."""
     run = load(part.build)
     parameters = inspect.signature(run, eval_str=True).parameters
     more = [one.replace(kind=one.KEYWORD_ONLY) for name, one in parameters.items() if name not in _ARGUMENTS]
 
-    def callback(overrides: list[str] | None = None, cfg: bool = False, **options: object) -> None:
-        words, names = _split(part, overrides or [], "names" in parameters)
+    def callback(typed: list[str] | None = None, cfg: bool = False, **options: object) -> None:
+        overrides, names = _split(part, typed or [], "names" in parameters)
         from kerv_cli.lab.command import chosen_store
 
-        with chosen_store(words) as words:
-            arguments = {"words": words, "names": names, "cfg": cfg}
+        with chosen_store(overrides) as overrides:
+            arguments = {"overrides": overrides, "names": names, "cfg": cfg}
             if "settings" in parameters or (cfg and "cfg" not in parameters):
-                arguments["settings"] = _settings(part, words, cfg)
-            with _noted([*part.name.split(), *words, *names, *_flags(made, options)]):
+                arguments["settings"] = _settings(part, overrides, cfg)
+            with _noted([*part.name.split(), *overrides, *names, *_flags(made, options)]):
                 run(**{name: value for name, value in arguments.items() if name in parameters}, **options)
 
     cfg_option = [] if part.settings is NoSettings else [_option("cfg", False, _CFG)]
-    callback.__signature__ = inspect.Signature([_option("overrides", None, _words_argument(part)), *cfg_option, *more])  # type: ignore[attr-defined]
+    options = [_option("typed", None, _typed_argument(part)), *cfg_option, *more]
+    callback.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     single = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
     help = "\n\n".join(filter(None, (inspect.cleandoc(part.traits.get("help", "")), part.traits.get("names"))))
     single.command(part.name, cls=CommandWithSettings, help=help, context_settings=CONTEXT)(callback)
@@ -95,11 +97,11 @@ def typer_command(part: Part) -> TyperCommand:
 
 
 @contextlib.contextmanager
-def _noted(words: list[str]) -> Iterator[None]:
-    """Note the command for the rows of what it begins; `kerv prepare` runs commands within its own."""
+def _noted(overrides: list[str]) -> Iterator[None]:
+    """Note the command for the rows of the runs that it begins. `kerv prepare` runs commands within its own."""
     from kerv_cli.lab.command import set_command
 
-    before = set_command(words)
+    before = set_command(overrides)
     try:
         yield
     finally:
@@ -107,14 +109,14 @@ def _noted(words: list[str]) -> Iterator[None]:
 
 
 def _flags(command: TyperCommand, options: Mapping[str, object]) -> list[str]:
-    """Return the options as they are typed, without those that are left out."""
+    """Return options as they are typed, without those that are left out."""
     names = {param.name: param.opts[0] for param in command.params}
     given = [(names[name], value) for name, value in options.items() if value not in (None, False)]
     return [word for name, value in given for word in ([name] if value is True else [name, str(value)])]
 
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 120}
-_ARGUMENTS = ("settings", "words", "names", "cfg")
+_ARGUMENTS = ("settings", "overrides", "names", "cfg")
 _CFG = Annotated[bool, typer.Option("--cfg", help="Print the resolved settings and stop.")]
 
 
@@ -122,17 +124,17 @@ def _option(name: str, default: object, annotation: object) -> inspect.Parameter
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
-def _words_argument(part: Part) -> object:
-    """The argument of all words that are no options; the help says what they can be in sections of its own."""
+def _typed_argument(part: Part) -> object:
+    """Return the argument for everything that is not an option. The help has sections of its own for it."""
     metavar = "NAME" if "names" in part.traits else "KEY=VALUE"
     argument = typer.Argument(metavar=metavar, hidden=True, autocompletion=complete)
     return Annotated[list[str] | None, argument]
 
 
 def complete(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Completions of a word: `me` -> `method=`; `method=s` -> every method that begins so. bash splits words at `=`."""
+    """Return completions: `me` -> `method=`; `method=s` -> every method that begins so. bash splits at `=`."""
     part = parts("command")[" ".join(ctx.command_path.split()[1:])]
-    keys, before = top_keys(part), [word for word in ctx.params.get("overrides") or () if word != "="]
+    keys, before = top_keys(part), [word for word in ctx.params.get("typed") or () if word != "="]
     if before and before[-1] in keys:
         return [name for name in _values(part, before[-1]) if name.startswith(incomplete)]
     key, equals, typed = incomplete.partition("=")
@@ -142,7 +144,7 @@ def complete(ctx: typer.Context, incomplete: str) -> list[str]:
 
 
 def _values(part: Part, key: str) -> list[str]:
-    """The names that a key can be set to; none where any value is possible."""
+    """Return the names that a key can be set to; none if any value is possible."""
     if key == "task":
         from kerv_cli.worlds import task_names
 
@@ -156,13 +158,13 @@ def _values(part: Part, key: str) -> list[str]:
     return []
 
 
-def _split(part: Part, words: list[str], named: bool) -> tuple[list[str], list[str]]:
-    """Splits words into (overrides, names). named: the command takes names; else every word has to be an override."""
+def _split(part: Part, typed: list[str], named: bool) -> tuple[list[str], list[str]]:
+    """Split what was typed into overrides and names."""
     if not named:
-        return words, []
+        return typed, []
     keys = set(top_keys(part))
-    overrides = [word for word in words if "=" in word and word.lstrip("+").partition("=")[0].split(".")[0] in keys]
-    names = [word for word in words if word not in overrides]
+    overrides = [one for one in typed if "=" in one and one.lstrip("+").partition("=")[0].split(".")[0] in keys]
+    names = [one for one in typed if one not in overrides]
     filters = set(re.findall(r"(\w+)=", part.traits["names"]))
     for name in names:
         key, equals, _ = name.partition("=")
@@ -171,14 +173,15 @@ def _split(part: Part, words: list[str], named: bool) -> tuple[list[str], list[s
     return overrides, names
 
 
-def _settings(part: Part, words: list[str], cfg: bool) -> Any:
-    """The command's settings. With --cfg they are printed and the command ends.
+def _settings(part: Part, overrides: list[str], cfg: bool) -> Any:
+    """Return the command's settings. With --cfg they are printed and the command ends.
 
     Raises:
-        UsageError: as `config.compose`. StorageError: as `places.check_writable`.
+        UsageError: As `config.compose`.
+        StorageError: As `places.check_writable`.
     """
     typed = part.traits.get("typed", {})
-    pairs = [(typed.get(key, key), equals, value) for key, equals, value in (word.partition("=") for word in words)]
+    pairs = [(typed.get(key, key), equals, value) for key, equals, value in (word.partition("=") for word in overrides)]
     lists = part.traits.get("lists", ())
     plain = [f"{key}=[{value.strip('[]')}]" if key in lists else key + equals + value for key, equals, value in pairs]
     settings: Any = compose(part.name.replace(" ", "_"), plain, part.settings)
@@ -191,12 +194,12 @@ def _settings(part: Part, words: list[str], cfg: bool) -> Any:
 
 
 class CommandWithSettings(TyperCommand):
-    """Adds to the help what the command's words can be."""
+    """A command whose help lists its settings."""
 
     part: Part
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        """Writes the settings that people use, commands below this one, and examples."""
+        """Write the settings that people use, the commands below this one, and examples."""
         keys = [_row(self.part, key) for key in self.part.traits.get("keys", "").split()]
         below = [part for name, part in parts("command").items() if name.startswith(f"{self.part.name} ")]
         if keys:
@@ -212,12 +215,12 @@ class CommandWithSettings(TyperCommand):
 
 
 def summary_of(part: Part) -> str:
-    """A command's help up to the first full stop or semicolon."""
+    """Return a command's help up to the first full stop or semicolon."""
     return re.split(r"[.;]\s", part.traits.get("help", "") + " ")[0]
 
 
 def _row(part: Part, key: str) -> tuple[str, str]:
-    """(key=default, type and description) of a setting. key: as typed."""
+    """Return (key=default, type and description) of a setting, for the help."""
     name = part.traits.get("typed", {}).get(key, key)
     schema = next(schema for schema in schemas_of(part) if name.split(".")[0] in {at.name for at in fields(schema)})
     at, value = field_of(schema, name)
@@ -229,7 +232,7 @@ def _row(part: Part, key: str) -> tuple[str, str]:
 
 
 def _of_file(schema: type, key: str, default: object) -> object:
-    """The value of a dotted key in the file of conf/ that its group chooses; `default` where that does not say."""
+    """Return the value of a dotted key in the file of conf/ that its group chooses, else `default`."""
     group, *path = key.split(".")
     file = conf_dir() / group / f"{choices_of(schema).get(group)}.yaml"
     value = read_yaml(file) if path and file.is_file() else {}
@@ -252,5 +255,5 @@ def _plain(value: object) -> str:
 
 
 def commands_below(prefix: str) -> Iterator[Part]:
-    """The commands whose names begin so, in the order of registration."""
+    """Yield the commands whose names begin with `prefix`, in the order of registration."""
     return (part for name, part in parts("command").items() if name.startswith(prefix))

@@ -31,7 +31,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON o
 
 
 def print_json(value: object) -> None:
-    """Prints a value as indented JSON; NaN and infinity, which JSON lacks, become null."""
+    """Print a value as indented JSON. NaN and infinity, which JSON lacks, become null."""
     typer.echo(json.dumps(_plain(value), indent=2, ensure_ascii=False))
 
 
@@ -66,13 +66,17 @@ def settings_yaml(settings: Any, indent: str = "") -> str:
 
 
 def print_notes(idle: Mapping[str, str]) -> None:
-    """Prints a line on stderr for each override that has no effect. idle: override -> why."""
+    """Print a line on stderr for each override that has no effect.
+
+    Args:
+        idle: Override -> why.
+    """
     for override, reason in idle.items():
         typer.echo(f"note: {override} has no effect: {reason}", err=True)
 
 
 def print_plan(text: str, as_json: bool = False) -> None:
-    """Prints what a command would do, for --plan, and ends it."""
+    """Print what a command would do, for --plan, and end it."""
     if as_json:
         print_json({"plan": text})
     else:
@@ -82,9 +86,14 @@ def print_plan(text: str, as_json: bool = False) -> None:
 
 @contextmanager
 def one_line_errors(words: Sequence[str]) -> Iterator[None]:
-    """Every exception within is printed as one line and becomes an exit code: a KervError's own, 2 for what typer
-    cannot parse, 130 for Ctrl-C, 1 for others. KERV_TRACEBACK=1 raises the exception instead. words: of the command
-    line."""
+    """Print every exception inside the block as one line, and exit.
+
+    The exit code is a KervError's own, 2 for what typer cannot parse, 130 for Ctrl-C, 1 for others. KERV_TRACEBACK=1
+    raises the exception instead.
+
+    Args:
+        words: The command line.
+    """
     try:
         yield
     except (typer.Exit, typer.Abort):
@@ -109,14 +118,14 @@ def one_line_errors(words: Sequence[str]) -> Iterator[None]:
 
 
 def _is_of_an_interrupt(error: BaseException | None) -> bool:
-    """Whether an error began as Ctrl-C: what OmegaConf does in a `finally` may fail on a node that is half built."""
+    """Return whether an error began as Ctrl-C: OmegaConf may fail on a node that is half built."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None
 
 
 def _parse_error(error: Any, words: Sequence[str]) -> str:
-    """What typer cannot parse, and that settings have no dashes. words: of the command line."""
+    """Return what typer cannot parse, and that settings have no dashes."""
     name, message = getattr(error, "option_name", None), " ".join(error.format_message().split())
     if name is None or not message.startswith("No such option") or getattr(error, "possibilities", None):
         return message
@@ -124,9 +133,9 @@ def _parse_error(error: Any, words: Sequence[str]) -> str:
     return f"{message.rstrip('.')}; settings have no dashes: {setting if '=' in setting else f'{setting}=VALUE'}"
 
 
-def results_word(words: Iterable[str]) -> str:
-    """Return ` results=DIR` and ` store=URL` for the end of a command to type next, if these words name them."""
-    return "".join(f" {shlex.quote(word)}" for word in words if word.startswith(("results=", "store=")))
+def results_word(overrides: Iterable[str]) -> str:
+    """Return ` results=DIR` and ` store=URL`, if these overrides set them, for a command to type next."""
+    return "".join(f" {shlex.quote(word)}" for word in overrides if word.startswith(("results=", "store=")))
 
 
 def _refuse(message: str, code: int, error: BaseException | None) -> None:
@@ -141,14 +150,14 @@ def _refuse(message: str, code: int, error: BaseException | None) -> None:
 
 @contextmanager
 def at_work(what: str) -> Iterator[None]:
-    """A spinner on a terminal while something takes seconds and has no count: libraries and weights that load."""
+    """Show a spinner on a terminal while libraries or weights load."""
     with console(stderr=True).status(what) if sys.stderr.isatty() else nullcontext():
         yield
 
 
 @contextmanager
 def progress_bar(title: str, record: Run | None = None) -> Iterator[Callable[..., None]]:
-    """Yield `advance(done, total, text="")`, which shows progress and notes it in the row of a command."""
+    """Yield `advance(done, total, text="")`, which shows progress and notes it in the row of a run."""
     with _shown(title) as show:
 
         def advance(done: int, total: int, text: str = "") -> None:
@@ -161,8 +170,10 @@ def progress_bar(title: str, record: Run | None = None) -> Iterator[Callable[...
 
 @contextmanager
 def _shown(title: str) -> Iterator[Callable[..., None]]:
-    """Yields `advance(done, total, text="")`: a progress bar on a terminal, elsewhere at most 10 lines (50 for totals
-    from 2000 on) with the time left."""
+    """Yield `advance(done, total, text="")`: a progress bar on a terminal, plain lines elsewhere.
+
+    There are at most 10 lines with the time left, and 50 for totals from 2000 on.
+    """
     if not sys.stderr.isatty():
         typer.echo(f"{title} …", err=True)
         yield _plain_lines(title)
@@ -200,7 +211,7 @@ def _plain_lines(title: str) -> Callable[..., None]:
 
 
 def console(stderr: bool = False) -> Console:
-    """A rich console; 200 columns wide where the output is no terminal."""
+    """Return a rich console. Without a terminal it is 200 columns wide."""
     from rich.console import Console
 
     wide = None if (sys.stderr if stderr else sys.stdout).isatty() else 200
@@ -208,7 +219,13 @@ def console(stderr: bool = False) -> Console:
 
 
 def print_table(columns: Iterable[str], rows: Iterable[Iterable[object]], title: str | None = None) -> None:
-    """Prints a table below its title; columns: its header. A title is never wrapped: it may hold a path to copy."""
+    """Print a table below its title.
+
+    Args:
+        columns: Its header.
+        rows: Its rows.
+        title: A line that is never wrapped, because it may hold a path to copy.
+    """
     from rich.table import Table
 
     table = Table(*columns)
@@ -220,7 +237,7 @@ def print_table(columns: Iterable[str], rows: Iterable[Iterable[object]], title:
 
 
 def print_figures(what: str, figures: Mapping[str, float], folder: object, as_json: bool = False) -> None:
-    """Prints named numbers, four digits of each, and the folder of what they belong to."""
+    """Print named numbers, four digits of each, and the folder of what they belong to."""
     if as_json:
         print_json({"folder": folder, **figures})
         return

@@ -37,8 +37,10 @@ class DemosExportSettings(CommandSettings):
     examples=("kerv demos name=mine task=MT10 episodes=100", "kerv demos name=visited policy=vision task=reach --plan"),
 )
 def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
-    """Record successful expert episodes, plain and perturbed, as a dataset; with policy=vision the states that a policy
-    visits by its method, labelled by the expert."""
+    """Record successful expert episodes, plain and disturbed, as a dataset.
+
+    With policy=vision it records the states that a policy visits by its method, labelled by the expert.
+    """
     from kerv_cli.lab.runs import making
     from kerv_cli.training.demonstrations import name_of
     from kerv_cli.worlds import resolve_tasks, spec_of
@@ -75,7 +77,7 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
 
 
 def _actor(settings: DemosSettings, task: str) -> PolicyActs | None:
-    """The policy that moves the robot instead of the expert; None: the expert. task: one of the recorded tasks."""
+    """Return the policy that moves the robot instead of the expert; None for the expert."""
     from kerv_cli.worlds import spec_of
 
     target = settings.policy.target

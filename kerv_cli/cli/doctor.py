@@ -1,4 +1,4 @@
-"""`kerv doctor`: checks this machine (rendering, torch, policies, disk) and names the remedy for each failure."""
+"""`kerv doctor`: check this machine and say what to do about each failure."""
 
 from __future__ import annotations
 
@@ -27,8 +27,10 @@ Repair = Annotated[bool, typer.Option("--repair", help="Remove what killed comma
     writes=False,
 )
 def doctor(settings: DoctorSettings, repair: Repair = False, as_json: AsJson = False) -> None:
-    """Check rendering, simulator, torch, shipped policies, disk and display; say what to do about what is missing. With
-    target=NAME or environment=NAME: whether that keeps its protocol."""
+    """Check rendering, simulator, torch, shipped policies, disk and display; say what to do about what is missing.
+
+    With target=NAME or environment=NAME check whether that keeps its protocol.
+    """
     if repair:
         _repair(settings)
         return

@@ -166,7 +166,7 @@ def print_study(table: DataFrame, store: StudyStore) -> None:
 
 
 def print_verdict(table: DataFrame, store: StudyStore, loss: float) -> None:
-    """Prints the last three lines of a study: the verdict, the page to open, the recording to watch."""
+    """Print the last three lines of a study: the verdict, the page to open, the recording to watch."""
     from kerv_cli.report.decide import verdict_of
 
     typer.echo(f"verdict: {verdict_of(table, loss)[0]}")

@@ -15,7 +15,7 @@ from kerv_cli.cli.common import ShowPlan, print_table, results_word
 from kerv_cli.training.settings import PrepareSettings
 
 NOT_OF_STEPS = ("for", "steps")
-"""Settings that the steps do not take; demos= is for all of them but the certificate."""
+"""Settings that the steps do not take. demos= is for all of them but the certificate."""
 
 
 @command(
@@ -26,15 +26,17 @@ NOT_OF_STEPS = ("for", "steps")
     typed={"for": "methods"},
     lists=("methods",),
 )
-def prepare(settings: PrepareSettings, words: list[str], plan: ShowPlan = False) -> None:
-    """Make everything that methods need of a target, in order: drafters, datastore, calibration, certificate. What is
-    there is skipped; the same command goes on where it was interrupted."""
+def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = False) -> None:
+    """Make everything that methods need of a target, in order: drafters, datastore, calibration, certificate.
+
+    Existing artifacts are skipped. The same command goes on where it was interrupted.
+    """
     from kerv_cli.training.preparation import THERE, Step
     from kerv_cli.training.preparation import plan as planned
 
     def line(step: Step) -> str:
-        """The step's command, as it can be typed alone."""
-        shared = [word for word in words if word.split("=")[0] not in NOT_OF_STEPS]
+        """Return the step's command, as it can be typed alone."""
+        shared = [word for word in overrides if word.split("=")[0] not in NOT_OF_STEPS]
         if step.command[-1] == "success":
             shared = [word for word in shared if not word.startswith("demos=")]
         return shlex.join([*step.command, *shared])
@@ -51,14 +53,16 @@ def prepare(settings: PrepareSettings, words: list[str], plan: ShowPlan = False)
         if step.state != THERE:
             typer.echo(f"\nkerv {line(step)}")
             run(shlex.split(line(step)))
-    typer.echo(f"\n{name} is ready: kerv sweep study=own policy.target={name}{results_word(words)}")
+    typer.echo(f"\n{name} is ready: kerv sweep study=own policy.target={name}{results_word(overrides)}")
 
 
 def run(line: Sequence[str]) -> None:
-    """Runs a command of kerv in this process.
+    """Run a command of kerv in this process.
 
     Raises:
-        KervError: as that command. Interrupted: Ctrl-C. typer.Exit: it failed and said why.
+        KervError: As that command.
+        Interrupted: Ctrl-C.
+        typer.Exit: It failed and said why.
     """
     name = max((name for name in parts("command") if " ".join(line).startswith(f"{name} ")), key=len)
     try:

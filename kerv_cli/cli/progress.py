@@ -1,4 +1,4 @@
-"""Shows the events of a running study: a progress bar on a terminal, plain lines elsewhere."""
+"""Show the events of a running study: a progress bar on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from kerv_cli.lab.events import BlockEnded, BlockStarted, BlockWaits, EpisodeEnd
 from kerv_cli.lab.plan import Block, Setting, count
 
 LOG_SECONDS = 30.0
-"""Between two lines of progress without a terminal."""
+"""Seconds between two lines of progress without a terminal."""
 
 
 class ProgressDisplay:
@@ -50,6 +50,7 @@ class ProgressDisplay:
             self._bar.stop()
 
     def __call__(self, event: Event) -> None:
+        """Show an event."""
         if isinstance(event, Started):
             self._start(event)
         elif isinstance(event, BlockStarted):

@@ -82,7 +82,7 @@ def report(
 
 
 def _print_choice(settings: ReportSettings, as_json: bool) -> None:
-    """Prints the choice of one study, or of every study that has results."""
+    """Print the choice of one study, or of every study that has results."""
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.decide import choices
     from kerv_cli.report.report import names_to_report

@@ -42,12 +42,16 @@ Folder = Annotated[Path | None, typer.Option("--dir", help="Where it is written;
 
 
 def _command_on_runs(name: str, *examples: str) -> Callable[[F], F]:
-    """Declares a command whose names are runs."""
+    """Declare a command whose names are runs."""
     return command(f"runs {name}", names=RUNS, keys="results", examples=examples)
 
 
 def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a run") -> list[str]:
-    """The names as those of runs. Raises UsageError: too few or too many."""
+    """Return names as those of runs.
+
+    Raises:
+        UsageError: Too few or too many.
+    """
     from kerv_cli.episodes.resolve import study_name
 
     if not least <= len(names) <= most:
@@ -162,7 +166,7 @@ def _print_results(results: list[Row]) -> None:
 
 @_command_on_runs("rerun", "kerv runs rerun last", "kerv runs rerun main --plan")
 def rerun(
-    settings: CommandSettings, names: list[str], words: list[str], plan: ShowPlan = False, as_json: AsJson = False
+    settings: CommandSettings, names: list[str], overrides: list[str], plan: ShowPlan = False, as_json: AsJson = False
 ) -> None:
     """Run a run again from what it stored, into a new folder, and say whether the tokens are the same."""
     from kerv_cli.catalogue.entries import find_run
@@ -201,7 +205,7 @@ def rerun(
         print_json({"run": entry.id, "folder": entry.folder, "episodes": shared, "same_tokens": same})
         return
     typer.echo(f"{entry.id}: the same tokens in {same} of {shared} episodes of {run.id}")
-    typer.echo(f"both side by side: kerv runs compare {run.id} {entry.id}{results_word(words)}")
+    typer.echo(f"both side by side: kerv runs compare {run.id} {entry.id}{results_word(overrides)}")
 
 
 @_command_on_runs("rm", "kerv runs rm last", "kerv runs rm main --yes")

@@ -40,11 +40,13 @@ if TYPE_CHECKING:
     examples=("kerv sweep study=demo", "kerv sweep study=threshold task=[reach,push] episodes=5 --plan"),
     each="rollout",
 )
-def sweep(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: AsJson = False) -> None:
-    """Run a study: every setting on every task with the same seeds, in turn. Episodes that are there are reused.
-    Without study= list the studies."""
-    if not cfg and not any(word.split("=")[0].split(".")[0] == "study" for word in words):
-        others = [word for word in words if not word.startswith(("results=", "store="))]
+def sweep(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: AsJson = False) -> None:
+    """Run a study: every setting on every task with the same seeds, in turn. Existing episodes are reused.
+
+    Without study= list the studies.
+    """
+    if not cfg and not any(word.split("=")[0].split(".")[0] == "study" for word in overrides):
+        others = [word for word in overrides if not word.startswith(("results=", "store="))]
         if others:
             raise UsageError(f"{' '.join(others)} of which study? name one, study=NAME: 'kerv sweep' lists them; "
                              "'kerv rollout -m' runs a grid of your own")  # fmt: skip
@@ -52,11 +54,11 @@ def sweep(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: 
         return
     from kerv_cli.episodes.resolve import resolve
 
-    resolved = resolve(words)
+    resolved = resolve(overrides)
     if cfg:
         print_settings(resolved)
         return
-    planned = planned_study(resolved, ["sweep", *words])
+    planned = planned_study(resolved, ["sweep", *overrides])
     if plan:
         print_study_plan(planned, as_json)
         return
@@ -67,7 +69,7 @@ def sweep(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: 
 
 
 def _list_studies(as_json: bool) -> None:
-    """Prints the studies of conf/ and how large each is."""
+    """Print the studies of conf/ and how large each is."""
     from kerv_cli.episodes.policy import tasks_of
 
     rows = []

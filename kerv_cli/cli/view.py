@@ -50,10 +50,10 @@ def view(
 
 
 def _place(results: str, name: str) -> Path:
-    """A path as it stands; a name that is none: the folder of the run; `last`: of the newest that has recordings.
+    """Return a path as it is; for the name of a run its folder; for `last` the newest run with recordings.
 
     Raises:
-        UsageError: no such run.
+        UsageError: No such run.
     """
     path = Path(name).expanduser()
     if path.exists() or path.suffix == ".rrd":

@@ -27,7 +27,7 @@ def setting_tables(data: StudyData, per_task: list[Row], whole: Row) -> Iterator
     if len(figures) > 1:
         figures.append(("all", whole))
     timed = is_timed(episodes)
-    headers = ("task", "success", "steps", "forwards/step", "AL", "accepted/round", "ms/step")
+    headers = ("task", "success", "steps", "forwards/step", "tokens/verification", "drafts accepted", "ms/step")
     seeds = f"{episodes['seed'].min()}…{episodes['seed'].max()}"
     observation = setting.identity.get("observation", "")
     title = f"{setting.label}, observation {observation}{stress_text(setting.settings)}, seeds {seeds}"
