@@ -22,17 +22,8 @@ def tables(calibration: Calibration, path: Path) -> Iterator[Table]:
     """
     errors = partial(moving_errors, calibration.errors, space=calibration.target.actions)
     kalman, hold = errors("kalman"), errors("hold")
-    columns: tuple[str, ...] = (
-        "task",
-        "fitted on",
-        "tested on",
-        "decodes",
-        "K_S",
-        "K p25",
-        "K p75",
-        "Kalman, h=1",
-        "hold, h=1",
-    )
+    columns: tuple[str, ...] = ("task", "fitted on", "tested on", "decodes", "K_S", "K p25", "K p75")
+    columns += ("Kalman, h=1", "hold, h=1")
     rows: list[tuple[object, ...]] = []
     for number, (name, counts) in enumerate(calibration.demos.tasks.items()):
         row = calibration.variability.get(name)

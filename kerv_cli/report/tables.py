@@ -214,21 +214,21 @@ def further_of(data: StudyData) -> dict[str, Any]:
     left_out = {*CSV_COLUMNS, "series", "unstressed"}
     measures = [name for name in columns[: columns.index("overrides")] if name not in left_out]
     labels: dict[str, Any] = {}
-    for rows, key in ((rows_of(data.table), "averaging"), (rows_of(data.per_task), "task")):
-        for row in rows:
-            setting = data.settings[row["label"]]
-            about = {
-                "name": setting.name,
-                "varies": dict(setting.varies),
-                "overrides": setting.overrides,
-                "settings": without(setting.settings, {"results", "task"}),
-                "identity": dict(setting.identity),
-                "provenance": {name: setting.settings["runtime"][name] for name in _RUNTIME}
-                | {name: row[name] for name in _PROVENANCE},
-                "measures": {},
-            }
-            values = {name: _json(row[name]) for name in measures}
-            labels.setdefault(row["label"], about)["measures"][row[key]] = values
+    for row in [*rows_of(data.table), *rows_of(data.per_task)]:
+        setting = data.settings[row["label"]]
+        about = {
+            "name": setting.name,
+            "varies": dict(setting.varies),
+            "overrides": setting.overrides,
+            "settings": without(setting.settings, {"results", "task"}),
+            "identity": dict(setting.identity),
+            "provenance": {name: setting.settings["runtime"][name] for name in _RUNTIME}
+            | {name: row[name] for name in _PROVENANCE},
+            "measures": {},
+        }
+        key = row["averaging"] if row["averaging"] in (MICRO, MACRO) else row["task"]
+        values = {name: _json(row[name]) for name in measures}
+        labels.setdefault(row["label"], about)["measures"][key] = values
     return {"study": data.study.name, "axis": data.study.axis, "labels": labels}
 
 
