@@ -66,7 +66,7 @@ missing=$("$PYTHON" - <<'PY'
 import importlib.util as found
 names = {"filterpy": "filterpy", "gymnasium": "gymnasium", "hydra": "hydra-core", "jinja2": "jinja2", "joblib": "joblib",
          "matplotlib": "matplotlib", "metaworld": "metaworld", "mujoco": "mujoco", "pandas": "pandas", "PIL": "pillow",
-         "onnx": "onnx", "onnxruntime": "onnxruntime", "pyarrow": "pyarrow", "pydantic": "pydantic", "yaml": "pyyaml",
+         "numba": "numba", "onnx": "onnx", "onnxruntime": "onnxruntime", "pyarrow": "pyarrow", "pydantic": "pydantic", "yaml": "pyyaml",
          "rich": "rich", "safetensors": "safetensors", "scipy": "scipy", "typer": "typer", "pytest": "pytest", "hypothesis": "hypothesis"}
 print(*[package for module, package in names.items() if found.find_spec(module) is None])
 PY

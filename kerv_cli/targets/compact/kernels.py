@@ -36,7 +36,7 @@ LANES = PANEL if "+avx512f" in FEATURES else 16
 """Outputs that several rows compute at once: their sums must fit into the vector registers."""
 FAST = {"contract", "reassoc", "nsz"}
 compiled = numba.njit(error_model="numpy", fastmath=FAST)
-NUMBER, WORD, LANE = ir.FloatType(), ir.IntType(64), ir.IntType(32)
+NUMBER, WORD, LANE, VOID, ADDRESS = ir.FloatType(), ir.IntType(64), ir.IntType(32), types.void, types.intp
 
 
 def _tile(rows: int, kind: int, lanes: int) -> Callable[..., None]:
@@ -46,10 +46,12 @@ def _tile(rows: int, kind: int, lanes: int) -> Callable[..., None]:
     their results, `stride` and `step` bytes apart. y = (x · weights) · scale + bias.
     """
     stored, size = {HALF: (ir.HalfType(), 2), INT8: (ir.IntType(8), 1), FLOAT: (NUMBER, 4)}[kind]
-    vector, fused = ir.VectorType(NUMBER, lanes), ("contract",)
+    vector, fused = ir.VectorType(NUMBER, lanes), {"flags": ("contract",)}
     nothing, zeros = ir.Constant(vector, ir.Undefined), ir.Constant(ir.VectorType(LANE, lanes), [0] * lanes)
 
-    def emit(builder: Any, weights: Any, factors: Any, inputs: Any, x: Any, stride: Any, y: Any, step: Any) -> None:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        weights, factors, inputs, x, stride, y, step = arguments
+
         def pointer(base: Any, index: Any, distance: Any, kind: Any) -> Any:
             return builder.inttoptr(builder.add(base, builder.mul(index, distance)), kind.as_pointer())
 
@@ -58,18 +60,20 @@ def _tile(rows: int, kind: int, lanes: int) -> Callable[..., None]:
             value.align = align
             return value
 
-        x = [builder.add(x, builder.mul(stride, WORD(r))) for r in range(rows)]
+        places = [builder.add(x, builder.mul(stride, WORD(r))) for r in range(rows)]
         before, loop, after = builder.block, builder.append_basic_block(), builder.append_basic_block()
         builder.branch(loop)
         builder.position_at_end(loop)
-        index, sums = builder.phi(WORD), [builder.phi(vector) for _ in range(rows)]
-        row = load(weights, index, PANEL * size, ir.VectorType(stored, lanes), size)
+        index, sums, totals = builder.phi(WORD), [builder.phi(vector) for _ in range(rows)], []
+        row, following = (
+            load(weights, index, PANEL * size, ir.VectorType(stored, lanes), size),
+            builder.add(index, WORD(1)),
+        )
         row = {HALF: builder.fpext, INT8: builder.sitofp, FLOAT: lambda value, _: value}[kind](row, vector)
-        totals, following = [], builder.add(index, WORD(1))
-        for r, total in enumerate(sums):
-            single = builder.insert_element(nothing, load(x[r], index, 4, NUMBER), LANE(0))
-            term = builder.fmul(row, builder.shuffle_vector(single, nothing, zeros), flags=fused)
-            totals.append(builder.fadd(total, term, flags=fused))
+        for place, total in zip(places, sums, strict=True):
+            single = builder.insert_element(nothing, load(place, index, 4, NUMBER), LANE(0))
+            term = builder.fmul(row, builder.shuffle_vector(single, nothing, zeros), **fused)
+            totals.append(builder.fadd(total, term, **fused))
         starts = [WORD(0), *[ir.Constant(vector, [0.0] * lanes)] * rows]
         for value, start, change in zip([index, *sums], starts, [following, *totals], strict=True):
             value.add_incoming(start, before)
@@ -78,21 +82,11 @@ def _tile(rows: int, kind: int, lanes: int) -> Callable[..., None]:
         builder.position_at_end(after)
         scale, bias = (load(factors, WORD(i), 4 * PANEL, vector) for i in range(2))
         for r, total in enumerate(totals):
-            result = builder.fadd(builder.fmul(total, scale, flags=fused), bias, flags=fused)
+            result = builder.fadd(builder.fmul(total, scale, **fused), bias, **fused)
             builder.store(result, pointer(y, WORD(r), step, vector)).align = 4
+        return context.get_dummy_value()
 
-    @intrinsic
-    def tile(typing: Any, weights: Any, factors: Any, inputs: Any, x: Any, stride: Any, y: Any, step: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            weights, factors, inputs, x, stride, y, step = arguments
-            for lane in range(0, PANEL, lanes):
-                w, f, to = (builder.add(a, WORD(b * lane)) for a, b in ((weights, size), (factors, 4), (y, 4)))
-                emit(builder, w, f, inputs, x, stride, to, step)
-            return context.get_dummy_value()
-
-        return types.void(*[types.intp] * 7), generate
-
-    return tile
+    return intrinsic(lambda typing, weights, factors, inputs, x, stride, y, step: (VOID(*[ADDRESS] * 7), generate))
 
 
 def _product(kind: int, size: int) -> Callable[..., None]:
@@ -102,16 +96,16 @@ def _product(kind: int, size: int) -> Callable[..., None]:
     @compiled
     def product(weights, factors, inputs, panels, x, stride, rows, y, step):
         for panel in range(panels):
-            w, f, r = weights + size * PANEL * inputs * panel, factors + 8 * PANEL * panel, 0
-            to = y + 4 * PANEL * panel
-            while r + 4 <= rows:
-                four(w, f, inputs, x + r * stride, stride, to + r * step, step)
-                r += 4
-            while r + 2 <= rows:
-                two(w, f, inputs, x + r * stride, stride, to + r * step, step)
-                r += 2
-            if r < rows:
-                one(w, f, inputs, x + r * stride, stride, to + r * step, step)
+            w, f, to = weights + size * PANEL * inputs * panel, factors + 8 * PANEL * panel, y + 4 * PANEL * panel
+            for c in range(0, PANEL, LANES):
+                r, wide, narrow = 0, w + size * c, f + 4 * c
+                while r + 4 <= rows:
+                    four(wide, narrow, inputs, x + r * stride, stride, to + r * step + 4 * c, step)
+                    r += 4
+                if r + 2 <= rows:
+                    two(wide, narrow, inputs, x + r * stride, stride, to + r * step + 4 * c, step)
+            if rows % 2:
+                one(w, f, inputs, x + (rows - 1) * stride, stride, to + (rows - 1) * step, step)
 
     return product
 
@@ -120,38 +114,24 @@ half_product = _product(HALF, 2) if EXPANDS_HALF else _product(FLOAT, 4)
 int8_product, product = _product(INT8, 1), _product(FLOAT, 4)
 
 
-@intrinsic
-def get(typing: Any, address: Any, index: Any) -> Any:
-    """Read the float32 number at an index after an address."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.load(builder.gep(builder.inttoptr(arguments[0], NUMBER.as_pointer()), [arguments[1]]))
-
-    return types.float32(types.intp, types.intp), generate
+def _read(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return builder.load(builder.gep(builder.inttoptr(arguments[0], NUMBER.as_pointer()), [arguments[1]]))
 
 
-@intrinsic
-def put(typing: Any, address: Any, index: Any, value: Any) -> Any:
-    """Write a float32 number to an index after an address."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        base = builder.inttoptr(arguments[0], NUMBER.as_pointer())
-        builder.store(arguments[2], builder.gep(base, [arguments[1]]))
-        return context.get_dummy_value()
-
-    return types.void(types.intp, types.intp, types.float32), generate
+def _write(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    builder.store(arguments[2], builder.gep(builder.inttoptr(arguments[0], NUMBER.as_pointer()), [arguments[1]]))
+    return context.get_dummy_value()
 
 
-@intrinsic
-def _times_two_to(typing: Any, x: Any, power: Any) -> Any:
-    """Multiply x by 2^power, both float32; power is whole, from −126 to 127."""
+def _shift(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    exponent = builder.shl(builder.add(builder.fptosi(arguments[1], LANE), LANE(127)), LANE(23))
+    return builder.fmul(arguments[0], builder.bitcast(exponent, NUMBER))
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        exponent = builder.shl(builder.add(builder.fptosi(arguments[1], LANE), LANE(127)), LANE(23))
-        return builder.fmul(arguments[0], builder.bitcast(exponent, NUMBER))
 
-    return types.float32(types.float32, types.float32), generate
-
+get = intrinsic(lambda typing, address, index: (types.float32(ADDRESS, ADDRESS), _read))
+put = intrinsic(lambda typing, address, index, value: (VOID(ADDRESS, ADDRESS, types.float32), _write))
+times_two_to = intrinsic(lambda typing, x, power: (types.float32(types.float32, types.float32), _shift))
+"""Read or write the float32 number at an index after an address; x · 2^power, for a whole power from −126 to 127."""
 
 _LOG2_E, _LN_2, _LN_2_REST = np.float32(math.log2(math.e)), np.float32(0.693359375), np.float32(-2.12194440e-4)
 _T2, _T3, _T4, _T5, _T6, _T7 = (np.float32(1 / math.factorial(n)) for n in range(2, 8))
@@ -165,7 +145,7 @@ def exponential(x):
     power = np.rint(x * _LOG2_E)
     x = (x - power * _LN_2) - power * _LN_2_REST
     value = (((((_T7 * x + _T6) * x + _T5) * x + _T4) * x + _T3) * x + _T2) * x * x + x + _ONE
-    return _times_two_to(value, power)
+    return times_two_to(value, power)
 
 
 @compiled

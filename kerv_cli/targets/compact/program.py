@@ -6,13 +6,12 @@ that cannot be written, or in NUMBA_CACHE_DIR.
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import functools
 import logging
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -42,21 +41,15 @@ def kernels() -> ModuleType:
         def on_end(self, event: Any) -> None:
             pass
 
-    with _alone(), event.install_listener("numba:compile", Told()):
+    mine = os.path.join(tempfile.gettempdir(), f"kerv-{os.getuid()}")
+    with open(f"{mine}.lock", "w", encoding="ascii") as lock, event.install_listener("numba:compile", Told()):
+        fcntl.flock(lock, fcntl.LOCK_EX)
         try:
             from kerv_cli.targets.compact import kernels
         except RuntimeError:  # numba finds no folder that it can write to
-            numba.config.CACHE_DIR = os.path.join(tempfile.gettempdir(), f"kerv-{os.getuid()}")
+            numba.config.CACHE_DIR = mine
             from kerv_cli.targets.compact import kernels
     return kernels
-
-
-@contextlib.contextmanager
-def _alone() -> Iterator[None]:
-    """Wait until no other process of this user compiles."""
-    with open(os.path.join(tempfile.gettempdir(), f"kerv-{os.getuid()}.lock"), "w", encoding="ascii") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
 
 class Matrix:
@@ -154,9 +147,7 @@ class Program:
             cache: The keys and values of earlier tokens; the new ones are written behind them.
             mask: From `attention_mask`.
         """
-        frames = self._filled(inputs)
-        where = _NOWHERE if positions is None else positions.numpy()
-        self._execute(frames, 1, where, cache, _CAUSAL if mask is None else mask.numpy())
+        frames, _ = self._execute(inputs, 1, positions, cache, mask)
         found = []
         for first, rows, stride, shape in self.results:
             block = frames[:, first : first + rows * stride].reshape(len(frames), rows, stride)[:, :, : shape[-1]]
@@ -165,29 +156,24 @@ class Program:
 
     def repeat(self, times: int, *inputs: Tensor, cache: Cache) -> np.ndarray:
         """Execute it `times` times, its outputs the next inputs -> (times, B) what ARGMAX gave each time."""
-        return self._execute(self._filled(inputs), times, np.array([cache.length]), cache, _CAUSAL)
-
-    def _filled(self, inputs: Sequence[Tensor]) -> np.ndarray:
-        """Frames with the inputs at their places."""
-        rows = inputs[0].numel() // self.places[0][1]
-        frames = np.empty((rows, self.size), np.float32)
-        for (first, size), value in zip(self.places, inputs, strict=True):
-            frames[:, first : first + size] = value.numpy().reshape(rows, size)
-        return frames
+        return self._execute(inputs, times, torch.tensor([cache.length]), cache, None)[1]
 
     def _execute(
-        self, frames: np.ndarray, times: int, positions: np.ndarray, cache: Cache | None, mask: np.ndarray
-    ) -> np.ndarray:
+        self, inputs: Sequence[Tensor], times: int, positions: Tensor | None, cache: Cache | None, mask: Tensor | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        where = np.zeros(1, np.int64) if positions is None else positions.numpy()
+        rows, tokens = inputs[0].numel() // self.places[0][1], len(where)
+        frames, results = np.empty((rows, self.size), np.float32), np.empty((times, rows), np.float32)
+        for (first, size), value in zip(self.places, inputs, strict=True):
+            frames[:, first : first + size] = value.numpy().reshape(rows, size)
         if cache is None:
-            layers, *sizes = self.cache
-            shape = max(1, layers), 2, len(frames) // len(positions), sizes[0], len(positions), sizes[1]
-            start, buffer = 0, np.empty(shape, np.float32)
+            layers, heads, channels = self.cache
+            start, buffer = 0, np.empty((max(1, layers), 2, rows // tokens, heads, tokens, channels), np.float32)
         else:
             start, buffer = cache.length, cache.buffer.numpy()
-        results = np.empty((times, len(frames)), np.float32)
+        if start + tokens + times - 1 > buffer.shape[4]:
+            raise IndexError(f"{tokens + times - 1} tokens after {start} in a cache of {buffer.shape[4]}")
+        seen = np.zeros((0, 1), np.float32) if mask is None else mask.numpy()
         tables = self.ops, times, self.last, self.indices, self.numbers
-        self.run(*tables, frames, positions, start, buffer, mask, results)
-        return results
-
-
-_NOWHERE, _CAUSAL = np.zeros(1, np.int64), np.zeros((0, 1), np.float32)
+        self.run(*tables, frames, where, start, buffer, seen, results)
+        return frames, results
