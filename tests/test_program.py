@@ -23,7 +23,7 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import EagleDrafter
 from kerv_cli.targets.checkpoint import compact, expanded
 from kerv_cli.targets.compact.packable import pack
-from kerv_cli.targets.compact.program import kernels
+from kerv_cli.targets.compact.program import Program, kernels
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
@@ -293,3 +293,9 @@ def test_processes_compile_once_and_say_so(tmp_path: Path) -> None:
     told = [process.communicate()[1].decode() for process in processes]
     assert [process.returncode for process in processes] == [0, 0, 0]
     assert sorted("compiling for this CPU" in text for text in told[:2]) == [False, True]
+
+
+def test_a_join_of_two_values_is_copied_together() -> None:
+    x = torch.randn(2, 1, 4)
+    program = Program(lambda x: torch.cat([x, x[..., :1].expand(1, 1, 3) * 3.0], -1), (1, 1, 4))
+    assert torch.equal(program(x)[0], torch.cat([x, 3.0 * x[..., :1].expand(2, 1, 3)], -1))

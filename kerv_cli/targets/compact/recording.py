@@ -111,7 +111,7 @@ class Tape:
     def register(self, *shape: int) -> Recorded:
         """Return a new place for a tensor of this shape."""
         first, size = self.begins[-1], int(np.prod(shape))
-        self.begins.append(first + size)
+        self.begins.append(first + size + 1)  # a gap: elements of two registers are never side by side
         return Recorded(self, torch.arange(first, first + size).view(shape))
 
     def emit(
