@@ -1,4 +1,4 @@
-"""Durations as text, for plans and progress."""
+"""Durations and numbers as text, for plans and progress."""
 
 from __future__ import annotations
 
@@ -16,3 +16,8 @@ def left(seconds: float, done: float, total: float) -> str:
 def about(seconds: float, source: str = "a guess") -> str:
     """Return an estimate and its source: `about 96 min (a guess)`."""
     return f"about {duration(seconds)} ({source})"
+
+
+def count(number: int, noun: str) -> str:
+    """Return a number with its noun: `1 task`, `2 tasks`."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -178,18 +178,11 @@ def _shown(title: str) -> Iterator[Callable[..., None]]:
         typer.echo(f"{title} …", err=True)
         yield _plain_lines(title)
         return
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich import progress as bars
 
-    timed = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    texts = (TextColumn(f"{{task.{name}}}") for name in ("description", "fields[text]"))
-    with Progress(next(texts), *timed, next(texts), console=console(stderr=True)) as bar:
+    timed = (bars.BarColumn(), bars.MofNCompleteColumn(), bars.TimeElapsedColumn(), bars.TimeRemainingColumn())
+    texts = (bars.TextColumn(f"{{task.{name}}}") for name in ("description", "fields[text]"))
+    with bars.Progress(next(texts), *timed, next(texts), console=console(stderr=True)) as bar:
         task = bar.add_task(title, total=None, text="")
         yield lambda done, total, text="": bar.update(task, completed=done, total=total, text=text)
 

@@ -4,21 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from kerv_cli.base.durations import about
+from kerv_cli.base.durations import about, count
 from kerv_cli.base.errors import Interrupted, UsageError
 from kerv_cli.base.limits import choice, setting
 from kerv_cli.base.places import artifact, results_dir
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import ShowPlan, print_figures, print_plan, print_table, progress_bar
-from kerv_cli.methods.settings import EXPERT, PolicySettings
 from kerv_cli.training.settings import DEMOS, DemosSettings
 from kerv_cli.worlds.settings import DemosImportSettings
-
-if TYPE_CHECKING:
-    from kerv_cli.training.dagger import PolicyActs
 
 
 @dataclass
@@ -43,28 +38,14 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
     """
     from kerv_cli.lab.runs import making
     from kerv_cli.training.demonstrations import name_of
-    from kerv_cli.worlds import resolve_tasks, spec_of
-    from kerv_cli.worlds.demos.recording import DemoConfig, record
+    from kerv_cli.training.recording import recording_of, seconds_of
+    from kerv_cli.worlds.demos.recording import record
 
-    tasks = resolve_tasks(settings.task)
+    config, actor = recording_of(settings)
     folder = artifact(settings.results, "demos", settings.name or name_of(settings.task))
-    actor = _actor(settings, tasks[0])
-    config = DemoConfig(
-        tasks=tasks,
-        episodes=settings.episodes,
-        first_seed=settings.seed,
-        perturbed=settings.perturbed,
-        camera=settings.world.camera,
-        frame_stride=settings.frame_stride,
-        workers=settings.runtime.workers,
-        horizon=settings.world.horizon,
-        policy=actor.sha256 if actor else "",
-        expert_share=settings.expert_share if actor else 0.0,
-    )
     if plan:
-        steps = spec_of(tasks[0]).horizon / 6 * settings.episodes * len(tasks)  # experts are about that quick
-        seconds = steps * (0.7 + 10 / settings.frame_stride) / 1000 / settings.runtime.workers
-        print_plan(f"{len(tasks)} tasks x {settings.episodes} episodes -> {folder}, {about(seconds)}")
+        what = f"{count(len(config.tasks), 'task')} x {count(settings.episodes, 'episode')}"
+        print_plan(f"{what} -> {folder}, {about(seconds_of(config))}")
     try:
         with making(settings.results, "demos", folder) as made, progress_bar("demonstrations", made) as advance:
             manifest = record(config, folder, advance, actor)
@@ -74,20 +55,6 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
         ) from None
     rows = ((n, len(row.episodes), f"{row.mean_steps:.0f}", len(row.failed_seeds)) for n, row in manifest.tasks.items())
     print_table(("task", "episodes", "mean steps", "failed seeds"), rows, f"demonstrations in {folder}")
-
-
-def _actor(settings: DemosSettings, task: str) -> PolicyActs | None:
-    """Return the policy that moves the robot instead of the expert; None for the expert."""
-    from kerv_cli.worlds import spec_of
-
-    target = settings.policy.target
-    if settings.policy.kind != EXPERT:
-        from kerv_cli.training.dagger import PolicyActs
-
-        return PolicyActs.of(settings, spec_of(task))
-    if target != PolicySettings().target:
-        raise UsageError(f"policy.target={target}: the expert acts, set policy=vision (or state) too")
-    return None
 
 
 @command(

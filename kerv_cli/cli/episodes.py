@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.base.durations import about
+from kerv_cli.base.durations import about, count
 from kerv_cli.cli.common import at_work, console, print_json, print_notes, print_table, settings_yaml
 
 if TYPE_CHECKING:
@@ -15,17 +15,11 @@ if TYPE_CHECKING:
 
     from kerv_cli.episodes.resolve import ResolvedStudy
     from kerv_cli.lab.events import Outcome
-    from kerv_cli.lab.plan import Episode
     from kerv_cli.lab.store import Plan, StudyStore
     from kerv_cli.lab.study import InterimAnalysis
 
 SECONDS_PER_EPISODE = 1.0
 """Before anything was measured; MT10 on one core takes 0.5 to 1.5."""
-
-
-def count(number: int, noun: str) -> str:
-    """Return a number with its noun: `1 task`, `2 tasks`."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def planned_study(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
@@ -93,28 +87,15 @@ def print_settings(resolved: ResolvedStudy) -> None:
 
 def print_study_plan(planned: Plan, as_json: bool) -> None:
     """Print which episodes would be run, why, and how long that takes."""
-    from kerv_cli.lab.plan import seeds_text
-    from kerv_cli.lab.study import estimate
+    from kerv_cli.lab.study import estimate, plan_rows
 
-    by_label: dict[str, list[Episode]] = {label: [] for label in planned.study.labels}
-    for one in planned.study.episodes:
-        by_label[one.setting.label].append(one)
-    columns = ("setting", "to run", "reused", "tasks", "seeds", "repeats", "why")
-    rows = []
-    for label, wanted in by_label.items():
-        to_run = [one for one in wanted if one in planned.missing]
-        tasks, repeats = len({one.task for one in wanted}), len({one.repeat for one in wanted})
-        why = "; ".join(dict.fromkeys(planned.missing[one] for one in to_run))
-        seeds = seeds_text(one.seed for one in wanted)
-        rows.append((label, len(to_run), len(wanted) - len(to_run), tasks, seeds, repeats, why))
-    store, to_run, reused = planned.store, planned.to_run, planned.existing
+    rows, store, to_run, reused = plan_rows(planned), planned.store, planned.to_run, planned.existing
     seconds, source = estimate(planned, SECONDS_PER_EPISODE)
     if as_json:
-        settings = [dict(zip(columns, row, strict=True)) for row in rows]
-        print_json({"study": store.name, "folder": store.root, "settings": settings, "to run": len(to_run),
+        print_json({"study": store.name, "folder": store.root, "settings": rows, "to run": len(to_run),
                     "reused": len(reused), "seconds": seconds, "source": source})  # fmt: skip
         return
-    print_table(columns, rows, f"study {store.name}, episodes")
+    print_table(rows[0], (row.values() for row in rows), f"study {store.name}, episodes")
     typer.echo(f"{count(len(to_run), 'episode')} to run, {len(reused)} reused, {about(seconds, source)}")
 
 

@@ -5,21 +5,13 @@ from __future__ import annotations
 import time
 from types import TracebackType
 
+from rich import progress as bars
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import (
-    BarColumn,
-    Progress,
-    SpinnerColumn,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
-from kerv_cli.base.durations import left
+from kerv_cli.base.durations import count, left
 from kerv_cli.lab.events import BlockEnded, BlockStarted, BlockWaits, EpisodeEnd, Event, SettingFailed, Started
-from kerv_cli.lab.plan import Block, Setting, count
+from kerv_cli.lab.plan import Block, Setting
 
 LOG_SECONDS = 30.0
 """Seconds between two lines of progress without a terminal."""
@@ -33,8 +25,8 @@ class ProgressDisplay:
 
     def __init__(self, console: Console | None = None) -> None:
         self.console = console or Console(stderr=True)
-        self._bar: Progress | None = None
-        self._task = TaskID(0)
+        self._bar: bars.Progress | None = None
+        self._task = bars.TaskID(0)
         self._total = self._ended = 0  # episodes
         self._part = 0.0  # of the episode that runs in this process
         self._began = self._logged = 0.0
@@ -112,16 +104,10 @@ class ProgressDisplay:
             self._print(f"{count(event.reused, 'episode')} there already")
         if not self.console.is_terminal or not event.to_run:
             return
-        columns = (
-            SpinnerColumn(),
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.fields[count]}"),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
-        )
-        self._bar = Progress(*columns, console=self.console, transient=True)
+        texts = [bars.TextColumn(text) for text in ("{task.description}", "{task.fields[count]}", "left")]
+        times = (bars.TimeElapsedColumn(), texts[2], bars.TimeRemainingColumn())
+        columns = (bars.SpinnerColumn(), texts[0], bars.BarColumn(), texts[1], *times)
+        self._bar = bars.Progress(*columns, console=self.console, transient=True)
         self._task = self._bar.add_task("preparing", total=event.to_run, count=self._count)
         self._bar.start()
 

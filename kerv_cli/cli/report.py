@@ -45,12 +45,7 @@ Choose = Annotated[
     typed={"study": "only"},
     lists=("on",),
 )
-def report(
-    settings: ReportSettings,
-    publish: Publish = False,
-    choose: Choose = False,
-    as_json: AsJson = False,
-) -> None:
+def report(settings: ReportSettings, publish: Publish = False, choose: Choose = False, as_json: AsJson = False) -> None:
     """Write CSV tables (per task and aggregated), plots and an HTML page of the studies."""
     from kerv_cli.cli.episodes import print_study, print_verdict
     from kerv_cli.episodes.resolve import study_name

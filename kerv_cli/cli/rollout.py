@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kerv_cli.base.durations import about
+from kerv_cli.base.durations import about, count
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import (
     AsJson,
@@ -19,7 +19,7 @@ from kerv_cli.cli.common import (
     results_word,
     settings_yaml,
 )
-from kerv_cli.cli.episodes import count, planned_rollout, run_study
+from kerv_cli.cli.episodes import planned_rollout, run_study
 from kerv_cli.episodes.settings import RolloutSettings
 
 if TYPE_CHECKING:

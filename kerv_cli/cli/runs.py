@@ -187,8 +187,9 @@ def rerun(
         raise UsageError(f"{run.id} is a {run.kind}: the command that makes it goes on where it is unfinished")
     if run.kind == "import":
         raise UsageError(f"{run.id} was imported: run vla-eval again, then 'kerv runs import'")
+    from kerv_cli.base.durations import count
     from kerv_cli.catalogue.again import plan_of
-    from kerv_cli.cli.episodes import count, run_planned
+    from kerv_cli.cli.episodes import run_planned
     from kerv_cli.report.compare import same_tokens
 
     planned = plan_of(run, results)
@@ -256,10 +257,7 @@ def export(
     names="NAME: a results folder of kerv 0.1.0, a kerv.db, vla-eval's recording-….sqlite, "
     "lerobot's eval_info.json, or folders that hold one.",
     keys="name baseline labels results",
-    examples=(
-        "kerv runs import ar/recording-1.sqlite kerv/recording-2.sqlite",
-        "kerv runs import old-results",
-    ),
+    examples=("kerv runs import ar/recording-1.sqlite kerv/recording-2.sqlite", "kerv runs import old-results"),
     lists=("labels",),
 )
 def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False) -> None:

@@ -17,10 +17,7 @@ from kerv_cli.serve.settings import ServeSettings
     "serve",
     ServeSettings,
     keys="protocol policy method task host port gripper batch origins",
-    examples=(
-        "kerv serve policy=vision method=one_pass",
-        "kerv serve protocol=vla_eval policy=state method=spec_vla",
-    ),
+    examples=("kerv serve policy=vision method=one_pass", "kerv serve protocol=vla_eval policy=state method=spec_vla"),
     typed={"task": "task_name"},  # one task's name; elsewhere it is a list
 )
 def serve(settings: ServeSettings, plan: ShowPlan = False) -> None:

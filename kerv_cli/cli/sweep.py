@@ -7,24 +7,11 @@ from typing import TYPE_CHECKING
 import typer
 
 from kerv_cli.base.config import compose, expand, groups, split
+from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UsageError
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import (
-    AsJson,
-    ShowPlan,
-    at_work,
-    print_json,
-    print_table,
-)
-from kerv_cli.cli.episodes import (
-    count,
-    planned_study,
-    print_settings,
-    print_study,
-    print_study_plan,
-    print_verdict,
-    run_study,
-)
+from kerv_cli.cli.common import AsJson, ShowPlan, at_work, print_json, print_table
+from kerv_cli.cli.episodes import planned_study, print_settings, print_study, print_study_plan, print_verdict, run_study
 from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 
 if TYPE_CHECKING:

@@ -23,12 +23,7 @@ Summary = Annotated[bool, typer.Option("--summary", help="Print what a recording
     names="NAME: runs (id, a unique part of it, or last), recordings (.rrd) or folders of them, and results=DIR.",
     writes=False,
 )
-def view(
-    settings: CommandSettings,
-    names: list[str],
-    to: To = None,
-    summary: Summary = False,
-) -> None:
+def view(settings: CommandSettings, names: list[str], to: To = None, summary: Summary = False) -> None:
     """Open recordings in the Rerun viewer; without a display, name the command that opens them."""
     from kerv_cli.report.viewing.viewer import find_recordings, open_recording, read_summary
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
+from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UsageError
 from kerv_cli.episodes.identity import (
     ENGINE,
@@ -383,8 +384,3 @@ def seeds_text(seeds: Iterable[int]) -> str:
         else:
             runs.append([seed, seed])
     return ";".join(str(a) if a == b else f"{a}-{b}" for a, b in runs)
-
-
-def count(number: int, noun: str) -> str:
-    """Return a number with its noun: `1 task`, `2 tasks`."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

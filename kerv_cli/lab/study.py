@@ -25,7 +25,7 @@ from kerv_cli.lab.database import EPISODES, Database
 from kerv_cli.lab.events import Event, OnEvent, Outcome, SettingFailed
 from kerv_cli.lab.execute import execute
 from kerv_cli.lab.executors import check_executor
-from kerv_cli.lab.plan import ALL, Episode, Setting, Study, all_episodes, plain_settings, seed_blocks
+from kerv_cli.lab.plan import ALL, Episode, Setting, Study, all_episodes, plain_settings, seed_blocks, seeds_text
 from kerv_cli.lab.runs import COMPLETE, Run, interrupted_since, run_rows
 from kerv_cli.lab.store import ROLLOUT, SWEEP, Plan, StudyStore, plan_study, studies
 
@@ -237,6 +237,26 @@ def _run_until_decided(
         if not undecided:
             break
     return total
+
+
+def plan_rows(planned: Plan) -> list[dict[str, object]]:
+    """Return a row per setting: how many episodes are missing, how many exist, and why any are run."""
+    rows: list[dict[str, object]] = []
+    for label in planned.study.labels:
+        episodes = [one for one in planned.study.episodes if one.setting.label == label]
+        missing = [one for one in episodes if one in planned.missing]
+        rows.append(
+            {
+                "setting": label,
+                "to run": len(missing),
+                "reused": len(episodes) - len(missing),
+                "tasks": len({one.task for one in episodes}),
+                "seeds": seeds_text(one.seed for one in episodes),
+                "repeats": len({one.repeat for one in episodes}),
+                "why": "; ".join(dict.fromkeys(planned.missing[one] for one in missing)),
+            }
+        )
+    return rows
 
 
 def estimate(planned: Plan, guess: float) -> tuple[float, str]:
