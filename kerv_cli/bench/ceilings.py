@@ -1,4 +1,4 @@
-"""The highest speedup of a method at measured latencies: every draft accepted whole (docs/methods.md §5)."""
+"""The highest speedup that a method can reach at measured latencies (docs/methods.md §5)."""
 
 from __future__ import annotations
 
@@ -14,8 +14,13 @@ from kerv_cli.methods.settings import EXPERT
 
 @dataclass(frozen=True)
 class MethodCeiling:
-    """free: drafting costs nothing. drafted: the drafter's own forwards count, where the method drafts with it; else
-    equal to free. Ratios of times per decode, AR over the method."""
+    """Speedups over AR per decode if every draft were accepted whole.
+
+    Attributes:
+        how: The forwards that remain, in words.
+        free: If drafting cost nothing.
+        drafted: With the costs of the drafter, if the method uses it.
+    """
 
     method: str
     how: str
@@ -24,8 +29,7 @@ class MethodCeiling:
 
 
 def ceilings(profile: Profile, tokens: int) -> list[MethodCeiling]:
-    """The ceilings of the methods in conf/method at N = `tokens`; the expert and methods that verify nothing have
-    none."""
+    """Return the ceilings of the methods in conf/method at N = `tokens`. Methods that verify nothing have none."""
     names = [name for name in groups()["method"] if name != EXPERT]
     candidates = (_ceiling(name, profile, tokens) for name in names)
     return [ceiling for ceiling in candidates if ceiling is not None]

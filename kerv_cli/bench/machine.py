@@ -1,4 +1,4 @@
-"""Measured rates of the device, bytes read and multiply-adds per second; and the stopwatch of the bench."""
+"""What a device can do, measured: bytes read and operations per second."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ class Machine:
 
 
 def synchronise(device: torch.device) -> None:
-    """Waits for the device's work."""
+    """Wait for the device's work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
 def timed(work: Callable[[], object], device: torch.device, repeats: int) -> np.ndarray:
-    """(repeats,) seconds of `work`, after two runs that do not count."""
+    """Return the seconds (repeats,) of `work`, after two runs that do not count."""
     for _ in range(2):
         work()
     seconds = np.empty(repeats)
@@ -84,7 +84,7 @@ def measure_machine(device: torch.device, dtype: torch.dtype) -> Machine:
 
 
 def product_with(weight: Tensor, dtype: torch.dtype) -> Callable[[Tensor], Tensor]:
-    """The function rows -> rows times the weight, as a forward on the weight's device multiplies in this format."""
+    """Return what multiplies rows with a weight as a forward on its device does in this number format."""
     if weight.device.type == "cpu" and dtype == torch.bfloat16 and multiplies_bfloat16():
         return BlockedLinear(weight)
     if weight.device.type == "cpu" and dtype == torch.float32:

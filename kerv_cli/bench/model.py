@@ -1,4 +1,4 @@
-"""The model under measurement: a policy's target, or a shape with random weights, and the drafter beside it."""
+"""The model that is measured: a policy's target, or a shape with random weights, and a drafter."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _SPARE = 1.15  # memory that must be free, over the weights: the prompt's encode
 
 @dataclass(frozen=True)
 class Sizes:
-    """A target's shape. vocabulary: tokens; weight, slot: bytes of a weight and of a number in the cache."""
+    """A target's shape, its number of tokens, and the bytes of a weight and of a number in the cache."""
 
     settings: TargetSettings
     vocabulary: int
@@ -49,19 +49,22 @@ class Sizes:
 
     @property
     def trunk_weights(self) -> int:
-        """Weights that every forward reads: the layers' matrices and the head."""
+        """Number of weights that every forward reads: the layers' matrices and the head."""
         return layer_weights(self.settings) * self.settings.layers + self.settings.width * self.vocabulary
 
     def forward(self, rows: int, cached: int) -> tuple[float, float]:
-        """Bytes and operations of a forward of `rows` tokens behind `cached` ones: every weight once, every key and
-        value once; two operations per weight and row, four per attended key's number."""
+        """Return the bytes and operations of a forward of `rows` tokens after `cached` ones.
+
+        It reads every weight, key and value once. It takes two operations per weight and row, and four per number of
+        an attended key.
+        """
         s, weights = self.settings, self.trunk_weights
         read = weights * self.weight + 2.0 * s.layers * (cached + rows) * s.width * self.slot
         attended = rows * cached + rows * (rows + 1) / 2
         return read, 2.0 * weights * rows + 4.0 * s.layers * s.width * attended
 
     def needs(self, kind: str, rows: int, prompt: int) -> tuple[float, float]:
-        """Bytes and operations of a cost of that kind; 0 where they are not counted. prompt: P."""
+        """Return the bytes and operations of a kind of cost; zeros if they are not counted. prompt: P."""
         s = self.settings
         drafter = float(layer_weights(s) + 2 * s.width**2 + s.width * self.vocabulary)
         # passes over the drafter's weights, and rows in them; a level of its tree is eight wide
@@ -74,8 +77,14 @@ class Sizes:
 
 @dataclass(frozen=True)
 class Model:
-    """The model under measurement. name: of the policy or shape. target: a ReadableTarget. drafter: EAGLE-style, of the
-    target's width. observation: any of the target's environment. is_shape: the weights are random."""
+    """The model that is measured.
+
+    Attributes:
+        name: Of the policy or shape.
+        target: A ReadableTarget.
+        observation: Any of the target's environment.
+        is_shape: Whether the weights are random.
+    """
 
     name: str
     target: Any
@@ -105,11 +114,11 @@ class Model:
 
 
 class ShapeTarget(CompactTarget):
-    """A compact target with random weights, built layer by layer in its final number format, so that memory never holds
-    7 B weights twice.
+    """A compact target with random weights.
 
-    On a CPU the prompt's encoder stays float32, where its packed weights are fastest. Layers after the first hold the
-    first one's numbers, shifted by a few rows: a forward reads them from other memory, as in a trained target.
+    It is built layer by layer in its final number format, so that memory never holds 7 B weights twice. On a CPU the
+    prompt's encoder stays float32, where it is compiled. Later layers hold the first one's numbers, shifted by a few
+    rows: a forward reads them from other memory, as in a trained target.
     """
 
     def __init__(self, settings: TargetSettings, device: torch.device, dtype: torch.dtype) -> None:
@@ -133,12 +142,12 @@ class ShapeTarget(CompactTarget):
             pack(self)
 
     def encode(self, observation: Observation) -> Tensor:
-        """The prompt (1, P, E) of an observation, in the trunk's number format."""
+        """Return the prompt (1, P, E) of an observation in the trunk's number format."""
         return super().encode(observation).to(self.dtype)
 
 
 def shifted_layers(settings: TargetSettings, device: torch.device, dtype: torch.dtype) -> Iterator[Layer]:
-    """The trunk's layers, frozen, one after the other."""
+    """Yield the trunk's layers, frozen, one after the other."""
     torch.manual_seed(0)
     first = Layer(settings.width, settings.heads, settings.feed_forward).requires_grad_(False)
     for parameter in first.parameters():
@@ -155,7 +164,7 @@ def shifted_layers(settings: TargetSettings, device: torch.device, dtype: torch.
 
 
 def layer_weights(settings: TargetSettings) -> int:
-    """Numbers in one decoder layer's matrices."""
+    """Return the number of weights in one decoder layer's matrices."""
     return 4 * settings.width**2 + 3 * settings.width * settings.feed_forward
 
 
@@ -200,7 +209,7 @@ def _shape(settings: BenchSettings) -> Model:
 
 
 def shape_of(name: str, tokens: int) -> TargetSettings:
-    """A shape of conf/target that decodes chunks of so many tokens or a few more."""
+    """Return a shape of conf/target that decodes chunks of at least so many tokens."""
     shape = compose("train_target", [f"target={name}"], TrainTargetSettings).target
     return replace(shape, chunk=-(-tokens // SPEC.actions.dofs))
 
@@ -213,13 +222,12 @@ def _drafter(target: ReadableTarget) -> EagleNetwork:
 
 
 def blank(target: Any) -> Observation:
-    """An observation of the target: black images and zeros."""
+    """Return an observation of black images and zeros."""
     return still_observation(target, target.observation, target.settings.image_size)
 
 
 def fastest(device: torch.device) -> torch.dtype:
-    """The number format in which one row times a matrix larger than the processor's caches takes less time here,
-    measured; bfloat16 on CUDA."""
+    """Return the number format in which a row times a large matrix is faster here, measured; bfloat16 on CUDA."""
     if device.type == "cuda":
         return torch.bfloat16
     if not multiplies_bfloat16():
@@ -233,7 +241,7 @@ def fastest(device: torch.device) -> torch.dtype:
 
 
 def free_memory(device: torch.device) -> float:
-    """Bytes that an allocation may take."""
+    """Return the bytes that can be allocated."""
     if device.type == "cuda":
         return float(torch.cuda.mem_get_info(device)[0])
     try:

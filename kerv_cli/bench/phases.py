@@ -49,10 +49,18 @@ Key = tuple[str, int]
 
 @dataclass(frozen=True)
 class Phase:
-    """One measured cost. kind: encode, prefill, verify (1 row: a single token), feed (the target's states into the
-    drafter), draft (rows: tokens of the drafter's chain), tree (rows: levels of its tree), early, retrieval (a draft of
-    the shipped policy's). rows: forwarded tokens. seconds: median; read, flops: bytes and operations that it cannot do
-    without; floor: the seconds that the device needs for them; share: floor over median."""
+    """One measured cost.
+
+    Attributes:
+        kind: encode, prefill, verify, feed (the target's states into the drafter), draft (the drafter's chain), tree
+            (its tree), or a draft of the shipped policy: early, retrieval, scout.
+        rows: Forwarded tokens; tokens of a chain, levels of a tree.
+        seconds: The median.
+        least: The least of all repeats.
+        read: Bytes that it must read at least.
+        flops: Operations that it must do at least.
+        floor: Seconds that the device needs for them; 0 if they are not counted.
+    """
 
     kind: str
     rows: int
@@ -65,7 +73,7 @@ class Phase:
 
     @property
     def share(self) -> float:
-        """Floor over median: 1 where the phase takes no longer than the device needs; noise may exceed it."""
+        """Floor ÷ median: 1 if the phase takes no longer than the device needs."""
         return self.floor / self.seconds
 
     @property
@@ -76,26 +84,26 @@ class Phase:
         return f"{self.kind} {self.rows}" if self.kind in FORWARDS[1:] else self.kind
 
     def as_dict(self) -> dict[str, float | str]:
-        """For JSON: the fields, and rates in GB/s and GFLOP/s."""
+        """Return the fields, and rates in GB/s and GFLOP/s, as JSON values."""
         rates = {"gb_per_s": self.read / self.seconds / 1e9, "gflop_per_s": self.flops / self.seconds / 1e9}
         return {"name": self.name, **asdict(self), **rates, "share": self.share}
 
 
 class Laps(Stopwatch):
-    """A stopwatch that keeps every lap, (phase, seconds)."""
+    """A stopwatch that keeps every lap: its phase and seconds."""
 
     def __init__(self, device: torch.device) -> None:
         self.laps: list[tuple[str, float]] = []
         super().__init__(device)
 
     def lap(self, phase: str) -> None:
-        """Ends a phase; see `Stopwatch.lap`."""
+        """End a lap of a phase."""
         before = self.phases[phase]
         super().lap(phase)
         self.laps.append((phase, self.phases[phase] - before))
 
     def stop(self) -> float:
-        """Seconds in all; see `Stopwatch.stop`."""
+        """Stop, and return all seconds."""
         seconds = super().stop()
         if self.events is not None:
             pairs = itertools.pairwise(self.events)
@@ -104,7 +112,7 @@ class Laps(Stopwatch):
 
 
 class Dummy(Proposer):
-    """Drafts so many nodes: a chain, and where that has no room for them further children of the root."""
+    """Draft a number of nodes: a chain, and more children of the root if the chunk has no room for a longer one."""
 
     name = "dummy"
 
@@ -118,7 +126,7 @@ class Dummy(Proposer):
 
 
 def decoders(model: Model) -> list[Decoder]:
-    """Decoders whose rounds have all the sizes that a chunk of N tokens can have. Everything drafted is accepted."""
+    """Return decoders whose rounds have all sizes that a chunk can have. They accept everything that is drafted."""
     target, size = model.target, model.size
     rule, everything = RelaxedRule(target.actions, strict_dofs=False), Fixed(target.actions.tokens)
 
@@ -136,7 +144,7 @@ def decoders(model: Model) -> list[Decoder]:
 def costs_of(decoder: Decoder, prompt: int, rounds: Sequence[Round], laps: Sequence[tuple[str, float]]) -> Iterator[
     tuple[Key, float]
 ]:  # fmt: skip
-    """The costs that a decode shows, each with its seconds; a forward ends when its argmax is on the host."""
+    """Yield the costs in a decode and their seconds. A forward ends when the CPU has its argmax."""
     seconds = {phase: sum(s for name, s in laps if name == phase) for phase in ("vision", "prefill", "verify")}
     yield ("encode", 1), seconds["vision"]
     yield ("prefill", prompt + rounds[0].tree_size), seconds["prefill"]
@@ -157,10 +165,10 @@ def costs_of(decoder: Decoder, prompt: int, rounds: Sequence[Round], laps: Seque
 
 @torch.inference_mode()
 def measure(model: Model, machine: Machine, settings: BenchSettings) -> tuple[Machine, list[Phase]]:
-    """Times every decoder of `decoders` by turns, a decode each, `repeats` times; then measures the machine again.
+    """Time all decoders in turn, `repeats` times, then measure the machine again.
 
     Returns:
-        The machine's best rates, and the costs with floors from these rates.
+        The machine's best rates, and the costs with floors at these rates.
     """
     device, evicting = model.target.device, torch.ones(_EVICTING)
     every, seconds = decoders(model), dict[Key, list[float]]()
@@ -216,7 +224,7 @@ def needs_of_draft(decoder: Any) -> tuple[float, float]:
 
 
 def source_methods() -> dict[str, str]:
-    """Kind of a proposer's own cost -> the method whose decodes measure it."""
+    """Return the kinds of proposers' own costs, each with the method whose decodes measure it."""
     measured = [part.traits for part in parts("proposer").values() if "measured_by" in part.traits]
     return {traits["cost"]: traits["measured_by"] for traits in measured}
 

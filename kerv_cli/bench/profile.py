@@ -22,7 +22,7 @@ Document = dict[str, Any]
 
 
 def profile_of(phases: Sequence[Phase], tokens: int) -> Profile:
-    """The profile of measured costs, their medians. tokens: N."""
+    """Return the profile of the medians of measured costs. tokens: N."""
     points = {
         kind: sorted((p.rows, p.seconds) for p in phases if p.kind == kind) for kind in (*FORWARDS, *source_methods())
     }
@@ -34,8 +34,10 @@ def profile_of(phases: Sequence[Phase], tokens: int) -> Profile:
 def projections(
     settings: BenchSettings, model: Model, machine: Machine, phases: Sequence[Phase]
 ) -> Iterator[tuple[str, Document]]:
-    """(device, document) of every device of `projections`, for the shape `projected` in bfloat16. Its rows behind the
-    prompt are those measured here."""
+    """Yield every device of `projections` and its document, for the shape `projected` in bfloat16.
+
+    The rows after the prompt are those measured here.
+    """
     shape = shape_of(settings.projected, model.size)
     sizes = Sizes(shape, model.target.actions.tokens, _HALF, _HALF)
     here, prompt = min(p.rows for p in phases if p.kind == "prefill"), prompt_of(shape)
@@ -60,8 +62,10 @@ def projections(
 
 
 def shares(phases: Sequence[Phase], machine: Machine) -> tuple[float, float]:
-    """Median share of the floor of the costs that are bound by memory, and of those bound by arithmetic; where there
-    are none of one kind, that of all."""
+    """Return the median floor ÷ time of costs bound by memory, and of costs bound by arithmetic.
+
+    Without costs of one kind the other kind's median stands for it.
+    """
     by_bound: dict[bool, list[float]] = {True: [], False: []}
     for p in phases:
         if p.floor > 0 and p.kind in FORWARDS:
@@ -74,9 +78,12 @@ def shares(phases: Sequence[Phase], machine: Machine) -> tuple[float, float]:
 def projected(
     phases: Sequence[Phase], reached: tuple[float, float], here: Machine, there: Machine, layers: int
 ) -> list[Phase]:
-    """The phases, with the bytes and operations that they need there, on a device that is not at hand: its floors
-    divided by the shares that were reached here, and the least that so many layers' passes take. What has no floor, the
-    encoder, scales with bandwidth; drafts of the shipped policy stay as they are. A projection, not a measurement."""
+    """Project phases, with the bytes and operations that they need there, onto a device that is not at hand.
+
+    A time is the device's floor divided by the share of the floor that was reached here, and at least what so many
+    layers' kernels take. The encoder has no floor: it scales with bandwidth. Drafts of the shipped policy stay as they
+    are. This is no measurement.
+    """
     projections = []
     for p in phases:
         passes = {"prefill": layers, "verify": layers, "feed": 1}.get(p.kind, p.rows - 1)
@@ -90,6 +97,6 @@ def projected(
 
 
 def prompt_of(shape: TargetSettings) -> int:
-    """P of a shape with these settings: vision tokens, instruction, scene, proprioception."""
+    """Return P of a shape: vision tokens, instruction, scene and proprioception."""
     vision = shape.grid**2 if shape.observation == "vision" else 0
     return vision + shape.instruction_tokens + shape.scene_tokens + 1

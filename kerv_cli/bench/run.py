@@ -1,4 +1,4 @@
-"""One bench: the card, every phase, ceilings, and the document that holds them all."""
+"""One benchmark: what the device can do, what every phase costs, ceilings, and the document of them all."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from kerv_cli.targets.provenance import stamp
 
 @dataclass(frozen=True)
 class Bench:
-    """The results of a bench. ceilings: by N."""
+    """The results of a benchmark; the ceilings by N."""
 
     model: Model
     machine: Machine
@@ -42,7 +42,7 @@ class Bench:
         return f"{self.model.name}, {self.dtype}, {where}, {torch.get_num_threads()} thread, caches cold at first"
 
     def document(self) -> Document:
-        """The whole result, for JSON."""
+        """Return the whole result as JSON values."""
         device = self.model.target.device
         return {
             "target": self.model.name,
@@ -85,7 +85,7 @@ def card_of(model: Model, machine: Machine, tokens: int) -> dict[str, Any]:
 
 
 def run(settings: BenchSettings, model: Model, machine: Machine) -> Bench:
-    """Measures the opened model."""
+    """Measure the opened model."""
     machine, phases = measure(model, machine, settings)
     profile = profile_of(phases, model.size)
     by_tokens = {n: ceilings(profile, n) for n in settings.tokens}
@@ -93,7 +93,7 @@ def run(settings: BenchSettings, model: Model, machine: Machine) -> Bench:
 
 
 def write(settings: BenchSettings, bench: Bench) -> list[Path]:
-    """Writes the document and the projections of `projected` -> their paths."""
+    """Write the document and the projections, and return their paths."""
     folder = results_dir(settings.results) / "bench"
     name = bench.model.name.rstrip("/").rsplit("/", 1)[-1]
     documents = {folder / f"{name}-{bench.dtype}.json": bench.document()}

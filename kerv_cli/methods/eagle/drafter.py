@@ -88,7 +88,7 @@ class EagleNetwork(LayerStack):
 
         def step(hidden: Tensor) -> Tensor:
             token = target.head(hidden).argmax(-1)
-            return self.compute([target.embedding(token)[None], hidden])
+            return self.recorded(target.embedding(token)[None], hidden)
 
         compiled = isinstance(target, CompactTarget) and target.packed is not None and self.packed is not None
         return Program(step, (1, 1, self.width), repeats=True) if compiled else None

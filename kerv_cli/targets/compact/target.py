@@ -237,7 +237,7 @@ class CompactTarget(Packable):
             shapes += [(1, space.state)]
 
         def step(token: Tensor) -> Tensor:
-            return self.head(self.trunk.compute([self.embedding(token)])).argmax(-1)
+            return self.head(self.trunk.recorded(self.embedding(token))).argmax(-1)
 
         return Compiled(Program(self.prompt, *shapes), Program(step, (1, 1), repeats=True))
 

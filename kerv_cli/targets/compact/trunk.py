@@ -114,7 +114,7 @@ class LayerStack(Packable):
         self.norm = nn.RMSNorm(width, eps=1e-5)
 
     def enter(self, *inputs: Tensor) -> Tensor:
-        """The inputs (B, T, E) -> what the first layer reads (B, T, E)."""
+        """Return what the first layer reads (B, T, E), of inputs (B, T, E)."""
         return inputs[0]
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
@@ -129,7 +129,7 @@ class LayerStack(Packable):
     def pack_weights(self) -> Program | Bfloat16Layers | None:
         """Return the compiled stack in float32, blocked layers in bfloat16 where the CPU multiplies that."""
         if self.norm.weight.dtype == torch.float32:
-            return Program(lambda *inputs: self.compute(inputs), *[(1, 1, self.width)] * self.inputs)
+            return Program(self.recorded, *[(1, 1, self.width)] * self.inputs)
         if self.norm.weight.dtype == torch.bfloat16 and multiplies_bfloat16():
             return Bfloat16Layers(self.rotary(slice(None)), self.layers)
         return None
@@ -146,17 +146,16 @@ class LayerStack(Packable):
         """
         x = inputs[0]
         mask = attention_mask(seen, x.shape[1], cache, x)
-        slots = cache.next_slots(x.shape[1]) if cache is not None else None
         packed = self.packed if self.is_packed(x) and (cache is None or not cache.fixed) else None
         if isinstance(packed, Program):
             hidden = packed(*inputs, positions=positions, cache=cache, mask=mask)[0].view(x.shape)
-        elif packed is not None:
-            hidden = self.norm(packed(self.enter(*inputs), positions, cache, slots, mask))
         elif isinstance(cache, CapturedCache) and self.captures(x):
             assert mask is not None
             hidden = self.norm(cache.run(self.run_layers, self.enter(*inputs), positions, mask))
         else:
-            hidden = self.compute(inputs, positions, cache, slots, mask)
+            slots = cache.next_slots(x.shape[1]) if cache is not None else None
+            layers = self.run_layers if packed is None else packed
+            hidden = self.norm(layers(self.enter(*inputs), positions, cache, slots, mask))
         if cache is not None:
             cache.length += x.shape[1]
         return hidden
@@ -165,16 +164,9 @@ class LayerStack(Packable):
         """Return whether a forward of x (B, T, E) over a cache of fixed shapes runs in a captured graph."""
         return x.is_cuda and x.shape[0] == 1 and not wants_gradient(x)
 
-    def compute(
-        self,
-        inputs: Sequence[Tensor],
-        positions: Tensor | slice = slice(None),
-        cache: Cache | None = None,
-        slots: Slots | None = None,
-        mask: Tensor | None = None,
-    ) -> Tensor:
-        """Return the hidden states by the modules; the cache's length stays. Without positions: for a recording."""
-        return self.norm(self.run_layers(self.enter(*inputs), positions, cache, slots, mask))
+    def recorded(self, *inputs: Tensor) -> Tensor:
+        """Return the hidden states of stand-ins for tensors, to record a program."""
+        return self.norm(self.run_layers(self.enter(*inputs), slice(None), None, None, None))
 
     def run_layers(
         self, x: Tensor, positions: Tensor | slice, cache: Cache | None, slots: Slots | None, mask: Tensor | None
