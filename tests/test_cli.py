@@ -73,22 +73,6 @@ def test_help_is_fast(words: list[str]) -> None:
     assert min(seconds(asked) for _ in range(5)) < max(0.5, 6 * typer)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (("rollout", "task=drawer-opne"), "unknown task or suite 'drawer-opne': did you mean drawer-open"),
-        (("train", "target", "target=smal"), "unknown target 'smal': did you mean small"),
-        (("rollout", "seed=5"), "seed=5 is a training seed"),
-        (("rollout", "threshold.r=900", "method=spec_vla"), "threshold.r=900"),
-        (("rollout", "runtime.device=tpu"), "runtime.device=tpu"),
-        (("sweep", "study=treshold"), "unknown study 'treshold': did you mean threshold"),
-    ],
-)
-def test_a_wrong_request_gets_one_line_and_exit_code_2(arguments: tuple[str, ...], says: str, policies: Path) -> None:
-    policy = ["policy=state", "policy.target=nano-state"] if arguments[0] == "rollout" else []
-    assert says in one_line(kerv(*arguments, *policy, f"results={policies}"), 2)
-
-
 def test_what_is_missing_or_damaged_gets_one_line_and_exit_code_1(policies: Path, tmp_path: Path) -> None:
     results = tmp_path / "results"
     shutil.copytree(policies, results)

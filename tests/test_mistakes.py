@@ -51,6 +51,8 @@ ANSWERS = [
     ("runs list kindd=x", "unknown key 'kindd': did you mean kind?"),
     ("rollout task=reach-v2", "unknown task or suite 'reach-v2': did you mean reach-v3"),
     ("rollout task=mt11", "unknown task or suite 'mt11': did you mean MT10"),
+    ("train target target=smal", "unknown target 'smal': did you mean small"),
+    ("sweep study=treshold", "unknown study 'treshold': did you mean threshold"),
     ("rollout method=AR", "unknown method 'AR': did you mean ar?"),
     ("prepare for=kervv", "unknown method 'kervv': did you mean kerv"),
     ("rollout rollout.clock=reel", "unknown rollout.clock 'reel': did you mean real?"),
@@ -66,6 +68,9 @@ ANSWERS = [
     ("rollout method=heisd boundary.f_star=25", "boundary.f_star=25.0: from 0 to 1"),
     ("rollout method=spec_vla boundary.f_star=0.3", "unknown key 'boundary.f_star'"),
     ("rollout episodes=3 episodes=4", "episodes is given twice"),
+    ("rollout seed=5", "seed=5 is a training seed"),
+    ("rollout threshold.r=900 method=spec_vla", "threshold.r=900"),
+    ("rollout runtime.device=tpu", "runtime.device=tpu: known are cpu, cuda"),
     # methods
     ("rollout method=part.yaml", "part.yaml:3: unknown proposer 'draftr': did you mean drafter"),
     ("rollout method=range.yaml", "range.yaml:4: boundary.f_star=25.0: from 0 to 1"),

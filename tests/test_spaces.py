@@ -89,16 +89,15 @@ def test_a_space_survives_its_json_and_a_damaged_one_gets_one_line() -> None:
 def test_what_was_made_for_other_actions_is_refused_by_the_first_difference() -> None:
     fitted = replace(SPACE, low=(-0.5,) * 4)
     fitted.check_same(SPACE, "the target", "the environment")
-    with pytest.raises(CheckpointError, match=r"low -0\.5, -0\.5, -0\.5, -0\.5, the target one with -1"):
-        fitted.check_same(SPACE, "the datastore", "the target", statistics=True)
-    with pytest.raises(CheckpointError, match="names dx, dy, dz, gripper, the environment one with dx, dy, dz, droll"):
-        SPACE.check_same(INSERTION.actions, "the target", "the environment")
-    loose = replace(SPACE, strict=())
-    with pytest.raises(CheckpointError, match="strict gripper, the drafter one with none"):
-        SPACE.check_same(loose, "the target", "the drafter")
-    other = replace(SPACE, groups=(Group("all", 4),))
-    with pytest.raises(CheckpointError, match=r"groups position 3\+gripper 1, the drafter one with all 4"):
-        SPACE.check_same(other, "the target", "the drafter")
+    others = {
+        "names": INSERTION.actions,
+        "strict": replace(SPACE, strict=()),
+        "groups": replace(SPACE, groups=(Group("all", 4),)),
+        "low": fitted,
+    }
+    for name, other in others.items():
+        with pytest.raises(CheckpointError, match=f"an action space with {name} "):
+            SPACE.check_same(other, "the target", "the drafter", statistics=True)
 
 
 def test_words_keep_their_ids_and_a_long_sentence_is_refused() -> None:
