@@ -64,7 +64,9 @@ class RunSettings(CommandSettings):
 class TaskSettings(RunSettings):
     """Settings of every command that works on tasks."""
 
-    task: list[str] = setting([], "tasks and suites: reach, drawer-open, MT10, …; empty: those that the target knows")
+    task: list[str] = setting(
+        [], "tasks and suites: reach, drawer-open, MT10, …; empty: those that the target was trained on"
+    )
 
 
 def choices_of(schema: type) -> dict[str, str]:

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 class ImportSettings(CommandSettings):
     """`kerv runs import`: recordings of vla-eval as a study (docs/vla_eval.md)."""
 
-    name: str = setting("", "of the study; empty: that of its benchmarks")
+    name: str = setting("", "name of the study; empty: the names of its benchmarks")
     baseline: str = setting("", "label of the setting that the others are compared with; empty: ar, else the first")
-    labels: list[str] = setting([], "of the recordings, in their order; empty: methods, or names of servers")
+    labels: list[str] = setting([], "labels of the recordings, in order; empty: methods, or names of servers")
 
 
 RUNS = "NAME: runs (id, a unique part of it, or last) and results=DIR."
