@@ -99,9 +99,11 @@ def test_a_verification_and_single_tokens_agree(dtype: str) -> None:
 
 
 @torch.inference_mode()
-def test_decodes_of_all_sizes_show_what_each_part_costs() -> None:
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_decodes_of_all_sizes_show_what_each_part_costs(dtype: str) -> None:
     """The forwards' rows are counted at the trunk, the costs' at the laps."""
-    model, rows, shown = open_model(NANO), list[int](), set[tuple[str, int]]()
+    model, rows = open_model(dataclasses.replace(NANO, dtype=dtype)), list[int]()
+    shown = set[tuple[str, int]]()
     model.target.trunk.register_forward_pre_hook(lambda _, inputs: rows.append(inputs[0].shape[1]))
     prompt = model.target.encode(model.observation)
     length = prompt.shape[1]

@@ -90,7 +90,7 @@ class EagleNetwork(LayerStack):
             token = target.head(hidden).argmax(-1)
             return self.recorded(target.embedding(token)[None], hidden)
 
-        compiled = isinstance(target, CompactTarget) and target.packed is not None and self.packed is not None
+        compiled = isinstance(target, CompactTarget) and target.packed is not None and isinstance(self.packed, Program)
         return Program(step, (1, 1, self.width), repeats=True) if compiled else None
 
 

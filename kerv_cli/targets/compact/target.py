@@ -44,8 +44,14 @@ from kerv_cli.worlds.views import frame_shape, views_of
 
 @dataclass(frozen=True)
 class Inputs:
-    """A batch of observations as tensors. images (B, 3, size, size x views) uint8 or None, proprioception (B, p) and
-    states (B, s) float32, words (B, L) int64. A vision policy does not read `states`."""
+    """A batch of observations as tensors; a vision policy does not read the states.
+
+    Attributes:
+        images: (B, 3, size, size · views) uint8, or None.
+        proprioception: (B, p) float32.
+        states: (B, s) float32.
+        words: (B, L) int64.
+    """
 
     images: Tensor | None
     proprioception: Tensor
@@ -64,13 +70,17 @@ class Compiled(NamedTuple):
 
 
 class CompactTarget(Packable):
-    """The compact policy: encoder, trunk and head; implements `ReadableTarget`. Parameters in float32.
+    """The compact policy: encoder, trunk and head; implements `ReadableTarget`. Its parameters are float32.
 
-    cameras: of a vision policy, the one whose images it reads; each of its views (`views_of`) has an encoder and vision
-    tokens of its own. frame_shape: of those images. segments: slice of the prompt by the name of its part.
-    sha256: of the weights it was loaded with, else empty. chunk: H, control steps it was trained to decode at once.
-    parallel: whether it decodes by `parallel_pass` alone; it has not learnt to continue action tokens. width: E. heads,
-    feed_forward: attention heads and hidden units of the trunk's layers, and of a drafter's.
+    Attributes:
+        cameras: The camera whose images a vision policy reads. Each of its views has an encoder and vision tokens.
+        frame_shape: Shape of those images.
+        segments: Slice of the prompt by the name of its part.
+        sha256: Of the weights it was loaded with, else empty.
+        chunk: H, control steps it was trained to decode at once.
+        parallel: Whether it decodes by `parallel_pass` alone. It has not learnt to continue action tokens.
+        width: E.
+        heads, feed_forward: Attention heads and hidden units of the trunk's layers, and of a drafter's.
     """
 
     centre: Tensor
@@ -120,7 +130,7 @@ class CompactTarget(Packable):
 
     @property
     def encoders(self) -> tuple[VisionEncoder, ...]:
-        """Of a vision policy, one per view, from left to right."""
+        """The encoders of a vision policy's views, from left to right."""
         return self.vision, *self.further_views
 
     @property
@@ -129,7 +139,7 @@ class CompactTarget(Packable):
         return self.width * (self.settings.scene_tokens + (3 if self.cameras else 2))
 
     def pooled(self, prompt: Tensor) -> Tensor:
-        """prompt (B, P, E) -> (B, F): scene tokens end to end, proprioception, mean word, mean vision token if any."""
+        """Pool a prompt (B, P, E) -> (B, F): scene tokens, proprioception, mean word, and mean vision token if any."""
         parts = self.segments
         pooled = [prompt[:, parts["scene"]].flatten(1), prompt[:, parts["proprioception"]].flatten(1)]
         pooled += [prompt[:, parts[name]].mean(1) for name in ("instruction", "vision") if name in parts]
@@ -146,10 +156,10 @@ class CompactTarget(Packable):
         return self.head.weight.dtype
 
     def inputs(self, observation: Observation) -> Inputs:
-        """One observation as a batch of one.
+        """Return one observation as a batch of one.
 
         Raises:
-            CheckpointError: numbers or images of another size than the policy was trained on.
+            CheckpointError: Numbers or images have another size than in training.
         """
         proprioception, state = (
             upload(np.asarray(x, dtype=np.float32), self.device)[None]
@@ -176,19 +186,18 @@ class CompactTarget(Packable):
         return Inputs(images, proprioception, state, upload([words], self.device))
 
     def encode(self, observation: Observation) -> Tensor:
-        """The prompt's embeddings (1, P, E); errors as `inputs`."""
+        """Return the prompt's embeddings (1, P, E); errors as `inputs`."""
         return self.encode_batch(self.inputs(observation))[0]
 
     def encode_many(self, observations: Sequence[Observation]) -> Tensor:
-        """The prompts' embeddings (B, P, E); errors as `inputs`."""
+        """Return the prompts' embeddings (B, P, E); errors as `inputs`."""
         batch = [self.inputs(observation) for observation in observations]
         images = [one.images for one in batch if one.images is not None]
         rows = (torch.cat([getattr(one, name) for one in batch]) for name in ("proprioception", "states", "words"))
         return self.encode_batch(Inputs(torch.cat(images) if images else None, *rows))[0]
 
     def encode_batch(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
-        """Prompt embeddings (B, P, E), and the positions of the places (B, K, 3) in metres that their scene tokens
-        carry."""
+        """Return prompt embeddings (B, P, E), and the places' positions (B, K, 3) in metres that they carry."""
         given = [inputs.words, inputs.proprioception, inputs.states]
         if self.cameras:
             assert inputs.images is not None
@@ -201,7 +210,7 @@ class CompactTarget(Packable):
         return self.prompt(*given)
 
     def prompt(self, words: Tensor, proprioception: Tensor, *seen: Tensor) -> tuple[Tensor, Tensor]:
-        """What `encode_batch` returns. seen: states (B, s), or vision tokens and image points of all views."""
+        """Compute `encode_batch` by the modules. seen: states (B, s), or vision tokens and points of all views."""
         embedded, hand = self.word_embedding(words), hand_features(proprioception, self.centre)
         if self.cameras:
             tokens, points = seen
@@ -217,7 +226,7 @@ class CompactTarget(Packable):
         return torch.cat([*parts, embedded, scene, felt], 1), places
 
     def located(self, points: Tensor, hand: Tensor, words: Tensor) -> Tensor:
-        """The places' estimated positions (B, K, 3), metres."""
+        """Estimate the places' positions (B, K, 3), metres."""
         # bfloat16 would round image points to a fifth of a cell: millimetres matter here
         with torch.autocast(points.device.type, enabled=False):
             features = torch.cat([points, hand, words.mean(1)], -1).to(self.head.weight.dtype)
@@ -246,13 +255,13 @@ class CompactTarget(Packable):
         return self.embedding(tokens)
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
-        """An empty cache. fixed: every forward has the same shapes; default: on CUDA."""
+        """Return an empty cache. fixed: every forward has the same shapes; default: on CUDA."""
         return self.trunk.new_cache(batch, capacity, fixed)
 
     def forward(
         self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
-        """Hidden states (B, T, E) of x (B, T, E) at `positions` (T,), behind the cached tokens."""
+        """Return the hidden states (B, T, E) of x (B, T, E) at `positions` (T,), after the cached tokens."""
         return self.trunk(x, positions, cache, seen)
 
     def continue_greedily(self, token: int, count: int, cache: Cache) -> list[int] | None:
@@ -265,16 +274,20 @@ class CompactTarget(Packable):
         return [int(token) for token in tokens[:, 0]]
 
     def parallel_pass(self, prompt: Tensor, cache: Cache | None = None) -> Tensor:
-        """prompt (B, P, E) -> hidden states (B, N, E) of all tokens, in one forward (docs/methods.md §6). No action
-        token is embedded: learned queries stand at their positions and see the prompt and each other."""
+        """Return the hidden states (B, N, E) of all tokens in one forward (docs/methods.md §6).
+
+        No action token is embedded: learned queries at their positions see the prompt (B, P, E) and each other.
+        """
         x = torch.cat([prompt, self.queries.to(prompt.dtype).expand(len(prompt), -1, -1)], 1)
         visible = np.tri(x.shape[1], dtype=bool)
         visible[prompt.shape[1] :] = True
         return self(x, torch.arange(x.shape[1], device=x.device), cache, visible)[:, prompt.shape[1] :]
 
     def teacher_forced(self, inputs: Inputs, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """tokens (B, N) -> logits (B, N, V) that predict them, and the positions of the places (B, K, 3), metres. A
-        parallel target is shown none of the tokens."""
+        """Return logits (B, N, V) that predict tokens (B, N), and the places' positions (B, K, 3), metres.
+
+        A parallel target is shown none of the tokens.
+        """
         prompt, places = self.encode_batch(inputs)
         if self.parallel:
             return self.head(self.parallel_pass(prompt)), places
