@@ -47,8 +47,7 @@ def conf_dir() -> Path:
 
 def groups() -> dict[str, list[str]]:
     """Return the groups of settings and the names in them: {"method": ["ar", "spec_vla", …], …}."""
-    root = conf_dir()
-    names = {d.name: {p.stem for p in d.glob("*.yaml")} for d in sorted(root.iterdir()) if d.is_dir()}
+    names = {d.name: {p.stem for p in d.glob("*.yaml")} for d in conf_dir().iterdir() if d.is_dir()}
     for group in SETTINGS_GROUPS:
         names.setdefault(group, set()).update(_parts_of(group))
     return {group: sorted(names[group]) for group in sorted(names)}

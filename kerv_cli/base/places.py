@@ -51,9 +51,8 @@ def artifact(results: str, kind: str, name: str) -> Path:
     Raises:
         UsageError: Neither a plain folder name nor a path.
     """
-    if "/" in name:
-        return as_path(name)
-    return results_dir(results) / "artifacts" / kind / check_name(name, f"{kind} name")
+    plain = "/" not in name
+    return results_dir(results) / "artifacts" / kind / check_name(name, f"{kind} name") if plain else as_path(name)
 
 
 def as_path(text: str) -> Path:

@@ -250,6 +250,6 @@ def _place_of(error: Exception) -> str:
     """Return `FILE:LINE: ` of an error in a plugin; empty if the plugin was not found."""
     if isinstance(error, SyntaxError):
         return f"{error.filename}:{error.lineno}: "
-    frames = traceback.extract_tb(error.__traceback__)[2:]
-    places = [f"{frame.filename}:{frame.lineno}: " for frame in frames if frame.filename[0] != "<"]
-    return next((place for place in reversed(places) if not place.startswith(__file__)), "")
+    frames = reversed(traceback.extract_tb(error.__traceback__)[2:])
+    own = (one for one in frames if one.filename[0] != "<" and one.filename != __file__)
+    return next((f"{one.filename}:{one.lineno}: " for one in own), "")
