@@ -19,7 +19,7 @@ from kerv_cli.episodes.expert import ExpertDecoder
 from kerv_cli.episodes.rows import decodes_blob, decodes_table, episode_row, read_decodes
 from kerv_cli.report.measures import MACRO, MICRO, measure
 from kerv_cli.report.viewing import save_recording
-from kerv_cli.report.viewing.facts import summary
+from kerv_cli.report.viewing.token_outcomes import summary
 from kerv_cli.report.viewing.viewer import read_recording
 from kerv_cli.worlds.metaworld.spec import SPEC
 from kerv_cli.worlds.settings import EVALUATION_SEED

@@ -14,11 +14,10 @@ from kerv_cli.lab.execute import RunEpisode
 from kerv_cli.lab.plan import Setting
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.decide import verdict_of
-from kerv_cli.report.latency import latency_table
 from kerv_cli.report.plots import latency_figure
 from kerv_cli.report.report import report
 from kerv_cli.report.summary import summary_frame
-from kerv_cli.report.tables import load_study
+from kerv_cli.report.tables import latency_table, load_study
 
 SHARE = {"ar": 1.0, "spec_vla": 0.4}
 

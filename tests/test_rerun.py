@@ -20,9 +20,8 @@ from rerun_synthetic import DOFS, decode_of, episode, prefill, skipped_decode, v
 from kerv_cli.base.errors import KervError, StorageError, UsageError
 from kerv_cli.engine.record import EpisodeRecord, Round
 from kerv_cli.report.viewing import save_recording, viewer
-from kerv_cli.report.viewing.facts import readable
 from kerv_cli.report.viewing.film import save_film
-from kerv_cli.report.viewing.token_outcomes import chunk_size, outcomes_of
+from kerv_cli.report.viewing.token_outcomes import chunk_size, outcomes_of, readable
 from kerv_cli.report.viewing.viewer import MOST_OPENED, find_recordings, open_recording, read_recording, read_summary
 
 

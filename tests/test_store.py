@@ -19,7 +19,7 @@ from kerv_cli.cli.app import app
 from kerv_cli.lab.command import STORE
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import Curve, making, run_rows
-from kerv_cli.report.curves import read_log
+from kerv_cli.report.plots import read_log
 from kerv_cli.training.demonstrations import open_demos
 
 HOLD = """

@@ -12,8 +12,7 @@ from studies_synthetic import swept, threshold_study
 
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.store import StudyStore, plan_study
-from kerv_cli.report.publish import Unpublishable, refusals
-from kerv_cli.report.report import report
+from kerv_cli.report.report import Unpublishable, refusals, report
 from kerv_cli.report.tables import load_study
 
 COMMIT = "c" * 40

@@ -65,8 +65,7 @@ def rollout(
 
 def _print_rollout(store: StudyStore, as_json: bool, where: str) -> None:
     from kerv_cli.report.measures import MICRO
-    from kerv_cli.report.setting import setting_tables
-    from kerv_cli.report.summary import SummaryTable
+    from kerv_cli.report.summary import SummaryTable, setting_tables
     from kerv_cli.report.tables import load_study, rows_of
 
     data = load_study(store)

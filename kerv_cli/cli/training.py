@@ -63,7 +63,7 @@ def _train(run: TrainingRun, record: Run, as_json: bool, loading: str, training:
         progress_bar(training, record) as advance,
     ):
         metrics = run.train(on_step)
-    from kerv_cli.report.curves import save_curves
+    from kerv_cli.report.plots import save_curves
 
     plot = save_curves(run.folder)
     if as_json:

@@ -17,8 +17,8 @@ from kerv_cli.catalogue.entries import RunEntry, description_of, store_of
 from kerv_cli.catalogue.stored import export_database
 from kerv_cli.episodes.rows import DECODE_SCHEMA
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.curves import read_log
 from kerv_cli.report.measures import MICRO
+from kerv_cli.report.plots import read_log
 from kerv_cli.report.tables import csv_text, flatten, is_number, load_study, rows_of
 
 PROJECT = "kerv"

@@ -6,6 +6,7 @@ import itertools
 import textwrap
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import pandas as pd
 from rich import box
@@ -14,8 +15,10 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from kerv_cli.report.measures import MICRO, Row, registered_columns
-from kerv_cli.report.tables import is_baseline, is_number, rows_of
+from kerv_cli.engine.record import PHASES
+from kerv_cli.episodes.identity import batch_of, stress_text
+from kerv_cli.report.measures import MICRO, Row, is_timed, registered_columns
+from kerv_cli.report.tables import StudyData, is_baseline, is_number, rows_of
 
 TextOf = Callable[[Row], str]
 
@@ -176,3 +179,39 @@ def not_in_turn(table: pd.DataFrame) -> list[str]:
     rows = table[timed & (table["label"] != table["baseline"]) & (table["pairs"] > 0) & table["speedup"].isna()]
     of_baseline = table.loc[table["label"] == table["baseline"], "time_per_step_ms"].notna().all()
     return [str(label) for label in dict.fromkeys(rows["label"])] if of_baseline else []
+
+
+_FIGURES = ("forwards_per_step", "AL", "accepted_per_round", "time_per_step_ms")
+
+
+def setting_tables(data: StudyData, per_task: list[Row], whole: Row) -> Iterator[tuple[Any, Any, str]]:
+    """Yield columns, rows and title of the tables of a study with one setting.
+
+    Args:
+        data: The study.
+        per_task: A row per task.
+        whole: The row over all tasks.
+    """
+    episodes, setting = data.episodes, data.study.settings[0]
+    by_task = {row["task"]: row for row in per_task}
+    figures = [(task, by_task[task]) for task in dict.fromkeys(episodes["task"])]
+    if len(figures) > 1:
+        figures.append(("all", whole))
+    timed = is_timed(episodes)
+    headers = ("task", "success", "steps", "forwards/step", "tokens/verification", "drafts accepted", "ms/step")
+    seeds = f"{episodes['seed'].min()}…{episodes['seed'].max()}"
+    observation = setting.identity.get("observation", "")
+    title = f"{setting.label}, observation {observation}{stress_text(setting.settings)}, seeds {seeds}"
+    if not timed:
+        title += f"; not timed: {batch_of(setting.settings)} episodes at a time"
+    yield headers, ((name, *_figures(row)) for name, row in figures), title
+    if timed:
+        decodes, total = episodes["decodes"].sum(), episodes["seconds"].sum()
+        seconds = {phase: episodes[f"seconds.{phase}"].sum() for phase in PHASES}
+        rows = [(name, f"{1000 * s / decodes:.2f}", f"{s / total:.0%}") for name, s in seconds.items() if s]
+        yield ("phase", "ms per decode", "share"), rows, "time by phase"
+
+
+def _figures(row: Row) -> list[str]:
+    successes, steps = f"{row['successes']}/{row['episodes']}", f"{row['steps'] / row['episodes']:.0f}"
+    return [successes, steps, *(f"{row[name]:.2f}" if is_number(row[name]) else "–" for name in _FIGURES)]

@@ -255,3 +255,23 @@ def rows_of(table: pd.DataFrame, averaging: str | None = None) -> list[Row]:
     """Return the table's rows, or the rows of one averaging, as dicts by column."""
     rows = table if averaging is None else table[table["averaging"] == averaging]
     return [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]
+
+
+_COLUMNS = (
+    "study", "label", "method", "ar", "rollout.clock", "rollout.latency", "rollout.latency_ms", "rollout.profile",
+    "rollout.ar_ms", "rollout.delay_compensation", "rollout.batch", "ar_latency_ms", "episodes", "felt_latency_ms",
+    "felt_latency_steps", "held_share", "forwards_per_step", "successes", "success", "success_low", "success_high",
+    "pairs", "difference", "difference_low", "difference_high", "only_baseline", "only_method", "mcnemar_p",
+    "prefill_draft.kind", "proposer.kind",
+)  # fmt: skip
+
+
+def latency_table(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of a study's table whose world, and whose baseline's world, goes on during a decode.
+
+    Its additional column `ar_latency_ms` is the mean latency of the baseline's decodes.
+    """
+    rows = table[table["averaging"] == MICRO]
+    latencies = dict(zip(rows["label"], rows["felt_latency_ms"], strict=True))
+    rows = rows.assign(ar=rows["baseline"], ar_latency_ms=rows["baseline"].map(latencies))
+    return rows.loc[rows["felt_latency_ms"].map(is_number) & rows["ar_latency_ms"].map(is_number), list(_COLUMNS)]
