@@ -31,10 +31,10 @@ from kerv_cli.report.report import report as write_report
 from kerv_cli.report.tables import load_study as load_data
 from kerv_cli.report.tables import rows_of
 from kerv_cli.report.viewing import save_recording
+from kerv_cli.serve.interface import Message
 from kerv_cli.serve.openpi import EXECUTED, RESET, OpenPi, metadata
 from kerv_cli.serve.policy import Policy as Served
 from kerv_cli.serve.settings import ServeSettings
-from kerv_cli.serve.wire import Message
 
 TABLES = ("settings", "tasks", "episodes")
 

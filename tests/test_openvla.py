@@ -32,10 +32,9 @@ from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.jacobi import JacobiProposer
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.openvla.config import TOWERS, Bounds, Language, Shape, action_space, read_shape
-from kerv_cli.targets.openvla.image import as_in_libero, cropped, pixels_of
-from kerv_cli.targets.openvla.importing import import_checkpoint
+from kerv_cli.targets.openvla.inputs import as_in_libero, cropped, pixels_of
 from kerv_cli.targets.openvla.loading import is_unread, layout
-from kerv_cli.targets.openvla.target import OpenVLATarget
+from kerv_cli.targets.openvla.target import OpenVLATarget, import_checkpoint
 from kerv_cli.targets.settings import BuildTargetSettings
 
 

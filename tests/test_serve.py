@@ -32,12 +32,11 @@ from kerv_cli.cli.app import app
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.settings import PolicySettings
-from kerv_cli.serve.guard import Finite
+from kerv_cli.serve.interface import packed, unpacked
 from kerv_cli.serve.openpi import OpenPi, observation_of
-from kerv_cli.serve.policy import Policy
+from kerv_cli.serve.policy import Finite, Policy
 from kerv_cli.serve.server import PolicyServer
 from kerv_cli.serve.settings import ServeSettings
-from kerv_cli.serve.wire import packed, unpacked
 
 
 def encoded(value: Any) -> Any:

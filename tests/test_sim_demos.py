@@ -11,8 +11,7 @@ import pytest
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.manifests import read_file
 from kerv_cli.worlds.demos.dataset import DemoDataset, DemoManifest
-from kerv_cli.worlds.demos.perturbation import Perturbation, is_perturbed
-from kerv_cli.worlds.demos.recording import DemoConfig, record
+from kerv_cli.worlds.demos.recording import DemoConfig, Perturbation, is_perturbed, record
 from kerv_cli.worlds.metaworld.spec import SPEC
 from kerv_cli.worlds.settings import CameraSettings
 

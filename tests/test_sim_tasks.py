@@ -12,7 +12,7 @@ from kerv_cli.worlds.metaworld.tasks import DIFFICULTIES, SUITES, TASKS
 
 
 def test_the_names_are_those_of_metaworld():
-    from kerv_cli.worlds.camera import load_mujoco
+    from kerv_cli.worlds.mujoco_world import load_mujoco
 
     load_mujoco()
     from metaworld.policies import ENV_POLICY_MAP

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from kerv_cli.base.errors import KervError, RenderingUnavailable, UnknownName, UsageError
-from kerv_cli.worlds.camera import box_average, choose_backend, find_backend
 from kerv_cli.worlds.metaworld.spec import SPEC
+from kerv_cli.worlds.mujoco_world import box_average, choose_backend, find_backend
 from kerv_cli.worlds.settings import CameraSettings
 
 # One task for nearly all: a benchmark's 50 placements cost up to a second per seed block. Its poses are stale at reset.

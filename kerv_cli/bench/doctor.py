@@ -94,7 +94,7 @@ def check_environment_of(settings: DoctorSettings) -> list[Finding]:
 
 def _rendering(spec: EnvironmentSpec, settings: DoctorSettings) -> str:
     """Draw frames of a world and time them. A backend can load and still draw nothing."""
-    from kerv_cli.worlds.camera import choose_backend
+    from kerv_cli.worlds.mujoco_world import choose_backend
 
     backend, first = choose_backend(), next(iter(spec.suites.values()), tuple(spec.tasks))[0]
     with spec.open_world(first, replace(settings.world.camera, name="")) as world:

@@ -62,14 +62,16 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, all_
     worlds = pairs[pairs["repeat"] == 0]  # a repeat is another time, not another world
     once = episodes[episodes["repeat"] == 0]
     timed = pairs if all_pairs else pairs[pairs["same_block"]]
+    success = _averaged(once, macro, lambda group: stats.wilson(int(group["success"].sum()), len(group)))
+    difference = _averaged(worlds, macro, lambda group: stats.paired_difference(pair_counts(group)))
     has_times = decodes(episodes) and is_timed(timed, "time_method") and is_timed(timed, "time_baseline")
     return {
         "successes": int(once["success"].sum()),
-        **columns_of("success", _averaged(once, macro, _success)),
+        **columns_of("success", success),
         **columns_of("speedup", _speedup(timed, "time", macro) if has_times else stats.NO_ESTIMATE),
         **columns_of("episode_speedup", _speedup(timed, "seconds", macro) if has_times else stats.NO_ESTIMATE),
         **(_mean_of_groups(episodes) if macro else _means(episodes)),
-        **paired_columns(pair_counts(worlds), _averaged(worlds, macro, _difference)),
+        **paired_columns(pair_counts(worlds), difference),
         "pairs_to_settle": stats.pairs_to_settle(pair_counts(worlds), MARGIN),
         "same_run": bool(len(pairs) and pairs["same_run"].all()),
         "same_block": float(pairs["same_block"].mean()) if len(pairs) else math.nan,
@@ -85,14 +87,6 @@ def _averaged(frame: pd.DataFrame, macro: bool, estimate: Callable[[pd.DataFrame
         return estimate(frame)
     estimates = [estimate(group) for _, group in frame.groupby("difficulty", sort=True)]
     return stats.mean_of([one for one in estimates if not math.isnan(one.value)])
-
-
-def _success(episodes: pd.DataFrame) -> Estimate:
-    return stats.wilson(int(episodes["success"].sum()), len(episodes))
-
-
-def _difference(pairs: pd.DataFrame) -> Estimate:
-    return stats.paired_difference(pair_counts(pairs))
 
 
 def pair_counts(pairs: pd.DataFrame) -> stats.PairedCounts:

@@ -173,19 +173,17 @@ def render(
     first, results = data.table.iloc[0], str(store.database.results)
     where = "" if results == "results" else f" results={shlex.quote(results)}"
     return template.render(
-        name=store.name,
+        store=store,
+        study=data.study,
         title=data.study.title or store.name,
         verdict=answer[:1].upper() + answer[1:],
         is_shown=is_shown,
         caution=caution(data.table),
-        note=data.study.note,
         about=f"{about(data.table)} · kerv {first['kerv_version']} at {str(first['git_commit'])[:12]}",
         columns=NOTE,
-        baseline=data.study.baseline,
         absent=list(dict.fromkeys(f"{one.setting.label} on {one.task}" for one in data.absent)),
         missing=len(data.absent),
-        planned=len(data.study.episodes),
-        how_to_run=f"Run `kerv sweep study={store.name}{where}`",
+        where=where,
         suite=_suite(data.table),
         decisions=read_decisions(store.root),
         figures=[base64.b64encode(figure).decode() for figure in figures],
@@ -194,7 +192,6 @@ def render(
         tasks=_by_task(data.per_task),
         recordings=[(path.stem, _href(path, store.root)) for path in store.recordings],
         files=[(path.name, _href(path, store.root)) for path in tables],
-        commands=[(setting.label, setting.overrides) for setting in data.study.settings],
     )
 
 

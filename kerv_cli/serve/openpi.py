@@ -14,11 +14,8 @@ import numpy as np
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.record import DecodeRecord
-from kerv_cli.serve.conversation import Conversation, Log, Reply
-from kerv_cli.serve.guard import HOLD
-from kerv_cli.serve.interface import Interface, hand_of, keys_of, text_of
-from kerv_cli.serve.policy import Policy
-from kerv_cli.serve.wire import Message, packed, unpacked
+from kerv_cli.serve.interface import Interface, Message, hand_of, keys_of, packed, text_of, unpacked
+from kerv_cli.serve.policy import HOLD, Conversation, Log, Policy, Reply
 
 STATE, IMAGE, PROMPT, RESET, EXECUTED = "observation/state", "observation/image", "prompt", "reset", "executed"
 

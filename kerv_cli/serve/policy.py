@@ -1,28 +1,32 @@
-"""The served policy: its interface, and decoders that are warmed up, one for every client."""
+"""The served policy: its interface, decoders that are warmed up, what it refuses to act on, and a client's episodes."""
 
 from __future__ import annotations
 
+import abc
+import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.registry import find
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.chunk import EpisodeState
 from kerv_cli.engine.decoder import Decoder
+from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.episodes.policy import artifacts_of, warm_up
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.artifacts import Use
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.settings import MethodSettings
-from kerv_cli.serve.guard import Finite, StateRange
 from kerv_cli.serve.interface import Interface
 from kerv_cli.serve.settings import ServeSettings
 from kerv_cli.targets.provenance import stamp
@@ -203,3 +207,145 @@ class Together:
                 return
             for one in batch:
                 self._answer([one])
+
+
+HOLD = "hold"
+"""Answer to a state out of range: the last action once more, instead of an error."""
+LEAST_WIDTH = 1.0
+"""Width of the range of a number that hardly moved in the demonstrations, in its own unit."""
+
+
+class StateRange:
+    """The range of the states on which a policy may act.
+
+    Args:
+        low: (p,) lowest numbers of the demonstrations.
+        high: (p,) highest numbers.
+        names: Names of the first numbers.
+        margin: How many widths of the range are added on each side.
+    """
+
+    def __init__(self, low: np.ndarray, high: np.ndarray, names: tuple[str, ...], margin: float) -> None:
+        added = margin * np.where(high - low < LEAST_WIDTH / 100, LEAST_WIDTH, high - low)
+        self.low, self.high, self.names = low - added, high + added, names
+
+    def outside(self, observation: Observation) -> str:
+        """Say which number is out of range; empty if none is."""
+        numbers = observation.state[: len(self.low)]
+        beyond = np.flatnonzero((numbers < self.low) | (numbers > self.high))
+        if not len(beyond):
+            return ""
+        first = int(beyond[0])
+        name = self.names[first] if first < len(self.names) else f"number {first}"
+        return (
+            f"the state is out of range: {name} is {numbers[first]:.4g}, the policy was trained on "
+            f"{self.low[first]:.4g} to {self.high[first]:.4g}, margin included"
+        )
+
+
+class Finite:
+    """A target that notes whether its prompts and logits are finite."""
+
+    def __init__(self, target: Target) -> None:
+        self._target = target
+        self._fine: list[Tensor] = []  # read once per decode, so that no forward waits for the device
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._target, name)
+
+    def encode(self, observation: Observation) -> Tensor:
+        """Return the target's prompt."""
+        return self._noted(self._target.encode(observation))
+
+    def head(self, hidden: Tensor) -> Tensor:
+        """Return the target's logits."""
+        return self._noted(self._target.head(hidden))
+
+    def _noted(self, numbers: Tensor) -> Tensor:
+        self._fine.append(torch.isfinite(numbers).all())
+        return numbers
+
+    def check(self) -> None:
+        """Raise KervError if the decode computed numbers that are not finite."""
+        fine, self._fine = self._fine, []
+        if fine and not bool(torch.stack(fine).all()):
+            raise KervError("the policy computed numbers that are not finite: no action is sent")
+
+
+Log = Callable[[str], None]
+
+
+class Reply(NamedTuple):
+    """The answer to a frame.
+
+    Attributes:
+        frame: What is sent.
+        seconds: Inference time, NaN if it was not measured; None if nothing was decoded.
+    """
+
+    frame: bytes
+    seconds: float | None = None
+
+
+class Conversation(abc.ABC):
+    """A client's episodes, decoded by a decoder of its own. A protocol is a subclass.
+
+    Attributes:
+        seats: Clients at a time.
+        ping_s: Seconds without an answer to a ping after which a client is gone; None sends no pings.
+        idle_s: Seconds without a message after which it is gone.
+        decoder: None before the first episode if it depends on the task.
+        last_ms: Milliseconds from the last decoded frame's arrival to the answer's end.
+    """
+
+    seats: int
+    ping_s: float | None
+    idle_s: float
+
+    def __init__(self, policy: Policy, log: Log = lambda line: None) -> None:
+        self.policy, self.interface, self.log = policy, policy.interface, log
+        self.task, self.last_ms = policy.task, math.nan
+        self.decoder: Any = None if policy.by_task else policy.lend_decoder(self.task)
+
+    def close(self) -> None:
+        """Give the decoder back, for the next client."""
+        self.policy.take_back(self.decoder)
+
+    def begin(self, task: str, seed: int, hand: np.ndarray) -> None:
+        """Begin an episode with the end effector at `hand` (3,) metres.
+
+        Raises:
+            CheckpointError: The method has no levels for the task.
+        """
+        if self.policy.by_task and (self.decoder is None or task != self.task):
+            self.decoder, self.task = self.policy.lend_decoder(task), task
+        self.decoder.reset(self.task or task, seed, hand)
+
+    def holds(self, observation: Observation, has_last: bool) -> bool:
+        """Return whether the last action is executed again, because the policy may not act on this state.
+
+        Raises:
+            UsageError: It may not, and errors are wanted or the episode has no last action.
+        """
+        why = self.policy.range.outside(observation) if self.policy.range else ""
+        if why and not (self.policy.settings.outside == HOLD and has_last):
+            raise UsageError(why)
+        if why:
+            self.log(f"{why}: the last action is held")
+        return bool(why)
+
+    def decode(self, observation: Observation) -> DecodeRecord:
+        """Return the actions for an observation, and their record."""
+        return self.policy.decode(self.decoder, observation)
+
+    def greeting(self) -> bytes | None:
+        """Return what the server says first; None if the client speaks first."""
+        return None
+
+    @abc.abstractmethod
+    def answer(self, frame: bytes | str) -> Reply | None:
+        """Return the answer to a frame, or None; raise KervError if something is wrong with it."""
+
+    @abc.abstractmethod
+    def fault(self, line: str) -> bytes | str:
+        """Return the frame that tells the client what was wrong with its last one."""

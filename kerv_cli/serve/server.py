@@ -17,8 +17,7 @@ import numpy as np
 
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.registry import load
-from kerv_cli.serve.conversation import Conversation, Log
-from kerv_cli.serve.policy import Policy
+from kerv_cli.serve.policy import Conversation, Log, Policy
 from kerv_cli.serve.settings import ServeSettings
 
 try:

@@ -23,10 +23,19 @@ from kerv_cli.base.places import results_dir
 from kerv_cli.base.spaces import Observation
 from kerv_cli.catalogue.served import path_of, write_served
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
-from kerv_cli.serve.conversation import Conversation, Log, Reply
-from kerv_cli.serve.interface import LARGEST, OPEN, Interface, hand_of, keys_of, text_of
-from kerv_cli.serve.policy import Policy
-from kerv_cli.serve.wire import Message, array_of, packed_as, read_map
+from kerv_cli.serve.interface import (
+    LARGEST,
+    OPEN,
+    Interface,
+    Message,
+    array_of,
+    hand_of,
+    keys_of,
+    packed_as,
+    read_map,
+    text_of,
+)
+from kerv_cli.serve.policy import Conversation, Log, Policy, Reply
 
 PROTOCOL_VERSION = 1
 _FORMATS = {("position", 3): "delta_xyz", ("rotation", 3): "axis_angle"}

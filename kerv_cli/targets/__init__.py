@@ -10,6 +10,6 @@ add(
     "openvla",
     "kerv_cli.targets.openvla.target:build",
     weights="kerv_cli.targets.openvla.target:check_weights",
-    importer="kerv_cli.targets.openvla.importing:import_checkpoint",
+    importer="kerv_cli.targets.openvla.target:import_checkpoint",
     images_alone=True,  # reads no state
 )

@@ -1,18 +1,30 @@
-"""Base of worlds that MuJoCo simulates."""
+"""Base of worlds that MuJoCo simulates, and their frames: offscreen, with an OpenGL backend that works here.
+
+Uses `mujoco.Renderer` directly: gymnasium's viewer draws garbage, without an error, as soon as several environments
+live in one process.
+"""
 
 from __future__ import annotations
 
+import atexit
+import functools
+import os
+import subprocess
+import sys
 from abc import abstractmethod
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kerv_cli.base.errors import RenderingUnavailable
 from kerv_cli.base.spaces import Observation
-from kerv_cli.worlds.camera import Camera
 from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import EnvironmentSpec, World
 from kerv_cli.worlds.stress.base import Model, ModelChanges
+
+if TYPE_CHECKING:
+    import mujoco
 
 
 class MujocoWorld(World):
@@ -55,3 +67,156 @@ class MujocoWorld(World):
             camera.close()
         self._cameras.clear()
         super().close()
+
+
+_HEADLESS = ("egl", "osmesa")
+_PROBE = """
+import ctypes, sys
+if sys.platform == "linux":
+    ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG: it ends with its parent
+import mujoco
+context = mujoco.GLContext(16, 16)
+context.make_current()
+context.free()
+"""
+_PROBE_SECONDS = 60.0
+
+
+def install_command() -> str:
+    """Return the shell command that installs both software OpenGL backends on Debian and Ubuntu."""
+    sudo = "" if os.geteuid() == 0 else "sudo "
+    return f"{sudo}apt-get install -y libegl1 libosmesa6 libgl1-mesa-dri libgl1"
+
+
+def choose_backend() -> str:
+    """Return the name of the OpenGL backend that draws the frames. Call it before mujoco is imported.
+
+    Respects `MUJOCO_GL`. Without it, tries EGL, then OSMesa, each in a process of its own: a broken driver cannot harm
+    this one. Worker processes inherit the choice through `MUJOCO_GL` and `PYOPENGL_PLATFORM`.
+
+    Raises:
+        RenderingUnavailable: Nothing can draw here, `MUJOCO_GL` switches drawing off, or mujoco was already imported
+            without a headless backend.
+    """
+    backend, error = find_backend()
+    if error:
+        raise RenderingUnavailable(error)
+    return backend
+
+
+@functools.cache
+def find_backend() -> tuple[str, str]:
+    """Return the backend, and an error message if there is none. Probes once per process."""
+    # Software rendering with a thread pool per context is slower for small frames and crowds out other workers.
+    os.environ.setdefault("LP_NUM_THREADS", "0")
+    backend = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if backend in ("disable", "disabled", "off", "false", "0"):
+        return "", f"MUJOCO_GL={backend} switches drawing off: unset it, or set it to egl"
+    if not backend:
+        if "mujoco.gl_context" in sys.modules:
+            return "", "mujoco was imported before a GL backend was chosen: set MUJOCO_GL=egl"
+        backend = next(filter(_draws, _HEADLESS), "")
+        if not backend:
+            return "", f"no OpenGL backend can draw here: {install_command()}"
+        os.environ["MUJOCO_GL"] = backend
+    if backend in _HEADLESS:
+        os.environ["PYOPENGL_PLATFORM"] = backend
+    return backend, ""
+
+
+def _draws(backend: str) -> bool:
+    environment = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
+    command = [sys.executable, "-c", _PROBE]
+    try:
+        subprocess.run(command, env=environment, capture_output=True, timeout=_PROBE_SECONDS, check=True)
+    except subprocess.SubprocessError:
+        return False
+    return True
+
+
+def load_mujoco() -> None:
+    """Import mujoco with a GL backend if there is one. Without one physics works, and opening a Camera fails."""
+    if find_backend()[1]:
+        os.environ.setdefault("MUJOCO_GL", "disable")  # without it mujoco asks for glfw, which needs a display
+    import mujoco  # noqa: F401
+
+
+class Camera:
+    """Draws one view of one model. Drawing reads the physics and never changes it."""
+
+    def __init__(self, model: mujoco.MjModel, config: CameraSettings, upside_down: bool) -> None:
+        """Open an offscreen context.
+
+        Args:
+            model: Model to draw.
+            config: View and size.
+            upside_down: Whether the view's raw images are rotated by 180 degrees.
+
+        Raises:
+            RenderingUnavailable: The GL backend cannot open a context.
+        """
+        backend = choose_backend()
+        import mujoco
+
+        self.config, self._upside_down = config, upside_down
+        self._model = model
+        self._camera = int(model.camera(config.name).id)
+        pixels = config.size * config.supersample
+        # The context reads them when it opens. Multisampling and shadow maps are most of a software frame's cost.
+        model.vis.quality.offsamples = 0
+        model.vis.quality.shadowsize = 0
+        model.vis.global_.offwidth = max(int(model.vis.global_.offwidth), pixels)
+        model.vis.global_.offheight = max(int(model.vis.global_.offheight), pixels)
+        try:
+            self._renderer = _open_renderer(model, pixels)
+        except Exception as error:  # each backend raises types of its own
+            raise RenderingUnavailable(
+                f"OpenGL backend '{backend}' cannot draw here ({error}): {install_command()}"
+            ) from error
+        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
+        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        self._pixels = np.empty((pixels, pixels, 3), dtype=np.uint8)
+        # An open context at interpreter exit prints an EGLError. This was registered after mujoco.egl was imported, so
+        # it runs before mujoco's own handler ends the display.
+        atexit.register(self.close)
+
+    def render(self, data: mujoco.MjData) -> NDArray[np.uint8]:
+        """Return a frame (size, size, 3) of the state in `data`, uint8 RGB, upright."""
+        fovy = self._model.cam_fovy[self._camera]
+        self._model.cam_fovy[self._camera] = self.config.fovy  # views of one model may differ in it: set per frame
+        self._renderer.update_scene(data, camera=self._camera)
+        self._model.cam_fovy[self._camera] = fovy
+        self._renderer.render(out=self._pixels)
+        frame = box_average(self._pixels, self.config.supersample)
+        return np.ascontiguousarray(frame[::-1, ::-1] if self._upside_down else frame)
+
+    def close(self) -> None:
+        """Free the context. Safe to call twice."""
+        atexit.unregister(self.close)
+        self._renderer.close()
+
+
+def _open_renderer(model: mujoco.MjModel, pixels: int) -> mujoco.Renderer:
+    import mujoco
+
+    class Renderer(mujoco.Renderer):
+        _gl_context = _mjr_context = None  # the destructor reads them, even if the constructor failed
+
+    return Renderer(model, height=pixels, width=pixels)
+
+
+def box_average(pixels: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+    """Return the means of factor x factor blocks, rounded to nearest, as a copy.
+
+    Args:
+        pixels: (factor * n, factor * m, channels) uint8.
+        factor: 1 to 16, so that a block's sum fits 16 bits.
+    """
+    if factor == 1:
+        return pixels.copy()
+    total = np.full((pixels.shape[0] // factor, pixels.shape[1] // factor, pixels.shape[2]), factor**2 // 2, np.uint16)
+    for row in range(factor):
+        for column in range(factor):
+            total += pixels[row::factor, column::factor]
+    total //= factor**2
+    return total.astype(np.uint8)

@@ -21,9 +21,8 @@ from kerv_cli.base.errors import KervError
 from kerv_cli.base.files import write_json
 from kerv_cli.targets.checkpoint import save_tensors
 from kerv_cli.targets.openvla.config import CONFIG, SHAPES, STATISTICS, Language, Shape, Tower
-from kerv_cli.targets.openvla.image import DEFAULTS, PREPROCESSOR
+from kerv_cli.targets.openvla.inputs import BEGIN, BOUNDARY, DEFAULTS, PREPROCESSOR, TOKENIZER
 from kerv_cli.targets.openvla.loading import Sizes, layout
-from kerv_cli.targets.openvla.prompt import BEGIN, BOUNDARY, TOKENIZER
 
 TINY = Shape(
     towers=(

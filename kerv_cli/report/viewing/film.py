@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.files import write_bytes
 from kerv_cli.report.viewing.token_outcomes import OUTCOMES
-from kerv_cli.report.viewing.viewer import chunks_of
+from kerv_cli.report.viewing.viewer import read_chunks
 
 RATE = 20
 """Largest number of pictures per second of simulated time."""
@@ -52,7 +52,7 @@ def _tracks(recording: Path) -> dict[str, Track]:
     values = {"camera": "EncodedImage:blob", "mode": "StateChange:state", "decode": "Scalars:scalars"}
     values["tokens"] = values["mode"]
     tracks: dict[str, Track] = {}
-    for chunk in chunks_of(recording):
+    for chunk in read_chunks(recording)[1]:
         batch, name = chunk.to_record_batch(), values.get(chunk.entity_path.split("/")[1])
         if name in batch.schema.names and not chunk.is_static:
             steps, times = batch["step"].to_pylist(), batch["time"].cast("int64").to_numpy() / 1e9

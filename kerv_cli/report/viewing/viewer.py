@@ -69,7 +69,7 @@ def open_recording(paths: Sequence[Path]) -> str:
     """
     chosen = paths[:MOST_OPENED]
     for path in chosen:
-        _read(path)
+        read_chunks(path)
     more = f" (the newest {len(chosen)} of {len(paths)})" if len(paths) > len(chosen) else ""
     if not has_display():
         command = f"rerun {' '.join(shlex.quote(path.name) for path in chosen)}"
@@ -112,7 +112,7 @@ def read_recording(path: Path) -> dict[str, Any]:
     Raises:
         KervError: The file is missing or damaged.
     """
-    reader, chunks = _read(path)
+    reader, chunks = read_chunks(path)
     name, episode = "", {}
     entities: dict[str, int] = {}
     times: dict[str, list[int]] = {}
@@ -149,16 +149,12 @@ def read_summary(path: Path) -> str:
     return "\n".join([*lines, f"  rows: {rows}"])
 
 
-def chunks_of(path: Path) -> list[Chunk]:
-    """Return every chunk of a recording.
+def read_chunks(path: Path) -> tuple[RrdReader, list[Chunk]]:
+    """Return the reader of a recording, and every chunk.
 
     Raises:
-        KervError: The file is missing or damaged.
+        KervError: The file is missing or damaged, or holds no recording.
     """
-    return _read(path)[1]
-
-
-def _read(path: Path) -> tuple[RrdReader, list[Chunk]]:
     from rerun.chunk import RrdReader
 
     with warnings.catch_warnings():

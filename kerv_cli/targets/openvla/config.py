@@ -115,11 +115,6 @@ class Shape:
         return self.language.vocab_size - self.padding
 
     @property
-    def vision_width(self) -> int:
-        """Channels of a patch, both towers together."""
-        return sum(tower.width for tower in self.towers)
-
-    @property
     def patches(self) -> int:
         """Vision tokens of the prompt."""
         return self.towers[0].patches

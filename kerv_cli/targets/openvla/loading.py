@@ -22,7 +22,7 @@ from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import regular, sha256_of, visible
 from kerv_cli.targets.openvla.config import CONFIG, Shape
 from kerv_cli.targets.openvla.trunk import LanguageModel, quantise
-from kerv_cli.targets.openvla.vision import Projector, VisionBackbone
+from kerv_cli.targets.openvla.vision import VisionBackbone, projector
 
 Sizes = tuple[int, ...]
 SINGLE = "model.safetensors"
@@ -107,20 +107,12 @@ def check_layout(shapes: Mapping[str, Sizes], expected: Mapping[str, Sizes], whe
     kinds = {
         "missing": [name for name in expected if name not in shapes],
         "unknown": [name for name in shapes if name not in expected],
-        "of another shape": [f"{name} {_text(shapes[name])}, not {_text(expected[name])}" for name in both],
+        "of another shape": [f"{name} {shapes[name]}, not {expected[name]}" for name in both],
     }
-    wrong = [f"{len(names)} {kind}: {_listed(names)}" for kind, names in kinds.items() if names]
+    listed = {kind: ", ".join([*names[:LISTED], *["…"] * (len(names) > LISTED)]) for kind, names in kinds.items()}
+    wrong = [f"{len(names)} {kind}: {listed[kind]}" for kind, names in kinds.items() if names]
     if wrong:
         raise CheckpointError(f"the weights in {where} are not those of its {CONFIG}: {'; '.join(wrong)}")
-
-
-def _text(sizes: Sizes) -> str:
-    return "x".join(map(str, sizes))
-
-
-def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
-    return ", ".join(names[:LISTED]) + more
 
 
 class OpenVLAModel(nn.Module):
@@ -129,7 +121,7 @@ class OpenVLAModel(nn.Module):
     def __init__(self, shape: Shape) -> None:
         super().__init__()
         self.vision_backbone = VisionBackbone(shape)
-        self.projector = Projector(shape)
+        self.projector = projector(shape)
         self.language_model = LanguageModel(shape.language)
 
 

@@ -8,6 +8,8 @@ Shapes: B batch, n patches, W width of a tower, E width of the language model.
 
 from __future__ import annotations
 
+from collections import OrderedDict
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -17,16 +19,9 @@ from kerv_cli.targets.openvla.config import Shape, Tower
 EPSILON = 1e-6  # of every layer norm
 
 
-class PatchEmbedding(nn.Module):
-    """Embeds patches by a convolution."""
-
-    def __init__(self, tower: Tower) -> None:
-        super().__init__()
-        self.proj = nn.Conv2d(3, tower.width, tower.patch, stride=tower.patch)
-
-    def forward(self, pixels: Tensor) -> Tensor:
-        """Map pixels (B, 3, h, w) to patches (B, n, W)."""
-        return self.proj(pixels).flatten(2).transpose(1, 2)
+def named(**layers: nn.Module) -> nn.Sequential:
+    """Return layers in a row, under the names of their weights."""
+    return nn.Sequential(OrderedDict(layers))
 
 
 class Attention(nn.Module):
@@ -44,19 +39,6 @@ class Attention(nn.Module):
         q, k, v = self.qkv(x).view(batch, tokens, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
         attended = F.scaled_dot_product_attention(q, k, v)
         return self.proj(attended.transpose(1, 2).reshape(batch, tokens, width))
-
-
-class Perceptron(nn.Module):
-    """Two layers with the exact GELU, in both towers (timm's SigLIP differs from transformers' in this)."""
-
-    def __init__(self, tower: Tower) -> None:
-        super().__init__()
-        self.fc1 = nn.Linear(tower.width, tower.feed_forward)
-        self.fc2 = nn.Linear(tower.feed_forward, tower.width)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Map x (B, n, W) to (B, n, W)."""
-        return self.fc2(F.gelu(self.fc1(x)))
 
 
 class LayerScale(nn.Module):
@@ -79,7 +61,9 @@ class Block(nn.Module):
         self.norm1 = nn.LayerNorm(tower.width, eps=EPSILON)
         self.attn = Attention(tower)
         self.norm2 = nn.LayerNorm(tower.width, eps=EPSILON)
-        self.mlp = Perceptron(tower)
+        # the exact GELU in both towers: timm's SigLIP differs from transformers' in this
+        width, hidden = tower.width, tower.feed_forward
+        self.mlp = named(fc1=nn.Linear(width, hidden), gelu=nn.GELU(), fc2=nn.Linear(hidden, width))
         self.ls1, self.ls2 = (LayerScale(tower.width) if tower.scaled else nn.Identity() for _ in range(2))
 
     def forward(self, x: Tensor) -> Tensor:
@@ -98,12 +82,12 @@ class VisionTower(nn.Module):
             self.cls_token = nn.Parameter(torch.zeros(1, 1, tower.width))
             self.reg_token = nn.Parameter(torch.zeros(1, tower.registers, tower.width))
         self.pos_embed = nn.Parameter(torch.zeros(1, tower.patches, tower.width))
-        self.patch_embed = PatchEmbedding(tower)
+        self.patch_embed = named(proj=nn.Conv2d(3, tower.width, tower.patch, stride=tower.patch))
         self.blocks = nn.ModuleList(Block(tower) for _ in range(tower.depth - 1))
 
     def forward(self, pixels: Tensor) -> Tensor:
         """Map normalised pixels (B, 3, h, w) to patches (B, n, W). Only patches get positions."""
-        x = self.patch_embed(pixels) + self.pos_embed
+        x = self.patch_embed(pixels).flatten(2).transpose(1, 2) + self.pos_embed
         if self.prefix:
             front = torch.cat([self.cls_token, self.reg_token], 1).expand(len(x), -1, -1)
             x = torch.cat([front, x], 1)
@@ -124,16 +108,8 @@ class VisionBackbone(nn.Module):
         return torch.cat([self.featurizer(pixels[:, :3]), self.fused_featurizer(pixels[:, 3:])], -1)
 
 
-class Projector(nn.Module):
-    """Three layers, the first four times as wide as its input."""
-
-    def __init__(self, shape: Shape) -> None:
-        super().__init__()
-        width, hidden = shape.vision_width, shape.language.hidden_size
-        self.fc1 = nn.Linear(width, 4 * width)
-        self.fc2 = nn.Linear(4 * width, hidden)
-        self.fc3 = nn.Linear(hidden, hidden)
-
-    def forward(self, patches: Tensor) -> Tensor:
-        """Map patches (B, n, W + W') to embeddings (B, n, E)."""
-        return self.fc3(F.gelu(self.fc2(F.gelu(self.fc1(patches)))))
+def projector(shape: Shape) -> nn.Sequential:
+    """Return the layers that map patches (B, n, W + W') to embeddings (B, n, E)."""
+    width, hidden = sum(tower.width for tower in shape.towers), shape.language.hidden_size
+    first, second, third = nn.Linear(width, 4 * width), nn.Linear(4 * width, hidden), nn.Linear(hidden, hidden)
+    return named(fc1=first, gelu1=nn.GELU(), fc2=second, gelu2=nn.GELU(), fc3=third)

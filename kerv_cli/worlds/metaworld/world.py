@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kerv_cli.base.spaces import Observation
-from kerv_cli.worlds.camera import load_mujoco
 from kerv_cli.worlds.metaworld.experts import OURS
-from kerv_cli.worlds.mujoco_world import MujocoWorld
+from kerv_cli.worlds.mujoco_world import MujocoWorld, load_mujoco
 from kerv_cli.worlds.spec import EnvironmentSpec
 
 _TASKS_PER_BENCHMARK = 50

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from kerv_cli.worlds.camera import load_mujoco
+from kerv_cli.worlds.mujoco_world import load_mujoco
 from kerv_cli.worlds.vectors import length
 
 load_mujoco()  # chooses the GL backend, which mujoco reads when it is imported
