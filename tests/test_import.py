@@ -19,8 +19,8 @@ import pytest
 from studies_synthetic import swept, threshold_study
 from typer.testing import CliRunner
 
-from kerv_cli.catalogue.lerobot import read_info
-from kerv_cli.catalogue.sqlite import connect_foreign
+from kerv_cli.catalogue.evaluations import read_evaluations
+from kerv_cli.catalogue.stored import connect_foreign
 from kerv_cli.cli.app import app
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MACRO
@@ -168,7 +168,7 @@ def test_results_of_lerobot_are_compared_as_pairs(tmp_path: Path) -> None:
     answer("report", "study=libero", f"results={tmp_path}/new")
     single = {"per_episode": [{"episode_ix": 0, "success": True, "seed": 7}], "aggregated": {"eval_ep_s": 1.0}}
     (tmp_path / "act/eval_info.json").write_text(json.dumps(single))
-    assert [one.seed for one in read_info(tmp_path / "act/eval_info.json")[0].episodes] == [7]
+    assert [one.seed for one in read_evaluations(tmp_path / "act/eval_info.json")[0].episodes] == [7]
     (tmp_path / "act/eval_info.json").write_text(json.dumps({"per_task": [{"metrics": 3}]}))
     assert "lerobot-eval" in refusal("runs", "import", str(act), f"results={tmp_path}/new")
 

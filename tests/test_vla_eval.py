@@ -44,8 +44,8 @@ from websockets.sync.client import connect
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import Observation
+from kerv_cli.catalogue.evaluations import labelled, read_evaluations
 from kerv_cli.catalogue.served import read_served
-from kerv_cli.catalogue.vla_eval import by_server, read_evaluations
 from kerv_cli.cli.app import app
 from kerv_cli.episodes.runner import Runner
 from kerv_cli.episodes.settings import RolloutSettings
@@ -491,9 +491,9 @@ def test_evaluations_of_other_episodes_are_refused(
     (first,), (second,) = (read_evaluations(recordings[name]) for name in ("ar", "naive_sd"))
     changes = {**changes, **({"config": {**second.config, **changes["config"]}} if "config" in changes else {})}
     with pytest.raises(UsageError, match=said):
-        by_server([[first], [replace(second, **changes)]])
+        labelled([[first], [replace(second, **changes)]])
     with pytest.raises(UsageError, match="each of the 2 recordings"):
-        by_server([[first], [second]], ["one"])
+        labelled([[first], [second]], ["one"])
 
 
 # --- LIBERO up to its container (docs/libero.md)

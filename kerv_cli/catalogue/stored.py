@@ -1,4 +1,7 @@
-"""Studies of another kerv.db: what `kerv runs export --to db` writes, or the database of another results folder."""
+"""Studies of another kerv.db: what `kerv runs export --to db` writes, or the database of another results folder.
+
+SQLite files of others are read with limits, because a small file can stand for a huge result.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +10,13 @@ import sqlite3
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import sqlalchemy as sa
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.files import write_folder
-from kerv_cli.catalogue.sqlite import connect_foreign
+from kerv_cli.base.files import regular, write_folder
 from kerv_cli.episodes.rows import DECODE_SCHEMA
 from kerv_cli.lab.database import (
     ABOUT,
@@ -36,6 +39,54 @@ from kerv_cli.worlds.demos.parquet import foreign_table
 _DAMAGE = (sa.exc.SQLAlchemyError, sqlite3.Error, pa.ArrowException, OSError, ValueError, KeyError, TypeError)
 _ROW = (*(column.name for column in MEASURES), "order", "started", "worker_pid")
 
+MOST_STEPS = 20_000_000
+"""Steps of SQLite's virtual machine that a connection may take, besides STEPS_PER_BYTE. They take about a second."""
+STEPS_PER_BYTE = 20
+MOST_VALUE = 2**28
+"""Bytes of one value of a SQLite file."""
+_EVERY = 10_000
+
+
+def connect_foreign(path: Path, **options: Any) -> sqlite3.Connection:
+    """Return a read-only connection to a SQLite file.
+
+    Queries end in an error after a number of steps that depends on the size of the file.
+
+    Args:
+        path: The file.
+        options: Options of `sqlite3.connect`.
+
+    Raises:
+        OSError: The file is missing or is not a regular file.
+        ValueError: The file is cut short, or has views.
+    """
+    size = regular(path).stat().st_size
+    log = path.with_name(f"{path.name}-wal")
+    # a file whose writer was killed has its last rows in the log, which an immutable connection does not read
+    immutable = "" if log.is_file() and log.stat().st_size else "&immutable=1"
+    connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro{immutable}", uri=True, **options)
+    try:
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_VALUE)
+        left = (MOST_STEPS + STEPS_PER_BYTE * size) // _EVERY
+
+        def count() -> bool:
+            nonlocal left
+            left -= 1
+            return left < 0
+
+        connection.set_progress_handler(count, _EVERY)
+        connection.execute("PRAGMA trusted_schema=OFF")
+        pages = connection.execute("PRAGMA page_count").fetchone()[0]
+        if immutable and size < pages * connection.execute("PRAGMA page_size").fetchone()[0]:
+            raise ValueError(f"only {size} bytes are there")
+        views = [name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'view'")]
+        if views:
+            raise ValueError(f"it has the view {views[0][:40]}, which could compute anything")
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
 
 @dataclass
 class Imported:
@@ -44,14 +95,27 @@ class Imported:
     names: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
-    def add(self, store: StudyStore, study: Study, episodes: Iterator[ImportedEpisode], command: Sequence[str]) -> bool:
-        """Write a study. If one of its name has episodes, leave it out and return False."""
+    def add(self, store: StudyStore, study: Study, episodes: Iterator[ImportedEpisode], command: Sequence[str]) -> None:
+        """Write a study. If one of its name has episodes, leave it out."""
         if store.counts()[0]:
             self.notes.append(f"{store.name} exists and was left out: 'kerv runs rm {store.name}' removes it")
-            return False
-        store.add(study, episodes, command)
-        self.names.append(store.name)
-        return True
+        else:
+            store.add(study, episodes, command)
+            self.names.append(store.name)
+
+    def leave_out(self, path: Path, error: BaseException) -> None:
+        """Note that a damaged study or part of one is left out."""
+        self.notes.append(f"{path} was left out: {' '.join(f'{type(error).__name__} {error}'.split())[:160]}")
+
+
+def check_one(path: Path, name: str, studies: int) -> None:
+    """Refuse a name for several studies.
+
+    Raises:
+        UsageError: There are several.
+    """
+    if name and studies != 1:
+        raise UsageError(f"name={name}: {path} holds {studies} studies, a name is for one")
 
 
 def episodes_in(connection: sa.Connection, settings: dict[int, Setting]) -> Iterator[ImportedEpisode]:
@@ -99,8 +163,7 @@ def import_database(results: Database, path: Path, name: str, imported: Imported
         if version > SCHEMA:
             raise newer(path, version)
         rows = connection.execute(sa.select(STUDIES).order_by(STUDIES.c.id)).all()
-        if name and len(rows) != 1:
-            raise UsageError(f"name={name}: {path} holds {len(rows)} studies, a name is for one")
+        check_one(path, name, len(rows))
         for row in rows:
             study, settings = stored_study(connection, row)
             store = StudyStore(results, name or study.name, study.kind)

@@ -262,7 +262,8 @@ def export(
 )
 def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False) -> None:
     """Read runs of another results folder, or evaluations of vla-eval or lerobot as a study of paired episodes."""
-    from kerv_cli.catalogue.recognise import import_evaluations, import_results, is_results
+    from kerv_cli.catalogue.evaluations import import_evaluations
+    from kerv_cli.catalogue.folders import import_results, is_results
     from kerv_cli.lab.database import Database
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.summary import SummaryTable

@@ -1,7 +1,7 @@
-"""Imports evaluations that vla-eval ran, as a study with a setting per model server.
+"""Imports evaluations that vla-eval and lerobot-eval ran, as a study with a setting per imported path.
 
-A recording is a SQLite file. For servers of kerv the decodes are known too (served.py). For other servers success and
-steps are known, but no times.
+A recording of vla-eval is a SQLite file. For servers of kerv the decodes are known too (served.py). For other servers
+success and steps are known, but no times. lerobot-eval writes `eval_info.json`, which has successes alone.
 """
 
 from __future__ import annotations
@@ -21,14 +21,18 @@ from typing import Any
 import pyarrow as pa
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
-from kerv_cli.base.files import visible
+from kerv_cli.base.files import read_mapping, visible
 from kerv_cli.catalogue.served import path_of, read_served
-from kerv_cli.catalogue.sqlite import connect_foreign
+from kerv_cli.catalogue.stored import connect_foreign
 from kerv_cli.episodes.identity import ENGINE, OBSERVATION
 from kerv_cli.episodes.rows import DECODE_SCHEMA, EPISODE_SCHEMA, INT
 from kerv_cli.episodes.settings import RolloutSettings, settings_from
 from kerv_cli.lab.plan import Episode, Setting, Study
 from kerv_cli.lab.store import IMPORT, ImportedEpisode, StudyStore
+
+LEROBOT_FILE = "eval_info.json"
+"""Name of lerobot-eval's results."""
+_DAMAGE = (sqlite3.Error, OSError, ValueError, KeyError, TypeError, AttributeError)
 
 _UNKNOWN_DECODE = {"index": 0, "step": 0, "mode": "elsewhere", "forwards": 0, "seconds": math.nan, "tokens": [],
                    "actions": [], "rounds": [], "compensated": 0, "skipped": False}  # fmt: skip
@@ -98,31 +102,122 @@ class Evaluation:
         return str(method or self.server.get("model_server") or "server")
 
 
-def read_evaluations(path: Path) -> list[Evaluation]:
-    """Return the evaluations in a recording of vla-eval, or in all recordings of a folder.
+def import_evaluations(
+    results: Path, paths: Sequence[Path], name: str, labels: Sequence[str], baseline: str, words: Sequence[str]
+) -> tuple[str, list[str]]:
+    """Write evaluations as one study.
+
+    Args:
+        results: The results folder.
+        paths: Recordings of vla-eval, results of lerobot-eval, or folders that hold some. Each is one setting.
+        name: Name of the study. Empty: that of the benchmarks.
+        labels: A label for each path. Empty: names of the servers.
+        baseline: Label of the baseline. Empty: ar, else the first.
+        words: Words after `kerv` of the command.
+
+    Returns:
+        The name of the study, and lines about missing episodes.
 
     Raises:
-        UsageError: There is no recording, or none has an episode.
-        CheckpointError: A recording is damaged or cut short.
+        UsageError: A path holds no evaluation, or they cannot be compared. Another study has the name, or there is no
+            such label.
+        StorageError: The disk refused.
+        CheckpointError: A file is damaged.
     """
-    files = [file for file in visible(path) if file.suffix == ".sqlite"] if path.is_dir() else [path]
-    if not files or not all(file.is_file() for file in files):
+    by_label = labelled([read_evaluations(path) for path in paths], labels)
+    evaluations = [(label, one) for label, of_path in by_label.items() for one in of_path]
+    benchmarks = list(dict.fromkeys(one.benchmark for _, one in evaluations))
+    name = name or re.sub(r"\W+", "_", "-".join(benchmarks))[:80].strip("_") or "imported"
+    store = StudyStore(results, name)
+    if store.exists and store.kind != IMPORT:
+        raise UsageError(f"study '{name}' exists and was not imported: choose another with name=")
+    baseline = baseline or ("ar" if "ar" in by_label else next(iter(by_label)))
+    if baseline not in by_label:
+        raise UsageError(f"baseline={baseline}: the recordings are of {', '.join(by_label)}")
+    settings = {label: Setting(label, "", _settings(one[0]), _identity(one)) for label, one in by_label.items()}
+    episodes = {
+        episode: (one, recorded)
+        for label, one in evaluations
+        for episode, recorded in _episodes(settings[label], one, len(benchmarks) > 1)
+    }
+    notes = [line for label, one in evaluations for line in _notes(label, one)]
+    title = f"{', '.join(dict.fromkeys(one.harness for _, one in evaluations))}: {', '.join(benchmarks)}"
+    study = Study(name, tuple(settings.values()), tuple(episodes), IMPORT, title, baseline, note="; ".join(notes))
+    existing = (
+        _imported(results, episode, one, recorded)
+        for episode, (one, recorded) in episodes.items()
+        if recorded is not None
+    )
+    StudyStore(results, name, IMPORT).add(study, existing, words)
+    return name, notes
+
+
+def read_evaluations(path: Path) -> list[Evaluation]:
+    """Return the evaluations in a file or a folder of vla-eval or lerobot-eval, which are of one server.
+
+    Raises:
+        UsageError: There is no recording, none has an episode, or there are several servers.
+        CheckpointError: A file is damaged or cut short.
+    """
+    info = path / LEROBOT_FILE if path.is_dir() else path
+    if info.name == LEROBOT_FILE and info.is_file():
+        files, read, what = [info], _read_lerobot, "file of lerobot-eval"
+    else:
+        files = [file for file in visible(path) if file.suffix == ".sqlite"] if path.is_dir() else [path]
+        read, what = _read_recording, "recording of vla-eval"
+    if not files:
         raise UsageError(f"{path}: no recording of vla-eval, recording-….sqlite")
-    evaluations = [one for file in files for one in _read(file) if one.episodes]
+    evaluations: list[Evaluation] = []
+    for file in files:
+        try:
+            evaluations += [one for one in read(file) if one.episodes]
+        except _DAMAGE as error:
+            why = " ".join(f"{type(error).__name__} {error}".split())[:120]
+            raise CheckpointError(f"{file} is damaged, cut short or no {what} ({why})") from error
     if not evaluations:
         raise UsageError(f"{path}: the recording holds no episode")
+    benchmarks = {one.benchmark for one in evaluations}
+    if len(benchmarks) < len(evaluations) or any(one.server != evaluations[0].server for one in evaluations):
+        raise UsageError(f"{path} holds several evaluations of a benchmark, or of several servers: name each file")
     return evaluations
 
 
-def _read(path: Path) -> list[Evaluation]:
-    try:
-        with contextlib.closing(connect_foreign(path)) as file:
-            return [
-                _evaluation(file, path, *row) for row in file.execute("SELECT eval_id, metadata FROM eval_metadata")
-            ]
-    except (sqlite3.Error, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        why = " ".join(f"{type(error).__name__} {error}".split())[:120]
-        raise CheckpointError(f"{path} is damaged, cut short or no recording of vla-eval ({why})") from error
+def _read_lerobot(path: Path) -> list[Evaluation]:
+    """Return the evaluations of lerobot-eval's results, one per group of tasks.
+
+    A file with several tasks has `per_task` (task_group, task_id and lists of metrics), one with a single task
+    `per_episode`. The file does not name the policy, so its name is that of the file's folder. Without a seed in the
+    file, an episode's number is its seed: lerobot-eval gives the episodes of every task the same seeds in order.
+    """
+    value = read_mapping(path)
+    groups: dict[str, list[RecordedEpisode]] = {}
+    overall = value.get("overall") or value.get("aggregated") or {}
+    seconds = float(overall.get("eval_ep_s") or 0.0)
+
+    def add(group: str, task: str, index: int, seed: int, success: Any) -> None:
+        if not isinstance(success, bool | int | float) or math.isnan(success):
+            raise ValueError(f"success {success!r} of episode {index}")
+        episode = RecordedEpisode(task, index, seed, bool(success), None, seconds, str(index), (float(seed),))
+        groups.setdefault(group, []).append(episode)
+
+    for one in value.get("per_task") or ():
+        for index, success in enumerate(one["metrics"]["successes"]):
+            add(str(one["task_group"]), f"task {one['task_id']}", index, index, success)
+    for index, row in enumerate(value["per_episode"] if not groups else ()):
+        add("lerobot", "task", index, index if row.get("seed") is None else int(row["seed"]), row["success"])
+    figures = {key: value for key, value in overall.items() if isinstance(value, int | float) and math.isfinite(value)}
+    name = path.resolve().parent.name
+    about = figures, {"model_server": name}
+    return [
+        Evaluation(path, f"{name} {group}", group, *about, tuple(episodes), len(episodes), "lerobot-eval")
+        for group, episodes in groups.items()
+    ]
+
+
+def _read_recording(path: Path) -> list[Evaluation]:
+    """Return the evaluations of a recording of vla-eval."""
+    with contextlib.closing(connect_foreign(path)) as file:
+        return [_evaluation(file, path, *row) for row in file.execute("SELECT eval_id, metadata FROM eval_metadata")]
 
 
 def _evaluation(file: sqlite3.Connection, path: Path, name: str, metadata: str) -> Evaluation:
@@ -157,20 +252,12 @@ def _episode(
     )
 
 
-@dataclass
-class Server:
-    """The evaluations of one model server, which are one setting of the study."""
-
-    label: str
-    evaluations: list[Evaluation]
-
-
-def by_server(recordings: Sequence[Sequence[Evaluation]], labels: Sequence[str] = ()) -> list[Server]:
-    """Group evaluations by their model server.
+def labelled(recordings: Sequence[list[Evaluation]], labels: Sequence[str] = ()) -> dict[str, list[Evaluation]]:
+    """Return the evaluations of each path by label, which are one setting.
 
     Args:
-        recordings: The evaluations of each recording.
-        labels: A label for each recording. Empty: names of the servers.
+        recordings: The evaluations of each path.
+        labels: A label for each path. Empty: names of the servers.
 
     Raises:
         UsageError: The number of labels is wrong, or the evaluations have different episodes.
@@ -179,93 +266,37 @@ def by_server(recordings: Sequence[Sequence[Evaluation]], labels: Sequence[str] 
         raise UsageError(
             f"labels={','.join(labels)}: write a different one for each of the {len(recordings)} recordings"
         )
-    servers: list[Server] = []
+    by_label: dict[str, list[Evaluation]] = {}
     for number, evaluations in enumerate(recordings):
-        for one in evaluations:
-            name = labels[number] if labels else one.name
-            for server in servers:
-                first, benchmarks = server.evaluations[0], {other.benchmark for other in server.evaluations}
-                is_same = first.server == one.server and one.benchmark not in benchmarks
-                if server.label == name if labels else is_same:
-                    server.evaluations.append(one)
-                    break
-            else:
-                taken = {server.label for server in servers}
-                label = next(n for n in (name, *(f"{name}-{i}" for i in range(2, 10_000))) if n not in taken)
-                servers.append(Server(label, [one]))
-    for server in servers[1:]:
-        _check_same_episodes(servers[0], server)
-    return servers
+        name = labels[number] if labels else evaluations[0].name
+        label = next(n for n in (name, *(f"{name}-{i}" for i in range(2, 10_000))) if n not in by_label)
+        by_label[label] = evaluations
+    first, *others = by_label
+    for other in others:
+        _check_same_episodes(f"{first} and {other}", by_label[first], by_label[other])
+    return by_label
 
 
-def _check_same_episodes(first: Server, other: Server) -> None:
-    pairs = [(a, b) for a in first.evaluations for b in other.evaluations if a.benchmark == b.benchmark]
+def _check_same_episodes(names: str, first: Sequence[Evaluation], other: Sequence[Evaluation]) -> None:
+    pairs = [(a, b) for a in first for b in other if a.benchmark == b.benchmark]
     if not pairs:
-        names = (", ".join(one.benchmark for one in server.evaluations) for server in (first, other))
-        raise UsageError(f"{first.label} and {other.label} have different benchmarks: {' and '.join(names)}")
+        benchmarks = (", ".join(one.benchmark for one in evaluations) for evaluations in (first, other))
+        raise UsageError(f"{names} have different benchmarks: {' and '.join(benchmarks)}")
     for a, b in pairs:
         left, right = _conditions(a.config), _conditions(b.config)
         for key in sorted(left.keys() | right.keys()):
             if left.get(key) != right.get(key):
                 raise UsageError(
-                    f"{first.label} and {other.label} have different episodes of {a.benchmark}: {key} is "
-                    f"{left.get(key)} and {right.get(key)}"
+                    f"{names} have different episodes of {a.benchmark}: {key} is {left.get(key)} and {right.get(key)}"
                 )
-    if not any(
-        {(one.task, one.seed) for one in a.episodes} & {(one.task, one.seed) for one in b.episodes} for a, b in pairs
-    ):
-        raise UsageError(f"{first.label} and {other.label} have no episode in common: neither task nor seed agree")
+    if not any({(e.task, e.seed) for e in a.episodes} & {(e.task, e.seed) for e in b.episodes} for a, b in pairs):
+        raise UsageError(f"{names} have no episode in common: neither task nor seed agree")
 
 
 def _conditions(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of a benchmark that determine its world."""
     params = {f"params.{key}": value for key, value in dict(config.get("params") or {}).items()}
     return {key: config.get(key) for key in ("benchmark", "mode", "max_steps")} | params
-
-
-def write_study(results: Path, name: str, servers: Sequence[Server], baseline: str, words: Sequence[str]) -> list[str]:
-    """Write the evaluations of these servers as a study.
-
-    Args:
-        results: The results folder.
-        name: Name of the study.
-        servers: A setting each.
-        baseline: Label of the baseline. Empty: ar, else the first.
-        words: Words after `kerv` of the command.
-
-    Returns:
-        Lines about missing episodes.
-
-    Raises:
-        UsageError: Another study has the name, or there is no such label.
-        StorageError: The disk refused.
-        CheckpointError: A served episode is damaged.
-    """
-    store = StudyStore(results, name)
-    if store.exists and store.kind != IMPORT:
-        raise UsageError(f"study '{name}' exists and was not imported: choose another with name=")
-    labels = [server.label for server in servers]
-    baseline = baseline or ("ar" if "ar" in labels else labels[0])
-    if baseline not in labels:
-        raise UsageError(f"baseline={baseline}: the recordings are of {', '.join(labels)}")
-    evaluations = [(server, one) for server in servers for one in server.evaluations]
-    benchmarks = list(dict.fromkeys(one.benchmark for _, one in evaluations))
-    settings = {server.label: Setting(server.label, "", _settings(server), _identity(server)) for server in servers}
-    episodes = {
-        episode: (one, recorded)
-        for server, one in evaluations
-        for episode, recorded in _episodes(settings[server.label], one, len(benchmarks) > 1)
-    }
-    notes = [line for server, one in evaluations for line in _notes(server.label, one)]
-    title = f"{', '.join(dict.fromkeys(one.harness for _, one in evaluations))}: {', '.join(benchmarks)}"
-    study = Study(name, tuple(settings.values()), tuple(episodes), IMPORT, title, baseline, note="; ".join(notes))
-    existing = (
-        _imported(results, episode, one, recorded)
-        for episode, (one, recorded) in episodes.items()
-        if recorded is not None
-    )
-    StudyStore(results, name, IMPORT).add(study, existing, words)
-    return notes
 
 
 def _episodes(
@@ -292,9 +323,8 @@ def _notes(label: str, one: Evaluation) -> Iterator[str]:
         yield f"{label}: {missing} of {one.planned} episodes of {one.benchmark} are missing"
 
 
-def _settings(server: Server) -> dict[str, Any]:
+def _settings(first: Evaluation) -> dict[str, Any]:
     """Return RolloutSettings that say what ran: those of a server of kerv, else defaults with the server's name."""
-    first = server.evaluations[0]
     stored = first.facts.get("settings")
     plain = dataclasses.asdict(RolloutSettings()) | {"method": first.name}
     if isinstance(stored, dict):
@@ -310,11 +340,11 @@ def _settings(server: Server) -> dict[str, Any]:
     return plain
 
 
-def _identity(server: Server) -> dict[str, str]:
+def _identity(evaluations: Sequence[Evaluation]) -> dict[str, str]:
     """Return hashes of the weights, and of what was recorded: a rollout never reuses an imported episode."""
-    recorded = [[one.id, [dataclasses.astuple(e) for e in one.episodes]] for one in server.evaluations]
+    recorded = [[one.id, [dataclasses.astuple(e) for e in one.episodes]] for one in evaluations]
     digest = hashlib.sha256(json.dumps(recorded, sort_keys=True).encode()).hexdigest()
-    hashes = {str(k): str(v) for k, v in dict(server.evaluations[0].facts.get("identity") or {}).items()}
+    hashes = {str(k): str(v) for k, v in dict(evaluations[0].facts.get("identity") or {}).items()}
     return {"target": "", **hashes, "evaluation": digest, OBSERVATION: "of the benchmark"}
 
 
@@ -344,9 +374,3 @@ def _imported(results: Path, episode: Episode, one: Evaluation, recorded: Record
         "imported": {"source": one.source.name, "evaluation": one.id, "config": one.config},
     }
     return ImportedEpisode(episode, row, decodes, f"{one.id} {episode.setting.label}", about)
-
-
-def study_name(servers: Sequence[Server]) -> str:
-    """Return a name for the study: that of its benchmarks."""
-    names = dict.fromkeys(one.benchmark for server in servers for one in server.evaluations)
-    return re.sub(r"\W+", "_", "-".join(names))[:80].strip("_") or "imported"

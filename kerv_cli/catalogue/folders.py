@@ -1,10 +1,10 @@
-"""Results folders of version 0.1.0: a folder per study, with plan.yaml, run.json and a folder per cell."""
+"""Imports results folders. Those of 0.1.0 have a folder per study, with plan.yaml, run.json and a folder per cell."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,11 @@ from kerv_cli.base.files import read_mapping, read_yaml, sha256_of, visible
 from kerv_cli.base.limits import check_label
 from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import SETTINGS_GROUPS, part_of
-from kerv_cli.catalogue.stored import Imported
+from kerv_cli.catalogue.stored import Imported, check_one, import_database
 from kerv_cli.episodes.identity import ENGINE
 from kerv_cli.episodes.rows import DECODE_SCHEMA, EPISODE_SCHEMA
 from kerv_cli.episodes.settings import RolloutSettings
-from kerv_cli.lab.database import Database
+from kerv_cli.lab.database import FILE, Database
 from kerv_cli.lab.plan import Episode, Setting, Study, plain_settings
 from kerv_cli.lab.store import ROLLOUT, SWEEP, ImportedEpisode, StudyStore
 from kerv_cli.methods.settings import with_artifacts
@@ -35,13 +35,56 @@ Cells = list[tuple[str, list[Episode]]]
 """Id of a cell and its episodes."""
 
 
-def older_studies(path: Path) -> list[tuple[str, Path]]:
+def is_results(path: Path) -> bool:
+    """Return whether a path is a results folder or a kerv.db.
+
+    Raises:
+        UsageError: It does not exist.
+    """
+    if not path.exists():
+        raise UsageError(
+            f"{path} does not exist: name a results folder, a kerv.db, or evaluations of vla-eval or lerobot"
+        )
+    return _database_of(path) is not None or bool(_older_studies(path))
+
+
+def _database_of(path: Path) -> Path | None:
+    """Return the database that a path is or holds. Its name ends with .db."""
+    file = path / FILE if path.is_dir() else path
+    return file if file.is_file() and file.suffix == Path(FILE).suffix else None
+
+
+def import_results(results: Database, paths: Sequence[Path], name: str = "") -> Imported:
+    """Copy the studies of results folders and databases.
+
+    Args:
+        results: Where they are copied to.
+        paths: Results folders of this version or 0.1.0, and databases.
+        name: Name of the study here, if there is only one. Empty: as there.
+
+    Raises:
+        UsageError: A path is the results folder itself, or `name` is set and there are several studies.
+        CheckpointError: A database is damaged.
+    """
+    imported = Imported()
+    for path in paths:
+        older, file = _older_studies(path), _database_of(path)
+        if older:
+            _import_older(results, path, name, imported)
+        if file is not None and (results.file is None or file.resolve() != results.file.resolve()):
+            import_database(results, file, name, imported)
+        elif not older:
+            raise UsageError(f"{path} is the results folder that it would be imported into: name another with results=")
+    return imported
+
+
+def _older_studies(path: Path) -> list[tuple[str, Path]]:
     """Return the studies and rollouts of version 0.1.0 in a folder: kind and folder of each."""
     found = [(kind, plan.parent) for name, kind in _FOLDERS.items() for plan in path.glob(f"{name}/[!.]*/plan.yaml")]
     return sorted(found, reverse=True)
 
 
-def import_older(results: Database, path: Path, name: str, imported: Imported) -> None:
+def _import_older(results: Database, path: Path, name: str, imported: Imported) -> None:
     """Copy every study and rollout into the database. Recordings and artifacts are files and stay where they are.
 
     Args:
@@ -54,9 +97,8 @@ def import_older(results: Database, path: Path, name: str, imported: Imported) -
         UsageError: `name` is set and there are several studies.
         StorageError: The disk refused.
     """
-    studies = older_studies(path)
-    if name and len(studies) != 1:
-        raise UsageError(f"name={name}: {path} holds {len(studies)} studies, a name is for one")
+    studies = _older_studies(path)
+    check_one(path, name, len(studies))
     for kind, folder in studies:
         store = StudyStore(results, name or folder.name, kind)
         try:
@@ -65,13 +107,9 @@ def import_older(results: Database, path: Path, name: str, imported: Imported) -
             commands = read_mapping(run)["commands"] if run.is_file() else []
             words = tuple(commands[-1]["arguments"]) if commands else ("runs", "import", str(path))
         except _DAMAGE as error:
-            imported.notes.append(_left_out(folder, error))
+            imported.leave_out(folder, error)
             continue
-        imported.add(store, study, _episodes(folder, cells, imported.notes), words)
-
-
-def _left_out(folder: Path, error: BaseException) -> str:
-    return f"{folder} was left out: {' '.join(f'{type(error).__name__} {error}'.split())[:160]}"
+        imported.add(store, study, _episodes(folder, cells, imported), words)
 
 
 def _study_of(folder: Path, name: str, kind: str) -> tuple[Study, Cells]:
@@ -112,7 +150,7 @@ def completed(stored: Mapping[str, Any]) -> dict[str, Any]:
     return plain_settings(plain)
 
 
-def _episodes(folder: Path, cells: Cells, notes: list[str]) -> Iterator[ImportedEpisode]:
+def _episodes(folder: Path, cells: Cells, imported: Imported) -> Iterator[ImportedEpisode]:
     """Yield the episodes of every whole cell. Each damaged one adds a line to the notes."""
     for name, episodes in cells:
         # a cell that ran again has newer folders NAME-2, NAME-3, …
@@ -123,7 +161,7 @@ def _episodes(folder: Path, cells: Cells, notes: list[str]) -> Iterator[Imported
         try:
             rows = list(_of_cell(cell, episodes))
         except _DAMAGE as error:
-            notes.append(_left_out(cell, error))
+            imported.leave_out(cell, error)
             continue
         yield from rows
 
@@ -143,11 +181,7 @@ def _of_cell(cell: Path, episodes: list[Episode]) -> Iterator[ImportedEpisode]:
         row = rows[one.seed]
         known = {name: row[name] for name in _ROW if name in row and row[name] == row[name]}  # without NaN
         mine = decodes.filter(pa.compute.equal(decodes["seed"], one.seed))
-        columns = [
-            mine[column.name].cast(column.type)
-            if column.name in mine.column_names
-            else pa.nulls(mine.num_rows, column.type)
-            for column in DECODE_SCHEMA
-        ]
-        table = pa.table(columns, schema=DECODE_SCHEMA)
+        # columns that it lacks are null
+        table = pa.concat_tables([DECODE_SCHEMA.empty_table(), mine], promote_options="permissive")
+        table = table.select(DECODE_SCHEMA.names).cast(DECODE_SCHEMA)
         yield ImportedEpisode(one, known, table, str(row["block"]), about, run, code=code)
