@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.settings import CommandSettings
@@ -11,9 +12,10 @@ from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.settings import settings_from
 from kerv_cli.lab.database import Database
-from kerv_cli.lab.plan import Episode, Setting
-from kerv_cli.lab.store import ROLLOUT, Plan
-from kerv_cli.lab.study import new_name, plan_again
+from kerv_cli.lab.plan import ALL, Episode, Setting
+from kerv_cli.lab.runs import unfinished
+from kerv_cli.lab.store import ROLLOUT, Plan, StudyStore, plan_study
+from kerv_cli.lab.study import new_name
 
 
 def plan_of(run: RunEntry, results: str) -> Plan:
@@ -27,8 +29,17 @@ def plan_of(run: RunEntry, results: str) -> Plan:
     new = {setting.label: _checked(setting, study.tasks, results) for setting in study.settings}
     episodes = tuple(Episode(new[one.setting.label], one.task, one.seed, one.repeat) for one in study.episodes)
     study = dataclasses.replace(study, settings=tuple(new.values()), episodes=episodes)
-    name = new_name(database, study) if study.kind == ROLLOUT else f"{run.id}-again"
-    return plan_again(database, study, name, again_words(run, results))
+    command = again_words(run, results)
+    row = unfinished(database, study.kind, command)
+    if row is not None:
+        name = row.name
+    elif study.kind == ROLLOUT:
+        name = new_name(database, study)
+    else:
+        names = (f"{run.id}-again{number if number > 1 else ''}" for number in itertools.count(1))
+        name = next(one for one in names if not StudyStore(database, one).exists)
+    study = dataclasses.replace(study, name=name)
+    return plan_study(database, study, ALL, row.started if row else "", command=command)
 
 
 def again_words(run: RunEntry, results: str) -> list[str]:

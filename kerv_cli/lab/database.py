@@ -37,6 +37,11 @@ def _table(name: str, *columns: sa.schema.SchemaItem) -> sa.Table:
     return sa.Table(name, _META, *columns)
 
 
+def _required(kind: Any, *names: str) -> list[sa.Column[Any]]:
+    """Return columns of one type that are never null."""
+    return [sa.Column(name, kind, nullable=False) for name in names]
+
+
 def _to(name: str, column: str, **options: Any) -> sa.Column[Any]:
     """Return a column that refers to another row, and is deleted with it."""
     return sa.Column(name, sa.ForeignKey(column, ondelete="CASCADE"), **options)
@@ -45,54 +50,40 @@ def _to(name: str, column: str, **options: Any) -> sa.Column[Any]:
 ABOUT = _table("kerv", sa.Column("key", sa.Text, primary_key=True), sa.Column("value", sa.Text, nullable=False))
 RUNS = _table(
     "runs",  # a row per command that was begun
+    # kind: sweep, rollout, import, or a kind of artifact; name: of the study or the artifact; started: ISO 8601, UTC;
+    # command: words after `kerv`; heartbeat: seconds since 1970
     sa.Column("id", sa.Text, primary_key=True),
-    sa.Column("kind", sa.Text, nullable=False),  # sweep, rollout, import, or a kind of artifact
-    sa.Column("name", sa.Text, nullable=False),  # of the study or the artifact
-    sa.Column("command", _JSON, nullable=False),  # words after `kerv`
-    sa.Column("status", sa.Text, nullable=False),
-    sa.Column("done", sa.Integer, nullable=False, default=0),
-    sa.Column("total", sa.Integer, nullable=False, default=0),
-    sa.Column("message", sa.Text, nullable=False, default=""),
-    sa.Column("host", sa.Text, nullable=False),
-    sa.Column("pid", sa.Integer, nullable=False),
-    sa.Column("started", sa.Text, nullable=False),  # ISO 8601, UTC
+    *_required(sa.Text, "kind", "name", "status", "message", "host", "started", "git_commit"),
+    *_required(sa.Integer, "done", "total", "pid"),
+    *_required(_JSON, "command"),
+    *_required(sa.Float, "heartbeat"),
     sa.Column("finished", sa.Text),
-    sa.Column("heartbeat", sa.Float, nullable=False),  # seconds since 1970
-    sa.Column("git_commit", sa.Text, nullable=False),
     sa.Index("runs_of_name", "kind", "name"),
 )
 STUDIES = _table(
     "studies",
     sa.Column("id", sa.Integer, primary_key=True),
     sa.Column("name", sa.Text, nullable=False, unique=True),
-    sa.Column("kind", sa.Text, nullable=False),  # sweep, rollout, import
-    sa.Column("created", sa.Text, nullable=False),
-    sa.Column("about", _JSON, nullable=False),  # title, baseline, axis, note, block
+    *_required(sa.Text, "kind", "created"),  # kind: sweep, rollout, import
+    *_required(_JSON, "about"),  # title, baseline, axis, note, block
 )
 SETTINGS = _table(
     "settings",  # a row of a study's table
     sa.Column("id", sa.Integer, primary_key=True),
     _to("study_id", "studies.id", nullable=False, index=True),
-    sa.Column("position", sa.Integer, nullable=False),
-    sa.Column("label", sa.Text, nullable=False),
-    sa.Column("name", sa.Text, nullable=False),  # shared by the settings of a grid
-    sa.Column("method", sa.Text, nullable=False),
-    sa.Column("varies", _JSON, nullable=False),  # key -> value in a grid
-    sa.Column("overrides", sa.Text, nullable=False),
     sa.Column("work", sa.Text, nullable=False, index=True),  # hash of what determines a result
-    sa.Column("settings", _JSON, nullable=False),
-    sa.Column("identity", _JSON, nullable=False),  # hashes of weights and data
+    *_required(sa.Integer, "position"),
+    *_required(sa.Text, "label", "name", "method", "overrides"),  # name: shared by the settings of a grid
+    # varies: key -> value in a grid; identity: hashes of weights and data
+    *_required(_JSON, "varies", "settings", "identity"),
     sa.UniqueConstraint("study_id", "label"),
 )
 BLOCKS = _table(
     "blocks",  # one attempt to run some episodes in one process, in which settings take turns
     sa.Column("id", sa.Text, primary_key=True),
-    sa.Column("run", sa.Text, nullable=False),
     sa.Column("claim", sa.Text),  # JSON: the episodes of the study that it runs; null when it has ended
-    sa.Column("seeds", sa.Text, nullable=False),
-    sa.Column("started", sa.Text, nullable=False),
-    sa.Column("code", sa.Text, nullable=False),  # hash of the source code
-    sa.Column("about", _JSON, nullable=False),  # machine, versions, commit, executor, workers
+    *_required(sa.Text, "run", "seeds", "started", "code"),  # code: hash of the source code
+    *_required(_JSON, "about"),  # machine, versions, commit, executor, workers
 )
 _INTEGERS = (
     "steps", "decodes", "forwards", "verifications", "tokens", "committed", "accepted", "first_rejected_sum",
@@ -114,16 +105,13 @@ MEASURES: tuple[sa.Column[Any], ...] = (
 EPISODES = _table(
     "episodes",
     sa.Column("id", sa.Integer, primary_key=True),
-    sa.Column("work", sa.Text, nullable=False),
-    sa.Column("task", sa.Text, nullable=False),
-    sa.Column("seed", sa.BigInteger, nullable=False),
-    sa.Column("repeat", sa.Integer, nullable=False),
+    *_required(sa.Text, "work", "task", "started"),
+    *_required(sa.BigInteger, "seed"),
+    *_required(sa.Integer, "repeat", "order"),  # order: number of episodes that the block ran before it
     sa.Column("block", sa.ForeignKey("blocks.id"), nullable=False),
-    sa.Column("order", sa.Integer, nullable=False),  # number of episodes that the block ran before it
-    sa.Column("started", sa.Text, nullable=False),
     sa.Column("worker_pid", sa.Integer),
     *MEASURES,
-    sa.Column("decode_seconds", sa.LargeBinary, nullable=False),  # (decodes,) little-endian float64
+    *_required(sa.LargeBinary, "decode_seconds"),  # (decodes,) little-endian float64
     # an episode can run again in another block, in turn with other settings or with other code
     sa.UniqueConstraint("work", "task", "seed", "repeat", "block"),
 )
@@ -136,17 +124,15 @@ WANTED = _table(
     sa.Column("task", sa.Text, primary_key=True),
     sa.Column("seed", sa.BigInteger, primary_key=True),
     sa.Column("repeat", sa.Integer, primary_key=True),
-    sa.Column("position", sa.Integer, nullable=False),
+    *_required(sa.Integer, "position"),
     sa.Column("episode_id", sa.ForeignKey("episodes.id", ondelete="SET NULL"), index=True),
     sa.Column("error", sa.Text),  # traceback of the last attempt if it failed
 )
 METRICS = _table(
     "metrics",  # curves of trainings
-    sa.Column("kind", sa.Text, primary_key=True),
-    sa.Column("name", sa.Text, primary_key=True),
+    *(sa.Column(name, sa.Text, primary_key=True) for name in ("kind", "name", "metric")),
     sa.Column("step", sa.Integer, primary_key=True),
-    sa.Column("metric", sa.Text, primary_key=True),
-    sa.Column("value", sa.Double, nullable=False),
+    *_required(sa.Double, "value"),
 )
 
 
@@ -283,7 +269,7 @@ def _file(path: Path) -> sa.Engine:
 def _configure(connection: Any, record: object) -> None:
     """Set up a new SQLite connection."""
     connection.isolation_level = None  # `_begin` begins the transactions
-    for pragma in ("journal_mode=WAL", "foreign_keys=ON", f"busy_timeout={LOCK_SECONDS * 1000}"):
+    for pragma in ("journal_mode=WAL", "foreign_keys=ON"):
         with contextlib.suppress(Exception):  # a read-only folder refuses the first
             connection.execute(f"PRAGMA {pragma}")
 

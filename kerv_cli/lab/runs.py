@@ -238,6 +238,12 @@ class Curve:
         return list(history.values())
 
 
+def unfinished(database: Database, kind: str, command: Sequence[str]) -> RunRow | None:
+    """Return the newest row of a command, or None if it is complete or there is none."""
+    row = next((row for row in run_rows(database, kind) if row.command == tuple(command)), None)
+    return None if row is None or row.status == COMPLETE else row
+
+
 def forget(database: Database, kind: str, name: str) -> None:
     """Delete the rows of all commands that made this study or artifact, and its curve."""
     with database.writing() as connection:

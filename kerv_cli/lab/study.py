@@ -26,8 +26,8 @@ from kerv_cli.lab.events import Event, OnEvent, Outcome, SettingFailed
 from kerv_cli.lab.execute import execute
 from kerv_cli.lab.executors import check_executor
 from kerv_cli.lab.plan import ALL, Episode, Setting, Study, all_episodes, plain_settings, seed_blocks, seeds_text
-from kerv_cli.lab.runs import COMPLETE, Run, interrupted_since, run_rows
-from kerv_cli.lab.store import ROLLOUT, SWEEP, Plan, StudyStore, plan_study, studies
+from kerv_cli.lab.runs import Run, interrupted_since, unfinished
+from kerv_cli.lab.store import ROLLOUT, SWEEP, Plan, StudyStore, plan_study
 
 InterimAnalysis = Callable[[StudyStore, Sequence[Episode], Sequence[str], int, int], list[str]]
 """Called after a block of seeds. It returns the labels of the settings that go on.
@@ -137,25 +137,11 @@ def plan_rollout(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
     check_writable(resolved.first.results)
     study, database = study_of(resolved, ROLLOUT), Database(resolved.first.results)
     runtime = replace(resolved.first.runtime, workers=1, executor="local")
-    for row in run_rows(database, ROLLOUT):
-        if row.command == tuple(command) and row.status != COMPLETE:
-            rest = plan_study(database, replace(study, name=row.name), ALL, row.started, runtime, command)
-            if rest.store.exists and rest.existing and rest.missing:
-                return rest
+    if row := unfinished(database, ROLLOUT, command):
+        rest = plan_study(database, replace(study, name=row.name), ALL, row.started, runtime, command)
+        if rest.store.exists and rest.existing and rest.missing:
+            return rest
     return plan_study(database, replace(study, name=new_name(database, study)), ALL, "", runtime, command)
-
-
-def plan_again(database: Database, study: Study, name: str, command: Sequence[str]) -> Plan:
-    """Plan to run a stored study again under another name.
-
-    The name is that of an interrupted repetition if there is one, else the first that is free of `name`, `name2`, ….
-    """
-    rows = run_rows(database, study.kind)
-    row = next((row for row in rows if row.command == tuple(command) and row.status != COMPLETE), None)
-    taken = {store.name for store in studies(database)}
-    free = next(one for one in (name, *(f"{name}{number}" for number in range(2, 10_000))) if one not in taken)
-    study = replace(study, name=row.name if row else free)
-    return plan_study(database, study, ALL, row.started if row else "", command=command)
 
 
 def new_name(database: Database, study: Study) -> str:

@@ -11,7 +11,7 @@ from kerv_cli.base.settings import read_settings
 from kerv_cli.catalogue.again import again_words
 from kerv_cli.catalogue.entries import RunEntry, description_of
 from kerv_cli.lab.database import Database
-from kerv_cli.lab.runs import COMPLETE, run_rows
+from kerv_cli.lab.runs import unfinished
 from kerv_cli.methods.settings import with_artifacts
 from kerv_cli.training.drafter import DrafterRun
 from kerv_cli.training.run import TrainingRun
@@ -29,10 +29,9 @@ def training_again(run: RunEntry, results: str) -> TrainingRun:
     if not isinstance(stored, dict):
         command = "target" if run.kind == "target" else "drafter"
         raise CheckpointError(f"{path} does not say how it was trained: train anew with 'kerv train {command}'")
-    command_words = tuple(again_words(run, results))
-    rows = [row for row in run_rows(Database(results), run.kind) if row.command == command_words]
-    if rows and rows[0].status != COMPLETE:
-        name = rows[0].name
+    row = unfinished(Database(results), run.kind, again_words(run, results))
+    if row is not None:
+        name = row.name
     else:
         names = (f"{run.folder.name}-again{number if number > 1 else ''}" for number in itertools.count(1))
         name = next(candidate for candidate in names if not (run.folder.parent / candidate).exists())
