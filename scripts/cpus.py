@@ -1,7 +1,7 @@
 """Run the tests that claim equality of bits or tokens (marker `bits`) under four kinds of CPU kernels:
 `python scripts/cpus.py [words for pytest]`. A line per kind; the exit status is 1 if a test fails or no kind can run.
 
-OpenBLAS, numpy, PyTorch, oneDNN and MKL choose their kernels by the CPU, and the last bits of their sums differ.
+OpenBLAS, numpy, PyTorch, oneDNN, MKL and numba choose their kernels by the CPU, and the last bits of their sums differ.
 """
 
 from __future__ import annotations
