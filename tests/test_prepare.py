@@ -59,7 +59,7 @@ def test_tasks_and_demonstrations_are_those_of_the_target(command: str) -> None:
 
 def test_a_target_is_trained_on_the_demonstrations_that_are_named(results: Path) -> None:
     planned = kerv("train", "target", "name=new", "demos=few", "--plan")
-    assert "8 demonstrations of 2 tasks, 6000 steps of 64 samples, about 96 min (a guess)" in planned
+    assert "8 demonstrations of 2 tasks, 6000 steps of 64 samples" in planned
     refused = kerv("train", "target", "name=new", "demos=few", "task=drawer-open", "--plan", code=1)
     assert "no episode of drawer-open-v3" in refused
     assert "'kerv demos task=drawer-open-v3'" in refused
@@ -157,11 +157,11 @@ def test_the_remedy_for_weights_of_another_target_works_as_it_is_typed(results: 
     kerv(*remove, "--yes")
     kerv(*train, *fast)
     assert "1 task, " in kerv(*rollout)
-    assert "4000 steps of 64, about 3 min (a guess)" in kerv(
+    assert "4000 steps of 64" in kerv(
         "train", "drafter", MINE, "policy.artifacts.drafter=b", "--plan"
     )
     few = kerv("train", "drafter", MINE, "policy.artifacts.drafter=b", "train.steps=400", "--plan")
-    assert "400 steps of 64, about 20 s (a guess)" in few
+    assert ", 400 steps of 64" in few
 
 
 @pytest.mark.usefixtures("results")

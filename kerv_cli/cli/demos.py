@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from kerv_cli.base.durations import about, count
+from kerv_cli.base.durations import count
 from kerv_cli.base.errors import Interrupted, UsageError
 from kerv_cli.base.limits import choice, setting
 from kerv_cli.base.places import artifact, results_dir
@@ -38,14 +38,14 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
     """
     from kerv_cli.lab.runs import making
     from kerv_cli.training.demonstrations import name_of
-    from kerv_cli.training.recording import recording_of, seconds_of
+    from kerv_cli.training.recording import recording_of
     from kerv_cli.worlds.demos.recording import record
 
     config, actor = recording_of(settings)
     folder = artifact(settings.results, "demos", settings.name or name_of(settings.task))
     if plan:
         what = f"{count(len(config.tasks), 'task')} x {count(settings.episodes, 'episode')}"
-        print_plan(f"{what} -> {folder}, {about(seconds_of(config))}")
+        print_plan(f"{what} -> {folder}")
     try:
         with making(settings.results, "demos", folder) as made, progress_bar("demonstrations", made) as advance:
             manifest = record(config, folder, advance, actor)

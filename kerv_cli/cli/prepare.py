@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import typer
 
-from kerv_cli.base.durations import about, duration
 from kerv_cli.base.errors import Interrupted
 from kerv_cli.base.registry import parts
 from kerv_cli.cli.command import command, typer_command
@@ -42,9 +41,7 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
         return shlex.join([*step.command, *shared])
 
     steps, name = planned(settings), settings.policy.target
-    rows = [(s.kind, s.state, duration(s.seconds) if s.seconds else "", f"kerv {line(s)}") for s in steps]
-    title = f"{name}, {about(sum(step.seconds for step in steps))}"
-    print_table(("what", "state", "about", "command"), rows, title)
+    print_table(("what", "state", "command"), [(s.kind, s.state, f"kerv {line(s)}") for s in steps], name)
     if plan:
         return
     for kind in [step.kind for step in steps]:

@@ -127,7 +127,6 @@ class Artifact(Generic[T]):
         noun: Its name in messages.
         made: How it is made, e.g. `trained`.
         command: Words after `kerv` that make one; empty if no command does.
-        seconds: A guess of how long `command` takes.
     """
 
     kind: str
@@ -135,7 +134,6 @@ class Artifact(Generic[T]):
     made = "trained"
     command: tuple[str, ...] = ()
     schema: type[T]
-    seconds = 30.0  # a guess of how long `command` takes
 
     @property
     def again(self) -> str:

@@ -82,13 +82,11 @@ class TrainableDrafter(Artifact[DrafterDescription]):
     Attributes:
         settings: Dataclass of its shapes and training.
         any_chunk: Whether it drafts for any H.
-        step_seconds: A guess of how long a training step takes on one core.
     """
 
     schema = DrafterDescription
     settings: type[Any]
     any_chunk = False
-    step_seconds = 0.05
 
     @property
     def command(self) -> tuple[str, ...]:  # type: ignore[override]

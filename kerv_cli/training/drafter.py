@@ -7,7 +7,6 @@ from typing import Any
 
 from torch import nn
 
-from kerv_cli.base.durations import about
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import set_up
@@ -56,14 +55,13 @@ class DrafterRun(TrainingRun):
         self.check_folder(f"policy.artifacts.{self.artifact_kind}")
 
     def plan(self) -> str:
-        """Return one line for --plan: target, observations, steps, time and folder."""
+        """Return one line for --plan: target, observations, steps and folder."""
         drafter, train = asdict(self.settings.drafter), self.settings.train
         layers = f"{drafter['layers']}-layer " if "layers" in drafter else ""
         samples = f", greedy decodes of {drafter['samples']} observations" if "samples" in drafter else ""
-        time = about(self.artifact.step_seconds * train.steps)
         return (
             f"{self.folder}: {layers}{self.artifact.noun} of {self.target_folder}{samples}, {train.steps} steps of "
-            f"{train.batch}, {time}"
+            f"{train.batch}"
         )
 
     def load(self, progress: OnProgress) -> None:

@@ -17,7 +17,7 @@ from kerv_cli.methods.artifacts import Artifacts, kind_of, removal
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.drafters import TrainableDrafter
 from kerv_cli.training.demonstrations import demos_for
-from kerv_cli.training.settings import PrepareSettings, TrainDrafterSettings
+from kerv_cli.training.settings import PrepareSettings
 from kerv_cli.worlds import specs
 
 THERE, MISSING = "there", "missing"
@@ -31,13 +31,11 @@ class Step:
         kind: Kind of the artifact.
         state: `there`, `missing`, `unfinished`, `step 300 of 4000`, …
         command: The words after `kerv` that make it, without those that all steps share.
-        seconds: A guess of how long that takes; 0 if it is there.
     """
 
     kind: str
     state: str
     command: tuple[str, ...]
-    seconds: float
 
 
 def plan(settings: PrepareSettings) -> list[Step]:
@@ -56,14 +54,10 @@ def plan(settings: PrepareSettings) -> list[Step]:
     steps: list[Step] = []
     for kind in kinds:
         files = kind_of(kind)
-        command, seconds = list(files.command_beside(kinds)), files.seconds
-        if isinstance(files, TrainableDrafter):
-            if settings.steps:
-                command.append(f"train.steps={settings.steps}")
-            train = compose("train_drafter", command[2:], TrainDrafterSettings).train
-            seconds = files.step_seconds * train.steps
-        state = _state(artifacts, kind, kinds)
-        steps.append(Step(kind, state, tuple(command), 0.0 if state == THERE else seconds))
+        command = files.command_beside(kinds)
+        if isinstance(files, TrainableDrafter) and settings.steps:
+            command = (*command, f"train.steps={settings.steps}")
+        steps.append(Step(kind, _state(artifacts, kind, kinds), command))
     if any(step.state != THERE and not find("artifact", step.kind).traits.get("study") for step in steps):
         demos_for(settings)
     return steps

@@ -39,12 +39,6 @@ def recording_of(settings: DemosSettings) -> tuple[DemoConfig, PolicyActs | None
     return config, actor
 
 
-def seconds_of(config: DemoConfig) -> float:
-    """Estimate how long a recording takes."""
-    steps = spec_of(config.tasks[0]).horizon / 6 * config.episodes * len(config.tasks)  # experts are about that quick
-    return steps * (0.7 + 10 / config.frame_stride) / 1000 / config.workers
-
-
 def _actor(settings: DemosSettings, task: str) -> PolicyActs | None:
     """Return the policy that moves the robot instead of the expert; None for the expert."""
     target = settings.policy.target

@@ -48,7 +48,7 @@ class TrainingRun(ABC):
 
     @abstractmethod
     def plan(self) -> str:
-        """Return one line for --plan: data, steps, time and folder."""
+        """Return one line for --plan: data, steps and folder."""
 
     @abstractmethod
     def load(self, progress: OnProgress) -> None:

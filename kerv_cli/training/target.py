@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import nn
 
-from kerv_cli.base.durations import about
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.places import artifact
 from kerv_cli.base.runtime import set_up
@@ -32,7 +31,6 @@ from kerv_cli.training.run import TrainingRun, refuse_unused
 from kerv_cli.training.settings import TrainTargetSettings
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
 from kerv_cli.worlds.demos.dataset import OnProgress
-from kerv_cli.worlds.views import views_of
 
 STATE_EPISODES = 200
 """Episodes from which the range of states is taken, at most."""
@@ -114,16 +112,12 @@ class TargetRun(TrainingRun):
         return folder
 
     def plan(self) -> str:
-        """Return one line for --plan: demonstrations, tasks, steps, time and folder."""
+        """Return one line for --plan: demonstrations, tasks, steps and folder."""
         target, train = self.settings.target, self.settings.train
         episodes = [episode for episode in self.dataset.episodes if episode.task in self.tasks]
-        # a guess for one core: the trunk's weights, and the pixels of every view
-        weights = target.layers * target.width * (4 * target.width + 3 * target.feed_forward)
-        views = len(views_of(self.world.camera.name)) if target.observation == "vision" else 0
-        seconds = train.steps * train.batch * (2.2e-9 * weights + 3e-4 * target.channels * views)
         return (
             f"{self.folder}: {target.size} on {target.observation}, {len(episodes)} demonstrations of "
-            f"{len(self.tasks)} tasks, {train.steps} steps of {train.batch} samples, {about(seconds)}"
+            f"{len(self.tasks)} tasks, {train.steps} steps of {train.batch} samples"
             + (f", beginning with {self.init}" if self.init else "")
         )
 

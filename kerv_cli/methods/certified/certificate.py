@@ -160,7 +160,7 @@ class Certificate:
 class CertificateArtifact(Artifact[Certificate]):
     """The certificate's single file."""
 
-    kind, noun, made, seconds = "certificate", "certificate", "issued", 120.0
+    kind, noun, made = "certificate", "certificate", "issued"
     command = ("calibrate", "success")
     schema = Certificate
 

@@ -151,7 +151,6 @@ class ScoutDrafter(EarlyDrafter):
 
     kind = noun = "scout"
     settings = ScoutSettings
-    step_seconds = 0.4
 
     def network(self, settings: ScoutSettings, target: Any) -> ScoutNetwork:
         """Return a fresh network that looks through the target's camera.
