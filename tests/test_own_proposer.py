@@ -31,7 +31,7 @@ from kerv_cli.episodes.settings import RolloutSettings, settings_from
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.kerv.prediction import Hold, PredictionProposer
-from kerv_cli.methods.merged.proposer import MergedProposer
+from kerv_cli.methods.merged import MergedProposer
 from kerv_cli.training.drafter import DrafterRun
 from kerv_cli.training.settings import TrainDrafterSettings
 from kerv_cli.worlds.metaworld.spec import SPEC

@@ -22,7 +22,7 @@ from kerv_cli.methods.heisd import SimilaritySkipSettings
 from kerv_cli.methods.heisd.datastore import Datastore, Manifest, prompt_key
 from kerv_cli.methods.heisd.rules import HybridProposer, Random, RetrievalProposer, VerifySkip
 from kerv_cli.methods.kerv.prediction import Hold, Kalman, Linear, Noise, PredictionProposer
-from kerv_cli.methods.merged.proposer import MergedProposer
+from kerv_cli.methods.merged import MergedProposer
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.worlds.metaworld.spec import SPEC
 

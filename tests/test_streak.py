@@ -12,7 +12,7 @@ from test_unverified import SHOWN, Near
 
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.parts import Fixed
-from kerv_cli.methods.merged.proposer import MergedProposer
+from kerv_cli.methods.merged import MergedProposer
 from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.methods.streak import StreakSkip, StreakSkipSettings
 

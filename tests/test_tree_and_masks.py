@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from kerv_cli.engine.acceptance import accept_by_distance
 from kerv_cli.engine.draft import Draft, ancestors_of, ancestors_on_device
 from kerv_cli.engine.tree import ROOT, TokenTree, merge
-from kerv_cli.methods.merged.proposer import rows_of
 from kerv_cli.targets.attention import Cache, attention_mask
 
 
@@ -119,16 +118,6 @@ def test_acceptance_is_its_definition(tree: TokenTree, data: st.DataObject, star
     end = found.path[-1] if found.path else ROOT
     children = [i for i, parent in enumerate(tree.parents) if parent == end]
     assert (found.rejected is None) == (not children)
-
-
-@settings(max_examples=60, deadline=None)
-@given(data=st.data(), keep=st.integers(1, 4))
-def test_a_merged_trees_nodes_have_their_chains_rows(data: st.DataObject, keep: int) -> None:
-    chains = data.draw(st.lists(st.lists(st.integers(0, 2), min_size=1, max_size=5), min_size=1, max_size=4))
-    tree = merge(chains[:keep])
-    flat = [tuple(chain[: i + 1]) for chain in chains for i in range(len(chain))]
-    for node, row in enumerate(rows_of(tree, chains)):
-        assert flat[row] == tuple(tree.tokens[i] for i in tree.path_to(node))
 
 
 @settings(max_examples=60, deadline=None)

@@ -19,7 +19,7 @@ from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.methods.heisd import SimilaritySkipSettings
 from kerv_cli.methods.heisd.rules import RetrievalProposer, VerifySkip
 from kerv_cli.methods.kerv.prediction import Hold, PredictionProposer
-from kerv_cli.methods.merged.proposer import MergedProposer
+from kerv_cli.methods.merged import MergedProposer
 from kerv_cli.methods.unverified import AlwaysSkip
 from kerv_cli.worlds.metaworld.spec import SPEC
 

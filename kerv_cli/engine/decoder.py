@@ -42,16 +42,12 @@ class Verified(NamedTuple):
 
     Attributes:
         hidden: The target's states of the forwarded tokens, (1, before + rows, E).
-        forwarded: Number of the draft's rows.
         tree: The nodes to judge, on the CPU.
-        rows: Row of each node among those forwarded.
         target_tokens: 1 + n tokens, on the CPU: the target's after the last committed token, then after each node.
     """
 
     hidden: Tensor
-    forwarded: int
     tree: TokenTree
-    rows: Sequence[int]
     target_tokens: list[int]
 
 
@@ -260,9 +256,7 @@ class Decoder(EpisodeState):
         targets, *vectors = read(argmax, *remote, *(tensor for tensor, _ in reads))
         for (_, receive), vector in zip(reads, vectors[len(remote) :], strict=True):
             receive(vector)
-        tree, rows = draft.judged(vectors[: len(remote)])
-        tokens = targets.astype(np.int64).tolist()
-        return Verified(hidden, len(draft), tree, rows, [tokens[0], *(tokens[1 + row] for row in rows)])
+        return Verified(hidden, draft.judged(vectors[: len(remote)]), targets.astype(np.int64).tolist())
 
     def accept(self, chunk: Chunk, verified: Verified, proposer: Proposer | None) -> Accepted:
         """Return the best path of the draft, by the acceptance rule."""
@@ -301,12 +295,12 @@ class Decoder(EpisodeState):
             target=tuple(target_tokens[node + 1] for node in after_rejection),
         )
         chunk.commit(record, [tree.tokens[node] for node in path] + bonus, rejection)
-        return self._keep(chunk, verified, [verified.rows[node] for node in path])
+        return self._keep(chunk, verified, list(path))
 
     def _keep(self, chunk: Chunk, verified: Verified, rows: list[int]) -> Tensor:
         """Drop all rows of the draft but `rows` from the cache, and return the states of what stays."""
         cache, hidden = chunk.cache, verified.hidden
-        end, before = cache.length - verified.forwarded, hidden.shape[1] - verified.forwarded
+        end, before = cache.length - len(verified.tree), hidden.shape[1] - len(verified.tree)
         if rows == list(range(len(rows))):  # a chain's rows are where they belong
             cache.length = end + len(rows)
             return hidden[:, : before + len(rows)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -26,14 +26,11 @@ class Draft:
         tokens: (n,) int64.
         parents: (n,) int64; None for a chain.
         levels: Maximum depth of the tree. Needed only when `parents` is on the GPU.
-        choose: Returns the tree to judge and the row of each of its nodes, after `Chunk.reads` are read. Needed only
-            when some rows are no nodes of that tree.
     """
 
     tokens: Tensor
     parents: Tensor | None = None
     levels: int = 0
-    choose: Callable[[], tuple[TokenTree, Sequence[int]]] | None = None
 
     @classmethod
     def of(cls, tokens: Sequence[int], parents: Sequence[int] | None = None) -> Draft:
@@ -58,12 +55,9 @@ class Draft:
         """Tokens and parents that are on the GPU."""
         return [x for x in (self.tokens, self.parents) if x is not None and x.device != HOST]
 
-    def judged(self, remote: Sequence[np.ndarray]) -> tuple[TokenTree, Sequence[int]]:
-        """Return the tree to judge and the row of each node, given what was read of `remote`."""
-        if self.choose is not None:
-            return self.choose()
-        tree = TokenTree.build(*(vector.astype(np.int64).tolist() for vector in remote)) if remote else self.tree
-        return tree, range(len(self))
+    def judged(self, remote: Sequence[np.ndarray]) -> TokenTree:
+        """Return the tree to judge, given what was read of `remote`."""
+        return TokenTree.build(*(vector.astype(np.int64).tolist() for vector in remote)) if remote else self.tree
 
     def tokens_on(self, device: torch.device) -> Tensor:
         """Return the tokens (n,) on a device."""

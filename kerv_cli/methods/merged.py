@@ -1,0 +1,102 @@
+"""Drafts of several sources as one prefix tree (docs/methods.md §5, ours), e.g. of `one_pass`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.limits import MOST_TOKENS, number
+from kerv_cli.base.registry import PREFILL, add, find
+from kerv_cli.engine.proposer import ChainProposer
+from kerv_cli.engine.tree import merge
+from kerv_cli.methods.heisd import RetrievalProposerSettings
+
+if TYPE_CHECKING:
+    from kerv_cli.engine.chunk import Chunk
+    from kerv_cli.engine.draft import Draft
+    from kerv_cli.methods.context import Context
+
+
+@dataclass
+class MergedProposerSettings:
+    """Merges whole drafts of several sources into one prefix tree (§5, ours).
+
+    The fallback sources draft only if no other is sure of its chunk, because every node costs time.
+    """
+
+    kind: str = "merged"
+    sources: list[str] = field(default_factory=lambda: ["early"])
+    fallback: list[str] = field(default_factory=lambda: ["hold"])
+    nodes: int = number(48, 1, MOST_TOKENS)  # the last sources' chains are dropped first
+    neighbours: int = number(1, 1, MOST_TOKENS)  # retrieval: stored chunks
+
+    def check_together(self, prefix: str) -> None:
+        """Refuse settings without a source, or with one that cannot draft whole chains before the prefill."""
+        if not self.sources:
+            raise UsageError("merged: name at least one of sources")
+        for name in (*self.sources, *self.fallback):
+            if not find("proposer", name, "source of a merged draft").traits.get("chains"):
+                raise UsageError(f"source '{name}' of a merged draft: it does not draft whole chunks from the prompt")
+
+
+def needs_of_sources(settings: MergedProposerSettings) -> tuple[str, ...]:
+    """Return the artifacts that the sources need together."""
+    names = (*settings.sources, *settings.fallback)
+    return tuple(dict.fromkeys(kind for name in names for kind in find("proposer", name).needs(None)))
+
+
+class MergedProposer(ChainProposer):
+    """Merges the chains of several sources into one prefix tree of at most `nodes` nodes.
+
+    If there are too many, the last chains are dropped first. The fallback sources draft only if no other is sure of its
+    chunk.
+    """
+
+    def __init__(self, sources: Sequence[ChainProposer], nodes: int, fallback: Sequence[ChainProposer] = ()) -> None:
+        together = [*sources, *fallback]
+        self.name = together[0].name if len(together) == 1 else "merged"
+        self.sources, self.fallback, self.nodes = sources, fallback, nodes
+
+    @classmethod
+    def build(cls, settings: MergedProposerSettings, context: Context) -> MergedProposer:
+        """Build proposer=merged."""
+
+        def source(name: str) -> ChainProposer:
+            part = find("proposer", name)
+            source_settings: Any = part.default
+            if isinstance(source_settings, RetrievalProposerSettings):
+                source_settings = RetrievalProposerSettings(neighbours=settings.neighbours, nodes=settings.nodes)
+            return part.built(source_settings, context)
+
+        sources, fallback = ([source(name) for name in names] for names in (settings.sources, settings.fallback))
+        return cls(sources, settings.nodes, fallback)
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        for source in (*self.sources, *self.fallback):
+            source.reset()
+
+    def propose(self, chunk: Chunk, depth: int) -> Draft:
+        """Return one prefix tree of all chains."""
+        from kerv_cli.engine.draft import Draft
+
+        chains = self.chains(chunk, depth)
+        tree = merge(chains)
+        while len(tree) > self.nodes:
+            chains = chains[:-1] or [chains[0][: self.nodes]]
+            tree = merge(chains)
+        return Draft.of(tree.tokens, tree.parents)
+
+    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        """Return the chains of the sources, and of the fallback sources if no source is sure."""
+        sources = list(self.sources)
+        if not any(source.is_sure(chunk) for source in sources):
+            sources += self.fallback
+        return [chain for source in sources for chain in source.chains(chunk, depth)]
+
+
+_BUILD = "kerv_cli.methods.merged:MergedProposer.build"
+_parts = (_BUILD, MergedProposerSettings, needs_of_sources)
+add("proposer", "merged", *_parts, colour=0xCC79A7, when=PREFILL, merged=True, cost="early")
