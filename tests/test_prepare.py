@@ -157,9 +157,7 @@ def test_the_remedy_for_weights_of_another_target_works_as_it_is_typed(results: 
     kerv(*remove, "--yes")
     kerv(*train, *fast)
     assert "1 task, " in kerv(*rollout)
-    assert "4000 steps of 64" in kerv(
-        "train", "drafter", MINE, "policy.artifacts.drafter=b", "--plan"
-    )
+    assert "4000 steps of 64" in kerv("train", "drafter", MINE, "policy.artifacts.drafter=b", "--plan")
     few = kerv("train", "drafter", MINE, "policy.artifacts.drafter=b", "train.steps=400", "--plan")
     assert ", 400 steps of 64" in few
 

@@ -30,8 +30,7 @@ from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.losses import soft_labels, token_loss
 from kerv_cli.training import imitation
 from kerv_cli.training.imitation import Imitation, lit, vocabulary, waypoints
-from kerv_cli.training.loop import Loop, Metrics, schedule
-from kerv_cli.training.resume import digest, read_state, write_state
+from kerv_cli.training.loop import Loop, Metrics, digest, read_state, schedule, write_state
 from kerv_cli.training.settings import TrainSettings
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.demos.recording import DemoConfig, record

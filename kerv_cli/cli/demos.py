@@ -37,8 +37,8 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
     With policy=vision it records the states that a policy visits by its method, labelled by the expert.
     """
     from kerv_cli.lab.runs import making
+    from kerv_cli.training.dagger import recording_of
     from kerv_cli.training.demonstrations import name_of
-    from kerv_cli.training.recording import recording_of
     from kerv_cli.worlds.demos.recording import record
 
     config, actor = recording_of(settings)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -21,14 +21,17 @@ from kerv_cli.engine.decoder import Decoder
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.calibration import (
+    NEVER,
     BoundarySection,
     Calibration,
     CalibrationArtifact,
     Demonstrations,
+    SkipLevel,
     SkipSection,
     Variability,
 )
 from kerv_cli.methods.compose import Method
+from kerv_cli.methods.heisd.datastore import Datastore
 from kerv_cli.methods.heisd.rules import BoundaryRanges
 from kerv_cli.targets.folders import check_not_shipped
 from kerv_cli.targets.observations import observations_of
@@ -36,12 +39,18 @@ from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import demos_for
 from kerv_cli.training.predictor_fit import choose_episodes, fit_filters, prediction_errors, read_windows
 from kerv_cli.training.settings import CalibrateSettings
-from kerv_cli.training.skip_levels import skip_section
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import OnProgress
 
 PRESAMPLED = 6
 """Episodes per task over which the decodes of pre-sampling are spread, at most."""
+
+ENTRIES = 4000
+"""Entries looked up per task, evenly spread. On MT10, levels from 1000 did not hold on other episodes."""
+LEAST = 20
+"""Entries that must be above a level to support it."""
+LOW, HIGH = 2.0, 1 / 3
+"""The bounds of s_min allow this multiple of the wrong chunks that s_min allows."""
 
 Stage = Callable[[str], AbstractContextManager[OnProgress]]
 """Opens a part of the work by its title and yields what is told its progress."""
@@ -207,3 +216,95 @@ def distribution(levels: Sequence[float], least: float) -> Variability:
     """Return percentiles of K and its median K_S; K is divided by K_S, which is therefore at least `least`."""
     low, high, top = np.percentile(levels, [25, 75, 90]).tolist()
     return Variability(max(float(np.median(levels)), least), len(levels), low, high, top)
+
+
+@dataclass(frozen=True)
+class Matches:
+    """n entries of one task and their best neighbours in other episodes."""
+
+    similarity: np.ndarray  # (n,) float32, cosine
+    error: np.ndarray  # (n,) mean absolute difference of the two chunks, normalised action units
+    strict: np.ndarray  # (n,) bool, whether a token of a strict DoF differs
+
+    def good(self, epsilon: float) -> np.ndarray:
+        """Return (n,) bool: the error is at most epsilon, and all tokens of strict DoFs are the expert's.
+
+        The gripper is judged apart: a wrong one hardly changes the mean over all DoFs, but drops the object.
+        """
+        return (self.error <= epsilon) & ~self.strict
+
+
+def match(store: Datastore, task: str) -> Matches:
+    """Compare up to ENTRIES entries of a task with their best neighbours in other episodes; none for one episode.
+
+    Each entry is looked up among the other episodes of its task. The best neighbour's chunk, which would have been
+    executed without verification, is compared with the entry's own: the expert's next actions (docs/methods.md §4.3).
+    """
+    shard = store.shards[task]
+    count = min(ENTRIES, shard.stop - shard.start) if len(np.unique(store.seeds[shard])) > 1 else 0
+    rows = np.linspace(shard.start, shard.stop - 1, count).astype(int)
+    similarity, drafts = np.zeros(count, np.float32), np.zeros((count, store.tokens.shape[1]), np.int64)
+    for i, row in enumerate(rows):
+        neighbours = store.query(store.vectors[row], task, 1, without=int(store.seeds[row]))
+        similarity[i], drafts[i] = neighbours.similarity[0], neighbours.chunks[0]
+    space, expert = store.manifest.actions, store.tokens[rows].astype(np.int64)
+    error = np.abs(space.values_of(drafts) - space.values_of(expert)).mean(1)
+    strict = (drafts != expert)[:, space.strict_tokens(expert.shape[1])].any(1)
+    return Matches(similarity, error, strict)
+
+
+def lowest_level(similarity: np.ndarray, good: np.ndarray, confidence: float, least: int = LEAST) -> float | None:
+    """Return the lowest similarity s such that at least the share `confidence` of the entries from s on is good.
+
+    Entries of equal similarity count together.
+
+    Args:
+        similarity: (n,) of the entries.
+        good: (n,) bool.
+        confidence: Share of good entries.
+        least: Entries that a level needs.
+
+    Returns:
+        The similarity; None if no level has that many good entries.
+    """
+    order = np.argsort(-similarity, kind="stable")
+    ranked = similarity[order]
+    above = np.arange(1, len(ranked) + 1)
+    enough = (np.cumsum(good[order]) / above >= confidence) & (above >= least)
+    enough[:-1] &= ranked[:-1] > ranked[1:]
+    return float(ranked[enough][-1]) if enough.any() else None
+
+
+def task_levels(matches: Matches, epsilon: float, confidence: float) -> SkipLevel:
+    """Return a task's s_min, the bounds between which feedback may move it, and the share of decodes it would skip.
+
+    The bounds low ≤ s_min ≤ high allow twice and a third of the wrong chunks: 0.8 and 0.967 for a confidence of 0.9. If
+    no level is good enough for high, it is the largest similarity seen. If none is for s_min, all three are NEVER.
+    """
+    good, wrong = matches.good(epsilon), 1 - confidence
+    s_min = lowest_level(matches.similarity, good, confidence)
+    if s_min is None:
+        return SkipLevel(NEVER, NEVER, NEVER, share=0.0, entries=len(matches.similarity))
+    low, high = (lowest_level(matches.similarity, good, 1 - wrong * factor) for factor in (LOW, HIGH))
+    skipped = matches.similarity >= s_min
+    return SkipLevel(
+        s_min,
+        low=s_min if low is None else min(low, s_min),
+        high=float(matches.similarity.max()) if high is None else max(high, s_min),
+        share=float(skipped.mean()),
+        entries=len(matches.similarity),
+        within=float(good[skipped].mean()),
+        error=float(matches.error[skipped].mean()),
+    )
+
+
+def skip_section(
+    store: Datastore, tasks: Sequence[str], epsilon: float, confidence: float, progress: OnProgress
+) -> SkipSection | None:
+    """Return the levels of those tasks that the datastore holds; None if it holds none of them."""
+    levels = {}
+    for done, task in enumerate(tasks, 1):
+        if task in store.shards:
+            levels[task] = task_levels(match(store, task), epsilon, confidence)
+        progress(done, len(tasks))
+    return SkipSection(store.content, epsilon, confidence, levels) if levels else None

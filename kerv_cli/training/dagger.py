@@ -1,7 +1,7 @@
-"""DAgger: a policy moves the robot, the expert labels the states that it visits (Ross, Gordon, Bagnell 2011).
+"""What `kerv demos` records: the scripted expert, or a policy whose states the expert labels.
 
-The policy may decode by any method. `method=scout_unverified` records the states that a drafter's unverified chunks
-lead to, to train the drafter on.
+The latter is DAgger (Ross, Gordon, Bagnell 2011). The policy may decode by any method. `method=scout_unverified`
+records the states that a drafter's unverified chunks lead to, to train the drafter on.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ from kerv_cli.episodes.identity import hash_of
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.parallel import native_decoder
+from kerv_cli.methods.settings import EXPERT, PolicySettings
 from kerv_cli.training.settings import DemosSettings
+from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.demos.recording import DemoConfig
 from kerv_cli.worlds.spec import EnvironmentSpec, World
 
@@ -138,3 +140,38 @@ def _hash(settings: DemosSettings) -> str:
         return _artifacts(settings).description.sha256
     hashes = _artifacts(settings).check(Method.of(settings).needs)
     return hash_of([hashes, {kind: asdict(part) for kind, part in settings.parts().items()}, settings.chunk])
+
+
+def recording_of(settings: DemosSettings) -> tuple[DemoConfig, PolicyActs | None]:
+    """Return what is recorded, and the policy that moves the robot; None if the expert does.
+
+    Raises:
+        UnknownName: No such task.
+        UsageError: A target without a policy that acts.
+        CheckpointError: No such policy.
+    """
+    tasks = resolve_tasks(settings.task)
+    actor = _actor(settings, tasks[0])
+    config = DemoConfig(
+        tasks=tasks,
+        episodes=settings.episodes,
+        first_seed=settings.seed,
+        perturbed=settings.perturbed,
+        camera=settings.world.camera,
+        frame_stride=settings.frame_stride,
+        workers=settings.runtime.workers,
+        horizon=settings.world.horizon,
+        policy=actor.sha256 if actor else "",
+        expert_share=settings.expert_share if actor else 0.0,
+    )
+    return config, actor
+
+
+def _actor(settings: DemosSettings, task: str) -> PolicyActs | None:
+    """Return the policy that moves the robot instead of the expert; None for the expert."""
+    target = settings.policy.target
+    if settings.policy.kind != EXPERT:
+        return PolicyActs.of(settings, spec_of(task))
+    if target != PolicySettings().target:
+        raise UsageError(f"policy.target={target}: the expert acts, set policy=vision (or state) too")
+    return None

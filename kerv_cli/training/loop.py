@@ -6,21 +6,35 @@ resumed run writes the same bytes as an uninterrupted one, on the same machine w
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
-from collections.abc import Callable, Iterator
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import FrameType
 from typing import Protocol
 
 import torch
+from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError, Interrupted, KervError
 from kerv_cli.base.files import write_text
+from kerv_cli.base.manifests import read
+from kerv_cli.targets.checkpoint import load_tensors, save_tensors
 from kerv_cli.targets.folders import RESUME
-from kerv_cli.training.interruption import until_interrupted
-from kerv_cli.training.resume import Metrics, Progress, read_state, write_state
 from kerv_cli.training.settings import TrainSettings
+
+Metrics = dict[str, float]
+_UNREADABLE = (SafetensorError, OSError, KeyError, TypeError, ValueError)
+SAME_REQUEST = 2.0
+"""Seconds in which a second signal is the same request: schedulers pass on what the process has received already."""
 
 
 class Objective(Protocol):
@@ -233,3 +247,97 @@ def without_subnormals() -> Iterator[None]:
         yield
     finally:
         torch.set_flush_denormal(False)
+
+
+@contextmanager
+def until_interrupted() -> Iterator[threading.Event]:
+    """Yield an event that the first SIGINT or SIGTERM sets; a later one of the same kind raises KeyboardInterrupt.
+
+    Outside the main thread nothing sets it. A signal that is ignored stays ignored.
+    """
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    first_times: dict[int, float] = {}
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        now = time.monotonic()
+        if now - first_times.setdefault(number, now) > SAME_REQUEST:
+            raise KeyboardInterrupt
+        if not stop.is_set():
+            again = "Ctrl-C again" if number == signal.SIGINT else "a second one"
+            print(f"stopping after this step; {again} stops at once and keeps the last saved state", file=sys.stderr)
+        stop.set()
+
+    # a shell's background job and nohup ignore SIGINT
+    signals = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, handle) for number in signals}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a run is.
+
+    Attributes:
+        identity: Hash of everything that determines the run.
+        step: Steps done.
+        history: Metrics of every validation.
+    """
+
+    identity: str
+    step: int
+    history: list[Metrics]
+
+
+def stored_identity(folder: Path) -> str | None:
+    """Return the identity of the run in the folder without reading its tensors; None if there is none to read."""
+    try:
+        return str(json.loads(_state(folder / RESUME)["progress"])["identity"])
+    except _UNREADABLE:
+        return None
+
+
+def write_state(path: Path, tensors: Mapping[str, Tensor], progress: Progress) -> None:
+    """Write tensors and progress into one file."""
+    text = json.dumps(asdict(progress), allow_nan=False)
+    # one key: safetensors orders several at random, and equal states must be equal bytes
+    save_tensors(path, tensors, {"state": json.dumps({"progress": text, "sha256": digest(tensors, text)})})
+
+
+def read_state(path: Path) -> tuple[dict[str, Tensor], Progress]:
+    """Read what `write_state` wrote.
+
+    Raises:
+        CheckpointError: The file is damaged, or holds numbers that are not finite.
+    """
+    try:
+        state = _state(path)
+        tensors, text = load_tensors(path, "training state"), state["progress"]
+        if state["sha256"] != digest(tensors, text):
+            raise ValueError("its hash does not fit")
+        return tensors, read(Progress, json.loads(text), str(path), tolerant=True)
+    except _UNREADABLE as error:
+        remedy = f"move {path.parent} aside to begin again"
+        raise CheckpointError(f"training state at {path} is damaged ({error}): {remedy}") from error
+
+
+def _state(path: Path) -> dict[str, str]:
+    with safe_open(path, "pt") as file:
+        state: dict[str, str] = json.loads((file.metadata() or {})["state"])
+    return state
+
+
+def digest(tensors: Mapping[str, Tensor], text: str) -> str:
+    """Return the SHA-256 over names, types, shapes and bytes of tensors, and a text."""
+    hasher = hashlib.sha256(text.encode())
+    for name in sorted(tensors):
+        tensor = tensors[name].detach().cpu().contiguous()
+        hasher.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        hasher.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return hasher.hexdigest()
