@@ -1,11 +1,14 @@
-"""Programs that are no modules of a package, e.g. those of scripts/."""
+"""Loads what tests need in a special way: programs of scripts/, artifacts for a target."""
 
 from __future__ import annotations
 
 import importlib.util
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+
+from kerv_cli.targets.checkpoint import TargetDescription
 
 
 def module_of(path: Path) -> Any:
@@ -17,3 +20,8 @@ def module_of(path: Path) -> Any:
     sys.modules[spec.name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
     return module
+
+
+def of_target(description: TargetDescription, target: object) -> Any:
+    """What an artifact is loaded for: stands for `Artifacts`."""
+    return SimpleNamespace(description=description, target=target)

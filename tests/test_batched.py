@@ -39,7 +39,7 @@ from kerv_cli.lab.study import EpisodeRunner
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.methods.parallel import ParallelPass
-from kerv_cli.methods.unverified import AlwaysSkip
+from kerv_cli.methods.streak import AlwaysSkip
 from kerv_cli.report.plots import study_figures
 from kerv_cli.report.reprice import NamedProfile, repriced_table
 from kerv_cli.report.summary import summary_frame

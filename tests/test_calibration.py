@@ -35,7 +35,7 @@ from kerv_cli.methods.calibration import (
     Variability,
 )
 from kerv_cli.methods.heisd.rules import BoundaryRanges
-from kerv_cli.methods.kerv.prediction import PREDICTORS, Noise, build_predictor
+from kerv_cli.methods.kerv.prediction import PREDICTORS, Noise
 from kerv_cli.targets.checkpoint import TargetDescription, read_target
 from kerv_cli.targets.folders import find_target
 from kerv_cli.training.calibration import CalibrationRun, distribution
@@ -162,7 +162,7 @@ def line_windows(slope: float) -> Windows:
 
 
 def test_errors_of_hold_and_linear_have_closed_forms() -> None:
-    noise = {kind: Noise.uniform(4, 1.0) for kind in PREDICTORS}
+    noise = {kind: Noise(*3 * [(1.0,) * 4]) for kind in PREDICTORS}
     errors = prediction_errors(line_windows(0.02), noise, SPACE)
     assert set(errors) == set(PREDICTORS)
     np.testing.assert_allclose(moving_errors(errors, "hold", SPACE), [[0] * 4, 0.02 * np.arange(1, 5)], atol=1e-12)
@@ -218,8 +218,8 @@ def test_a_run_writes_what_the_next_session_reads(results: Path, target: str) ->
     assert loaded.skip is None
     assert "kept" not in loaded.provenance
     assert [line.split(":")[0] for line in run.notes] == ["skip levels"]
-    for kind in PREDICTORS:
-        predictor = build_predictor(kind, SPACE.is_strict, loaded.noise, window=loaded.window)
+    for kind, predictor_class in PREDICTORS.items():
+        predictor = predictor_class(SPACE.is_strict, loaded.noise.get(kind), window=loaded.window)
         np.testing.assert_allclose(predictor.predict(np.full((10, 4), 0.25), 4), 0.25)
 
 
@@ -251,7 +251,7 @@ def calibration(levels: dict[str, float]) -> Calibration:
         target=MadeFor("a" * 64, SPACE, 4),
         demos=Demonstrations("b" * 64, {}),
         window=10,
-        noise={kind: Noise.uniform(4, 1.0) for kind in ("kalman", "damped")},
+        noise={kind: Noise(*3 * [(1.0,) * 4]) for kind in ("kalman", "damped")},
         errors={},
         variability={task: Variability(level, 5, level, level, level) for task, level in levels.items()},
         boundary=BoundarySection(8, {"15": BoundaryRanges(0.01, 2.0, 0.0, 0.2)}),

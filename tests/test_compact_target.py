@@ -11,10 +11,10 @@ import torch
 from examples.own_target import SEVEN
 from hypothesis import given
 from hypothesis import strategies as st
+from loaded import of_target
 
 from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
-from kerv_cli.methods.artifacts import Request
 from kerv_cli.methods.eagle.drafter import EagleDrafter
 from kerv_cli.methods.early.drafter import EarlyDrafter
 from kerv_cli.targets.attention import attention_mask
@@ -94,7 +94,7 @@ def test_the_shipped_targets_load_with_metaworlds_spaces(name: str) -> None:
     assert target.observation == SPEC.observation
     assert target.cameras == (("corner4",) if name == "mt10-vision" else ())
     assert target.max_prompt == (31 if name == "mt10-vision" else 15)
-    request = Request(description, target)
+    request = of_target(description, target)
     drafter = EagleDrafter().load(shipped_dir() / name / "drafter", request)
     early = EarlyDrafter().load(shipped_dir() / name / "early", request)
     assert (drafter.width, early.tokens) == (target.width, target.chunk * 4)

@@ -10,12 +10,13 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from loaded import of_target
 from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.cli.app import app
-from kerv_cli.methods.artifacts import MadeFor, Request
+from kerv_cli.methods.artifacts import MadeFor
 from kerv_cli.methods.drafters import Training
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import (
@@ -281,7 +282,7 @@ def test_it_trains_from_the_command_line_and_drafts_for_its_target_alone(results
     assert "accepted_r9" in done.stdout
     target, description = load_target(results / "artifacts/target/nano-vision")
     files, folder = EarlyDrafter(), results / "artifacts/early/whole"
-    own, early = files.checked(folder, description), files.load(folder, Request(description, target))
+    own, early = files.checked(folder, description), files.load(folder, of_target(description, target))
     assert own.target == description.sha256
     assert own.chunk == target.chunk
     assert own.provenance["settings"]["drafter"]["width"] == early.settings.width == 32
@@ -301,15 +302,15 @@ def test_a_saved_drafter_drafts_the_same_and_a_missing_one_says_what_to_run(tmp_
     early = drafter(SMALL, target)
     early.standardise(torch.randn(20, target.pooled_width))
     with pytest.raises(CheckpointError, match="kerv train drafter drafter=early"):
-        EarlyDrafter().load(tmp_path, Request(description, target))
+        EarlyDrafter().load(tmp_path, of_target(description, target))
     EarlyDrafter().save(tmp_path, early, MadeFor.of(description), {}, settings=dataclasses.asdict(early.settings))
-    loaded = EarlyDrafter().load(tmp_path, Request(description, target))
+    loaded = EarlyDrafter().load(tmp_path, of_target(description, target))
     features = torch.randn(1, target.pooled_width)
     assert tokens_of(loaded, features, 0) == tokens_of(early, features, 0)
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:-1] + b"x")
     with pytest.raises(CheckpointError):
-        EarlyDrafter().load(tmp_path, Request(description, target))
+        EarlyDrafter().load(tmp_path, of_target(description, target))
 
 
 def test_the_config_brings_its_own_optimisation_and_yields_to_the_command_line() -> None:

@@ -19,7 +19,6 @@ from kerv_cli.methods.kerv.prediction import (
     Linear,
     Noise,
     Predictor,
-    build_predictor,
     kalman_weights,
 )
 
@@ -37,7 +36,7 @@ NOISE = {name: noise_of(5.0, 0.5, 0.8 if name == "damped" else 1.0) for name in 
 
 @functools.cache
 def predictor(kind: str, held: tuple[bool, ...] = HELD, **shape: int) -> Predictor:
-    return build_predictor(kind, np.array(held), NOISE, **shape)
+    return PREDICTORS[kind](np.array(held), NOISE.get(kind), **shape)
 
 
 def most_probable_path(window: np.ndarray, q: float, r: float, steps: int, damping: float = 1.0) -> np.ndarray:
@@ -103,7 +102,7 @@ def test_hold_and_linear() -> None:
 
 @settings(deadline=None)  # the machine is shared
 @given(
-    st.sampled_from(PREDICTORS),
+    st.sampled_from(tuple(PREDICTORS)),
     arrays(np.float64, (7, DOFS), elements=st.floats(-1, 1)),
     st.tuples(*[st.booleans()] * DOFS),
     st.integers(0, HORIZON),

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from loaded import of_target
 from test_openvla import kerv
 
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.methods.artifacts import Request
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.targets.checkpoint import load_target
@@ -77,9 +77,9 @@ def test_a_policy_of_seven_dofs_is_trained_and_decodes_with_its_drafters(results
         words = [f"drafter={kind}", "policy.target=arm", "drafter.samples=12"]
         assert kerv("train", "drafter", *words, *common) == (0, "")
     target, description = load_target(results / "artifacts/target/arm")
-    request = Request(description, target)
-    drafter = EagleDrafter().load(results / "artifacts/drafter/arm", request)
-    early = EarlyDrafter().load(results / "artifacts/early/arm", request)
+    loaded = of_target(description, target)
+    drafter = EagleDrafter().load(results / "artifacts/drafter/arm", loaded)
+    early = EarlyDrafter().load(results / "artifacts/early/arm", loaded)
     assert early.strict.tolist() == [dof == 6 for dof in range(7)] * target.chunk
     shown = Observation(np.full(7, 0.1), np.full(19, 0.1), "turn the peg and push it into the tilted slot")
     plain = Decoder(target).decode(shown)

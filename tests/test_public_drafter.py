@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 import torch
 from examples.tiny_openvla import write_checkpoint
+from loaded import of_target
 from safetensors.torch import load_file, save_file
 from test_decoding_lossless import decode, plain_greedy
 from test_openvla import imported, kerv, loaded, shown
 from torch import Tensor
 
-from kerv_cli.methods.artifacts import Request
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.eagle.public import Convention, PublicDrafter, PublicShape
 from kerv_cli.targets.checkpoint import read_target
@@ -119,7 +119,8 @@ def test_it_is_imported_beside_its_target(
     description = json.loads((results / "artifacts/drafter/openvla/drafter.json").read_text())
     assert description["public"]["convention"] == {"positions": "text", "mask": "causal"}
     described = read_target(results / "artifacts/target/openvla")
-    own: Any = EagleDrafter().load(results / "artifacts/drafter/openvla", Request(described, target))
+    described_target = of_target(described, target)
+    own: Any = EagleDrafter().load(results / "artifacts/drafter/openvla", described_target)
     assert (own.draft_position(40), drafter.draft_position(40)) == (24, 40)
     for name, tensor in own.state_dict().items():
         torch.testing.assert_close(tensor, drafter.state_dict()[name])

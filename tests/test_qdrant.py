@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.registry import find
 from kerv_cli.methods.heisd import QdrantSearchSettings
-from kerv_cli.methods.heisd.datastore import ExactIndex, best
+from kerv_cli.methods.heisd.datastore import Datastore, ExactIndex, best
 
 ROWS = {"a": slice(0, 60), "b": slice(60, 61), "c": slice(61, 300)}
 SEEDS = np.random.default_rng(1).integers(0, 4, 300)
@@ -19,7 +19,10 @@ pytest.importorskip("qdrant_client")
 
 
 def searched(vectors: np.ndarray, shards: dict[str, slice] = ROWS, **where: str) -> Any:
-    return find("datastore", "qdrant").built(vectors, SEEDS, shards, "d" * 64, QdrantSearchSettings(**where))
+    rows = np.arange(len(vectors))
+    manifest: Any = SimpleNamespace(content="d" * 64)
+    search = QdrantSearchSettings(**where)
+    return Datastore(manifest, vectors, rows[:, None], SEEDS, rows, rows, shards, search=search).index
 
 
 def vectors_of(kind: str, width: int) -> np.ndarray:
@@ -37,7 +40,8 @@ def vectors_of(kind: str, width: int) -> np.ndarray:
 @pytest.mark.parametrize("width", [3, 48])
 def test_the_neighbours_are_those_of_exact_search(kind: str, width: int) -> None:
     vectors = vectors_of(kind, width)
-    exact, qdrant = ExactIndex(vectors, SEEDS, ROWS), searched(vectors)
+    qdrant = searched(vectors)
+    exact = ExactIndex(qdrant.store, None)
     for key in (vectors[0], vectors[61], vectors[:7].mean(0), np.zeros(width, np.float32)):
         for task in ROWS:
             for k, without in ((1, None), (5, 2), (17, 0), (1000, 3)):

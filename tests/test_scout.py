@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from loaded import of_target
 from typer.testing import CliRunner
 
 from kerv_cli.base.errors import CheckpointError, UsageError
@@ -19,15 +20,14 @@ from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings
-from kerv_cli.methods.artifacts import Request
+from kerv_cli.methods.artifacts import Use
 from kerv_cli.methods.certified import CertifiedSkipSettings, ScopedSettings
-from kerv_cli.methods.certified.certificate import Candidate, Certificate, certified, scoped
+from kerv_cli.methods.certified.certificate import Candidate, Certificate, CertificateArtifact, certified, scoped
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.merged import MergedProposerSettings
 from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.methods.scout.drafter import ScoutDrafter, ScoutNetwork, ScoutProposer, check_sees
-from kerv_cli.methods.streak import StreakSkip, StreakSkipSettings
-from kerv_cli.methods.unverified import AlwaysSkip
+from kerv_cli.methods.streak import AlwaysSkip, StreakSkip, StreakSkipSettings
 from kerv_cli.report.certificate import folder_of
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.packable import pack
@@ -143,7 +143,7 @@ def test_it_is_trained_from_the_command_line_for_its_target_alone(results: Path)
     assert "object_error_cm" in done.stdout
     target, description = load_target(results / "artifacts/target/nano-vision")
     files, folder = ScoutDrafter(), results / "artifacts/scout/mine"
-    assert files.load(folder, Request(description, target)).settings.width == 24
+    assert files.load(folder, of_target(description, target)).settings.width == 24
     state = load_target(results / "artifacts/target/nano-state")[0]
     with pytest.raises(CheckpointError):
         check_sees(state)
@@ -224,9 +224,10 @@ def test_a_certificate_of_another_draft_method_chunk_format_or_world_is_refused(
         deploy(certificate(target, 0, dtype="bfloat16"))
     with pytest.raises(UsageError, match=r"chunk=4: the certificate is of 8"):
         deploy(certificate(target, 0, chunk=8))
-    issued.check_world({"camera": {"size": 96}, "horizon": 500, "stress": {"kind": "push"}})
+    world = {"camera": {"size": 96}, "horizon": 500, "stress": {"kind": "push"}}
+    CertificateArtifact().check_use(issued, Use({}, "float32", "metaworld", world=world))
     with pytest.raises(UsageError, match=r"world.horizon=120: the certificate is of 500"):
-        issued.check_world({"camera": {"size": 96}, "horizon": 120})
+        CertificateArtifact().check_use(issued, Use({}, "float32", "metaworld", world={**world, "horizon": 120}))
 
 
 def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results: Path) -> None:

@@ -15,8 +15,8 @@ from kerv_cli.base.limits import check_settings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.record import DecodeRecord
-from kerv_cli.methods.sp_vla import SpeedSkipSettings
-from kerv_cli.methods.sp_vla.schedule import Ridge, SpeedSkip
+from kerv_cli.methods.kerv.prediction import Ridge
+from kerv_cli.methods.sp_vla import SpeedSkip, SpeedSkipSettings
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 SPACE = SPEC.actions

@@ -20,7 +20,7 @@ from kerv_cli.methods.heisd import SimilaritySkipSettings
 from kerv_cli.methods.heisd.rules import RetrievalProposer, VerifySkip
 from kerv_cli.methods.kerv.prediction import Hold, PredictionProposer
 from kerv_cli.methods.merged import MergedProposer
-from kerv_cli.methods.unverified import AlwaysSkip
+from kerv_cli.methods.streak import AlwaysSkip
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 PAUSE = 0.03

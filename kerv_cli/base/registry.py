@@ -33,7 +33,6 @@ MODULES = (
     "kerv_cli.methods.kerv",
     "kerv_cli.methods.parallel",
     "kerv_cli.methods.streak",
-    "kerv_cli.methods.unverified",
     "kerv_cli.methods.sp_vla",
     "kerv_cli.methods.heisd",
     "kerv_cli.methods.jacobi",

@@ -30,15 +30,6 @@ _LOADED: dict[tuple[Any, ...], Any] = {}
 
 
 @dataclass(frozen=True)
-class Request:
-    """What an artifact is loaded for."""
-
-    description: TargetDescription
-    target: Any = None  # a ReadableTarget, as networks read it
-    search: Any = None
-
-
-@dataclass(frozen=True)
 class Use:
     """What the artifacts of a method are used for, before anything is loaded.
 
@@ -152,13 +143,13 @@ class Artifact(Generic[T]):
         """Return the file of its description."""
         return path / f"{self.kind}.json"
 
-    def load(self, path: Path, request: Request) -> Any:
-        """Return the artifact, loaded for a target. One without other files is its description.
+    def load(self, path: Path, artifacts: Artifacts) -> Any:
+        """Return the artifact, loaded for the target of `artifacts`. One without other files is its description.
 
         Raises:
             CheckpointError: As `checked`, or files that do not fit.
         """
-        return self.checked(path, request.description)
+        return self.checked(path, artifacts.description)
 
     def made_for(self, description: T) -> MadeFor:
         """Return the target that it was made for."""
@@ -242,8 +233,8 @@ class Artifacts:
         return checkpoint.read_target(self.folder)
 
     @property
-    def target(self) -> Target:
-        """The target, loaded."""
+    def target(self) -> Any:
+        """The target, loaded: a Target, of most families a ReadableTarget."""
         return _target(self.folder, self.description.sha256, self.device, self.dtype)
 
     def path(self, kind: str) -> Path:
@@ -297,7 +288,7 @@ class Artifacts:
         path, digest = self.path(kind), self.check([kind])[kind]
         key = kind, path, digest, self.folder, self.device, self.dtype, repr(self.search)
         if key not in _LOADED:
-            _LOADED[key] = kind_of(kind).load(path, Request(self.description, self.target, self.search))
+            _LOADED[key] = kind_of(kind).load(path, self)
         return _LOADED[key]
 
 

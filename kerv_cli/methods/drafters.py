@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.proposer import Proposer
-from kerv_cli.methods.artifacts import Artifact, MadeFor, Request, removal
+from kerv_cli.methods.artifacts import Artifact, Artifacts, MadeFor, removal
 from kerv_cli.methods.context import Context
 from kerv_cli.targets import checkpoint
 from kerv_cli.targets.compact.packable import load_packed
@@ -145,9 +145,9 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         """Return how to replace one of another target: a training goes on only with its own."""
         return f"{removal(self.kind, path)}, then {self.again}"
 
-    def load(self, path: Path, request: Request) -> Any:
+    def load(self, path: Path, artifacts: Artifacts) -> Any:
         """Return the network with its weights, frozen, on the target's device in its number format."""
-        target, description = request.target, self.checked(path, request.description)
+        target, description = artifacts.target, self.checked(path, artifacts.description)
         settings = read(self.settings, description.settings, f"the {self.noun}'s settings", tolerant=True)
         return load_packed(self.network(settings, target), path, self.kind, target.device, target.dtype)
 

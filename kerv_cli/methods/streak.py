@@ -1,17 +1,19 @@
-"""Trust drafts for as long as verifications agree with them (docs/methods.md §4.5, ours)."""
+"""Drafts that are not verified: always (docs/methods.md §6), or while verifications agree with them (§4.5, ours)."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from kerv_cli.base.limits import number
-from kerv_cli.base.registry import add
+from kerv_cli.base.registry import NoSettings, add
 from kerv_cli.engine.parts import Skip
 
 if TYPE_CHECKING:
     from kerv_cli.engine.chunk import Chunk
     from kerv_cli.engine.proposer import ChainProposer
+    from kerv_cli.engine.protocol import Cache
     from kerv_cli.methods.context import Context
 
 TRUSTED, STREAK = "trusted", "streak"
@@ -89,5 +91,31 @@ class StreakSkip(Skip):
         return tolerance > 0 and chunk.distance(self.chain[: len(targets)], targets) <= tolerance
 
 
-_BUILD = "kerv_cli.methods.streak:StreakSkip.build"
-add("skip", "streak", _BUILD, StreakSkipSettings, colour=0xE8C547, takes_draft=True, merges=True)
+class AlwaysSkip(Skip):
+    """Executes every draft unverified. If the source has no whole chunk yet, the target decodes."""
+
+    def __init__(self, source: ChainProposer) -> None:
+        self.source = source
+
+    @classmethod
+    def build(cls, settings: NoSettings, context: Context) -> AlwaysSkip:
+        """Build skip=always."""
+        return cls(context.built["prefill_draft"])
+
+    def take(self, chunk: Chunk) -> bool:
+        """Fill the chunk with the source's draft -> whether there was one of all N tokens."""
+        chains = self.source.chains(chunk, chunk.size)
+        if not chains or len(chains[0]) < chunk.size:
+            return False
+        chunk.skip(chains[0], self.source.name)
+        return True
+
+    def take_many(self, chunks: Sequence[Chunk], cache: Callable[[int], Cache]) -> None:
+        """Fill several chunks with the source's drafts."""
+        for chunk, tokens in zip(chunks, self.source.tokens_of(chunks), strict=True):
+            chunk.skip(tokens, self.source.name)
+
+
+_FILE = "kerv_cli.methods.streak:"
+add("skip", "streak", _FILE + "StreakSkip.build", StreakSkipSettings, colour=0xE8C547, takes_draft=True, merges=True)
+add("skip", "always", _FILE + "AlwaysSkip.build", takes_draft=True, verifies=False, batchable=True)

@@ -13,7 +13,7 @@ import numpy as np
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.methods.calibration import Errors
-from kerv_cli.methods.kerv.prediction import FILTERS, PREDICTORS, Noise, build_predictor, kalman_weights
+from kerv_cli.methods.kerv.prediction import FILTERS, PREDICTORS, Noise, kalman_weights
 from kerv_cli.targets.observations import check_tail, held_out_every
 from kerv_cli.training.demonstrations import check_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
@@ -146,8 +146,8 @@ def prediction_errors(windows: Windows, noise: Mapping[str, Noise], space: Actio
     """Return predictor -> task -> DoF -> H mean absolute errors on the held-out episodes, normalised units."""
     window, horizon = windows.past.shape[1], windows.future.shape[1]
     errors: Errors = {}
-    for kind in PREDICTORS:
-        predictor = build_predictor(kind, space.is_strict, noise, window, window, horizon)
+    for kind, predictor_class in PREDICTORS.items():
+        predictor = predictor_class(space.is_strict, noise.get(kind), window, window, horizon)
         errors[kind] = {}
         for number, task in enumerate(windows.tasks):
             chosen = windows.held_out & (windows.task == number)

@@ -127,25 +127,6 @@ class Certificate:
         if dtype != self.dtype:
             raise UsageError(f"skip=certified with runtime.dtype={dtype}: the certificate is of {self.dtype}")
 
-    def check_world(self, world: Mapping[str, Any]) -> None:
-        """Refuse another camera or horizon. A stressed world is allowed: the certificate says nothing about stress.
-
-        Raises:
-            UsageError: Another one; the message names both values.
-        """
-        for key, certified in self.world.items():
-            if world.get(key) != certified:
-                raise UsageError(f"skip=certified with world.{key}={world.get(key)}: the certificate is of {certified}")
-
-    def check_environment(self, name: str) -> None:
-        """Refuse a policy of another environment.
-
-        Raises:
-            UsageError: Another one; the message names both.
-        """
-        if name != self.environment:
-            raise UsageError(f"skip=certified with a policy of {name}: the certificate is of {self.environment}")
-
     def sentence(self) -> str:
         """Return the certificate in one sentence."""
         chosen = self.certified
@@ -173,10 +154,18 @@ class CertificateArtifact(Artifact[Certificate]):
         return description.drafts
 
     def check_use(self, description: Certificate, use: Use) -> None:
-        """Refuse another environment, world or, on its tasks, method."""
-        description.check_environment(use.environment)
-        if use.world is not None:
-            description.check_world(use.world)
+        """Refuse another environment, camera or horizon and, on its tasks, another method.
+
+        A stressed world is allowed: the certificate says nothing about stress.
+        """
+        if use.environment != description.environment:
+            raise UsageError(
+                f"skip=certified with a policy of {use.environment}: the certificate is of {description.environment}"
+            )
+        world = use.world or description.world
+        for key, certified in description.world.items():
+            if world.get(key) != certified:
+                raise UsageError(f"skip=certified with world.{key}={world.get(key)}: the certificate is of {certified}")
         if description.certified is not None and not set(use.tasks).isdisjoint(description.tasks):
             description.check_method(use.method, use.dtype)
 

@@ -7,7 +7,9 @@ position i + 2. The drafter's cache holds the whole prompt. Rotary positions cou
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,8 @@ from torch import Tensor, nn
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.runtime import set_up
+from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import HOST, Draft
@@ -27,19 +31,22 @@ from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import ReadableTarget, Target
 from kerv_cli.engine.transfer import upload
 from kerv_cli.engine.tree import ROOT
-from kerv_cli.methods.artifacts import Artifacts, MadeFor, Request
+from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.drafters import DrafterDescription, Metrics, TrainableDrafter, Training
 from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.examples import StatesByLength, TeacherStates, decode_demonstrations
 from kerv_cli.methods.eagle.public import Convention, PublicDrafter, PublicShape, load_public, read_public
 from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.compact.program import Program
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import LayerStack
+from kerv_cli.targets.observations import Rows, held_out_every, observations_of, prompts_of, steps_of
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
+
+VALIDATED = 60
+"""Held-out observations that a validation decodes."""
 
 
 class EagleNetwork(LayerStack):
@@ -206,6 +213,63 @@ def _best(tokens: Tensor, parents: Tensor, scores: Tensor, nodes: int, depth: in
     return Draft(tokens[best], index[parents[best]], depth)
 
 
+@dataclass(frozen=True)
+class TeacherStates(Rows):
+    """The target's greedy decodes of n observations whose prompts are equally long."""
+
+    prompt: Tensor  # (n, P, E) float16
+    hidden: Tensor  # (n, P + N − 1, E) float16
+    tokens: Tensor  # (n, N) int64
+
+
+@dataclass(frozen=True)
+class StatesByLength:
+    """Teacher states in a group per length of the prompt. Rows are counted through all groups."""
+
+    groups: tuple[TeacherStates, ...]
+
+    def __len__(self) -> int:
+        return sum(map(len, self.groups))
+
+    def parts(self, indices: Tensor) -> list[TeacherStates]:
+        """Return the rows at `indices` (B,), in batches of one prompt length."""
+        batches, first = [], 0
+        for group in self.groups:
+            rows = indices[(indices >= first) & (indices < first + len(group))] - first
+            if len(rows):
+                batches.append(group.where(rows))
+            first += len(group)
+        return batches
+
+    def prompts(self) -> list[Tensor]:
+        """Return all prompts (1, P, E)."""
+        return [prompt for group in self.groups for prompt in group.prompt.split(1)]
+
+
+def _decodes(
+    target: Target,
+    dataset: DemoDataset,
+    rows: Sequence[tuple[int, int]],
+    limit: int,
+    on_progress: OnProgress,
+) -> StatesByLength:
+    """Return the decodes of at most `limit` of the rows (episode, control step), evenly spread."""
+    chosen = [rows[i] for i in torch.linspace(0, len(rows) - 1, min(limit, len(rows))).long().tolist()]
+    groups, done = defaultdict[int, list[TeacherStates]](list), 0
+
+    def observations() -> Iterator[Observation]:
+        for index, group in itertools.groupby(chosen, lambda row: row[0]):
+            steps = np.array([step for _, step in group])
+            yield from observations_of(target, dataset.load(index), steps, dataset.manifest.observation)
+
+    for prompt in prompts_of(target, observations()):
+        tokens, hidden = greedy(target, prompt)
+        groups[prompt.shape[1]].append(TeacherStates(prompt.half().cpu(), hidden.half().cpu(), tokens.cpu()))
+        done += len(prompt)
+        on_progress(done, len(chosen))
+    return StatesByLength(tuple(map(TeacherStates.joined, groups.values())))
+
+
 @dataclass(frozen=True, kw_only=True)
 class EagleDescription(DrafterDescription):
     """The JSON of an EAGLE-style drafter; `public` is the shape of one in the public layout."""
@@ -226,12 +290,12 @@ class EagleDrafter(TrainableDrafter):
         """Return a fresh network of the target's width, heads and feed-forward width."""
         return EagleNetwork(settings, target.width, target.heads, target.feed_forward)
 
-    def load(self, path: Path, request: Request) -> EagleNetwork | PublicDrafter:
+    def load(self, path: Path, artifacts: Artifacts) -> EagleNetwork | PublicDrafter:
         """Return the network, ready for inference, of whichever layout."""
-        description: Any = self.checked(path, request.description)
+        description: Any = self.checked(path, artifacts.description)
         if description.public is not None:
-            return load_public(path, description.public, request.target)
-        network: EagleNetwork = super().load(path, request)
+            return load_public(path, description.public, artifacts.target)
+        network: EagleNetwork = super().load(path, artifacts)
         return network
 
     @classmethod
@@ -244,6 +308,7 @@ class EagleDrafter(TrainableDrafter):
             context.artifact(cls.kind), context.target, settings.depth, settings.top_k, settings.nodes
         )
 
+    @torch.inference_mode()
     def examples(
         self,
         target: Target,
@@ -252,8 +317,18 @@ class EagleDrafter(TrainableDrafter):
         held_out: float,
         progress: OnProgress,
     ) -> tuple[StatesByLength, StatesByLength]:
-        """Return the target's states and tokens, for training and validation."""
-        return decode_demonstrations(target, dataset, settings.samples, held_out, progress)
+        """Return the target's greedy decodes of the *observations* of demonstrations, not the expert's answers.
+
+        Raises:
+            CheckpointError: A single episode, or a damaged one.
+        """
+        every = held_out_every(len(dataset.episodes), held_out)
+        rows: tuple[list[tuple[int, int]], ...] = ([], [])
+        for index in range(len(dataset.episodes)):
+            steps = steps_of(dataset.load(index), bool(target.cameras))
+            rows[index % every == every - 1].extend((index, int(t)) for t in steps)
+        states = _decodes(target, dataset, rows[0], settings.samples, progress)
+        return states, _decodes(target, dataset, rows[1], VALIDATED, lambda done, total: None)
 
     def loss(self, training: Training, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
         """Return the mean loss over the unrolled passes, and the token loss of each pass."""

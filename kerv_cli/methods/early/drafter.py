@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.chunk import Chunk
-from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.engine.transfer import read
@@ -156,48 +154,25 @@ def radius_of(chunks: Sequence[Chunk]) -> int:
 
 
 class EarlyProposer(ChainProposer):
-    """The early drafter's chunk (docs/methods.md §5), drafted once per observation.
-
-    Attributes:
-        waits: Whether the CPU reads a draft before its verification. On a GPU it reads it with the target's tokens.
-    """
+    """The early drafter's chunk (docs/methods.md §5), drafted once per observation."""
 
     name = "early"
 
     def __init__(self, early: EarlyNetwork, target: ReadableTarget) -> None:
         self.early, self.target = early, target
-        self.waits = target.device.type == "cpu"
         self._drafted: tuple[Chunk, list[int], float] | None = None  # the chunk, its draft and the odds
 
     def drafted(self, chunk: Chunk) -> tuple[list[int], float]:
         """Return the draft of the chunk's N tokens and the odds that all are accepted."""
         if self._drafted is None or self._drafted[0] is not chunk:
-            self.receive(chunk, read(self._rows([chunk])[0])[0])
-        assert self._drafted is not None
+            numbers = read(self._rows([chunk])[0])[0]
+            self._drafted = chunk, numbers[:-1].astype(np.int64).tolist(), float(numbers[-1])
         return self._drafted[1:]
 
     def _rows(self, chunks: Sequence[Chunk]) -> Tensor:
         """Return the drafts (B, N + 1) of chunks whose limits are equal, as `EarlyNetwork.draft`."""
         features = torch.cat([self.target.pooled(chunk.prompt) for chunk in chunks])
         return self.early.draft(features, radius_of(chunks))
-
-    def on_device(self, chunk: Chunk) -> Tensor | None:
-        """Return the draft and its odds on the GPU, (N + 1,); None if the CPU has them."""
-        if self.waits or (self._drafted is not None and self._drafted[0] is chunk):
-            return None
-        return self._rows([chunk])[0]
-
-    def receive(self, chunk: Chunk, numbers: np.ndarray) -> None:
-        """Take the vector of `on_device` that the CPU has read."""
-        self._drafted = chunk, numbers[:-1].astype(np.int64).tolist(), float(numbers[-1])
-
-    def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """Return the drafted chain."""
-        numbers, start = self.on_device(chunk), len(chunk.tokens)
-        if numbers is None:
-            return super().propose(chunk, depth)
-        chunk.reads.append((numbers, partial(self.receive, chunk)))
-        return Draft(numbers[start : min(chunk.size, start + depth)].long())
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         """Return the drafted tokens after the committed ones."""

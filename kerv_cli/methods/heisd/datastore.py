@@ -12,6 +12,7 @@ On disk: `vectors.npy` (rows, d) float32 or float16, `payload.parquet`, `project
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -29,7 +30,7 @@ from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.protocol import ReadableTarget
-from kerv_cli.methods.artifacts import Artifact, Request
+from kerv_cli.methods.artifacts import Artifact, Artifacts
 from kerv_cli.methods.heisd import MANIFEST, QdrantSearchSettings
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.worlds import spec_of
@@ -162,34 +163,17 @@ def best(vectors: np.ndarray, rows: np.ndarray, key: np.ndarray, k: int) -> tupl
 class ExactIndex:
     """datastore=exact, the default: one matrix product in this process."""
 
-    def __init__(
-        self,
-        vectors: np.ndarray,
-        seeds: np.ndarray,
-        shards: Mapping[str, slice],
-        digest: str = "",
-        settings: object = None,
-    ) -> None:
-        """Keep the vectors.
-
-        Args:
-            vectors: (rows, d) float32.
-            seeds: (rows,) seed of each row's episode.
-            shards: Task -> rows.
-            digest: Hash of the datastore, for other searches.
-            settings: For other searches.
-        """
-        self.vectors, self.seeds, self.shards = vectors, seeds, shards
-        self.longest = float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
+    def __init__(self, store: Datastore, settings: object) -> None:
+        self.store = store
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
         """Return candidate rows, also those that rounding may have put after the k-th."""
-        shard = self.shards[task]
-        scores = self.vectors[shard] @ key
+        shard = self.store.shards[task]
+        scores = self.store.vectors[shard] @ key
         if without is not None:
-            scores[self.seeds[shard] == without] = -np.inf
+            scores[self.store.seeds[shard] == without] = -np.inf
         least = np.partition(scores, -k)[-k] if k <= len(scores) else -np.inf
-        slack = ROUNDING * self.longest * math.sqrt(key @ key)
+        slack = ROUNDING * self.store.longest * math.sqrt(key @ key)
         return np.flatnonzero((scores >= least - slack) & (scores > -np.inf)) + shard.start
 
 
@@ -200,22 +184,8 @@ class QdrantIndex:
     search. A collection is named by the datastore's hash, so a folder or server keeps it for later processes.
     """
 
-    def __init__(
-        self,
-        vectors: np.ndarray,
-        seeds: np.ndarray,
-        shards: Mapping[str, slice],
-        digest: str,
-        settings: QdrantSearchSettings,
-    ) -> None:
+    def __init__(self, store: Datastore, settings: QdrantSearchSettings) -> None:
         """Open the collection of this datastore, and fill it if it is not complete.
-
-        Args:
-            vectors: (rows, d) float32.
-            seeds: (rows,) seed of each row's episode.
-            shards: Rows of each task.
-            digest: Hash of the datastore.
-            settings: Server or folder.
 
         Raises:
             UsageError: qdrant-client is not installed, or the server or folder cannot be used.
@@ -224,24 +194,22 @@ class QdrantIndex:
             raise UsageError("datastore=qdrant needs the extra: pip install 'kerv[qdrant]'")
         from qdrant_client import QdrantClient, models
 
-        self.vectors, self.seeds, self.shards = vectors, seeds, shards
-        self.longest = float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
-        self.models, self.name, self.settings = models, f"kerv-{digest[:32]}", settings
+        self.store, self.models, self.name, self.settings = store, models, f"kerv-{store.content[:32]}", settings
         with self._errors():
             memory = None if settings.url or settings.path else ":memory:"
             self.client = QdrantClient(memory, url=settings.url, path=settings.path, check_compatibility=False)
             if not self.client.collection_exists(self.name):
-                parameters = models.VectorParams(size=vectors.shape[1], distance=models.Distance.DOT)
+                parameters = models.VectorParams(size=store.vectors.shape[1], distance=models.Distance.DOT)
                 self.client.create_collection(self.name, parameters)
-            if self.client.count(self.name).count != len(vectors):  # new, or filled in part
-                tasks = [(task, row) for task, shard in shards.items() for row in range(shard.start, shard.stop)]
-                payloads = [{"task": task, "seed": int(seeds[row])} for task, row in tasks]
+            if self.client.count(self.name).count != len(store.vectors):  # new, or filled in part
+                tasks = [(task, row) for task, shard in store.shards.items() for row in range(shard.start, shard.stop)]
+                payloads = [{"task": task, "seed": int(store.seeds[row])} for task, row in tasks]
                 rows = [row for _, row in tasks]
-                self.client.upload_collection(self.name, vectors[rows], payloads, rows, wait=True)
+                self.client.upload_collection(self.name, store.vectors[rows], payloads, rows, wait=True)
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
         """Return candidate rows, see `Index`."""
-        m, shard = self.models, self.shards[task]
+        m, store, shard = self.models, self.store, self.store.shards[task]
         must = [m.FieldCondition(key="task", match=m.MatchValue(value=task))]
         other = [] if without is None else [m.FieldCondition(key="seed", match=m.MatchValue(value=without))]
         exact = m.SearchParams(exact=True) if self.settings.url else None  # local mode has no other search
@@ -252,10 +220,10 @@ class QdrantIndex:
         rows = np.sort(np.array([point.id for point in found], dtype=np.int64))
         if len(found) < k + MARGIN:
             return rows
-        slack = 2 * ROUNDING * self.longest * math.sqrt(key @ key)
-        if found[-1].score < best(self.vectors, rows, key, k)[1][-1] - slack:
+        slack = 2 * ROUNDING * store.longest * math.sqrt(key @ key)
+        if found[-1].score < best(store.vectors, rows, key, k)[1][-1] - slack:
             return rows
-        return np.flatnonzero(self.seeds[shard] != without) + shard.start
+        return np.flatnonzero(store.seeds[shard] != without) + shard.start
 
     @contextmanager
     def _errors(self) -> Iterator[None]:
@@ -292,11 +260,19 @@ class Datastore:
     left: np.ndarray
     shards: dict[str, slice]
     projection: np.ndarray | None = None  # (pooled numbers, d)
-    index: Index | None = None  # the search; None: ExactIndex
+    search: Any = None  # settings of the search; None: exact. Each finds the same neighbours
 
-    def __post_init__(self) -> None:
-        if self.index is None:
-            object.__setattr__(self, "index", ExactIndex(self.vectors, self.seeds, self.shards))
+    @functools.cached_property
+    def index(self) -> Index:
+        """The search."""
+        kind = self.search.kind if self.search else "exact"
+        index: Index = registry.find("datastore", kind, "datastore.kind").built(self, self.search)
+        return index
+
+    @functools.cached_property
+    def longest(self) -> float:
+        """Length of the longest vector."""
+        return float(np.linalg.norm(self.vectors, axis=1).max(initial=0.0))
 
     @classmethod
     def open(cls, folder: Path, description: TargetDescription, search: Any = None) -> Datastore:
@@ -305,7 +281,7 @@ class Datastore:
         Args:
             folder: Its folder.
             description: The target's.
-            search: Settings of the search; None for exact search. Each finds the same neighbours.
+            search: Settings of the search; None for exact search.
 
         Raises:
             CheckpointError: No datastore there, a damaged one, one that was built for another target, other action
@@ -313,12 +289,9 @@ class Datastore:
             UsageError: An unknown search, one whose packages are not installed, or a server that does not answer.
         """
         manifest = DatastoreArtifact().checked(folder, description)
-        parts = _arrays(folder, manifest)
-        index = None
-        if search is not None:
-            part = registry.find("datastore", search.kind, "datastore.kind")
-            index = part.built(parts["vectors"], parts["seeds"], parts["shards"], manifest.content, search)
-        return cls(manifest, **parts, index=index)
+        store = cls(manifest, **_arrays(folder, manifest), search=search)
+        _ = store.index  # a search that does not work is refused now
+        return store
 
     @property
     def tasks(self) -> Collection[str]:
@@ -352,7 +325,6 @@ class Datastore:
         """
         if task not in self.shards:
             raise UnknownName("task of the datastore", task, self.shards)
-        assert self.index is not None
         key = np.asarray(key, dtype=np.float32)
         rows, similarity = best(self.vectors, self.index.candidates(key, task, k, without), key, k)
         chunks = self.tokens[rows].astype(np.int64)
@@ -409,6 +381,6 @@ class DatastoreArtifact(Artifact[Manifest]):
         """Return `Manifest.content`."""
         return description.content
 
-    def load(self, path: Path, request: Request) -> Datastore:
+    def load(self, path: Path, artifacts: Artifacts) -> Datastore:
         """Return the datastore, opened."""
-        return Datastore.open(path, request.description, request.search)
+        return Datastore.open(path, artifacts.description, artifacts.search)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, number
@@ -140,20 +140,16 @@ class Kinematic:
     An episode begins at K = K_S, the reference level.
     """
 
-    def __init__(self, r_min: int, r_max: int, phi: float, k_s: float) -> None:
-        self.r_min, self.r_max, self.phi, self.k_s = r_min, r_max, phi, k_s
-        self.reset()
-
-    @classmethod
-    def build(cls, settings: KinematicThresholdSettings, context: Context) -> Self:
-        """Build threshold=kinematic or change. K_S is the task's, from the calibration, if none is given.
+    def __init__(self, settings: KinematicThresholdSettings, context: Context) -> None:
+        """Take K_S of the task from the calibration, if the settings give none.
 
         Raises:
             UsageError: A radius above the largest distance of two tokens.
         """
         context.check_radius("r_max", settings.r_max)
-        k_s = settings.k_s if settings.k_s is not None else context.calibration.k_s(context.task)
-        return cls(settings.r_min, settings.r_max, settings.phi, k_s)
+        self.r_min, self.r_max, self.phi = settings.r_min, settings.r_max, settings.phi
+        self.k_s = settings.k_s if settings.k_s is not None else context.calibration.k_s(context.task)
+        self.reset()
 
     def reset(self) -> None:
         """Set r as after a decode with K = K_S."""
@@ -201,15 +197,11 @@ class Schedule:
     The defaults are KERV's public code: 3 + 12 · exp(−(t / τ)^3).
     """
 
-    def __init__(self, r_min: int, r_max: int, phi: float, tau: float) -> None:
-        self.r_min, self.r_max, self.phi, self.tau = r_min, r_max, phi, tau
-        self.reset()
-
-    @classmethod
-    def build(cls, settings: ScheduleThresholdSettings, context: Context) -> Schedule:
-        """Build threshold=schedule. The errors are those of `Kinematic.build`."""
+    def __init__(self, settings: ScheduleThresholdSettings, context: Context) -> None:
+        """Take the settings. The errors are those of `Kinematic`."""
         context.check_radius("r_max", settings.r_max)
-        return cls(settings.r_min, settings.r_max, settings.phi, settings.tau)
+        self.settings = settings
+        self.reset()
 
     def reset(self) -> None:
         """Start again at t = 0."""
@@ -217,7 +209,8 @@ class Schedule:
 
     def radius(self) -> int:
         """Return r(t) rounded to the nearest bin."""
-        return nearest(falling(self.r_min, self.r_max, self.decodes / self.tau, self.phi))
+        s = self.settings
+        return nearest(falling(s.r_min, s.r_max, self.decodes / s.tau, s.phi))
 
     def update(self, variability: float | None) -> None:
         """Increase t. K is not used."""
@@ -237,7 +230,7 @@ def nearest(r: float) -> int:
     return math.floor(r + 0.5)
 
 
-for _name, _class in (("kinematic", "Kinematic"), ("change", "Change")):
-    _kinematic = (f"{__name__}:{_class}.build", KinematicThresholdSettings, needs_of_variability)
-    add("threshold", _name, *_kinematic)
-add("threshold", "schedule", f"{__name__}:Schedule.build", ScheduleThresholdSettings)
+_kinematic = (KinematicThresholdSettings, needs_of_variability)
+add("threshold", "kinematic", f"{__name__}:Kinematic", *_kinematic)
+add("threshold", "change", f"{__name__}:Change", *_kinematic)
+add("threshold", "schedule", f"{__name__}:Schedule", ScheduleThresholdSettings)

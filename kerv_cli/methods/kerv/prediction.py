@@ -7,7 +7,7 @@ once; a prediction is one small matrix product. Actions are normalised to [-1, 1
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,11 +37,6 @@ class Noise:
     q: tuple[float, ...]
     r: tuple[float, ...]
     damping: tuple[float, ...]
-
-    @classmethod
-    def uniform(cls, dofs: int, q: float) -> Noise:
-        """Return one q for all DoFs, r = 1, no damping."""
-        return cls((q,) * dofs, (1.0,) * dofs, (1.0,) * dofs)
 
 
 @functools.lru_cache(maxsize=64)
@@ -84,16 +79,24 @@ class Predictor:
     name = ""
     least = 1  # actions without which the weights are not defined
 
-    def __init__(self, held: np.ndarray, minimum: int = MINIMUM, window: int = WINDOW, horizon: int = HORIZON) -> None:
+    def __init__(
+        self,
+        held: np.ndarray,
+        noise: Noise | None = None,
+        minimum: int = MINIMUM,
+        window: int = WINDOW,
+        horizon: int = HORIZON,
+    ) -> None:
         """Compute the weights.
 
         Args:
             held: (D,) bool, DoFs that are never extrapolated.
+            noise: Fitted noise, for a filter.
             minimum: Fewer actions give no prediction.
             window: Most actions that count.
             horizon: Most steps ahead.
         """
-        self.held, self.dofs = np.asarray(held, dtype=bool), len(held)
+        self.held, self.dofs, self.noise = np.asarray(held, dtype=bool), len(held), noise
         self.minimum, self.window, self.horizon = minimum, window, horizon
         self.tables = {m: self._table(m) for m in range(minimum, window + 1)}
 
@@ -151,19 +154,9 @@ class Kalman(Predictor):
     name = "kalman"
     least = 2
 
-    def __init__(
-        self,
-        held: np.ndarray,
-        noise: Noise,
-        minimum: int = MINIMUM,
-        window: int = WINDOW,
-        horizon: int = HORIZON,
-    ) -> None:
-        self.noise = noise
-        super().__init__(held, minimum, window, horizon)
-
     def weights(self, dof: int, window: int) -> np.ndarray:
         """Return (horizon, window) of the filter with this DoF's noise."""
+        assert self.noise is not None
         q, r, damping = self.noise.q[dof], self.noise.r[dof], self.noise.damping[dof]
         return kalman_weights(q, r, window, self.horizon, damping)
 
@@ -174,41 +167,42 @@ class Damped(Kalman):
     name = "damped"
 
 
-PLAIN: dict[str, type[Predictor]] = {kind.name: kind for kind in (Hold, Linear)}
-FILTERS: dict[str, type[Kalman]] = {kind.name: kind for kind in (Kalman, Damped)}
-PREDICTORS = (*PLAIN, *FILTERS)
+class Ridge(Predictor):
+    """SP-VLA: the line through the last `window` actions, by ridge regression on time.
 
-
-def build_predictor(
-    kind: str,
-    held: np.ndarray,
-    noise: Mapping[str, Noise],
-    minimum: int = MINIMUM,
-    window: int = WINDOW,
-    horizon: int = HORIZON,
-) -> Predictor:
-    """Return the predictor `kind`.
-
-    Args:
-        kind: Its name.
-        held: (D,) bool, DoFs that keep their last value.
-        noise: Fitted noise of each kind of filter.
-        minimum: As `Predictor`, like the next two.
-        window: Most actions that count.
-        horizon: Most steps ahead.
+    Attributes:
+        penalty: λ, on both coefficients.
     """
-    if kind in PLAIN:
-        return PLAIN[kind](held, minimum, window, horizon)
-    return FILTERS[kind](held, noise[kind], minimum, window, horizon)
+
+    name = "ridge"
+
+    def __init__(self, held: np.ndarray, penalty: float, window: int, horizon: int) -> None:
+        self.penalty = penalty
+        super().__init__(held, None, window, window, horizon)
+
+    def weights(self, dof: int, window: int) -> np.ndarray:
+        """Return (horizon, window): X' (XᵀX + λI)⁻¹ Xᵀ.
+
+        The rows of X are (t, 1) for t = 0, 1, …; X' has later steps.
+        """
+        times = np.arange(window + self.horizon)
+        rows = np.stack([times, np.ones(len(times))], 1)
+        past, ahead = rows[:window], rows[window:]
+        fitted: np.ndarray = np.linalg.solve(past.T @ past + self.penalty * np.eye(2), past.T)
+        return ahead @ fitted
+
+
+FILTERS = ("kalman", "damped")
+PREDICTORS = {kind.name: kind for kind in (Hold, Linear, Kalman, Damped)}
 
 
 def predictor_of(settings: NoSettings, context: Context) -> Predictor:
     """Return a predictor over the target's chunk. A filter's noise comes from the calibration."""
-    name, held, horizon = settings.kind, context.target.actions.is_strict, context.target.chunk
-    if name in PLAIN:
-        return PLAIN[name](held, PLAIN[name].least, horizon=horizon)
+    kind, held, horizon = PREDICTORS[settings.kind], context.target.actions.is_strict, context.target.chunk
+    if kind.name not in FILTERS:
+        return kind(held, minimum=kind.least, horizon=horizon)
     fitted = context.calibration
-    return FILTERS[name](held, fitted.noise[name], window=fitted.window, horizon=horizon)
+    return kind(held, fitted.noise[kind.name], window=fitted.window, horizon=horizon)
 
 
 class PredictionProposer(ChainProposer):

@@ -1,43 +1,38 @@
-"""SP-VLA's schedule (docs/methods.md §6.1): the hand's speed decides who gives the next chunk."""
+"""SP-VLA's schedule (docs/methods.md §6.1): a regression where the motion is fast, the target where it is slow."""
 
 from __future__ import annotations
 
+import math
 from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from kerv_cli.engine.chunk import Chunk, Situation
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.limits import number
+from kerv_cli.base.registry import add
 from kerv_cli.engine.parts import Skip
-from kerv_cli.methods.context import Context
-from kerv_cli.methods.kerv.prediction import Predictor
-from kerv_cli.methods.sp_vla import SpeedSkipSettings
+
+if TYPE_CHECKING:
+    from kerv_cli.engine.chunk import Chunk, Situation
+    from kerv_cli.methods.context import Context
+    from kerv_cli.methods.kerv.prediction import Ridge
 
 
-class Ridge(Predictor):
-    """The line through the last `window` actions, by ridge regression on time. Strict DoFs are held.
+@dataclass
+class SpeedSkipSettings:
+    """Executes chunks of a ridge regression over the last actions while the hand is fast."""
 
-    Attributes:
-        penalty: λ, on both coefficients.
-    """
+    kind: str = "speed"
+    v_min: float = number(0.3, 0, 1000)  # speed of the hand from which on motion is intuitive, metres per second
+    v_max: float = number(1000.0, 0, 1000)  # … and up to which
+    buffer: int = number(6, 2, 10)  # n, last executed actions that the regression reads
+    share: float = number(0.5, 0, 1)  # τ, share of these above which the target must have decoded
+    penalty: float = number(1e-4, 0, 1e6)  # λ of the regression
 
-    name = "ridge"
-    least = 2
-
-    def __init__(self, held: np.ndarray, penalty: float, window: int, horizon: int) -> None:
-        """penalty: λ, on both coefficients."""
-        self.penalty = penalty
-        super().__init__(held, window, window, horizon)
-
-    def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return (horizon, window): X' (XᵀX + λI)⁻¹ Xᵀ.
-
-        The rows of X are (t, 1) for t = 0, 1, …; X' has later steps.
-        """
-        times = np.arange(window + self.horizon)
-        rows = np.stack([times, np.ones(len(times))], 1)
-        past, ahead = rows[:window], rows[window:]
-        fitted: np.ndarray = np.linalg.solve(past.T @ past + self.penalty * np.eye(2), past.T)
-        return ahead @ fitted
+    def check_together(self, prefix: str) -> None:
+        """Refuse speeds that are not in order."""
+        if self.v_min > self.v_max:
+            raise UsageError(f"skip.v_min={self.v_min:g} skip.v_max={self.v_max:g}: v_min must not be above v_max")
 
 
 class SpeedSkip(Skip):
@@ -51,13 +46,14 @@ class SpeedSkip(Skip):
 
     def __init__(self, settings: SpeedSkipSettings, ridge: Ridge) -> None:
         self.settings, self.ridge = settings, ridge
-        self.decoded: deque[bool] = deque(maxlen=settings.buffer)  # of the last executed actions: by the target?
-        self.executed = 0  # actions in the episode
-        self.by_target = True  # whether the chunk in hand is the target's
+        self.decoded: deque[bool] = deque(maxlen=settings.buffer)
+        self.executed, self.by_target = 0, True
 
     @classmethod
     def build(cls, settings: SpeedSkipSettings, context: Context) -> SpeedSkip:
         """Build skip=speed."""
+        from kerv_cli.methods.kerv.prediction import Ridge
+
         target = context.target
         return cls(settings, Ridge(target.actions.is_strict, settings.penalty, settings.buffer, target.chunk))
 
@@ -80,6 +76,9 @@ class SpeedSkip(Skip):
 
     def _is_intuitive(self, situation: Situation, control_hz: float) -> bool:
         """Return whether the hand's speed is in range and the target decoded more than `share` of the buffer."""
-        speed = control_hz * float(np.linalg.norm(situation.path[-1] - situation.path[-2]))
+        speed = control_hz * math.dist(situation.path[-1], situation.path[-2])
         s = self.settings
         return s.v_min <= speed <= s.v_max and sum(self.decoded) > s.share * s.buffer
+
+
+add("skip", "speed", "kerv_cli.methods.sp_vla:SpeedSkip.build", SpeedSkipSettings, colour=0x8C6D31)
