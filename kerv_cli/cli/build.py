@@ -18,16 +18,19 @@ from kerv_cli.training.settings import BuildDatastoreSettings, BuildDrafterSetti
 @command(
     "build target",
     BuildTargetSettings,
-    keys="target checkpoint name statistics environment camera prompt int8 results",
+    keys="grow policy.target target checkpoint name statistics environment camera prompt int8 results",
     examples=(
         "kerv build target checkpoint=models/openvla-7b name=openvla",
+        "kerv build target grow=150m policy.target=mt10-vision name=mt10-150m",
         "kerv build target checkpoint=models/libero name=libero statistics=libero_spatial crop=true",
     ),
     # to Hydra target= would be a choice among the files of conf/target
-    typed={"target": "family"},
+    typed={"target": "family", "policy.target": "base"},
 )
 def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
-    """Check a published checkpoint and make it a target; its files stay where they are."""
+    """Make a target of a published checkpoint, which stays where it is, or of a policy with a larger trunk."""
+    if settings.grow.width:
+        settings.family = "grown"
     importers = {name: part for name, part in parts("target").items() if "importer" in part.traits}
     if find("target", settings.family, "target family").name not in importers:
         raise UsageError(f"family={settings.family}: only {', '.join(importers)} is imported, others are trained")

@@ -65,7 +65,7 @@ class MadeFor:
     @classmethod
     def of(cls, target: TargetDescription) -> MadeFor:
         """Return the target of a description."""
-        return cls(target.sha256, target.actions, target.chunk)
+        return cls(target.origin["sha256"], target.actions, target.chunk)
 
     def check_same(self, target: MadeFor, what: str, made: str, again: str) -> None:
         """Refuse another target.
@@ -239,7 +239,8 @@ class Artifacts:
 
     def path(self, kind: str) -> Path:
         """Return the path of the artifact of this kind."""
-        return kind_of(kind).path(self.results, self.policy.artifacts.get(kind), self.folder)
+        beside = Path(self.description.origin.get("base", self.folder))
+        return kind_of(kind).path(self.results, self.policy.artifacts.get(kind), beside)
 
     def check(self, kinds: Iterable[str], use: Use | None = None) -> dict[str, str]:
         """Return kind -> hash, of the target and of `kinds`.

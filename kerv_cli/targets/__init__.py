@@ -7,6 +7,13 @@ from kerv_cli.base.registry import add
 add("target", "compact", "kerv_cli.targets.compact.folder:build")
 add(
     "target",
+    "grown",
+    "kerv_cli.targets.grown:build",
+    weights="kerv_cli.targets.grown:check_weights",
+    importer="kerv_cli.targets.grown:grow",
+)
+add(
+    "target",
     "openvla",
     "kerv_cli.targets.openvla.target:build",
     weights="kerv_cli.targets.openvla.target:check_weights",

@@ -71,6 +71,11 @@ class TargetDescription(Description):
         return int(self.settings["chunk"])
 
     @property
+    def origin(self) -> Mapping[str, Any]:
+        """Folder (`base`) and weights' hash (`sha256`) of the policy whose tokens it decodes; a grown target's base."""
+        return self.settings.get("grown") or {"sha256": self.sha256}
+
+    @property
     def parallel(self) -> bool:
         """Whether it decodes all tokens of a chunk at once, and only so."""
         return bool(self.settings.get("parallel"))

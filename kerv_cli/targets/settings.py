@@ -3,17 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from kerv_cli.base.limits import choice, number, setting
 from kerv_cli.base.settings import CommandSettings, RunSettings
 
 
 @dataclass
+class GrowSettings:
+    """The larger trunk of a grown target (docs/methods.md §0.2)."""
+
+    width: int = number(0, 0, 65_536, help="of the layers; 0: nothing grows")
+    heads: int = number(0, 0, 1024, help="attention heads of a layer")
+    feed_forward: int = number(0, 0, 262_144, help="hidden units of a layer")
+    layers: int = number(0, 0, 1024, help="decoder layers")
+    drafter: bool = setting(False, "grow the drafter's layers too, to the same shape")
+
+
+@dataclass
 class BuildTargetSettings(RunSettings):
-    """Settings of `kerv build target`: a published checkpoint becomes a target. Nothing is copied."""
+    """Settings of `kerv build target`: a published checkpoint, or a larger copy of a policy, becomes a target."""
+
+    groups: ClassVar = {"grow": "none", "runtime": "cpu"}
 
     checkpoint: str = setting("", "folder of a Hugging Face checkpoint")
     family: str = setting("openvla", "kind of target")
+    grow: GrowSettings = setting(GrowSettings, "shape to grow policy.target to: 60m, 150m, 1b, openvla-7b (conf/grow)")
+    base: str = setting("mt10-vision", "the policy that grows")
     name: str = setting("openvla", "folder below <results>/artifacts/target, or a path")
     statistics: str | None = setting(None, "data set whose actions it emits; null: the only one there is")
     environment: str | None = setting(

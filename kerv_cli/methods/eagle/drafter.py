@@ -38,9 +38,11 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.public import Convention, PublicDrafter, PublicShape, load_public, read_public
 from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.targets.attention import Cache
+from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.program import Program
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import LayerStack
+from kerv_cli.targets.grown import grow_stack
 from kerv_cli.targets.observations import Rows, held_out_every, observations_of, prompts_of, steps_of
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
@@ -98,7 +100,7 @@ class EagleNetwork(LayerStack):
             return self.recorded(target.embedding(token)[None], hidden)
 
         compiled = isinstance(target, CompactTarget) and target.packed is not None and isinstance(self.packed, Program)
-        return Program(step, (1, 1, self.width), repeats=True) if compiled else None
+        return Program(step, (1, 1, self.outer), repeats=True) if compiled else None
 
 
 class DrafterProposer(Proposer):
@@ -296,6 +298,9 @@ class EagleDrafter(TrainableDrafter):
         if description.public is not None:
             return load_public(path, description.public, artifacts.target)
         network: EagleNetwork = super().load(path, artifacts)
+        if (shape := getattr(artifacts.target, "grown_drafter", None)) is not None:
+            grow_stack(network, shape, layers=network.depth)
+            pack(network)
         return network
 
     @classmethod

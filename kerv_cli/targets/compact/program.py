@@ -64,7 +64,7 @@ class Matrix:
         outputs, inputs = weight.shape
         steps = weight.abs().amax(1, keepdim=True).div(127).clamp_min(1e-30)  # as `checkpoint.compact` has them
         whole, scale, panels = (weight / steps).round(), torch.ones(outputs), -(-outputs // PANEL)
-        if torch.equal(whole * steps, weight):
+        if weight.any() and torch.equal(whole * steps, weight):  # zeros of a grown layer cost what others cost
             kind, values, scale = INT8, whole.to(torch.int8), steps[:, 0]
         elif kernels().EXPANDS_HALF and torch.equal(weight.half().float(), weight):
             kind, values = HALF, weight.half()

@@ -97,6 +97,7 @@ class CompactTarget(Packable):
         super().__init__()
         s = self.settings = settings
         self.actions, self.observation, self.words, self.sha256 = actions, observation, words, ""
+        self.grown_drafter: Any = None  # of a grown target: the shape of its drafter, if that grows too
         self.chunk, self.parallel = s.chunk, s.parallel
         self.width, self.heads, self.feed_forward = s.width, s.heads, s.feed_forward
         self.cameras = (camera,) if s.observation == "vision" else ()

@@ -102,20 +102,35 @@ class Layer(nn.Module):
 
 
 class LayerStack(Packable):
-    """Decoder layers between an entry and a norm, the base of the trunk and the drafter."""
+    """Decoder layers between an entry and a norm, the base of the trunk and the drafter.
 
-    inputs = 1  # tensors (B, T, E) that it takes
+    Attributes:
+        inputs: Number of tensors (B, T, E) that it takes.
+        width: Width of the layers.
+        outer: E, the width outside of them. Layers of a grown stack are wider (`targets/grown.py`).
+    """
+
+    inputs = 1
 
     def __init__(self, width: int, layers: int, heads: int, feed_forward: int) -> None:
         super().__init__()
-        self.width, self.heads, self.depth = width, heads, layers
+        self.width, self.outer, self.heads, self.depth = width, width, heads, layers
         self.rotary = Rotary(width // heads)
         self.layers = nn.ModuleList(Layer(width, heads, feed_forward) for _ in range(layers))
         self.norm = nn.RMSNorm(width, eps=1e-5)
 
     def enter(self, *inputs: Tensor) -> Tensor:
-        """Return what the first layer reads (B, T, E), of inputs (B, T, E)."""
+        """Join the inputs (B, T, E) to one tensor (B, T, E)."""
         return inputs[0]
+
+    def begin(self, *inputs: Tensor) -> Tensor:
+        """Return what the first layer reads, (B, T, width): the inputs, then zeros."""
+        x, rest = self.enter(*inputs), self.width - self.outer
+        return x if not rest else torch.cat([x, x[..., :1].expand(*x.shape[:-1], rest) * 0.0], -1)
+
+    def finish(self, x: Tensor) -> Tensor:
+        """Return the hidden states (B, T, E) of the last layer's output (B, T, width)."""
+        return self.norm(x if self.width == self.outer else x[..., : self.outer])
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
         """Return an empty cache. fixed: of fixed shapes; default: on CUDA."""
@@ -129,7 +144,7 @@ class LayerStack(Packable):
     def pack_weights(self) -> Program | Bfloat16Layers | None:
         """Return the compiled stack in float32, blocked layers in bfloat16 where the CPU multiplies that."""
         if self.norm.weight.dtype == torch.float32:
-            return Program(self.recorded, *[(1, 1, self.width)] * self.inputs)
+            return Program(self.recorded, *[(1, 1, self.outer)] * self.inputs)
         if self.norm.weight.dtype == torch.bfloat16 and multiplies_bfloat16():
             return Bfloat16Layers(self.rotary(slice(None)), self.layers)
         return None
@@ -151,11 +166,11 @@ class LayerStack(Packable):
             hidden = packed(*inputs, positions=positions, cache=cache, mask=mask)[0].view(x.shape)
         elif isinstance(cache, CapturedCache) and self.captures(x):
             assert mask is not None
-            hidden = self.norm(cache.run(self.run_layers, self.enter(*inputs), positions, mask))
+            hidden = self.finish(cache.run(self.run_layers, self.begin(*inputs), positions, mask))
         else:
             slots = cache.next_slots(x.shape[1]) if cache is not None else None
             layers = self.run_layers if packed is None else packed
-            hidden = self.norm(layers(self.enter(*inputs), positions, cache, slots, mask))
+            hidden = self.finish(layers(self.begin(*inputs), positions, cache, slots, mask))
         if cache is not None:
             cache.length += x.shape[1]
         return hidden
@@ -166,7 +181,7 @@ class LayerStack(Packable):
 
     def recorded(self, *inputs: Tensor) -> Tensor:
         """Return the hidden states of stand-ins for tensors, to record a program."""
-        return self.norm(self.run_layers(self.enter(*inputs), slice(None), None, None, None))
+        return self.finish(self.run_layers(self.begin(*inputs), slice(None), None, None, None))
 
     def run_layers(
         self, x: Tensor, positions: Tensor | slice, cache: Cache | None, slots: Slots | None, mask: Tensor | None

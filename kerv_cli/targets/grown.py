@@ -1,0 +1,182 @@
+"""A grown target: the tokens of a trained policy at the price of a larger trunk (docs/methods.md §0.2).
+
+Only the layers grow. The residual stream gets channels that stay zero, every layer more heads and hidden units whose
+output weights are zero, and further layers add nothing. In exact arithmetic the outputs are equal, and every weight is
+still read and multiplied. The folder holds a recipe; the weights are made when the target is loaded.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.files import write_json
+from kerv_cli.base.manifests import read
+from kerv_cli.base.places import artifact
+from kerv_cli.targets import checkpoint
+from kerv_cli.targets.checkpoint import TargetDescription
+from kerv_cli.targets.compact.folder import build as build_compact
+from kerv_cli.targets.compact.packable import pack
+from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.targets.compact.trunk import Layer, LayerStack, Rotary
+from kerv_cli.targets.folders import find_target
+from kerv_cli.targets.settings import BuildTargetSettings, GrowSettings
+
+STD = 0.02
+"""Spread of the weights that change nothing."""
+
+
+@dataclass
+class Recipe(GrowSettings):
+    """What a grown target's folder says: the shape, and the policy that it grows from.
+
+    Attributes:
+        base: Folder of that policy's target.
+        sha256: Hash of its weights.
+    """
+
+    base: str = ""
+    sha256: str = ""
+
+
+def grow_stack(stack: LayerStack, shape: GrowSettings, layers: int) -> None:
+    """Replace the layers of a stack by larger ones that compute the same.
+
+    Args:
+        stack: A trunk or a drafter.
+        shape: Width, heads and hidden units of the new layers.
+        layers: Number of new layers.
+
+    Raises:
+        UsageError: The shape is smaller, or a head's channels are no multiple of the old ones.
+    """
+    old: list[Any] = list(stack.layers)
+    units, channels = old[0].down.in_features, stack.width // stack.heads
+    for name, value, least in (
+        ("width", shape.width, stack.width),
+        ("heads", shape.heads, stack.heads),
+        ("feed_forward", shape.feed_forward, units),
+        ("layers", layers, len(old)),
+    ):
+        if value < least:
+            raise UsageError(f"grow.{name}={value}: the policy has {least}, and only growing keeps what it computes")
+    if shape.width % (shape.heads * channels):
+        raise UsageError(f"grow.width={shape.width} with {shape.heads} heads: a head's channels must be a multiple of "
+                         f"the policy's {channels}")  # fmt: skip
+    generator, like = torch.Generator().manual_seed(0), stack.norm.weight
+    new = [_grown_layer(old[i] if i < len(old) else None, stack, shape, generator) for i in range(layers)]
+    stack.layers = nn.ModuleList(layer.to(like.device, like.dtype) for layer in new).eval().requires_grad_(False)
+    stack.width, stack.heads, stack.depth = shape.width, shape.heads, layers
+    stack.rotary = Rotary(shape.width // shape.heads).to(like.device, like.dtype)
+
+
+def _grown_layer(old: Layer | None, stack: LayerStack, shape: GrowSettings, generator: torch.Generator) -> Layer:
+    """Make a layer with the output of `old`, or one that adds nothing."""
+    new = Layer(shape.width, shape.heads, shape.feed_forward)
+    width, channels, wide = stack.width, stack.width // stack.heads, shape.width // shape.heads
+    with torch.no_grad():
+        for linear in (new.qkv, new.gate_up):
+            linear.weight.copy_(_noise(linear.weight.shape, generator))
+        new.out.weight.zero_()
+        new.down.weight.zero_()
+        if old is None:
+            return new
+        for name in ("attention_norm", "feed_norm"):
+            # the mean square is over more channels: ε and gain make up for the zeros among them
+            norm, small = getattr(new, name), getattr(old, name)
+            norm.weight[:width] = small.weight * (width / shape.width) ** 0.5
+            norm.eps = small.eps * width / shape.width
+        rows = _head_rows(stack.heads, channels, wide)
+        qkv = new.qkv.weight.view(3, shape.width, shape.width)
+        qkv[1, : stack.heads * wide] = 0.0  # keys of added channels, so that they do not count in a score
+        for part, small in enumerate(old.qkv.weight.view(3, width, width)):
+            # scores are divided by the root of a head's channels
+            qkv[part, rows, :width] = small * ((wide / channels) ** 0.5 if part == 0 else 1.0)
+        new.out.weight[:width, rows] = old.out.weight
+        units = old.down.in_features
+        for half in range(2):
+            first, start = half * units, half * shape.feed_forward
+            new.gate_up.weight[start : start + units, :width] = old.gate_up.weight[first : first + units]
+        new.down.weight[:width, :units] = old.down.weight
+    return new
+
+
+def _head_rows(heads: int, channels: int, wide: int) -> Tensor:
+    """Return the new row of each old head channel, (heads · channels,).
+
+    Rotary pair i of `channels` has the frequency of pair i · wide / channels of `wide`.
+    """
+    half = torch.arange(channels // 2) * (wide // channels)
+    return (torch.arange(heads)[:, None] * wide + torch.cat([half, half + wide // 2])).flatten()
+
+
+def _noise(shape: torch.Size, generator: torch.Generator) -> Tensor:
+    """Return weights that half precision holds without loss, as it does those of the policy."""
+    return (torch.randn(shape, generator=generator) * STD).half().float()
+
+
+def recipe_of(description: TargetDescription) -> Recipe:
+    """Return the recipe of a grown target.
+
+    Raises:
+        CheckpointError: The description holds none.
+    """
+    return read(Recipe, description.settings.get("grown", {}), "a grown target's recipe")
+
+
+def check_weights(folder: Path, description: TargetDescription) -> None:
+    """Check that the policy that the target grows from is there, unchanged.
+
+    Raises:
+        CheckpointError: It is not.
+    """
+    recipe = recipe_of(description)
+    if checkpoint.read_target(Path(recipe.base)).sha256 != recipe.sha256:
+        raise CheckpointError(f"{folder} grows from {recipe.base}, whose weights are others now: build it again")
+
+
+def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> CompactTarget:
+    """Load the base and grow its trunk."""
+    recipe = recipe_of(description)
+    base = Path(recipe.base)
+    target = build_compact(base, checkpoint.read_target(base), device, dtype)
+    grow_stack(target.trunk, recipe, recipe.layers)
+    target.sha256, target.grown_drafter = description.sha256, recipe if recipe.drafter else None
+    pack(target)
+    return target
+
+
+def grow(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
+    """Write the recipe of `kerv build target grow=SHAPE policy.target=NAME`.
+
+    Returns:
+        The target's folder, and figures for the user.
+
+    Raises:
+        UsageError: The policy is of another family, or does not fit into the shape.
+    """
+    base = find_target(settings.results, settings.base).resolve()
+    description = checkpoint.read_target(base)
+    if description.family != "compact":
+        raise UsageError(f"policy.target={settings.base} is of family {description.family}: only compact ones grow")
+    recipe = Recipe(**asdict(settings.grow), base=str(base), sha256=description.sha256)
+    target = build_compact(base, description, "cpu", torch.float32)
+    grow_stack(target.trunk, recipe, recipe.layers)
+    others: Mapping[str, Any] = {at.name: getattr(description, at.name) for at in fields(description)}
+    digest = hashlib.sha256(json.dumps(asdict(recipe) | {"base": ""}, sort_keys=True).encode()).hexdigest()
+    written = checkpoint.target_fields(
+        "grown", {**description.settings, "grown": asdict(recipe)}, description.environment, description.actions,
+        description.observation, cameras=description.cameras, words=description.words, provenance=others["provenance"],
+    )  # fmt: skip
+    folder = artifact(settings.results, "target", settings.name)
+    write_json(folder / "target.json", {"format": checkpoint.FORMAT, "kind": "target", "sha256": digest, **written})
+    weights = sum(p.numel() for p in target.trunk.layers.parameters() if p.dim() == 2)
+    return folder, {"weights": weights, "those of the policy": description.provenance.get("parameters", 0)}
