@@ -19,6 +19,7 @@ from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.eagle.drafter import DrafterProposer
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.checkpoint import load_target, read_target
+from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.folders import find_target
 from kerv_cli.targets.grown import grow_stack
@@ -42,9 +43,12 @@ def test_grown_layers_compute_the_same(policies: Path, width: int, heads: int, u
     target, _ = load_target(find_target(str(policies), "nano-vision"))
     x, positions = torch.randn(1, 9, target.width), torch.arange(9)
     with torch.inference_mode():
-        expected = target.trunk.compute((x,), positions)
+        expected = target.trunk(x, positions)
         grow_stack(target.trunk, GrowSettings(width=width, heads=heads, feed_forward=units), layers)
-        torch.testing.assert_close(target.trunk.compute((x,), positions), expected, rtol=1e-3, atol=1e-5)
+        assert len(target.trunk.layers) == layers
+        torch.testing.assert_close(target.trunk(x, positions), expected, rtol=1e-3, atol=1e-5)
+        pack(target)
+        torch.testing.assert_close(target.trunk(x, positions), expected, rtol=1e-3, atol=1e-5)
 
 
 def test_a_shape_that_is_too_small_is_refused(policies: Path) -> None:

@@ -59,6 +59,7 @@ def grow_stack(stack: LayerStack, shape: GrowSettings, layers: int) -> None:
         UsageError: The shape is smaller, or a head's channels are no multiple of the old ones.
     """
     old: list[Any] = list(stack.layers)
+    stack.packed = None
     units, channels = old[0].down.in_features, stack.width // stack.heads
     for name, value, least in (
         ("width", shape.width, stack.width),
