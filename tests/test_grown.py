@@ -37,7 +37,6 @@ def observation(seed: int, size: int = 96) -> Observation:
     )
 
 
-
 @pytest.mark.parametrize(("width", "heads", "units", "layers"), [(64, 2, 64, 2), (128, 4, 96, 3), (96, 3, 65, 4)])
 def test_grown_layers_compute_the_same(policies: Path, width: int, heads: int, units: int, layers: int) -> None:
     target, _ = load_target(find_target(str(policies), "nano-vision"))

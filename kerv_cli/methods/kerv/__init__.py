@@ -191,6 +191,24 @@ class Change(Kinematic):
         self.last = variability
 
 
+class Quoted(Change):
+    """KERV's threshold as quoted (arXiv 2603.01581): r ← min(r + (r_max − r_min) · exp(−(|ΔK| / K_S)^φ), r_max).
+
+    The addend is never negative, so r climbs from r_min to r_max and stays there.
+    """
+
+    def reset(self) -> None:
+        """Begin at r_min."""
+        self.r, self.last = float(self.r_min), self.k_s
+
+    def update(self, variability: float | None) -> None:
+        """Raise r by the less the more K changed. A decode without K leaves it."""
+        if variability is not None:
+            change = abs(variability - self.last) / self.k_s
+            self.r = min(self.r_max, self.r + falling(0, self.r_max - self.r_min, change, self.phi))
+            self.last = variability
+
+
 class Schedule:
     """Open loop: r(t) = r_min + (r_max − r_min) · exp(−(t / τ)^φ), t decodes into the episode.
 
@@ -230,7 +248,14 @@ def nearest(r: float) -> int:
     return math.floor(r + 0.5)
 
 
+<<<<<<< HEAD
 _kinematic = (KinematicThresholdSettings, needs_of_variability)
 add("threshold", "kinematic", f"{__name__}:Kinematic", *_kinematic)
 add("threshold", "change", f"{__name__}:Change", *_kinematic)
 add("threshold", "schedule", f"{__name__}:Schedule", ScheduleThresholdSettings)
+=======
+for _name, _class in (("kinematic", "Kinematic"), ("change", "Change"), ("quoted", "Quoted")):
+    _kinematic = (f"{__name__}:{_class}.build", KinematicThresholdSettings, needs_of_variability)
+    add("threshold", _name, *_kinematic)
+add("threshold", "schedule", f"{__name__}:Schedule.build", ScheduleThresholdSettings)
+>>>>>>> 5e42055 (Add KERV's threshold as quoted, and the study of the papers in their regime)
