@@ -248,14 +248,8 @@ def nearest(r: float) -> int:
     return math.floor(r + 0.5)
 
 
-<<<<<<< HEAD
 _kinematic = (KinematicThresholdSettings, needs_of_variability)
 add("threshold", "kinematic", f"{__name__}:Kinematic", *_kinematic)
 add("threshold", "change", f"{__name__}:Change", *_kinematic)
+add("threshold", "quoted", f"{__name__}:Quoted", *_kinematic)
 add("threshold", "schedule", f"{__name__}:Schedule", ScheduleThresholdSettings)
-=======
-for _name, _class in (("kinematic", "Kinematic"), ("change", "Change"), ("quoted", "Quoted")):
-    _kinematic = (f"{__name__}:{_class}.build", KinematicThresholdSettings, needs_of_variability)
-    add("threshold", _name, *_kinematic)
-add("threshold", "schedule", f"{__name__}:Schedule.build", ScheduleThresholdSettings)
->>>>>>> 5e42055 (Add KERV's threshold as quoted, and the study of the papers in their regime)
