@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +17,8 @@ from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.eagle.drafter import DrafterProposer
 from kerv_cli.methods.settings import PolicySettings
-from kerv_cli.targets.checkpoint import load_target, read_target
+from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.packable import pack
-from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.folders import find_target
 from kerv_cli.targets.grown import grow_stack
 from kerv_cli.targets.settings import GrowSettings
