@@ -20,7 +20,7 @@ from kerv_cli.episodes.settings import RolloutSettings
 
 SCHEMAS = {name.replace(" ", "_"): part.settings for name, part in parts("command").items()}
 # which command each group belongs to
-HOMES = {"target": "train_target", "drafter": "train_drafter", "study": "sweep"}
+HOMES = {"target": "train_target", "grow": "build_target", "drafter": "train_drafter", "study": "sweep"}
 
 
 def test_every_command_composes_and_shows_what_every_setting_is() -> None:
