@@ -32,7 +32,7 @@ from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.record import UNTIMED, EpisodeRecord
 from kerv_cli.episodes import policy as policies_of
 from kerv_cli.episodes import runner as run
-from kerv_cli.episodes.together import Request, run_together
+from kerv_cli.episodes.runner import Request, run_together
 from kerv_cli.lab.execute import RunEpisode
 from kerv_cli.lab.plan import Episode, Setting, Study, blocks_of
 from kerv_cli.lab.study import EpisodeRunner

@@ -42,7 +42,8 @@ def test_strict_speculation_is_ar_in_closed_loop(policies: Path, policy: str) ->
 
 
 def test_the_record_of_an_episode_adds_up(policies: Path) -> None:
-    wanted = settings(policies, "method=spec_vla", "threshold.r=200", "acceptance.strict_dofs=false", "record=1")
+    wanted = settings(policies, "method=spec_vla", "threshold.r=200", "acceptance.strict_dofs=false")
+    wanted.record = 1
     record = episodes(compose_with(wanted, "nano-vision"), 1)[0]
     assert record.steps == 10 == len(record.actions) == len(record.path) - 1 == len(record.gripper) - 1
     assert record.decode_steps == (0, 4, 8)

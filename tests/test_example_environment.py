@@ -13,7 +13,7 @@ from kerv_cli.base import registry
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.registry import Part
 from kerv_cli.episodes.episode import run_episode
-from kerv_cli.episodes.expert import ExpertDecoder
+from kerv_cli.episodes.policy import ExpertDecoder
 from kerv_cli.report.viewing import save_recording
 from kerv_cli.report.viewing.viewer import read_recording
 from kerv_cli.worlds.settings import CameraSettings

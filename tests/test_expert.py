@@ -15,8 +15,8 @@ from kerv_cli.base.errors import KervError, UnknownName
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.record import PHASES, EpisodeRecord
 from kerv_cli.episodes.episode import run_episode
-from kerv_cli.episodes.expert import ExpertDecoder
-from kerv_cli.episodes.rows import decodes_blob, decodes_table, episode_row, read_decodes
+from kerv_cli.episodes.policy import ExpertDecoder
+from kerv_cli.episodes.rows import decodes_table, episode_row, read_decodes, table_blob
 from kerv_cli.report.measures import MACRO, MICRO, measure
 from kerv_cli.report.viewing import save_recording
 from kerv_cli.report.viewing.token_outcomes import summary
@@ -64,7 +64,7 @@ def test_a_record_has_one_step_and_no_target(episode: EpisodeRecord) -> None:
 def test_rows_keep_it_and_measures_are_undefined_instead_of_divided_by_zero(episode: EpisodeRecord) -> None:
     row = episode_row(episode)
     assert (row["forwards"], row["verifications"], row["tokens"], row["first_rejected_count"]) == (0, 0, 0, 0)
-    stored = read_decodes(decodes_blob(episode))
+    stored = read_decodes(table_blob(decodes_table(episode)))
     assert stored.equals(decodes_table(episode))
     third = stored.to_pylist()[3]
     assert third["actions"] == episode.decodes[3].actions.tolist()

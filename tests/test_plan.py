@@ -18,8 +18,7 @@ from studies_synthetic import IDENTITY, part, settings_of, study_of, swept, thre
 import kerv_cli
 from kerv_cli.base.errors import UsageError
 from kerv_cli.episodes import identity
-from kerv_cli.episodes.code import code_hash
-from kerv_cli.episodes.identity import ENGINE, hash_of, work_of
+from kerv_cli.episodes.identity import ENGINE, code_hash, hash_of, work_of
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.plan import Block, Setting, Study, all_episodes, blocks_of, plain_settings
@@ -222,7 +221,7 @@ def test_other_code_runs_again_on_request_only(database: Database, monkeypatch: 
     study = threshold_study(["reach-v3"])
     swept(database.results, study)
     assert not plan_study(database, study, "changed").missing
-    monkeypatch.setattr("kerv_cli.episodes.code.code_hash", lambda: "f" * 64)
+    monkeypatch.setattr("kerv_cli.episodes.identity.code_hash", lambda: "f" * 64)
     assert not plan_study(database, study).missing
     assert why(plan_study(database, study, "changed")) == {"other code"}
 

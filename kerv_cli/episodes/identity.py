@@ -6,13 +6,17 @@ something is renamed or added, and settings that give the same tokens are the sa
 
 from __future__ import annotations
 
+import ast
 import functools
 import hashlib
+import importlib.util
 import json
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
+import kerv_cli
 from kerv_cli.base import registry
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.registry import METHOD_KINDS, PART_GROUPS, part_of
@@ -189,3 +193,42 @@ def idle_keys(settings: RolloutSettings) -> dict[str, str]:
     if not settings.record:
         idle["record_size"] = "record=0 saves no recording"
     return idle
+
+
+_COMPUTING = ("base", "engine", "methods", "targets", "worlds", "episodes")
+"""Rooms whose code an episode runs."""
+
+
+@functools.cache
+def code_hash() -> str:
+    """Return the hex SHA-256 over the names and syntax trees of the files that compute an episode.
+
+    It is provenance: it tells which episodes other code computed. The files are kerv's own and those of registered
+    plugins. Comments, docstrings and layout do not count.
+    """
+    root, digest = Path(kerv_cli.__file__).parent, hashlib.sha256()
+    own = sorted(path for room in _COMPUTING for path in (root / room).rglob("*.py"))
+    for name, path in [*((path.relative_to(root).as_posix(), path) for path in own), *_of_plugins()]:
+        content = _meaning(path.read_bytes()) if path.suffix == ".py" else path.read_bytes()
+        digest.update(f"{name}\0".encode() + hashlib.sha256(content).digest())
+    return digest.hexdigest()
+
+
+def _meaning(source: bytes) -> bytes:
+    """Return the syntax tree as text, without docstrings."""
+    return ast.dump(_WithoutDocstrings().visit(ast.parse(source))).encode()
+
+
+class _WithoutDocstrings(ast.NodeTransformer):
+    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
+        alone = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        return None if alone else node
+
+
+def _of_plugins() -> Iterator[tuple[str, Path]]:
+    kinds = set(registry.kinds()) - {"executor", "command"}
+    modules = {part.build.partition(":")[0] for kind in kinds for part in registry.parts(kind).values()}
+    for name in sorted(module for module in modules if module and not module.startswith("kerv_cli.")):
+        spec = importlib.util.find_spec(name)
+        if spec is not None and spec.origin is not None:
+            yield name, Path(spec.origin)

@@ -8,16 +8,18 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+import torch
 
-from kerv_cli.base.errors import UsageError
+from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.decoder import Decoder
+from kerv_cli.engine.record import DecodeRecord
+from kerv_cli.engine.stopwatch import Stopwatch
 from kerv_cli.episodes import clock
 from kerv_cli.episodes.clock import RealClock
 from kerv_cli.episodes.episode import ActionDecoder
-from kerv_cli.episodes.expert import ExpertDecoder
 from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.episodes.settings import DEFAULT_TASKS, WAITS, RolloutSettings
 from kerv_cli.methods.artifacts import Artifacts, Use
@@ -26,7 +28,7 @@ from kerv_cli.methods.settings import EXPERT, MethodSettings
 from kerv_cli.targets.checkpoint import TargetDescription, described
 from kerv_cli.targets.folders import find_target
 from kerv_cli.worlds import resolve_tasks, spec_of
-from kerv_cli.worlds.spec import EnvironmentSpec
+from kerv_cli.worlds.spec import EnvironmentSpec, Expert
 from kerv_cli.worlds.views import frame_shape
 
 PRIVILEGED = "state (privileged)"
@@ -203,3 +205,53 @@ def warm_up(
     for i in range(decodes):
         for action in decoder.decode(still).actions:
             decoder.observe(action, np.array([0.01 * i, 0.0, 0.1]))
+
+
+class ExpertDecoder:
+    """Decodes one control step at a time with the environment's scripted controller of the task.
+
+    It reads the privileged state, as `observation=state` does. It has no target: its records have no forwards, rounds
+    and tokens. Its time is not compared with a decoding method's.
+    """
+
+    cameras: tuple[str, ...] = ()
+
+    def __init__(self) -> None:
+        self.task: str | None = None
+        self.expert: Expert | None = None
+        self.dofs = 0
+
+    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
+        """Begin an episode."""
+        if self.expert is None or task != self.task:
+            spec = spec_of(task)
+            self.task, self.expert, self.dofs = task, spec.expert(task), spec.actions.dofs
+
+    def decode(self, observation: Observation) -> DecodeRecord:
+        """Return one control step's action (1, D), environment units.
+
+        Raises:
+            KervError: There was no reset, or the expert's answer is not D finite numbers.
+        """
+        if self.expert is None:
+            raise KervError("the expert does not know its task yet: reset it before decoding")
+        stopwatch = Stopwatch(torch.device("cpu"))
+        action = self.expert(observation)
+        seconds = stopwatch.stop()
+        if action.shape != (self.dofs,) or not np.isfinite(action).all():
+            raise KervError(f"the expert of {self.task} answered {action} to a state it cannot read")
+        return DecodeRecord(
+            tokens=(),
+            actions=action[None].astype(np.float32),
+            forwards=0,
+            rounds=(),
+            mode=EXPERT,
+            seconds=seconds,
+            phases=stopwatch.phases,
+        )
+
+    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
+        """Do nothing: it needs no history."""
+
+    def finish(self, success: bool) -> None:
+        """Do nothing: it does not learn."""

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from kerv_cli.base.registry import parts
-from kerv_cli.engine.record import PHASES, DecodeRecord, Delay, EpisodeRecord, Round
+from kerv_cli.engine.record import PHASES, DecodeRecord, EpisodeRecord, Round
 
 INT, FLOAT, TEXT, FLAG = pa.int64(), pa.float64(), pa.string(), pa.bool_()
 Fields = dict[str, tuple[pa.DataType, Callable[..., Any]]]
@@ -31,9 +31,9 @@ def _judged(value: Callable[[Round], int]) -> Callable[[EpisodeRecord], int]:
     return _summed(lambda decode: sum(value(one) for one in decode.rounds if one.is_verification))
 
 
-def _delays(value: Callable[[Delay], Any]) -> Callable[[EpisodeRecord], Any]:
-    """Sum over the decodes during which the world went on."""
-    return _summed(lambda decode: 0 if decode.delay is None else value(decode.delay))
+def _delay(name: str) -> Callable[[DecodeRecord], Any]:
+    """Return an attribute of a decode's delay, None if the world waited."""
+    return lambda decode: getattr(decode.delay, name, None)
 
 
 def _phase(phase: str) -> Callable[[DecodeRecord], float | None]:
@@ -70,12 +70,11 @@ _EPISODE: Fields = {
     "retrieval_decodes": (INT, _summed(lambda decode: any(_looks_up(r.proposer) for r in decode.rounds))),
     "deviation_sum": (FLOAT, _summed(lambda decode: decode.deviation)),  # normalised action units, over sampled decodes
     "deviation_count": (INT, _summed(lambda decode: decode.deviation is not None)),
-    "delay_decodes": (INT, _delays(lambda delay: 1)),  # decodes during which the world went on
-    "delay_seconds": (FLOAT, _delays(lambda delay: delay.seconds)),  # of those: latency that the world felt
-    "delay_steps": (INT, _delays(lambda delay: delay.steps)),  # the same in control steps
-    "carried_steps": (INT, _delays(lambda delay: delay.carried)),  # of those: on the chunk before
-    "held_steps": (INT, _delays(lambda delay: delay.held)),  # … on the last action
-    "dropped_steps": (INT, _delays(lambda delay: delay.dropped)),  # actions of new chunks left out as stale
+    "delay_decodes": (INT, _summed(lambda decode: decode.delay is not None)),  # during which the world went on
+    "delay_seconds": (FLOAT, _summed(_delay("seconds"))),  # of those: latency that the world felt
+    "delay_steps": (INT, _summed(_delay("steps"))),  # the same in control steps
+    # of those: on the chunk before; on the last action; actions of new chunks left out as stale
+    **{f"{name}_steps": (INT, _summed(_delay(name))) for name in ("carried", "held", "dropped")},
     **_attributes("path_length", "jerk", kind=FLOAT),  # of the end effector: metres; m/s³
     **_attributes("wall_seconds", kind=FLOAT),
     "initial_state": (pa.list_(FLOAT), lambda episode: np.asarray(episode.initial_state, np.float64).ravel().tolist()),
@@ -91,10 +90,6 @@ _ROUND = pa.struct(
         for field in fields(Round)
     ]
 )
-
-
-def _delay(name: str) -> Callable[[DecodeRecord], Any]:
-    return lambda decode: getattr(decode.delay, name, None)
 
 
 _DECODE: Fields = {
@@ -128,11 +123,6 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
-def decodes_blob(record: EpisodeRecord) -> bytes:
-    """Return the decodes of one episode as a compressed Parquet file with the columns of DECODE_SCHEMA."""
-    return table_blob(decodes_table(record))
-
-
 def decodes_table(record: EpisodeRecord) -> pa.Table:
     """Return the decodes of one episode, with the columns of DECODE_SCHEMA."""
     rows = [
@@ -150,7 +140,7 @@ def table_blob(table: pa.Table) -> bytes:
 
 
 def read_decodes(blob: bytes, columns: Sequence[str] | None = None) -> pa.Table:
-    """Return the decodes in a blob of `decodes_blob`, or only `columns`."""
+    """Return the decodes in a blob of `table_blob`, or only `columns`."""
     return pq.read_table(io.BytesIO(blob), columns=columns, use_threads=False)
 
 

@@ -31,9 +31,8 @@ from kerv_cli.base.files import storage_errors, visible
 from kerv_cli.base.leftovers import clean, temporary_beside
 from kerv_cli.base.registry import find
 from kerv_cli.engine.record import EpisodeRecord
-from kerv_cli.episodes.code import code_hash
-from kerv_cli.episodes.identity import ENGINE
-from kerv_cli.episodes.rows import decodes_blob, episode_row, seconds_blob
+from kerv_cli.episodes.identity import ENGINE, code_hash
+from kerv_cli.episodes.rows import decodes_table, episode_row, seconds_blob, table_blob
 from kerv_cli.lab.database import BLOCKS, now
 from kerv_cli.lab.events import (
     BlockEnded,
@@ -184,7 +183,7 @@ class BlockRun:
             "decode_seconds": seconds_blob(decode.seconds for decode in record.decodes),
         }
         about = stamp(str(one.setting.settings["runtime"]["device"]))
-        return Message(self.block.episodes.index(one), row, decodes_blob(record), about)
+        return Message(self.block.episodes.index(one), row, table_blob(decodes_table(record)), about)
 
 
 def failure_of(error: BaseException) -> SettingFailed:

@@ -241,7 +241,7 @@ def split(
             command, which was interrupted.
         earlier: Newest stored setting of a label, and its work. Explains what changed.
     """
-    from kerv_cli.episodes.code import code_hash
+    from kerv_cli.episodes.identity import code_hash
 
     def is_usable(row: StoredEpisode) -> bool:
         if rerun == ALL:

@@ -18,9 +18,8 @@ from kerv_cli.base.runtime import set_up
 from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.resolve import ResolvedStudy
-from kerv_cli.episodes.runner import Runner, close_worlds, is_recorded, run_batch
+from kerv_cli.episodes.runner import Request, Runner, close_worlds, is_recorded, run_batch
 from kerv_cli.episodes.settings import settings_from
-from kerv_cli.episodes.together import Request
 from kerv_cli.lab.database import EPISODES, Database
 from kerv_cli.lab.events import Event, OnEvent, Outcome, SettingFailed
 from kerv_cli.lab.execute import execute
