@@ -32,7 +32,7 @@ list(recording._run_jobs(Config, None, [("a", range(1)), ("b", range(1))], None)
 JOBS = """
 import os, sys, time
 from kerv_cli.lab.executors import SlurmOptions
-from kerv_cli.lab.executors.slurm import build
+from kerv_cli.lab.executors.clusters import build_slurm as build
 def work(path):
     open(path, "a").write(f"{os.getpid()}\\n{os.getppid()}\\n")
     time.sleep(60)
@@ -51,7 +51,7 @@ time.sleep(60)
 """
 GUARD = """
 import os, subprocess, sys, time
-from kerv_cli.lab.executors.guard import guard
+from kerv_cli.lab.executors.clusters import guard
 with guard():
     server = subprocess.Popen(["sh", "-c", "sleep 60 & echo $!; sleep 1.5"], stdout=-1, text=True)
     agent = int(server.stdout.readline())

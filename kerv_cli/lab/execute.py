@@ -33,17 +33,8 @@ from kerv_cli.base.registry import find
 from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.episodes.identity import ENGINE, code_hash
 from kerv_cli.episodes.rows import decodes_table, episode_row, seconds_blob, table_blob
+from kerv_cli.lab import events
 from kerv_cli.lab.database import BLOCKS, now
-from kerv_cli.lab.events import (
-    BlockEnded,
-    BlockStarted,
-    BlockWaits,
-    EpisodeEnd,
-    OnEvent,
-    Outcome,
-    SettingFailed,
-    Started,
-)
 from kerv_cli.lab.executors import Executor, WorkerLost, check_executor
 from kerv_cli.lab.plan import Block, Episode, Setting, seeds_text, split
 from kerv_cli.lab.runs import Run, is_running
@@ -75,7 +66,7 @@ class Message:
     row: dict[str, Any] = field(default_factory=dict)
     decodes: bytes = b""
     about: dict[str, Any] = field(default_factory=dict)
-    failure: SettingFailed | None = None
+    failure: events.SettingFailed | None = None
 
 
 Send = Callable[[Message], None]
@@ -186,18 +177,18 @@ class BlockRun:
         return Message(self.block.episodes.index(one), row, table_blob(decodes_table(record)), about)
 
 
-def failure_of(error: BaseException) -> SettingFailed:
+def failure_of(error: BaseException) -> events.SettingFailed:
     """Return what to tell of an error: its message in one line, with type and place if it is not one of kerv's own."""
     trace = "".join(traceback.format_exception(error))
     text = " ".join(str(error).split())
     if isinstance(error, KervError):
-        return SettingFailed(text, trace, error)
+        return events.SettingFailed(text, trace, error)
     frames = traceback.extract_tb(error.__traceback__)
     line = f" ({os.path.basename(frames[-1].filename)}:{frames[-1].lineno})" if frames else ""
-    return SettingFailed(f"{type(error).__name__}: {text[:200]}{line}", trace)
+    return events.SettingFailed(f"{type(error).__name__}: {text[:200]}{line}", trace)
 
 
-def execute(plan: Plan, prepare: Prepare, record: Run, on_event: OnEvent = lambda event: None) -> Outcome:
+def execute(plan: Plan, prepare: Prepare, record: Run, on_event: events.OnEvent = lambda event: None) -> events.Outcome:
     """Run the missing episodes of a plan, block by block.
 
     If a setting raises or its worker is killed, it is reported as failed and the rest of its block goes on. Blocks that
@@ -225,7 +216,6 @@ class _Attempt:
         id: Id of its row.
         spool: Where its worker sends messages.
         last: The episode that began last.
-        is_here: Whether it runs in this process.
         future: Its end.
         ended: Episodes that ended.
         failed: Episodes that failed, or that do not run because their setting failed.
@@ -235,7 +225,6 @@ class _Attempt:
     id: str
     spool: Spool
     last: Episode
-    is_here: bool
     future: Future[None] = field(default_factory=Future)
     ended: set[Episode] = field(default_factory=set)
     failed: set[Episode] = field(default_factory=set)
@@ -248,21 +237,22 @@ class _Attempt:
 class _Sweep:
     """State of one call of `execute`."""
 
-    def __init__(self, plan: Plan, prepare: Prepare, record: Run, on_event: OnEvent) -> None:
+    def __init__(self, plan: Plan, prepare: Prepare, record: Run, on_event: events.OnEvent) -> None:
         self.plan, self.prepare, self.record, self.on_event = plan, prepare, record, on_event
         self.database, self.runtime = plan.store.database, plan.runtime
-        self.outcome = Outcome(reused=list(plan.existing))
+        self.outcome = events.Outcome(reused=list(plan.existing))
         self.waiting: deque[Block] = deque(plan.blocks())
         self.elsewhere: list[Block] = []  # another sweep runs them
         self.attempts: list[_Attempt] = []
+        self.is_here = self.runtime.executor == "local" and self.runtime.workers == 1
         self.spool = temporary_beside(self.database.results / "spool")
 
-    def run(self) -> Outcome:
+    def run(self) -> events.Outcome:
         clock, to_run = time.perf_counter(), self.plan.to_run
         options = check_executor(self.runtime)
         clean(self.database.results)  # messages to processes that were killed
         self.record.beat(0, len(to_run))
-        self.on_event(Started(len(to_run), len(self.plan.existing)))
+        self.on_event(events.Started(len(to_run), len(self.plan.existing)))
         if to_run:
             threads = max(one.setting.settings["runtime"]["threads"] for one in to_run)
             part = find("executor", self.runtime.executor)
@@ -301,17 +291,16 @@ class _Sweep:
         name = f"{self.record.id}-{secrets.token_hex(4)}"
         if not self._claim(block, name):
             self.elsewhere.append(block)
-            self.on_event(BlockWaits(block))
+            self.on_event(events.BlockWaits(block))
             return
-        is_here = executor.slots == 1 and self.runtime.executor == "local"
-        attempt = _Attempt(block, name, Spool(self.spool / name), block.episodes[0], is_here)
+        attempt = _Attempt(block, name, Spool(self.spool / name), block.episodes[0])
         self.attempts.append(attempt)
         if not self._leave_out_existing(attempt):
             self._release(attempt)
             return
-        self.on_event(BlockStarted(attempt.block))
-        send: Send = functools.partial(self._receive, attempt) if is_here else attempt.spool
-        if not is_here:
+        self.on_event(events.BlockStarted(attempt.block))
+        send: Send = functools.partial(self._receive, attempt) if self.is_here else attempt.spool
+        if not self.is_here:
             with storage_errors(attempt.spool.folder):
                 attempt.spool.folder.mkdir(parents=True)
         attempt.future = executor.submit(BlockRun(attempt.block, self.prepare, send))
@@ -344,7 +333,7 @@ class _Sweep:
                     connection.execute(self.plan.store.update_of(one).values(episode_id=row.id, error=None))
         for one in existing:
             self.outcome.reused.append(one)
-            self.on_event(EpisodeEnd(one, elsewhere=True))
+            self.on_event(events.EpisodeEnd(one, elsewhere=True))
         attempt.block = Block(tuple(missing))
         return bool(missing)
 
@@ -360,7 +349,7 @@ class _Sweep:
             self._write(attempt, one, message)
             attempt.ended.add(one)
             self.outcome.done.append(one)
-            self.on_event(EpisodeEnd(one, bool(message.row["success"]), float(message.row["wall_seconds"])))
+            self.on_event(events.EpisodeEnd(one, bool(message.row["success"]), float(message.row["wall_seconds"])))
             self.record.beat(len(self.outcome.done))
 
     def _write(self, attempt: _Attempt, one: Episode, message: Message) -> None:
@@ -378,7 +367,7 @@ class _Sweep:
             name = self.plan.study.name
             raise KervError(f"study {name} was deleted while it ran: the same command begins it anew")
 
-    def _fail(self, attempt: _Attempt, one: Episode, failure: SettingFailed) -> None:
+    def _fail(self, attempt: _Attempt, one: Episode, failure: events.SettingFailed) -> None:
         """Note that a setting failed on a task. Its other episodes of the block do not run."""
         if isinstance(failure.error, StorageError):
             raise failure.error
@@ -400,16 +389,16 @@ class _Sweep:
         self._take(attempt)
         error = attempt.future.exception()
         lost: list[Episode] = []
-        if isinstance(error, StorageError) or (error is not None and attempt.is_here):
+        if isinstance(error, StorageError) or (error is not None and self.is_here):
             raise error
         if isinstance(error, WorkerLost):  # the episode that ran has failed; the others run again
-            self._fail(attempt, attempt.last, SettingFailed(str(error)))
+            self._fail(attempt, attempt.last, events.SettingFailed(str(error)))
             lost = self._lost(attempt)
         elif error is not None:
             for one in attempt.block.episodes:
                 self._fail(attempt, one, failure_of(error))
         self._release(attempt)
-        self.on_event(BlockEnded(attempt.block))
+        self.on_event(events.BlockEnded(attempt.block))
         if lost:
             self.waiting.append(Block(tuple(lost)))
 

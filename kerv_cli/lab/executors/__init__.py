@@ -43,6 +43,16 @@ class Executor(Protocol):
         """End the workers. With `abandon`, kill those that work."""
 
 
+def settle(
+    future: Future[Any], result: Callable[[], Any], explained: Callable[[Exception], Exception] = lambda error: error
+) -> None:
+    """Set the result of a function, or its error as `explained` returns it."""
+    try:
+        future.set_result(result())
+    except Exception as error:  # noqa: BLE001 - the future holds any exception
+        future.set_exception(explained(error))
+
+
 def check_executor(runtime: RuntimeSettings) -> Any:
     """Check and return the options of the chosen executor, without importing its package.
 
@@ -89,5 +99,5 @@ class RayOptions:
 
 
 add("executor", "local", "kerv_cli.lab.executors.local:build", LocalOptions)
-add("executor", "slurm", "kerv_cli.lab.executors.slurm:build", SlurmOptions, package="submitit", extra="slurm")
-add("executor", "ray", "kerv_cli.lab.executors.ray:build", RayOptions, package="ray", extra="ray")
+add("executor", "slurm", "kerv_cli.lab.executors.clusters:build_slurm", SlurmOptions, package="submitit", extra="slurm")
+add("executor", "ray", "kerv_cli.lab.executors.clusters:build_ray", RayOptions, package="ray", extra="ray")

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from kerv_cli.base.processes import begin_worker, check_workers
-from kerv_cli.lab.executors import THREAD_VARIABLES, Executor, WorkerLost
+from kerv_cli.lab.executors import THREAD_VARIABLES, Executor, WorkerLost, settle
 
 T = TypeVar("T")
 
@@ -29,10 +29,7 @@ class InProcess:
     def submit(self, work: Callable[[], T], /) -> Future[T]:
         """Run a function."""
         future: Future[T] = Future()
-        try:
-            future.set_result(work())
-        except Exception as error:  # noqa: BLE001 - the future holds any exception
-            future.set_exception(error)
+        settle(future, work)
         return future
 
     def close(self, abandon: bool) -> None:
@@ -67,10 +64,7 @@ class Processes:
             )
             return
         self._free.append(pool)
-        if error is not None:
-            outer.set_exception(error)
-        else:
-            outer.set_result(inner.result())
+        settle(outer, inner.result)
 
     def _new_pool(self) -> Any:
         from joblib.externals.loky import ProcessPoolExecutor
