@@ -101,9 +101,9 @@ def policies(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def few_validations(monkeypatch: pytest.MonkeyPatch) -> None:
     """A drafter in training is validated on 4 observations, not on 60 of which each is decoded twice."""
-    from kerv_cli.methods.eagle import examples
+    from kerv_cli.methods.eagle import drafter
 
-    monkeypatch.setattr(examples, "VALIDATED", 4)
+    monkeypatch.setattr(drafter, "VALIDATED", 4)
 
 
 @contextlib.contextmanager

@@ -20,7 +20,6 @@ from typer.testing import CliRunner
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import read_json, sha256_of, write_json
-from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
 from kerv_cli.engine.record import Round
@@ -38,10 +37,11 @@ from kerv_cli.methods.heisd.rules import BoundaryRanges
 from kerv_cli.methods.kerv.prediction import PREDICTORS, Noise
 from kerv_cli.targets.checkpoint import TargetDescription, read_target
 from kerv_cli.targets.folders import find_target
-from kerv_cli.training.calibration import CalibrationRun, distribution
-from kerv_cli.training.predictor_fit import (
+from kerv_cli.training.calibration import (
+    CalibrationRun,
     Windows,
     choose_episodes,
+    distribution,
     episode_windows,
     fit_noise,
     moving_errors,
@@ -223,24 +223,6 @@ def test_a_run_writes_what_the_next_session_reads(results: Path, target: str) ->
         np.testing.assert_allclose(predictor.predict(np.full((10, 4), 0.25), 4), 0.25)
 
 
-@pytest.mark.bits
-def test_the_presampled_variability_is_the_decoders_own(results: Path) -> None:
-    """The decoder's K is the function of the tokens it records."""
-    run = CalibrationRun(settings(results))
-    decoder = run.decoder()
-    episode = run.dataset.load(0)
-    decoder.reset(episode.task, 0, episode.end_effector[0])
-    record = decoder.decode(Observation(episode.states[0][:4], episode.states[0], "reach"))
-    judged = [
-        abs(d - v)
-        for r in record.rounds
-        for i, (d, v) in enumerate(zip(r.drafted, r.target_tokens, strict=False))
-        if (r.start + i) % 4 != 3  # the gripper is strict
-    ]
-    assert record.variability == pytest.approx(BIN * sum(judged) / len(judged))
-    assert len(judged) > 3
-
-
 def test_a_task_without_a_reference_level_is_named() -> None:
     with pytest.raises(CheckpointError, match="no reference level K_S for push-v3, only for reach-v3"):
         calibration({"reach-v3": 0.7}).k_s("push-v3")
@@ -291,14 +273,6 @@ def test_what_does_not_fit_is_refused_in_one_line(
         CalibrationArtifact().checked(path, description())
     assert "\n" not in str(caught.value)
     assert "kerv calibrate" in str(caught.value)
-
-
-def test_a_missing_calibration_names_the_command(tmp_path: Path) -> None:
-    path = tmp_path / "calibration.json"
-    for _ in range(2):
-        with pytest.raises(CheckpointError, match="run 'kerv calibrate'"):
-            CalibrationArtifact().checked(path, description())
-        path.write_text("[1]")
 
 
 @pytest.mark.parametrize(

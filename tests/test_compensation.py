@@ -10,8 +10,6 @@ import torch
 from examples.own_target import MockTarget
 from test_decoding_lossless import plain_greedy
 
-from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.limits import check_settings
 from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
@@ -186,18 +184,3 @@ def test_without_a_gripper_to_hold_the_drafts_is_taken(wrong: int) -> None:
     assert chunk.closed is not None
     gripper = drafted[D - 1] if wrong < D - 1 else truth[D - 1]  # the first step's, until it is known
     assert chunk.closed[-1, D - 1] == pytest.approx(SPACE.values_of(np.array(gripper)))
-
-
-@pytest.mark.parametrize(
-    ("values", "error", "says"),
-    [
-        ({"predictor": "draft", "use_target_token": False}, UsageError, "leave rectifier.use_target_token=true"),
-        ({"predictor": "kalmann"}, UnknownName, "unknown rectifier.predictor 'kalmann': did you mean kalman"),
-        ({"min_verified": -1}, UsageError, "rectifier.min_verified=-1: from 0 to"),
-    ],
-)
-def test_what_cannot_compensate_is_refused(values: dict[str, Any], error: type[Exception], says: str) -> None:
-    with pytest.raises(error) as caught:
-        check_settings(CompensateSettings(**values), "rectifier")
-    assert says in str(caught.value)
-    assert "\n" not in str(caught.value)

@@ -121,22 +121,6 @@ def test_the_chunk_counts_and_is_executed(method: str) -> None:
     assert (decoder.steps, decoder.target.chunk > 2) == (2, True)
 
 
-def test_an_actors_failed_episode_is_kept(tmp_path: Path) -> None:
-    class Still:
-        def reset(self, world: object, seed: int) -> None: ...
-
-        def act(self, label: np.ndarray) -> np.ndarray:
-            return np.zeros(4)
-
-    config = DemoConfig(("reach-v3",), 1, camera=SHORT, frame_stride=50, workers=1, horizon=20, policy="still")
-    world = SPEC.open_world("reach-v3", SHORT)
-    episode = run_expert(world, 0, config, Still())
-    world.close()
-    assert episode is not None
-    assert (episode.steps, len(episode.labels)) == (20, 20 + config.tail)
-    assert not episode.executed.any()
-
-
 @pytest.mark.parametrize(
     ("target", "spec", "camera", "says"),
     [

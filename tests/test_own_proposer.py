@@ -92,17 +92,6 @@ def test_it_is_lossless_wherever_it_drafts(
         assert_adds_up(result)
 
 
-def test_a_perfect_table_drafts_the_whole_chunk_in_one_forward() -> None:
-    target = MockTarget(SEVEN, chunk=2)
-    prompt = torch.randn(1, 5, target.width, generator=torch.Generator().manual_seed(3)).double()
-    truth = np.reshape(plain_greedy(target, prompt), (2, 7))
-    before = np.arange(100, 107)
-    decoder = Decoder(target, Parts(prefill_draft=FollowProposer(FollowTable.fit([[before, *truth]], SEVEN))))  # type: ignore[list-item]
-    decoder.situation.history.append(SEVEN.values_of(before))
-    chunk = decoder.decode_prompt(prompt)
-    assert (chunk.forwards, chunk.tokens) == (1, truth.flatten().tolist())
-
-
 @pytest.mark.bits
 @pytest.mark.parametrize(
     ("overrides", "wanted"),
@@ -165,8 +154,6 @@ def test_it_is_trained_from_the_command_line_and_drafts_in_a_rollout(results: Pa
     ("words", "says"),
     [
         (["drafter=folow"], "unknown drafter 'folow': did you mean follow"),
-        (["drafter=follow", "drafter.width=3"], "unknown key 'drafter.width'"),
-        (["drafter=follow", "drafter.share=0"], "drafter.share=0.0: above 0, at most 1"),
         (["drafter.kind=follow"], "drafter.kind=follow: choose drafter=follow, each has settings of its own"),
     ],
 )

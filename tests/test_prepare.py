@@ -162,15 +162,6 @@ def test_the_remedy_for_weights_of_another_target_works_as_it_is_typed(results: 
     assert ", 400 steps of 64" in few
 
 
-@pytest.mark.usefixtures("results")
-def test_another_run_in_the_folder_is_refused_before_anything_is_read() -> None:
-    words = ("train", "target", "name=short", "demos=few", "target=nano", "target.observation=state", "train.batch=2")
-    kerv(*words, "train.steps=1")
-    kerv(*words, "train.steps=2", "--plan")
-    another = kerv(*words, "train.lr=0.5", "--plan", code=1)
-    assert "other settings or data: choose another name=, or remove it with 'kerv runs rm target/short'" in another
-
-
 @pytest.mark.usefixtures("results", "few_validations")
 def test_an_artifact_is_shown_with_the_settings_that_it_was_made_with() -> None:
     quick = ["demos=few", "task=[reach-v3]", "train.steps=1", "train.batch=2"]

@@ -129,15 +129,15 @@ def test_packed_weights_give_the_same_draft(target: CompactTarget, scout: ScoutN
 
 
 def test_it_is_trained_from_the_command_line_for_its_target_alone(results: Path) -> None:
-    words = [
-        "train",
-        "drafter",
-        "drafter=scout",
-        "demos=few",
-        "policy.target=nano-vision",
+    words = ["train", "drafter", "drafter=scout", "demos=few", "policy.target=nano-vision"]
+    words += [
         "policy.artifacts.scout=mine",
+        "drafter.width=24",
+        "drafter.rank=4",
+        "train.batch=8",
+        "train.steps=4",
+        "train.scene_steps=2",
     ]
-    words += ["drafter.width=24", "drafter.rank=4", "train.batch=8", "train.steps=4", "train.scene_steps=2"]
     done = CliRunner().invoke(app, [*words, "train.held_out=0.34", "train.validate_every=4", f"results={results}"])
     assert done.exit_code == 0, done.output
     assert "object_error_cm" in done.stdout
@@ -248,14 +248,8 @@ def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results: Pat
     serve = ["serve", "--plan", "policy.target=nano-vision", f"results={results}", "port=0"]
     serve += ["prefill_draft=scoped", "prefill_draft.outside=hold", "skip=certified"]
     assert CliRunner().invoke(app, serve).exit_code == 0
-    deploy = [
-        "rollout",
-        "--plan",
-        "method=one_pass_certified",
-        "prefill_draft.outside=hold",
-        "policy.target=nano-vision",
-    ]
-    deploy += [f"task={TASK}", "threshold.r=9", "world.horizon=8", f"results={results}"]
+    deploy = ["rollout", "--plan", "method=one_pass_certified", "prefill_draft.outside=hold"]
+    deploy += ["policy.target=nano-vision", f"task={TASK}", "threshold.r=9", "world.horizon=8", f"results={results}"]
     other = CliRunner().invoke(app, deploy)
     assert other.exit_code == 2  # before anything runs
     assert "with proposer.kind=drafter: the certificate is of none" in other.stderr

@@ -83,32 +83,6 @@ def test_the_sequence_rule_is_its_definition(
         assert found.rejected in children
 
 
-def judge(tokens: list[int], start: int = 0, wanted: int = 100) -> int:
-    """Accepted length of a chain whose target tokens are all `wanted`."""
-    tree = TokenTree.build(tokens)
-    found = accept_by_group(
-        tree, [wanted] * (len(tokens) + 1), start, LIMITS, group_limit=30, bounds=POSITION_GRIPPER.bounds
-    )
-    return len(found.path)
-
-
-@pytest.mark.parametrize(
-    ("tokens", "start", "accepted"),
-    [
-        ([110, 110, 110, 100], 0, 4),  # 10 + 10 + 10 = 30
-        ([110, 110, 111, 100], 0, 0),  # 31: the whole group goes, its good tokens too
-        ([115, 85, 100, 100], 0, 4),  # signs do not cancel, but 15 + 15 = 30
-        ([116, 100, 100, 100], 0, 0),  # one token beyond 15
-        ([110, 110, 110, 101], 0, 3),  # the gripper is exact and a group of its own
-        ([100, 100, 100, 100, 110, 110, 111], 0, 4),  # the sum starts anew with every group …
-        ([100, 100, 100, 100, 100, 100], 0, 4),  # leaves the tree inside a group
-        ([115, 115, 100], 1, 3),  # begun by the bonus: two tokens remain, 30
-    ],
-)
-def test_groups_are_accepted_or_rejected_whole(tokens: list[int], start: int, accepted: int) -> None:
-    assert judge(tokens, start) == accepted
-
-
 def test_a_rejected_group_is_shown_by_its_first_token() -> None:
     tree = TokenTree.build([100, 100, 100, 100, 104, 100, 90, 103], [-1, 0, 1, 2, 3, 4, 5, 3])
     found = accept_by_group(tree, [100] * 9, 0, LIMITS, group_limit=10, bounds=POSITION_GRIPPER.bounds)

@@ -189,26 +189,6 @@ def test_weights_can_be_stored_in_fewer_bits(tmp_path: Path) -> None:
     assert sizes["int8"] < 0.6 * sizes["float16"]
 
 
-WITHOUT_VIEWER = """
-import sys
-sys.modules["rerun"] = None  # an import of it raises
-from kerv_cli.cli.app import app
-results = sys.argv[1]
-train = ["target=nano", "target.observation=state", "train.steps=2", "train.batch=2"]
-train += ["train.validate_every=2", "train.closed_loop=1", "world.horizon=4", "name=blind", "demos=few"]
-code = app(["train", "target", "task=drawer-close", *train, f"results={results}"], standalone_mode=False)
-asked = ["policy=state", "policy.target=blind", "episodes=1", "world.horizon=4", "record=0"]
-sys.exit(code or app(["rollout", "task=drawer-close", *asked, f"results={results}"], standalone_mode=False))
-"""
-
-
-def test_training_and_an_unrecorded_rollout_need_no_viewer(results: Path) -> None:
-    command = [sys.executable, "-W", "ignore", "-c", WITHOUT_VIEWER, str(results)]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=200)
-    assert run.returncode == 0, run.stderr
-    assert "forwards/step" in run.stdout
-
-
 def test_the_schedule_warms_up_and_decays_in_both_phases() -> None:
     settings = TrainSettings(steps=100, warmup=10, scene_steps=40)
     rates = [schedule(step, settings) for step in range(100)]

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from kerv_cli.methods.calibration import Calibration
-from kerv_cli.training.predictor_fit import moving_errors
+from kerv_cli.training.calibration import moving_errors
 
 Table = tuple[tuple[str, ...], list[tuple[object, ...]], str]
 """Columns, rows and title."""

@@ -303,23 +303,11 @@ def columns_of(episode: DemoEpisode, index: int, count: int) -> dict[str, Tensor
     return {"episodes": torch.full((count,), index), "perturbed": torch.full((count,), episode.perturbed)}
 
 
-def accepted_tokens(drafts: Tensor, teacher: Tensor, r: int, strict: Tensor) -> Tensor:
-    """Return the lengths (n,) of the longest prefixes within r bins of the teacher.
-
-    Approximates relaxed acceptance, in which later target tokens depend on the accepted draft.
-
-    Args:
-        drafts: (n, N) tokens.
-        teacher: (n, N) tokens of the target.
-        r: Radius in bins.
-        strict: (N,) bool, tokens that must be equal.
-    """
-    limit = torch.where(strict, 0, r)
-    return ((drafts - teacher).abs() <= limit).long().cumprod(1).sum(1)
-
-
 def measure(logits: Tensor, examples: Decodes, strict: Tensor) -> Metrics:
     """Return accepted tokens and the share of whole chunks at every radius, and the token accuracy.
+
+    Accepted is the longest prefix within the radius of the target's tokens. That approximates relaxed acceptance, in
+    which later target tokens depend on the accepted draft.
 
     Args:
         logits: (n, N, V) of the drafter.
@@ -333,8 +321,8 @@ def measure(logits: Tensor, examples: Decodes, strict: Tensor) -> Metrics:
 
     metrics: Metrics = {}
     for name, r in {"strict": 0, "r3": 3, "r9": 9}.items():
-        drafts = choose(logits, r, strict)
-        accepted = accepted_tokens(drafts, examples.tokens, r, strict)
+        right = (choose(logits, r, strict) - examples.tokens).abs() <= torch.where(strict, 0, r)
+        accepted = right.long().cumprod(1).sum(1)
         metrics[f"accepted_{name}"] = balanced(accepted)
         metrics[f"whole_{name}"] = balanced(accepted == logits.shape[1])
     metrics["token_accuracy"] = balanced((logits.argmax(-1) == examples.tokens).float().mean(1))
