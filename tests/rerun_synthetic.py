@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+from studies_synthetic import still_episode
 
 from kerv_cli.engine.record import PHASES, DecodeRecord, EpisodeRecord, Round
-from kerv_cli.worlds.metaworld.spec import SPEC
 
 DOFS = 4
 
@@ -112,20 +114,13 @@ def episode(kind: str, horizon: int = 60, chunk: int = 4, frames: int = 0, seed:
         base = np.stack([np.broadcast_to(rows, (frames, frames)), np.broadcast_to(rows[:, None], (frames, frames))], -1)
         for i in range(step + 1):
             pictures[i] = np.concatenate([base, np.full((frames, frames, 1), i % 256, np.uint8)], axis=2)
-    return EpisodeRecord(
-        environment=SPEC.name,
-        space=SPEC.actions,
-        task="drawer-open-v3",
+    return replace(
+        still_episode("drawer-open-v3", 7, True, decodes),
         instruction="open the drawer",
-        seed=7,
-        success=True,
         steps=step,
-        decodes=tuple(decodes),
         decode_steps=tuple(starts),
         actions=np.stack(actions).astype(np.float32),
         path=path.astype(np.float32),
         gripper=(0.5 + 0.5 * np.cos(angle)).astype(np.float32),
-        initial_state=np.zeros(6),
         frames=pictures,
-        wall_seconds=1.5,
     )

@@ -44,19 +44,19 @@ def part(kind: str, name: str, **values: Any) -> Any:
     return find(kind, name).settings(kind=name, **values)
 
 
-def still_episode(task: str, seed: int, success: bool, decodes: Sequence[DecodeRecord]) -> EpisodeRecord:
-    """An episode of one control step per decode in which nothing moves: for what is measured of its decodes."""
-    steps = len(decodes)
+def still_episode(task: str, seed: int, success: bool, decodes: Sequence[DecodeRecord], each: int = 1) -> EpisodeRecord:
+    """An episode in which nothing moves, with `each` control steps per decode: for what is measured of its decodes."""
+    steps = each * len(decodes)
     return EpisodeRecord(
         environment=SPEC.name,
         space=SPEC.actions,
         task=task,
-        instruction="",
+        instruction="reach the goal",
         seed=seed,
         success=success,
         steps=steps,
         decodes=tuple(decodes),
-        decode_steps=tuple(range(steps)),
+        decode_steps=tuple(range(0, steps, each)),
         actions=np.zeros((steps, 4), np.float32),
         path=np.zeros((steps + 1, 3), np.float32),
         gripper=np.zeros(steps + 1, np.float32),
@@ -125,21 +125,9 @@ def episode(setting: Setting, task: str, seed: int) -> EpisodeRecord:
     rng = generator(task, seed, setting.label)
     r = setting.settings["threshold"].get("r", 9)
     slow = setting.settings["method"] == "ar"
-    decodes = tuple(ar_decode(rng) if slow else draft_decode(rng, r) for _ in range(rng.integers(12, 25)))
-    steps = 4 * len(decodes)
-    return EpisodeRecord(
-        environment=SPEC.name,
-        space=SPEC.actions,
-        task=task,
-        instruction="reach the goal",
-        seed=seed,
-        success=bool(difficulty < 0.9 - 0.015 * max(0, r - 5)),
-        steps=steps,
-        decodes=decodes,
-        decode_steps=tuple(range(0, steps, 4)),
-        actions=np.zeros((steps, 4), np.float32),
-        path=np.zeros((steps + 1, 3), np.float32),
-        gripper=np.zeros(steps + 1, np.float32),
+    decodes = [ar_decode(rng) if slow else draft_decode(rng, r) for _ in range(rng.integers(12, 25))]
+    return replace(
+        still_episode(task, seed, bool(difficulty < 0.9 - 0.015 * max(0, r - 5)), decodes, 4),
         initial_state=initial_state,
         wall_seconds=2.0 * sum(d.seconds for d in decodes),
     )

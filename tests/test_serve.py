@@ -99,13 +99,12 @@ def seen(seed: int, **changes: Any) -> dict[str, Any]:
     }
 
 
-def until(condition: Any) -> None:
-    """Waits at most 5 s."""
-    for _ in range(500):
-        if condition():
-            return
+def until(condition: Any, seconds: float = 5) -> None:
+    """Waits at most that long."""
+    ends = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < ends, "waited in vain"
         time.sleep(0.01)
-    raise AssertionError("waited in vain")
 
 
 @pytest.mark.bits
@@ -265,10 +264,8 @@ def test_the_command_answers_and_stops_when_told(policies: Path, tmp_path: Path)
     with (tmp_path / "log").open("w") as log:
         process = subprocess.Popen([sys.executable, "-m", "kerv_cli", *words], stderr=log, env=environment)
         try:
-            until_slow = time.monotonic() + 60
-            while "listens on" not in (said := (tmp_path / "log").read_text()) and time.monotonic() < until_slow:
-                time.sleep(0.05)
-            client = Client(int(said.rsplit(":", 1)[1]))
+            until(lambda: "listens on" in (tmp_path / "log").read_text(), 60)
+            client = Client(int((tmp_path / "log").read_text().rsplit(":", 1)[1]))
             assert client.infer({"observation/state": np.zeros(39), "prompt": ""})["actions"].shape == (4, 4)
             process.send_signal(signal.SIGTERM)
             assert process.wait(20) == 0

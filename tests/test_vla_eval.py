@@ -10,7 +10,6 @@ import sqlite3
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +23,7 @@ import vla_eval
 from examples.tiny_openvla import write_checkpoint
 from PIL import Image
 from studies_synthetic import swept, threshold_study
-from test_serve import serving
+from test_serve import serving, until
 from typer.testing import CliRunner
 from vla_eval.benchmarks.base import StepBenchmark, StepResult
 from vla_eval.model_servers.predict import PredictModelServer
@@ -194,16 +193,9 @@ def test_a_chunk_is_sent_step_by_step_and_decoded_once(policy: Policy) -> None:
         client.tell("episode_start", {"task": {"name": "reach-v3"}})
         chunk = [client.act() for _ in range(4)]
         client.act(images={"corner4": np.zeros((96, 96, 3), np.uint8)})
-        until = time.monotonic() + 10  # the line comes behind the answer
-        while sum("answers" in line for line in log) < 2 and time.monotonic() < until:
-            time.sleep(0.01)
-        assert sum("answers" in line for line in log) == 2
+        until(lambda: sum("answers" in line for line in log) == 2)  # the line comes after the answer
     expected = policy.artifacts.target
     assert np.array(chunk).shape == (4, len(expected.actions.names))
-
-
-def shown(camera: str, image: Any) -> dict[str, Any]:
-    return {**seen(0), "images": {camera: image}}
 
 
 BLACK = np.zeros((96, 96, 3), np.uint8)
@@ -217,10 +209,11 @@ BOMB = {"__image__": True, "format": "raw", "data": b"", "dtype": "<f8", "shape"
         ("hello", {"protocol_version": 9}, "protocol version 9 is not known here: this server speaks 1"),
         ("greeting", {}, "a message of type greeting: hello, episode_start, observation, episode_end"),
         ("observation", [1], "a message of type observation"),
-        ("observation", shown("corner2", BLACK), "camera corner4: the message has images of corner2"),
-        ("observation", shown("corner4", BLACK[:64, :64]), "images.corner4 is (64, 64, 3)"),
-        ("observation", shown("corner4", NO_PNG), "cannot be read as PNG or JPEG"),
-        ("observation", shown("corner4", BOMB), "does not fit its bytes"),
+        ("observation", {"state": [0.0] * 4, "images": {"corner2": BLACK}}, "images of corner2"),
+        ("observation", {"state": [0.0] * 4, "images": {"corner4": BLACK[:64, :64]}}, "images.corner4 is (64, 64, 3)"),
+        ("observation", {"state": [0.0] * 4, "images": {"corner4": NO_PNG}}, "cannot be read as PNG or JPEG"),
+        ("observation", {"state": [0.0] * 4, "images": {"corner4": BOMB}}, "does not fit its bytes"),
+        ("observation", {"state": [0.0] * 7, "images": {"corner4": BLACK}}, "4 or 39 numbers are wanted"),
     ],
 )
 def test_a_wrong_message_gets_one_line_and_the_next_one_an_answer(
@@ -233,15 +226,6 @@ def test_a_wrong_message_gets_one_line_and_the_next_one_an_answer(
         assert said in told["error"]
         assert "\n" not in told["error"]
         assert any(said in line for line in log)
-        assert client.act().shape == (4,)
-
-
-@pytest.mark.parametrize("frame", [b"\xc1garbage", b"", "text", msgpack.packb([1]), msgpack.packb({"type": []})])
-def test_garbage_gets_one_line_and_the_server_goes_on(policy: Policy, frame: bytes | str) -> None:
-    with serving(policy) as (port, _):
-        client = Client(port)
-        client.connection.send(frame)
-        assert client.hear()[0] == "error"
         assert client.act().shape == (4,)
 
 
@@ -327,11 +311,7 @@ def test_a_benchmark_that_cannot_be_says_so(params: dict[str, Any], said: str) -
 
 
 class Scripted(PredictModelServer):
-    """A model server of vla-eval's own: moves towards the goal, which is privileged; dofs: numbers of its action."""
-
-    def __init__(self, dofs: int = 4) -> None:
-        super().__init__()
-        self.dofs = dofs
+    """A model server of vla-eval's own: moves towards the goal, which is privileged."""
 
     def get_observation_params(self) -> dict[str, Any]:
         return {"privileged": True, "send_images": False}
@@ -344,7 +324,7 @@ class Scripted(PredictModelServer):
 
     def predict(self, obs: dict[str, Any], ctx: Any) -> dict[str, Any]:
         move = np.clip(10 * (obs["state"][36:39] - obs["state"][:3]), -1, 1)
-        return {"actions": np.append(move, np.zeros(self.dofs - 3))}
+        return {"actions": np.append(move, 0.0)}
 
 
 @pytest.fixture(scope="module")
@@ -367,16 +347,6 @@ def test_a_server_of_vla_eval_meets_meta_world(recordings: dict[str, Path]) -> N
     assert {(e.task, e.seed) for e in one.episodes} == {("reach-v3", 100_000 + i) for i in range(3)}
     assert all(episode.success for episode in one.episodes)
     assert len({episode.start for episode in one.episodes}) == 3
-
-
-def test_seven_numbers_for_four_dofs_end_the_episode_in_one_line(tmp_path: Path) -> None:
-    with vla_eval.serve_background(Scripted(7)) as server:
-        run(config_of("kerv_cli.worlds.vla_eval:MetaWorld", 1, tasks="reach", horizon=5), server.url, tmp_path, "seven")
-    (one,) = read_evaluations(tmp_path)
-    assert [episode.reason for episode in one.episodes] == ["env_step"]
-    with sqlite3.connect(tmp_path / "recording-seven.sqlite") as file:
-        (detail,) = file.execute("SELECT failure_detail FROM episode_results").fetchone()
-    assert "4 finite numbers" in detail
 
 
 # --- recordings as studies
