@@ -3,13 +3,35 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from studies_synthetic import still_episode
 
 from kerv_cli.engine.record import PHASES, DecodeRecord, EpisodeRecord, Round
+from kerv_cli.report.viewing.viewer import read_chunks
 
 DOFS = 4
+
+
+def read_recording(path: Path) -> dict[str, Any]:
+    """Its blueprint, the episode's facts, entities -> rows, and timelines -> first and last."""
+    reader, chunks = read_chunks(path)
+    episode: dict[str, Any] = {}
+    entities: dict[str, int] = {}
+    times: dict[str, list[int]] = {}
+    for chunk in chunks:
+        batch = chunk.to_record_batch()
+        if chunk.entity_path == "/__properties/episode":
+            episode = {f.name: batch[f.name][0].as_py()[0] for f in batch.schema if not f.name.startswith("rerun.")}
+        elif not chunk.entity_path.startswith("/__properties"):
+            rows = 0 if chunk.is_static else chunk.num_rows
+            entities[chunk.entity_path] = entities.get(chunk.entity_path, 0) + rows
+            for timeline in ("step", "time") if rows else ():
+                times.setdefault(timeline, []).extend(batch[timeline].cast("int64").to_pylist())
+    timelines = {timeline: (min(values), max(values)) for timeline, values in times.items()}
+    return {"blueprint": reader.blueprints(), "episode": episode, "entities": entities, "timelines": timelines}
 
 
 def prefill(token: int) -> Round:

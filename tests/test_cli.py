@@ -114,9 +114,6 @@ def test_rollout_prints_figures_and_writes_a_recording(policies: Path, tmp_path:
         assert word in run.stdout
     (recording,) = results.glob("rollouts/*-spec_vla/rollouts/spec_vla-drawer-open-v3-100000-*.rrd")
     assert recording.stat().st_size > 10_000
-    seen = kerv("view", "--summary", str(recording))
-    assert seen.returncode == 0, seen.stderr
-    assert "drawer-open-v3" in seen.stdout
 
 
 def test_sweep_resumes_and_report_writes_tables(policies: Path, tmp_path: Path) -> None:

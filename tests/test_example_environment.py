@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from examples.point_mass import SPEC
+from rerun_synthetic import read_recording
 
 from kerv_cli.base import registry
 from kerv_cli.base.errors import KervError, UsageError
@@ -15,7 +16,6 @@ from kerv_cli.base.registry import Part
 from kerv_cli.episodes.episode import run_episode
 from kerv_cli.episodes.policy import ExpertDecoder
 from kerv_cli.report.viewing import save_recording
-from kerv_cli.report.viewing.viewer import read_recording
 from kerv_cli.worlds.settings import CameraSettings
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from rerun_synthetic import read_recording
 
 from kerv_cli.base.errors import KervError, UnknownName
 from kerv_cli.base.spaces import Observation
@@ -20,7 +21,6 @@ from kerv_cli.episodes.rows import decodes_table, episode_row, read_decodes, tab
 from kerv_cli.report.measures import MACRO, MICRO, measure
 from kerv_cli.report.viewing import save_recording
 from kerv_cli.report.viewing.token_outcomes import summary
-from kerv_cli.report.viewing.viewer import read_recording
 from kerv_cli.worlds.metaworld.spec import SPEC
 from kerv_cli.worlds.settings import EVALUATION_SEED
 from kerv_cli.worlds.spec import World

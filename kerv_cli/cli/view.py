@@ -12,7 +12,6 @@ from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
 
 To = Annotated[Path | None, typer.Option("--to", help="Write a film of one recording: FILE.mp4 or FILE.gif.")]
-Summary = Annotated[bool, typer.Option("--summary", help="Print what a recording holds instead.")]
 
 
 @command(
@@ -23,16 +22,12 @@ Summary = Annotated[bool, typer.Option("--summary", help="Print what a recording
     names="NAME: runs (id, a unique part of it, or last), recordings (.rrd) or folders of them, and results=DIR.",
     writes=False,
 )
-def view(settings: CommandSettings, names: list[str], to: To = None, summary: Summary = False) -> None:
+def view(settings: CommandSettings, names: list[str], to: To = None) -> None:
     """Open recordings in the Rerun viewer; without a display, name the command that opens them."""
-    from kerv_cli.report.viewing.viewer import find_recordings, open_recording, read_summary
+    from kerv_cli.report.viewing.viewer import find_recordings, open_recording
 
     paths = [_place(settings.results, name) for name in names] or [Path(settings.results)]
     recordings = find_recordings(paths)
-    if summary:
-        for recording in recordings:
-            typer.echo(read_summary(recording))
-        return
     if to is not None:
         from kerv_cli.report.viewing.film import save_film
 

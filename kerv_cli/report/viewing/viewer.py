@@ -10,7 +10,7 @@ import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.files import regular
@@ -100,53 +100,6 @@ def _start(command: list[str]) -> None:
             log.seek(0)
             lines = log.read().decode(errors="replace").strip().splitlines() or [f"exit status {status}"]
             raise KervError(f"the Rerun viewer ended at once: {lines[-1]}")
-
-
-def read_recording(path: Path) -> dict[str, Any]:
-    """Return the contents of a recording.
-
-    Returns:
-        `application`, `name`, `bytes`, `blueprint` (whether it carries a layout), `episode` (the facts of the episode),
-        `entities` (path -> rows that are not static), `timelines` (name -> (first, last): control steps, nanoseconds).
-
-    Raises:
-        KervError: The file is missing or damaged.
-    """
-    reader, chunks = read_chunks(path)
-    name, episode = "", {}
-    entities: dict[str, int] = {}
-    times: dict[str, list[int]] = {}
-    for chunk in chunks:
-        batch = chunk.to_record_batch()
-        if chunk.entity_path == "/__properties/episode":
-            episode = {f.name: batch[f.name][0].as_py()[0] for f in batch.schema if not f.name.startswith("rerun.")}
-        elif "RecordingInfo:name" in batch.schema.names:
-            name = batch["RecordingInfo:name"][0].as_py()[0]
-        elif not chunk.entity_path.startswith("/__properties"):
-            rows = 0 if chunk.is_static else chunk.num_rows
-            entities[chunk.entity_path] = entities.get(chunk.entity_path, 0) + rows
-            for timeline in ("step", "time") if rows else ():
-                times.setdefault(timeline, []).extend(batch[timeline].cast("int64").to_pylist())
-    return {
-        "application": reader.recordings()[0].application_id,
-        "name": name,
-        "bytes": path.stat().st_size,
-        "blueprint": bool(reader.blueprints()),
-        "episode": episode,
-        "entities": dict(sorted(entities.items())),
-        "timelines": {timeline: (min(values), max(values)) for timeline, values in times.items()},
-    }
-
-
-def read_summary(path: Path) -> str:
-    """Return `read_recording` as text; errors as there."""
-    contents = read_recording(path)
-    first, last = contents["timelines"].get("step", (0, 0))
-    lines = [f"{path}: {contents['name']}, {contents['bytes'] / 1e6:.2f} MB, steps {first} to {last}"]
-    for key, value in sorted(contents["episode"].items()):
-        lines.append(f"  {key:<20} {f'{value:.4g}' if isinstance(value, float) else value}")
-    rows = ", ".join(f"{entity[1:]} {count}" for entity, count in contents["entities"].items() if count)
-    return "\n".join([*lines, f"  rows: {rows}"])
 
 
 def read_chunks(path: Path) -> tuple[RrdReader, list[Chunk]]:
