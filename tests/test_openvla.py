@@ -472,8 +472,6 @@ def test_weights_that_changed_after_the_import_are_refused(checkpoint: Path, tmp
 @pytest.mark.parametrize(
     ("image", "words"),
     [
-        (np.zeros((56, 56, 3), np.float32), "open"),
-        (np.zeros((3, 56, 56), np.uint8), "open"),
         (None, "open"),
         (np.zeros((56, 56, 3), np.uint8), "turn " * 90),
     ],

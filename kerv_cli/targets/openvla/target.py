@@ -23,20 +23,13 @@ from kerv_cli.base.files import write_json
 from kerv_cli.base.manifests import read
 from kerv_cli.base.places import artifact
 from kerv_cli.base.registry import find, load
-from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
+from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.engine.transfer import upload
 from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.checkpoint import FORMAT, TargetDescription, target_fields
-from kerv_cli.targets.openvla.config import Shape, action_space, read_shape, read_statistics
-from kerv_cli.targets.openvla.inputs import Normalisation, Prompter, pixels_of, read_normalisations
-from kerv_cli.targets.openvla.loading import (
-    OpenVLAModel,
-    check_finite,
-    digest_of,
-    load_model,
-    open_checked,
-    open_shards,
-)
+from kerv_cli.targets.openvla.config import action_space, read_shape, read_statistics
+from kerv_cli.targets.openvla.inputs import Prompter, pixels_of, read_normalisations
+from kerv_cli.targets.openvla.loading import check_finite, digest_of, load_model, open_checked, open_shards
 from kerv_cli.targets.provenance import provenance
 from kerv_cli.targets.settings import BuildTargetSettings
 
@@ -74,17 +67,15 @@ class OpenVLATarget:
     """The policy in a folder of published files. It reads the image of one camera."""
 
     def __init__(
-        self,
-        model: OpenVLAModel,
-        shape: Shape,
-        actions: ActionSpace,
-        prompter: Prompter,
-        settings: OpenVLASettings,
-        camera: str,
-        normalisations: tuple[Normalisation, Normalisation],
+        self, settings: OpenVLASettings, description: TargetDescription, device: str, dtype: torch.dtype
     ) -> None:
-        self.model, self.shape, self.actions, self.prompter = model, shape, actions, prompter
-        self.settings, self.cameras, self.normalisations = settings, (camera,), normalisations
+        """Load the checkpoint, frozen; errors as `build`."""
+        source = Path(settings.checkpoint)
+        self.settings, self.actions, self.cameras = settings, description.actions, tuple(description.cameras)
+        self.shape = shape = read_shape(source)
+        self.prompter = Prompter(source, shape, settings.prompt, settings.prompt_tokens)
+        self.normalisations = read_normalisations(source)
+        self.model = model = load_model(source, shape, device, dtype, settings.int8)
         self.chunk, self.width = settings.chunk, shape.language.hidden_size
         self.heads, self.feed_forward = shape.language.num_attention_heads, shape.language.intermediate_size
         self.max_prompt = shape.patches + settings.prompt_tokens
@@ -113,18 +104,13 @@ class OpenVLATarget:
 
         Raises:
             CheckpointError: The camera's image is missing.
-            UsageError: The image is not (h, w, 3) uint8, or the instruction is too long.
+            UsageError: The instruction is too long.
         """
         camera = self.cameras[0]
         if camera not in observation.images:
             raise CheckpointError(f"the target sees camera '{camera}', whose image was not drawn")
-        image = np.asarray(observation.images[camera])
-        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or min(image.shape) < 2:
-            raise UsageError(
-                f"the image of camera '{camera}' has shape {image.shape} and type {image.dtype}: "
-                "height x width x 3 of uint8 are wanted"
-            )
-        patches = self.see(pixels_of(image, self.shape, self.normalisations, self.settings.crop, self.settings.libero))
+        image, settings = observation.images[camera], self.settings
+        patches = self.see(pixels_of(image, self.shape, self.normalisations, settings.crop, settings.libero))
         words = self.words(observation.instruction)
         return torch.cat([words[:, :1], patches, words[:, 1:]], 1)
 
@@ -162,13 +148,7 @@ def build(folder: Path, description: TargetDescription, device: str, dtype: torc
     Raises:
         CheckpointError: The description is not OpenVLA's, or its checkpoint is missing or does not fit its config.
     """
-    settings = read_settings(folder, description)
-    source = Path(settings.checkpoint)
-    shape = read_shape(source)
-    prompter = Prompter(source, shape, settings.prompt, settings.prompt_tokens)
-    model = load_model(source, shape, device, dtype, settings.int8)
-    normalisations = read_normalisations(source)
-    return OpenVLATarget(model, shape, description.actions, prompter, settings, description.cameras[0], normalisations)
+    return OpenVLATarget(read_settings(folder, description), description, device, dtype)
 
 
 def read_settings(folder: Path, description: TargetDescription) -> OpenVLASettings:
@@ -219,20 +199,11 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
     read_normalisations(source)
     shards = open_checked(source, shape)
     parameters, hashes = check_finite(shards), shards.hashes()
-    computed = {"prompt": settings.prompt, "crop": settings.crop, "int8": settings.int8}
-    if settings.libero:  # hashes of older targets lack it
-        computed["libero"] = True
-    target = OpenVLASettings(
-        checkpoint=str(source),
-        statistics=statistics,
-        files=shards.sizes(),
-        prompt=settings.prompt,
-        crop=settings.crop,
-        libero=settings.libero,
-        int8=settings.int8,
-        prompt_tokens=settings.prompt_tokens,
-        image_size=shape.towers[0].image,
-    )
+    chosen = {name: getattr(settings, name) for name in ("prompt", "crop", "int8", "libero")}
+    sizes = {"prompt_tokens": settings.prompt_tokens, "image_size": shape.towers[0].image}
+    target = OpenVLASettings(str(source), statistics, shards.sizes(), **chosen, **sizes)
+    if not settings.libero:  # hashes of older targets lack it
+        del chosen["libero"]
     origin = {"command": "kerv build target", "settings": asdict(settings), "files": hashes, "parameters": parameters}
     fields = target_fields(
         "openvla",
@@ -244,7 +215,7 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
         provenance={**origin, **provenance(settings.runtime.device)},
     )
     folder = artifact(settings.results, "target", settings.name)
-    described = {"format": FORMAT, "kind": "target", "sha256": digest_of(hashes, computed), **fields}
+    described = {"format": FORMAT, "kind": "target", "sha256": digest_of(hashes, chosen), **fields}
     write_json(folder / "target.json", described)
     tokens = shape.patches + len(prompt)
     figures = {"parameters": parameters, "prompt tokens": tokens, "action tokens": actions.tokens, "DoFs": actions.dofs}

@@ -253,7 +253,7 @@ class DemoDataset:
             raise CheckpointError(
                 f"{entry.path} changed since it was recorded: move it aside and run 'kerv demos' again"
             )
-        episode = load_episode(entry.path, self.manifest.actions, self.manifest.observation)
+        episode = load_episode(entry.path)
         frames = episode.frames
         if not self.views or not isinstance(frames, EncodedFrames):
             return episode

@@ -13,7 +13,6 @@ from safetensors.numpy import save
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import write_bytes
-from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.worlds.demos.frames import LENGTH, EncodedFrames, encode_png, header_of
 
 FORMAT = "1"
@@ -101,11 +100,11 @@ def _with_sorted_metadata(data: bytes) -> bytes:
     return LENGTH.pack(len(text)) + text + data[start:]
 
 
-def load_episode(path: Path, actions: ActionSpace, observation: ObservationSpace) -> DemoEpisode:
-    """Read one episode of an environment that has these spaces.
+def load_episode(path: Path) -> DemoEpisode:
+    """Read one episode.
 
     Raises:
-        CheckpointError: The file is missing, damaged, of another format or of other spaces.
+        CheckpointError: The file is missing, damaged or of another format.
     """
     try:
         with safe_open(path, framework="numpy") as file:
@@ -114,15 +113,9 @@ def load_episode(path: Path, actions: ActionSpace, observation: ObservationSpace
                 raise CheckpointError(f"{path} is not a demonstration episode of format {FORMAT}")
             arrays = {attribute: file.get_tensor(name) for attribute, name in _ARRAYS.items()}
             offsets = file.get_tensor("png_offsets")
-        steps = int(metadata["steps"])
+        steps, seed = int(metadata["steps"]), int(metadata["seed"])
         frames = EncodedFrames.of_file(path, offsets, int(metadata["frame_size"]), int(metadata.get("frame_width", 0)))
-        shapes = arrays["states"].shape, arrays["executed"].shape, arrays["labels"].shape[1:]
-        wanted = (steps, observation.state), (steps, actions.dofs), (actions.dofs,)
-        if shapes != wanted or len(arrays["labels"]) < steps or len(arrays["frame_steps"]) != len(frames):
-            raise ValueError(
-                f"the arrays do not hold {steps} steps of {wanted[0][1]} state numbers and {wanted[2]} DoFs"
-            )
         perturbed = metadata["perturbed"] == "true"
-        return DemoEpisode(metadata["task"], int(metadata["seed"]), perturbed, steps, frames, **arrays)
+        return DemoEpisode(metadata["task"], seed, perturbed, steps, frames, **arrays)
     except (OSError, SafetensorError, KeyError, ValueError) as error:
         raise CheckpointError(f"{path} is missing or damaged: {error}") from error

@@ -285,8 +285,7 @@ def _record_seed(config: DemoConfig, out: Path, world: World, seed: int, actor: 
     if failure.exists():
         return None
     with contextlib.suppress(CheckpointError):  # missing or damaged: record it again
-        episode = load_episode(path, world.spec.actions, world.spec.observation)
-        return EpisodeEntry.of(path, episode)
+        return EpisodeEntry.of(path, load_episode(path))
     recorded = run_expert(world, seed, config, actor)
     if recorded is None:
         perturbed = is_perturbed(seed, config.perturbed)
