@@ -199,13 +199,11 @@ def choose(monkeypatch):
     find_backend.cache_clear()
 
 
-def test_osmesa_is_taken_where_egl_does_not_work(choose):
+def test_osmesa_is_taken_where_egl_does_not_work_and_a_choice_is_respected(choose):
     assert choose("osmesa") == "osmesa"
     assert (os.environ["MUJOCO_GL"], os.environ["PYOPENGL_PLATFORM"]) == ("osmesa", "osmesa")
     assert os.environ["LP_NUM_THREADS"] == "0"
-
-
-def test_a_backend_that_the_user_chose_is_respected(choose):
+    find_backend.cache_clear()
     assert choose(MUJOCO_GL="glfw") == "glfw"
 
 

@@ -62,7 +62,8 @@ def _choice(where: str, rows: Sequence[Row], loss: float) -> Choice:
     order = [] if success < verdict.SOLVED else safest_first(rows)
     best = _fastest(list(itertools.takewhile(lambda row: -POINTS * row["difference_low"] < loss, order)))
     # a setting is shown only after all safer ones
-    pairs = itertools.accumulate((_pairs_needed(row, loss) for row in order), max)
+    counts = (stats.PairedCounts(*(int(row[name]) for name in stats.PairedCounts._fields)) for row in order)
+    pairs = itertools.accumulate((stats.pairs_to_settle(one, loss / POINTS) for one in counts), max)
     reached = {str(row["label"]): least for row, least in zip(order, pairs, strict=True) if math.isfinite(least)}
     candidate = None if best else _fastest([row for row in order if str(row["label"]) in reached])
     label = str(candidate["label"]) if candidate else ""
@@ -102,11 +103,6 @@ def _fastest(rows: Sequence[Row]) -> Row | None:
         key=lambda row: (row[f"{SPEED}_low"] > 1, row[SPEED]) if is_number(row[SPEED]) else (False, -math.inf),
         default=None,
     )
-
-
-def _pairs_needed(row: Row, loss: float) -> float:
-    counts = stats.PairedCounts(*(int(row[name]) for name in stats.PairedCounts._fields))
-    return stats.pairs_to_settle(counts, loss / POINTS)
 
 
 def pareto(rows: Sequence[Row]) -> list[Row]:

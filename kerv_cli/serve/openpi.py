@@ -99,7 +99,7 @@ class OpenPi(Conversation):
         if self.holds(observation, len(self.last) > 0):
             record = DecodeRecord((), self.last[-1:], 0, (), HOLD, 0.0, {})
         else:
-            record = self.decode(observation)
+            record = self.policy.decode(self.decoder, observation)
         self.last, self.last_hand = record.actions, hand
         self.decodes += 1
         timing = {"infer_ms": 1000 * record.seconds}

@@ -334,10 +334,6 @@ class Conversation(abc.ABC):
             self.log(f"{why}: the last action is held")
         return bool(why)
 
-    def decode(self, observation: Observation) -> DecodeRecord:
-        """Return the actions for an observation, and their record."""
-        return self.policy.decode(self.decoder, observation)
-
     def greeting(self) -> bytes | None:
         """Return what the server says first; None if the client speaks first."""
         return None

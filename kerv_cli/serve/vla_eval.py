@@ -160,7 +160,7 @@ class VlaEval(Conversation):
             return self._act(episode, episode.sent[-1], None)
         seconds = None
         if not episode.left:
-            record = self.decode(self._observation(episode, payload, numbers))
+            record = self.policy.decode(self.decoder, self._observation(episode, payload, numbers))
             seconds = record.seconds
             episode.decodes.append(record)
             episode.decode_steps.append(step)

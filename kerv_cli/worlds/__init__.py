@@ -103,7 +103,7 @@ for _name, _class, _needed in (
     ("light", "scene:Light", ("model",)),
     ("colour", "scene:Colour", ("model",)),
     ("camera", "scene:CameraJitter", ("model",)),
-    ("object", "objects:Objects", ("model", "range")),
+    ("object", "scene:Objects", ("model", "range")),
 ):
     add("stress", _name, f"kerv_cli.worlds.stress.{_class}", needed=_needed)
 add("stress", "none", needed=())
