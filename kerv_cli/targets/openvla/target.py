@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -200,8 +200,8 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
     shards = open_checked(source, shape)
     parameters, hashes = check_finite(shards), shards.hashes()
     chosen = {name: getattr(settings, name) for name in ("prompt", "crop", "int8", "libero")}
-    sizes = {"prompt_tokens": settings.prompt_tokens, "image_size": shape.towers[0].image}
-    target = OpenVLASettings(str(source), statistics, shards.sizes(), **chosen, **sizes)
+    target = OpenVLASettings(str(source), statistics, shards.sizes(), **chosen)
+    target = replace(target, prompt_tokens=settings.prompt_tokens, image_size=shape.towers[0].image)
     if not settings.libero:  # hashes of older targets lack it
         del chosen["libero"]
     origin = {"command": "kerv build target", "settings": asdict(settings), "files": hashes, "parameters": parameters}
