@@ -30,6 +30,11 @@ def own_parts() -> dict[str, dict[str, Part]]:
     }
 
 
+def test_the_worked_example_is_the_file() -> None:
+    page = (ROOT / "docs/extending.md").read_text(encoding="utf-8")
+    assert f"```python\n{(EXAMPLES / 'own_threshold.py').read_text(encoding='utf-8')}```" in page
+
+
 def test_every_kind_is_named_with_its_files() -> None:
     named = {kind for first, *_ in ROWS for kind in re.findall(r"`(\w+)`", first)}
     assert named >= {*registry.kinds(), "column"}
