@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
@@ -15,9 +14,7 @@ if TYPE_CHECKING:
     from kerv_cli.training.run import TrainingRun
 
 
-def run_training(
-    run: TrainingRun, plan: bool, as_json: bool, loading: str, training: str, command: Sequence[str] = ()
-) -> None:
+def run_training(run: TrainingRun, plan: bool, as_json: bool, loading: str, training: str) -> None:
     """Train with progress, or print the plan.
 
     Args:
@@ -26,7 +23,6 @@ def run_training(
         as_json: Print the result as JSON.
         loading: Title of the progress while data are read.
         training: Title of the progress while it trains.
-        command: Words after `kerv` that go on with it; by default those that were typed.
 
     Raises:
         UsageError: Another process trains this.
@@ -35,7 +31,7 @@ def run_training(
         print_plan(run.plan(), as_json)
     from kerv_cli.lab.runs import making
 
-    with making(run.settings.results, run.artifact_kind, run.folder, command) as record:
+    with making(run.settings.results, run.artifact_kind, run.folder) as record:
         _train(run, record, as_json, loading, training)
 
 
