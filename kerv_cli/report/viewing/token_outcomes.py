@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -90,9 +91,7 @@ def _judged(one_round: Round) -> list[tuple[int, TokenOutcome]]:
     """Return (index in the chunk, outcome) of every token that one round judged."""
     outcomes = []
     drafts, targets, threshold = one_round.drafted, one_round.target_tokens, one_round.threshold
-    for i in range(max(len(drafts), len(targets))):
-        draft = drafts[i] if i < len(drafts) else None
-        target = targets[i] if i < len(targets) else None
+    for i, (draft, target) in enumerate(itertools.zip_longest(drafts, targets)):
         index = one_round.start + i
         if one_round.mode == "skip":
             kind = "skipped"
