@@ -20,16 +20,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from safetensors.torch import load_file, save_file
-from test_decoding_lossless import RandomTrees, assert_adds_up, decode, plain_greedy
+from test_decoding_lossless import RandomTrees, assert_adds_up, plain_greedy
 from typer.testing import CliRunner
 
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
-from kerv_cli.methods.jacobi import JacobiProposer
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.openvla.config import TOWERS, Bounds, Language, Shape, action_space, read_shape
 from kerv_cli.targets.openvla.inputs import as_in_libero, cropped, pixels_of
@@ -330,18 +327,6 @@ def test_strict_decoding_equals_ar(
     assert result.tokens == truth
     assert result.size == 7
     assert_adds_up(result)
-
-
-@pytest.mark.bits
-def test_the_methods_run_on_it(target: OpenVLATarget) -> None:
-    torch.manual_seed(0)
-    drafter = EagleDrafter().network(DrafterSettings(), target).eval().requires_grad_(False)
-    for seed in range(3):
-        with torch.inference_mode():
-            prompt = target.encode(shown(seed))
-            truth = plain_greedy(target, prompt)
-        for proposer in (DrafterProposer(drafter, target, 5, 4, 20), JacobiProposer()):
-            assert decode(target, proposer, prompt).tokens == truth
 
 
 # --- formats of the weights
