@@ -173,19 +173,6 @@ def test_newer_tables_are_refused(database: Database, monkeypatch: pytest.Monkey
         begun(Database(database.results), "b")
 
 
-@pytest.mark.parametrize("url", ["results/kerv.db", "postgresql://kerv@host:port/kerv", "mysql://root@host/kerv"])
-def test_a_wrong_url_is_one_line(tmp_path: Path, url: str) -> None:
-    with pytest.raises(UsageError) as error:
-        studies(Database(tmp_path, url))
-    assert "postgresql://USER@HOST/DB" in told(error)
-
-
-def test_a_server_that_does_not_answer_is_one_line_without_the_password(tmp_path: Path) -> None:
-    with pytest.raises(StorageError, match=r"does not answer .*start the server") as error:
-        begun(Database(tmp_path, "postgresql://kerv:secret@127.0.0.1:1/kerv"), "a")
-    assert "secret" not in told(error)
-
-
 @pytest.mark.parametrize("harm", ["no database", "cut", "changed", "empty", "a folder"])
 def test_a_damaged_file_is_one_line(tmp_path: Path, harm: str) -> None:
     swept(tmp_path, STUDY)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import shutil
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -297,10 +296,3 @@ def test_what_depends_on_the_order_of_episodes_is_reused_whole(database: Databas
     ran = store.frame().query("label == 'heisd'")
     assert ran["block"].nunique() == 1
     assert ran.sort_values("order")["seed"].is_monotonic_increasing
-
-
-@pytest.mark.parametrize("missing", [[100_001], [100_000, 100_002]])
-def test_episodes_that_failed_are_planned_again(database: Database, missing: Sequence[int]) -> None:
-    study = study_of({"ar": settings_of("ar")}, ["reach-v3"], block=1)
-    swept(database.results, study, raising(RuntimeError(), seeds=missing))
-    assert to_run(plan_study(database, study)) == {("ar", "reach-v3"): (missing, "new seeds")}

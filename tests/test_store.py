@@ -123,5 +123,5 @@ def test_a_store_is_used_by_one_command_and_no_password_is_kept(
     line = kerv("runs", "list", store, where, code=1)
     assert "does not answer" in line
     assert "secret" not in line
-    for url in ("nonsense", "mysql://server/kerv"):
+    for url in ("nonsense", "mysql://server/kerv", "postgresql://kerv@host:port/kerv"):
         assert "postgresql://USER@HOST/DB" in kerv("runs", "list", f"store={url}", where, code=2)

@@ -114,10 +114,10 @@ def test_a_benchmark_run_by_vla_eval_has_the_episodes_of_a_rollout(
     for path in (results / "served" / f"{name}-MetaWorld").iterdir():
         episode = read_served(path)
         assert episode is not None
-        served[episode.episode["task"], episode.episode["seed"]] = episode
+        served[episode[0]["task"], episode[0]["seed"]] = episode
     for record in map(Runner(settings, "reach-v3").episode, (100_000, 100_001)):
-        episode = served.pop(("reach-v3", record.seed))
-        row, decodes = episode.episode, episode.decodes.to_pylist()
+        row, table = served.pop(("reach-v3", record.seed))
+        decodes = table.to_pylist()
         assert (row["success"], row["steps"], row["forwards"]) == (record.success, record.steps, record.forwards)
         assert [one["tokens"] for one in decodes] == [list(one.tokens) for one in record.decodes]
         assert [one["mode"] for one in decodes] == [one.mode for one in record.decodes]

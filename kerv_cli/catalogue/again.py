@@ -29,7 +29,7 @@ def plan_of(run: RunEntry, results: str) -> Plan:
     new = {setting.label: _checked(setting, study.tasks, results) for setting in study.settings}
     episodes = tuple(Episode(new[one.setting.label], one.task, one.seed, one.repeat) for one in study.episodes)
     study = dataclasses.replace(study, settings=tuple(new.values()), episodes=episodes)
-    command = again_words(run, results)
+    command = ["runs", "rerun", run.id, *([] if results == CommandSettings().results else [f"results={results}"])]
     row = unfinished(database, study.kind, command)
     if row is not None:
         name = row.name
@@ -40,12 +40,6 @@ def plan_of(run: RunEntry, results: str) -> Plan:
         name = next(one for one in names if not StudyStore(database, one).exists)
     study = dataclasses.replace(study, name=name)
     return plan_study(database, study, ALL, row.started if row else "", command=command)
-
-
-def again_words(run: RunEntry, results: str) -> list[str]:
-    """Return the words after `kerv` that repeat a run, or go on with an interrupted repetition."""
-    default = CommandSettings().results
-    return ["runs", "rerun", run.id, *([] if results == default else [f"results={results}"])]
 
 
 def _checked(setting: Setting, tasks: list[str], results: str) -> Setting:

@@ -330,7 +330,7 @@ def check_removable(run: RunEntry) -> None:
         raise UsageError(f"{run.id} is running: stop it first")
 
 
-def remove(run: RunEntry, results: str | Path = "") -> None:
+def remove(run: RunEntry, results: str | Path) -> None:
     """Remove a run's folder and its rows.
 
     First the folder is renamed to a temporary name, which every command ignores and a later one removes. If this
@@ -338,7 +338,7 @@ def remove(run: RunEntry, results: str | Path = "") -> None:
 
     Args:
         run: What to remove.
-        results: Its results folder. Default: the one that holds its folder.
+        results: Its results folder.
 
     Raises:
         StorageError: The disk refused.
@@ -350,6 +350,5 @@ def remove(run: RunEntry, results: str | Path = "") -> None:
             sync(run.folder.parent)
     if run.has_episodes:
         store_of(run).remove()
-    database = Database(results or run.folder.parents[1 if run.has_episodes else 2])
-    forget(database, run.kind, run.id if run.has_episodes else run.id.removeprefix(f"{run.kind}/"))
+    forget(Database(results), run.kind, run.id if run.has_episodes else run.id.removeprefix(f"{run.kind}/"))
     shutil.rmtree(gone, ignore_errors=True)

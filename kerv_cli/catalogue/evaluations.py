@@ -24,7 +24,7 @@ from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import read_mapping, visible
 from kerv_cli.catalogue.served import path_of, read_served
 from kerv_cli.catalogue.stored import connect_foreign
-from kerv_cli.episodes.identity import ENGINE, OBSERVATION
+from kerv_cli.episodes.identity import ENGINE, OBSERVATION, flat
 from kerv_cli.episodes.rows import DECODE_SCHEMA, EPISODE_SCHEMA, INT
 from kerv_cli.episodes.settings import RolloutSettings, settings_from
 from kerv_cli.lab.plan import Episode, Setting, Study
@@ -295,8 +295,7 @@ def _check_same_episodes(names: str, first: Sequence[Evaluation], other: Sequenc
 
 def _conditions(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of a benchmark that determine its world."""
-    params = {f"params.{key}": value for key, value in dict(config.get("params") or {}).items()}
-    return {key: config.get(key) for key in ("benchmark", "mode", "max_steps")} | params
+    return flat({key: config.get(key) for key in ("benchmark", "mode", "max_steps", "params")})
 
 
 def _episodes(
@@ -358,8 +357,8 @@ def _imported(results: Path, episode: Episode, one: Evaluation, recorded: Record
     row: dict[str, Any] = {"success": recorded.success, "steps": recorded.steps}
     row |= {"initial_state": list(recorded.start), "wall_seconds": recorded.seconds}
     if served is not None:
-        row = {name: served.episode.get(name) for name in (*EPISODE_SCHEMA.names, "started")} | row
-        decodes = served.decodes
+        stored, decodes = served
+        row = {name: stored.get(name) for name in (*EPISODE_SCHEMA.names, "started")} | row
     else:
         row = {column.name: 0 for column in EPISODE_SCHEMA if column.type == INT} | {"decodes": 1} | row
         decodes = pa.Table.from_pylist([_UNKNOWN_DECODE], schema=DECODE_SCHEMA)

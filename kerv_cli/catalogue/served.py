@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,19 +22,6 @@ from kerv_cli.episodes.rows import DECODE_SCHEMA, decodes_table, episode_row
 SERVED = "served"
 _KEY = b"kerv"
 _NAME = re.compile(r"\w[\w.-]{0,199}")
-
-
-@dataclass(frozen=True)
-class Served:
-    """An episode as its server saw it.
-
-    Attributes:
-        episode: Columns of the table `episodes`.
-        decodes: Table with the columns of rows.DECODE_SCHEMA.
-    """
-
-    episode: dict[str, Any]
-    decodes: pa.Table
 
 
 def path_of(results: Path, evaluation: str, episode: str) -> Path | None:
@@ -67,8 +53,8 @@ def write_served(path: Path, record: EpisodeRecord, started: str, by: Mapping[st
         file.write_table(table)
 
 
-def read_served(path: Path) -> Served | None:
-    """Return the episode in a file, or None if there is no file.
+def read_served(path: Path) -> tuple[dict[str, Any], pa.Table] | None:
+    """Return the columns of the episode in a file and its decodes, or None if there is no file.
 
     Raises:
         CheckpointError: The file is damaged.
@@ -78,8 +64,7 @@ def read_served(path: Path) -> Served | None:
             table = file.read_all()
         facts = json.loads((table.schema.metadata or {})[_KEY])
         table = table.replace_schema_metadata(None)
-        decodes = table.select(DECODE_SCHEMA.names).cast(DECODE_SCHEMA)
-        return Served(facts["episode"], decodes)
+        return facts["episode"], table.select(DECODE_SCHEMA.names).cast(DECODE_SCHEMA)
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
