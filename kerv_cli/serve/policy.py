@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.base.errors import KervError, UnknownName, UsageError
+from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.registry import find
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.batched import BatchDecoder
@@ -31,6 +31,7 @@ from kerv_cli.serve.interface import Interface
 from kerv_cli.serve.settings import ServeSettings
 from kerv_cli.targets.provenance import stamp
 from kerv_cli.worlds import specs
+from kerv_cli.worlds.spec import EnvironmentSpec
 
 VLA_EVAL = "vla_eval"
 """The protocol whose clients name the task of every episode."""
@@ -49,6 +50,7 @@ class Policy:
         range: Range of the states it may act on; None if its target does not say.
 
     Raises:
+        UnknownName: The policy's environment has no task of that name.
         UsageError: Numbers out of range, or parts that do not belong together.
         CheckpointError: No such policy, or an artifact of another one.
     """
@@ -59,12 +61,13 @@ class Policy:
         self.settings = settings
         self.artifacts = artifacts_of(settings)
         self.description = self.artifacts.description
-        self.task = self._task()
+        spec, name = specs().get(self.description.environment), settings.task_name
+        self.task = spec.task(name).name if spec and name else name
         self.method = Method.of(settings)
         self.method.check(self.description, settings.batch, "batch")
         use = Use(self.method.settings, settings.runtime.dtype, self.description.environment)
         self.identity = self.artifacts.check(self.method.needs, use)
-        self.interface = self._interface()
+        self.interface = self._interface(spec)
         self.range = self._range()
         self.by_task = not self.task and bool(self._artifacts_with("by_task"))
         if self.by_task and settings.protocol != VLA_EVAL and self._artifacts_with("needs_task"):
@@ -77,22 +80,8 @@ class Policy:
         self._together = Together(BatchDecoder(first), settings.batch) if settings.batch > 1 else None
         self._idle: list[Decoder] = [] if self.by_task else [first]
 
-    def _task(self) -> str:
-        """Return the full name of the settings' task; empty if they name none.
-
-        Raises:
-            UnknownName: The policy's environment has no such task.
-        """
-        name, spec = self.settings.task_name, specs().get(self.description.environment)
-        if not name or spec is None:
-            return name
-        full = spec.expand(name)
-        if len(full) != 1:
-            raise UnknownName("task", name, spec.tasks)
-        return str(full[0])
-
-    def _interface(self) -> Interface:
-        description, spec = self.description, specs().get(self.description.environment)
+    def _interface(self, spec: EnvironmentSpec | None) -> Interface:
+        description = self.description
         return Interface(
             actions=description.actions,
             space=spec.actions if spec else description.actions,
