@@ -209,7 +209,7 @@ def test_the_key_pools_the_named_parts_of_the_prompt(results: Path) -> None:
     assert np.allclose(prompt_key(prompt, target, ["scene"]), unit[1], atol=1e-6)
     whole = prompt_key(prompt, target, ["vision", "scene", "proprioception"])
     assert np.allclose(whole, torch.cat(unit, -1) / 3**0.5, atol=1e-6)
-    assert whole.dtype == np.float32
+    assert whole.dtype == torch.float32
     assert target.segments["proprioception"].stop == target.max_prompt
     state = opened(results)[1]
     assert "vision" not in state.segments

@@ -46,7 +46,7 @@ class KnownDraft:
 def stored(target: CompactTarget, prompt: torch.Tensor, chunks: np.ndarray, left: int = 50) -> Datastore:
     """A datastore whose entries lie around this prompt's key; entry i is of episode i."""
     random = np.random.default_rng(0)
-    key = prompt_key(prompt, target, ["scene"])[0]
+    key = prompt_key(prompt, target, ["scene"])[0].numpy()
     vectors = key + 0.05 * random.standard_normal((len(chunks), len(key)))
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     return Datastore(

@@ -119,7 +119,8 @@ class DatastoreBuild:
         tokens = target.actions.encode(read_chunks(episode, steps, target.chunk)).reshape(len(steps), -1)
         observations = observations_of(target, episode, steps, self.dataset.manifest.observation)
         size = -(-len(steps) // -(-len(steps) // BATCH))  # equal batches
-        keys = [prompt_key(prompt, target, self.settings.key) for prompt in prompts_of(target, observations, size)]
+        prompts = prompts_of(target, observations, size)
+        keys = [prompt_key(prompt, target, self.settings.key).cpu().numpy() for prompt in prompts]
         return {
             "seed": np.full(len(steps), episode.seed),
             "step": steps.astype(np.int64),  # control steps since the start

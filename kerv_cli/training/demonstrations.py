@@ -139,17 +139,3 @@ def seen_by(dataset: DemoDataset, camera: str, who: str, remedy: str) -> DemoDat
     if recorded.startswith(f"{camera}+"):
         return replace(dataset, views=len(views_of(camera)))
     raise CheckpointError(f"the demonstrations in {dataset.path} show camera {recorded}, {who} {camera}: {remedy}")
-
-
-def subset(dataset: DemoDataset, tasks: Sequence[str]) -> DemoDataset:
-    """Return the dataset with only the episodes of `tasks` (tasks and suites). No tasks: the whole dataset.
-
-    Raises:
-        UnknownName: No such task.
-        CheckpointError: The dataset has no episode of a task.
-    """
-    if not tasks:
-        return dataset
-    names = resolve_tasks(tasks)
-    check_tasks(dataset, names)
-    return replace(dataset, episodes=[entry for entry in dataset.episodes if entry.task in names])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 from torch import nn
@@ -14,7 +14,7 @@ from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.drafters import TrainableDrafter
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.folders import check_not_shipped, find_target
-from kerv_cli.training.demonstrations import demos_for, subset
+from kerv_cli.training.demonstrations import check_tasks, demos_for
 from kerv_cli.training.run import TrainingRun, refuse_unused
 from kerv_cli.training.settings import TrainDrafterSettings
 from kerv_cli.worlds import resolve_tasks
@@ -46,8 +46,11 @@ class DrafterRun(TrainingRun):
         self.target_folder = find_target(settings.results, settings.policy.target)
         self.folder = Artifacts(settings.results, settings.policy).path(self.artifact_kind)
         check_not_shipped(self.folder, f"policy.artifacts.{self.artifact_kind}")
-        self.settings, dataset = demos_for(settings)
-        self.dataset = subset(dataset, self.settings.task)
+        self.settings, self.dataset = demos_for(settings)
+        if self.settings.task:
+            names = resolve_tasks(self.settings.task)
+            check_tasks(self.dataset, names)
+            self.dataset = replace(self.dataset, episodes=[e for e in self.dataset.episodes if e.task in names])
         self.description = read_target(self.target_folder)
         self.description.check_autoregressive(
             f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"

@@ -83,15 +83,7 @@ class Manifest:
         return content_of(self.key, self.chunk, self.target, self.files)
 
 
-def prompt_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) -> np.ndarray:
-    """Return the keys (B, d) float32 of length 1 of prompts (B, P, E), on the CPU.
-
-    The errors are those of `pooled_key`.
-    """
-    return pooled_key(prompt, target, segments).cpu().numpy()
-
-
-def pooled_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) -> Tensor:
+def prompt_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) -> Tensor:
     """Return the keys (B, d) float32 of length 1 of prompts (B, P, E), with d = segments · E.
 
     Raises:
@@ -244,9 +236,6 @@ class Neighbours:
     steps: np.ndarray  # (k,) int64, control step of the stored episode
     left: np.ndarray  # (k,) int64, control steps from there to the stored episode's end
 
-    def __len__(self) -> int:
-        return len(self.similarity)
-
 
 @dataclass(frozen=True)
 class Datastore:
@@ -305,7 +294,7 @@ class Datastore:
 
     def pooled(self, prompt: Tensor, target: ReadableTarget) -> Tensor:
         """Return the pooled prompt (p,) float32 for `key_of`, on the device; prompt (1, P, E)."""
-        return pooled_key(prompt, target, self.manifest.key)[0]
+        return prompt_key(prompt, target, self.manifest.key)[0]
 
     def key_of(self, pooled: np.ndarray) -> np.ndarray:
         """Return the key (d,) float32 of a pooled prompt (p,)."""
