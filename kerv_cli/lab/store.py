@@ -446,14 +446,8 @@ def _earlier(database: Database, study: Study) -> dict[str, tuple[Setting, str]]
         return {row.label: (_setting_of(row), row.work) for row in rows}
 
 
-def studies(database: Database, kind: str | None = None) -> list[StudyStore]:
-    """Return the studies of the database, the newest first.
-
-    Args:
-        database: The database.
-        kind: Only those of this kind.
-    """
+def studies(database: Database) -> list[StudyStore]:
+    """Return the studies of the database, the newest first."""
     query = sa.select(STUDIES.c.name, STUDIES.c.kind).order_by(STUDIES.c.id.desc())
-    query = query if kind is None else query.where(STUDIES.c.kind == kind)
     with database.reading() as connection:
         return [StudyStore(database, row.name, row.kind) for row in connection.execute(query)]
