@@ -444,6 +444,13 @@ def test_evaluations_of_other_episodes_are_refused(
         labelled([[first], [second]], ["one"])
 
 
+def test_a_folder_with_recordings_of_two_servers_is_refused(recordings: dict[str, Path], tmp_path: Path) -> None:
+    for name in ("ar", "naive_sd"):
+        shutil.copy(recordings[name], tmp_path)
+    with pytest.raises(UsageError, match="of several servers: name each file"):
+        read_evaluations(tmp_path)
+
+
 # --- LIBERO up to its container (docs/libero.md)
 
 
