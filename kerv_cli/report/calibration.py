@@ -1,4 +1,4 @@
-"""Tables of what `kerv calibrate` found."""
+"""Print what `kerv calibrate` measured, as tables."""
 
 from __future__ import annotations
 
@@ -10,15 +10,18 @@ from kerv_cli.methods.calibration import Calibration
 from kerv_cli.training.calibration import moving_errors
 
 Table = tuple[tuple[str, ...], list[tuple[object, ...]], str]
-"""Columns, rows and title."""
+"""Column names, rows and title."""
 
 
 def tables(calibration: Calibration, path: Path) -> Iterator[Table]:
-    """Yield the tables of levels by task, of the predictors' errors and of verify-skip.
+    """Yield up to three tables: motion per task, prediction errors, and thresholds for verify-skip.
+
+    The first holds the kinematic variability levels K_S and K of each task (docs/methods.md §3). The third, present
+    only if it was calibrated, says when a retrieved chunk may be executed without verification (§4).
 
     Args:
-        calibration: What was found.
-        path: Its file, for the title.
+        calibration: The calibration.
+        path: Its file, which the title names.
     """
     errors = partial(moving_errors, calibration.errors, space=calibration.target.actions)
     kalman, hold = errors("kalman"), errors("hold")

@@ -1,4 +1,7 @@
-"""Issues the certificate of success from a study's paired episodes (docs/methods.md §4.6, ours)."""
+"""Issue a certificate of success from a study's paired episodes.
+
+The certificate states how much success a setting loses at most against AR (docs/methods.md §4.6, ours).
+"""
 
 from __future__ import annotations
 
@@ -34,19 +37,19 @@ from kerv_cli.worlds import resolve_tasks, spec_of
 POINTS = 100.0
 
 _VARIED = ("prefill_draft", "skip")
-"""Kinds of parts in which candidates may differ."""
+"""Kinds of parts in which the candidates may differ."""
 _CONDITIONS = ("task", "seed", "episodes", "world", "rollout.clock", "runtime.dtype", "policy.kind", "policy.target")
-"""Settings that all must share, the baseline too."""
+"""Settings that must be the same for all candidates and the baseline."""
 _OF_CANDIDATES = ("chunk", "policy", *(kind for kind in METHOD_KINDS if kind not in _VARIED))
-"""Settings that all candidates must share."""
+"""Settings that must be the same for all candidates. The baseline may differ."""
 
 
 def folder_of(resolved: ResolvedStudy) -> Path:
-    """Return the folder of a study's certificate, after checking that the study can give one.
+    """Check that a study can give a certificate. Return the folder to write the certificate into.
 
     Raises:
-        UsageError: Settings that differ in more than how they trust, seeds that are not for selection, or a shipped
-            policy's certificate.
+        UsageError: The study has only a baseline, its candidates differ in more than `prefill_draft` and `skip`, its
+            seeds are not selection seeds, or the folder belongs to a policy that kerv ships.
     """
     baseline, *candidates = _settings(resolved)
     if not candidates:
@@ -61,10 +64,13 @@ def folder_of(resolved: ResolvedStudy) -> Path:
 
 
 def _check_conditions(resolved: ResolvedStudy) -> None:
-    """Refuse what a certificate does not say.
+    """Refuse studies to which a certificate does not apply.
 
-    A certificate names one chunk, method, policy, number format and world. The world is not stressed and waits for the
-    policy. The comparison is with AR.
+    All candidates must have the same chunk, method, policy, number format and world. The world must have no stress and
+    wait for the policy. The baseline must be AR.
+
+    Raises:
+        UsageError: A condition is not met.
     """
     baseline, first = _settings(resolved)[:2]
     for label, other in resolved.settings.items():
@@ -90,10 +96,17 @@ def _check_conditions(resolved: ResolvedStudy) -> None:
 def certify(
     resolved: ResolvedStudy, store: StudyStore, wanted: Sequence[Episode], margin: float, delta: float
 ) -> Certificate:
-    """Test the study's settings in their order, each at delta, up to the first that fails.
+    """Test the study's settings in their order, each at level delta, up to the first that fails.
 
     By fixed-sequence testing, the probability that any certified setting loses more than `margin` points is at most
     delta.
+
+    Args:
+        resolved: The study.
+        store: Its stored episodes.
+        wanted: Episodes to use.
+        margin: Largest acceptable loss of success against AR, in points.
+        delta: Probability of a wrong certificate.
     """
     baseline, first = _settings(resolved)[:2]
     episodes = load_study(store, wanted).episodes
@@ -131,7 +144,16 @@ def certify(
 def _candidate(
     label: str, settings: RolloutSettings, pairs: pd.DataFrame, margin: float, delta: float, testing: bool
 ) -> Candidate:
-    """Return one setting's result over its pairs with AR."""
+    """Test one setting against AR.
+
+    Args:
+        label: The setting's label.
+        settings: The setting.
+        pairs: Its episodes paired with AR's, from `paired`.
+        margin: Largest acceptable loss of success, in points.
+        delta: Level of the test.
+        testing: False after an earlier setting has failed: the setting gets no p-value.
+    """
     ar, own = (pairs[f"success_{side}"].to_numpy(float) for side in ("baseline", "method"))
     # (n,) values in a random order that has nothing to do with the tasks
     seed = int.from_bytes(hashlib.sha256(str(len(ar)).encode()).digest()[:4], "big")
@@ -153,14 +175,14 @@ def _candidate(
 
 
 def write(folder: Path, certificate: Certificate) -> Path:
-    """Write the certificate and return its file."""
+    """Write the certificate into the folder and return the file's path."""
     path = CertificateArtifact().json(folder)
     write_json(path, {**dataclasses.asdict(certificate), "actions": certificate.actions.as_dict()})
     return path
 
 
 def candidate_rows(certificate: Certificate) -> list[dict[str, str]]:
-    """Return a row per candidate, as text."""
+    """Return the table of candidates to print: one dictionary of column to text per candidate."""
     return [
         {
             "setting": one.label,
@@ -176,12 +198,13 @@ def candidate_rows(certificate: Certificate) -> list[dict[str, str]]:
 
 
 def _needed_text(pairs: int) -> str:
+    """Return how many more pairs a candidate needs, as text. 0 gives no text; −1 stands for "not at these rates"."""
     if pairs > MOST_PAIRS:
         return f"more than {MOST_PAIRS:,}"
     return {0: "", -1: "not at these rates"}.get(pairs, f"about {pairs}")
 
 
 def _settings(resolved: ResolvedStudy) -> list[RolloutSettings]:
-    """Return the baseline's settings, then the candidates' in their order."""
+    """Return the baseline's settings first, then the candidates' settings in the study's order."""
     others = [settings for label, settings in resolved.settings.items() if label != resolved.study.baseline]
     return [resolved.settings[resolved.study.baseline], *others]

@@ -1,4 +1,4 @@
-"""Two runs side by side: in which settings they differ, and by how much their results do."""
+"""Compare two runs (`kerv compare`): which settings differ, and how their results differ."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ _PROVENANCE = ("host", "device_name", "git_commit", "torch_version", "mujoco_ver
 
 @dataclass(frozen=True)
 class Side:
-    """One side of a comparison.
+    """One of the two things compared: a setting of a run with episodes, or a training.
 
     Attributes:
-        name: What it is called.
-        run: Its run.
-        label: One of the run's settings; empty for a training.
-        data: The run's episodes, read by `pairs_to_compare`.
+        name: Name to print.
+        run: The run.
+        label: Label of the setting in the run. Empty for a training.
+        data: Episodes of the run. None until `pairs_to_compare` reads them, and for a training.
     """
 
     name: str
@@ -42,10 +42,15 @@ class Side:
 
 
 def sides(results: str, name: str) -> list[Side]:
-    """Return the sides that a name stands for: `ID` is every setting of a run, `ID:LABEL` one of them.
+    """Find what a name on the command line stands for.
+
+    Args:
+        results: Results folder.
+        name: `ID` stands for every setting of the run with that id, `ID:LABEL` for one setting.
 
     Raises:
-        UsageError, UnknownName: No such run or setting.
+        UsageError: The run has no such setting.
+        UnknownName: There is no such run.
     """
     identifier, _, label = name.partition(":")
     run = find_run(results, identifier)
@@ -60,14 +65,20 @@ def sides(results: str, name: str) -> list[Side]:
 
 
 def pairs_to_compare(results: str, first: str, second: str) -> list[tuple[Side, Side]]:
-    """Return pairs of the settings that both runs have.
+    """Return which settings of two runs to compare with each other.
 
-    If they share fewer than two, they are the first run's first setting with each of the second run's.
+    Settings with the same label form pairs. If the runs share fewer than two labels, the first run's first setting is
+    compared with each setting of the second run.
+
+    Args:
+        results: Results folder.
+        first: Name of the first run, as in `sides`.
+        second: Name of the second run.
 
     Raises:
-        UsageError, UnknownName: No such run or setting, a training beside a run with episodes, or a run without
-            episodes.
-        CheckpointError: A damaged run.
+        UsageError: There is no such setting, a run has no episodes, or only one of the runs is a training.
+        UnknownName: There is no such run.
+        CheckpointError: A run is damaged.
     """
     ours, theirs = sides(results, first), sides(results, second)
     if ours[0].run.has_episodes != theirs[0].run.has_episodes:
@@ -81,14 +92,15 @@ def pairs_to_compare(results: str, first: str, second: str) -> list[tuple[Side, 
 
 
 def compare(first: Side, second: Side) -> Row:
-    """Return the differences between two sides, as JSON values.
+    """Return the differences between two settings or two trainings, as JSON values.
 
     Returns:
-        `first` and `second` (names), `settings` (key and both values, for every key in which they differ; None if a
-        side lacks it), `results` (a row per measure: both values, the change, its 95 % interval if it has one).
+        `first` and `second`: the two names. `settings`: every key whose values differ, with both values; None if one
+        side does not have the key. `results`: for each measure both values, the change, and the change's 95 % interval
+        if there is one.
 
     Raises:
-        UsageError: A setting without episodes.
+        UsageError: A setting has no episodes.
     """
     ours, theirs = _settings_of(first), _settings_of(second)
     pairs = {key: (ours.get(key), theirs.get(key)) for key in [*ours, *theirs]}
@@ -149,7 +161,7 @@ def _interval(values: Row, name: str, what: str) -> Row:
 
 
 def same_tokens(first: RunEntry, second: RunEntry) -> tuple[int, int]:
-    """Return in how many episodes the tokens are equal, and how many episodes both runs have.
+    """Return how many of the shared episodes have equal tokens, and how many episodes the two runs share.
 
     Raises:
         UsageError: A run has no episode.
@@ -160,7 +172,7 @@ def same_tokens(first: RunEntry, second: RunEntry) -> tuple[int, int]:
 
 
 def _tokens(run: RunEntry) -> dict[tuple[str, str, int, int], list[list[int]]]:
-    """Return the tokens of every decode by label, task, seed and repeat of the episode."""
+    """Return the tokens of every decode, by the label, task, seed and repeat of the episode."""
     store = store_of(run)
     frame = store.frame()
     if frame.empty:

@@ -1,9 +1,13 @@
-"""Which setting to take (`kerv report --choose`), and which settings a sweep stops (`until=decided`).
+"""Decide which setting to take (`kerv report --choose`) and which settings a sweep may stop (`until=decided`).
 
-Both judge by a bound on the loss of success (docs/methods.md §7). A choice tests the settings of a finished study in a
-fixed order, the safest first, up to the first that fails. Its error is that of one test. A sweep looks after every
-block of seeds, with Pocock's constant boundary (Biometrika 64, 1977). A setting exactly at the bound is misjudged at
-any of the planned looks with a probability of at most 5 %.
+Both ask whether a setting loses less success against the baseline than a given bound (docs/methods.md §7).
+
+`--choose` works on a finished study. It tests the settings in a fixed order, the safest first, and ends at the first
+that fails (fixed-sequence testing). So the error rate over all tests is that of one test.
+
+`until=decided` looks at the results after every block of seeds. The intervals use Pocock's constant boundary
+(Biometrika 64, 1977): if a setting's true loss is exactly the bound, the probability that any of the planned looks
+decides it is at most 5 %.
 """
 
 from __future__ import annotations
@@ -33,7 +37,15 @@ SPEED = "episode_speedup"
 
 
 def verdict_of(table: pd.DataFrame, loss: float) -> tuple[str, bool]:
-    """Return a study's answer in one sentence, and whether a setting is shown to be faster at that loss in points."""
+    """Return a study's answer as a sentence for the report.
+
+    Args:
+        table: The study's table, with one row per setting and averaging.
+        loss: Largest acceptable loss of success against the baseline, in points (percentage points).
+
+    Returns:
+        The sentence, and whether a setting is shown both to be faster and to lose less than `loss`.
+    """
     rows, is_shown = rows_of(table, MICRO), False
     if not any(row["pairs"] and not is_baseline(row) for row in rows):
         text = "success: " + ", ".join(f"{row['label']} {POINTS * row['success']:.1f} %" for row in rows)
@@ -46,18 +58,25 @@ def verdict_of(table: pd.DataFrame, loss: float) -> tuple[str, bool]:
 
 
 def choices(table: pd.DataFrame, per_task: pd.DataFrame, loss: float) -> list[Choice]:
-    """Return the choice for all tasks, then the choice for each task.
+    """Return which setting to take for all tasks together, followed by which to take for each task.
 
     Args:
-        table: A study's table.
-        per_task: A study's table by task.
-        loss: Bound on the loss of success, points.
+        table: The study's table, pooled over tasks.
+        per_task: The same table with rows per task.
+        loss: Largest acceptable loss of success against the baseline, in points.
     """
     tasks = {str(task): rows_of(rows) for task, rows in per_task.groupby("task", sort=True)}
     return [_choice(where, rows, loss) for where, rows in {"all tasks": rows_of(table, MICRO), **tasks}.items()]
 
 
 def _choice(where: str, rows: Sequence[Row], loss: float) -> Choice:
+    """Choose a setting for one task or for all tasks.
+
+    Args:
+        where: The task's name, or `all tasks`.
+        rows: The table's rows there, one per setting, the baseline included.
+        loss: Largest acceptable loss of success against the baseline, in points.
+    """
     success = next((float(row["success"]) for row in rows if is_baseline(row)), math.nan)
     order = [] if success < verdict.SOLVED else safest_first(rows)
     best = _fastest(list(itertools.takewhile(lambda row: -POINTS * row["difference_low"] < loss, order)))
@@ -82,10 +101,11 @@ def _choice(where: str, rows: Sequence[Row], loss: float) -> Choice:
 
 
 def safest_first(rows: Sequence[Row]) -> list[Row]:
-    """Return the settings in the order in which they are tested; none of it looks at success.
+    """Return the settings in the order in which `--choose` tests them. The order does not depend on success.
 
-    First what executes less unverified (in whole per cent, and settings that decode nothing last), then what asks the
-    target more often per step, then the study's order. Settings that were timed and not faster are left out.
+    Settings come first if a smaller share of their executed actions is unverified (rounded to whole per cent; settings
+    that decode nothing come last). Ties go to more target forwards per control step, then to the study's order.
+    The baseline, settings without pairs, and settings that were timed and were not faster are left out.
     """
 
     def order(row: Row) -> tuple[float, float]:
@@ -97,7 +117,11 @@ def safest_first(rows: Sequence[Row]) -> list[Row]:
 
 
 def _fastest(rows: Sequence[Row]) -> Row | None:
-    """Return the fastest setting, those that are shown to be faster first; if none is timed, the last one tested."""
+    """Return the fastest of the tested settings, or None if there are none.
+
+    Settings whose interval shows that they are faster than the baseline come before all others. If no setting has a
+    measured speed, return the one that was tested last.
+    """
     return max(
         reversed(rows),
         key=lambda row: (row[f"{SPEED}_low"] > 1, row[SPEED]) if is_number(row[SPEED]) else (False, -math.inf),
@@ -106,7 +130,10 @@ def _fastest(rows: Sequence[Row]) -> Row | None:
 
 
 def pareto(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows that no other one beats in both speed per episode and success, the fastest first."""
+    """Return the rows that no other row beats in both speed per episode and success, the fastest first.
+
+    The baseline has speed 1. Rows without a measured speed are left out.
+    """
 
     def point(row: Row) -> tuple[float, float]:
         return (1.0 if is_baseline(row) else float(row[SPEED]), float(row["success"]))
@@ -121,14 +148,19 @@ def pareto(rows: Sequence[Row]) -> list[Row]:
 
 _CONSTANTS = (1.960, 2.178, 2.289, 2.361, 2.413, 2.453, 2.485, 2.512, 2.535, 2.555, 2.572, 2.588, 2.602, 2.614, 2.626,
               2.637, 2.646, 2.655, 2.663, 2.671)  # fmt: skip
-"""Pocock's boundary on |z| for 1, 2, … equally spaced looks and 5 %, two-sided (Jennison and Turnbull, table 2.1)."""
+"""Pocock's critical values of |z| for 1, 2, … 20 equally spaced looks, at 5 % two-sided in all (Jennison and Turnbull,
+Group Sequential Methods, table 2.1).
+"""
 
 
 def confidence_of_a_look(looks: int) -> float:
-    """Return the confidence of the interval at each of several looks.
+    """Return the confidence that an interval needs at each look, so that all looks together have 95 %.
+
+    Args:
+        looks: Number of planned looks.
 
     Raises:
-        UsageError: More looks than the boundary is tabled for.
+        UsageError: There are more looks than Pocock's table covers.
     """
     if not 1 <= looks <= len(_CONSTANTS):
         raise UsageError(f"until=decided with {looks} looks: at most {len(_CONSTANTS)}; set study.block higher")
@@ -136,14 +168,30 @@ def confidence_of_a_look(looks: int) -> float:
 
 
 def decision_of(label: str, counts: stats.PairedCounts, margin: float, look: int, looks: int) -> Decision:
-    """Judge a setting by a bound on the loss, given as a share of episodes."""
+    """Decide whether a setting's loss of success is smaller or larger than a bound, or still open.
+
+    Args:
+        label: The setting's label.
+        counts: Outcomes of its pairs with the baseline so far.
+        margin: The bound, as a share of episodes (0.03: three points).
+        look: Number of this look, from 1.
+        looks: Number of planned looks.
+    """
     difference = stats.paired_difference(counts, confidence_of_a_look(looks))
     answer = SMALLER if difference.low > -margin else LARGER if difference.high < -margin else OPEN
     return Decision(label, answer, int(sum(counts)), look, *difference)
 
 
 def decisions(data: StudyData, labels: Sequence[str], margin: float, look: int, looks: int) -> list[Decision]:
-    """Judge settings by all their pairs with the baseline."""
+    """Decide for each setting from all its pairs with the baseline.
+
+    Args:
+        data: The study with the episodes that have run.
+        labels: Settings to decide.
+        margin: Largest acceptable loss of success, as a share of episodes.
+        look: Number of this look, from 1.
+        looks: Number of planned looks.
+    """
     episodes = data.episodes[data.episodes["repeat"] == 0]
     baseline = episodes[episodes["label"] == data.study.baseline]
     pairs = {label: pair_counts(paired(episodes[episodes["label"] == label], baseline)) for label in labels}
@@ -151,11 +199,14 @@ def decisions(data: StudyData, labels: Sequence[str], margin: float, look: int, 
 
 
 def judge(loss: float, tell: Callable[[str], None]) -> InterimAnalysis:
-    """Return the `analysis` of `study.run` for a bound on the loss of success.
+    """Return the function that a sweep calls after every block of seeds to learn which settings are still open.
 
     Args:
-        loss: The bound, in points.
-        tell: Takes a line of progress.
+        loss: Largest acceptable loss of success against the baseline, in points.
+        tell: Receives one line of progress per look.
+
+    Returns:
+        The `analysis` argument of `study.run`. It writes decided.json and returns the labels to continue with.
     """
     latest: dict[str, Decision] = {}
 
@@ -170,7 +221,13 @@ def judge(loss: float, tell: Callable[[str], None]) -> InterimAnalysis:
 
 
 def write_decisions(folder: Path, answers: Mapping[str, Decision], loss: float, looks: int) -> None:
-    """Write decided.json into the study's folder: the last decision on every label.
+    """Write decided.json into the study's folder, with the latest decision on every setting.
+
+    Args:
+        folder: The study's folder.
+        answers: Label to decision.
+        loss: Largest acceptable loss of success, in points.
+        looks: Number of planned looks.
 
     Raises:
         StorageError: The disk is full or read-only.
@@ -181,10 +238,13 @@ def write_decisions(folder: Path, answers: Mapping[str, Decision], loss: float, 
 
 
 def read_decisions(folder: Path) -> list[Row]:
-    """Return the last decisions of `until=decided` in a study's folder; none if it was swept without.
+    """Return the latest decision on every setting, as JSON objects. The list is empty without `until=decided`.
+
+    Args:
+        folder: The study's folder.
 
     Raises:
-        CheckpointError: The file is damaged.
+        CheckpointError: decided.json is damaged.
     """
     path = folder / "decided.json"
     return list(read_json(path)["settings"]) if path.is_file() else []

@@ -1,4 +1,7 @@
-"""Runs for other trackers (trackio, Weights & Biases offline, MLflow: optional packages), or as files."""
+"""Export runs to other trackers (trackio, Weights & Biases offline, MLflow) or to files.
+
+The trackers are optional packages.
+"""
 
 from __future__ import annotations
 
@@ -23,20 +26,20 @@ from kerv_cli.report.tables import csv_text, flatten, is_number, load_study, row
 
 PROJECT = "kerv"
 FILES = ("csv", "parquet", "db")
-"""What is written without a tracker."""
+"""Export formats that need no tracker."""
 _AT_ONCE = 100  # episodes in memory
 
 
 @dataclass(frozen=True)
 class Tracked:
-    """What a tracker shows as one run.
+    """A run in the form in which trackers take it.
 
     Attributes:
-        name: Its name.
-        group: What it belongs to.
+        name: Name of the run in the tracker.
+        group: Group of the run in the tracker.
         config: Settings.
-        history: (step, numbers), one per episode, or per validation of a training.
-        summary: Numbers of the whole run.
+        history: (step, measures), one per episode, or one per validation of a training.
+        summary: Measures of the whole run.
     """
 
     name: str
@@ -47,11 +50,17 @@ class Tracked:
 
 
 def export(run: RunEntry, to: str, folder: Path) -> list[str]:
-    """Hand a run to a tracker, or write it into a folder, and return the names of the runs or files.
+    """Export a run to a tracker or to files. Return the names of the tracker's runs or of the files.
+
+    Args:
+        run: The run.
+        to: A tracker or file format: a key of TRACKERS or one of FILES.
+        folder: Where the files or the tracker's local data go.
 
     Raises:
-        UnknownName: No such tracker.
-        UsageError: Its package is not installed; the message says how to install it.
+        UnknownName: There is no such tracker or format.
+        UsageError: The tracker's package is not installed (the message says how to install it), or the run has no
+            episodes.
     """
     if to not in (*FILES, *TRACKERS):
         raise UnknownName("tracker", to, (*FILES, *TRACKERS))
@@ -66,7 +75,7 @@ def export(run: RunEntry, to: str, folder: Path) -> list[str]:
 
 
 def _to_parquet(store: StudyStore, folder: Path) -> list[str]:
-    """Write episodes.parquet and decodes.parquet."""
+    """Write all episodes of a study to episodes.parquet and all its decodes to decodes.parquet."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -91,7 +100,7 @@ def _to_parquet(store: StudyStore, folder: Path) -> list[str]:
 
 
 def tracked_runs(run: RunEntry) -> Iterator[Tracked]:
-    """Yield one per setting for a sweep or a rollout, one for any other run."""
+    """Yield one tracked run per setting of a sweep or rollout. Any other run is a single tracked run."""
     if not run.has_episodes:
         log = read_log(run.folder) if run.is_training else pd.DataFrame()
         history = [(int(row.pop("step")), _numbers(row)) for row in rows_of(log)]
@@ -164,4 +173,4 @@ TRACKERS: dict[str, Callable[[Tracked, Path], str]] = {
     "wandb": _to_wandb,
     "mlflow": _to_mlflow,
 }
-"""Name of a tracker, of its package and of kerv's extra -> the function that hands a run over."""
+"""Tracker -> function that exports a run to it. The names are also those of the packages and of kerv's extras."""

@@ -1,4 +1,4 @@
-"""The measures of docs/methods.md §7, from rows of the table `episodes`."""
+"""Compute the measures of docs/methods.md §7 from stored episodes (rows of the database's table `episodes`)."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from kerv_cli.report import statistics as stats
 from kerv_cli.report.statistics import Estimate
 
 Row = dict[str, Any]
-"""One row of a table by column."""
+"""One row of a table: column name to value."""
 
 MICRO = "micro over tasks"
 MACRO = "macro over difficulty groups"
 MARGIN = 0.03
-"""Largest loss of success that counts as non-inferior, as a share of episodes."""
+"""Loss of success, as a share of episodes, below which a setting counts as non-inferior to the baseline."""
 
 COMPARABLE = ("device", "device_name", "dtype", "threads")
-"""Columns that must be equal for times to be comparable."""
+"""Columns in which two episodes must agree before their times are compared."""
 
 _RATIOS = {
     "AL": ("committed", "verifications"),
@@ -39,23 +39,27 @@ _RATIOS = {
     "felt_latency_steps": ("delay_steps", "delay_decodes"),
     "held_share": ("held_steps", "steps"),
 }
-"""Measures that are a sum over episodes divided by another; NaN if the divisor is 0."""
+"""Measure -> (numerator, denominator), each a column summed over episodes. NaN if the denominator is 0."""
 
 
 def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, all_pairs: bool = False) -> Row:
     """Return every measure of a setting.
 
-    `speedup` compares the time per control step, `episode_speedup` the time per episode. Both are NaN if no target
-    decodes, if there are no pairs, or if an episode of either side was not timed. `same_run` says whether all pairs
-    were measured in one run, `same_block` the share of pairs that were measured in one block.
+    `speedup` compares the time per control step, `episode_speedup` the time per episode. Both are NaN if there are no
+    usable pairs, if an episode was not timed, or if the setting runs no decoder (the scripted expert). `same_run` says
+    whether the two episodes of every pair come from one run. `same_block` is the share of pairs that were measured
+    in one block (side by side in one process).
 
     Args:
-        episodes: Episodes of the setting, with columns of rows.EPISODE_SCHEMA, decode_seconds, difficulty, run and
-            those of `COMPARABLE`.
-        baseline: Episodes of the baseline, with the same columns.
-        averaging: MACRO averages each measure within every difficulty group and returns the unweighted mean of the
-            groups. Anything else pools the episodes. Paired counts, p and pairs_to_settle are always pooled.
-        all_pairs: Also use times of pairs that were not measured in turn in one block.
+        episodes: Episodes of the setting, one per row. Columns: those of rows.EPISODE_SCHEMA, `decode_seconds`,
+            `difficulty`, `run`, and those of `COMPARABLE`.
+        baseline: Episodes of the baseline, with the same columns. May be empty.
+        averaging: MACRO computes a measure for every difficulty group and returns the unweighted mean of the groups.
+            Any other value pools all episodes. Paired counts, McNemar's p and `pairs_to_settle` are always pooled.
+        all_pairs: Whether speedups also use pairs that were not measured in one block.
+
+    Returns:
+        Column name to value. A measure without data is NaN.
     """
     pairs = paired(episodes, baseline)
     macro = averaging == MACRO
@@ -82,7 +86,13 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, all_
 
 
 def _averaged(frame: pd.DataFrame, macro: bool, estimate: Callable[[pd.DataFrame], Estimate]) -> Estimate:
-    """Estimate the whole frame, or average the estimates of the difficulty groups that have one."""
+    """Apply `estimate` to all rows, or average its values over the difficulty groups.
+
+    Args:
+        frame: Episodes or pairs, with a column `difficulty`.
+        macro: Whether to average over difficulty groups. Groups whose estimate is NaN are left out.
+        estimate: Computes an estimate from some rows of `frame`.
+    """
     if not macro:
         return estimate(frame)
     estimates = [estimate(group) for _, group in frame.groupby("difficulty", sort=True)]
@@ -90,12 +100,20 @@ def _averaged(frame: pd.DataFrame, macro: bool, estimate: Callable[[pd.DataFrame
 
 
 def pair_counts(pairs: pd.DataFrame) -> stats.PairedCounts:
-    """Count the rows of `paired` by success of the baseline and of the method."""
+    """Count how often both, one or none of the two sides succeeded, in a table made by `paired`."""
     return stats.paired_counts(pairs["success_baseline"].to_numpy(), pairs["success_method"].to_numpy())
 
 
 def paired_columns(counts: stats.PairedCounts, difference: Estimate) -> Row:
-    """Return the columns that compare success. `mcnemar_p` is NaN without pairs."""
+    """Return the table columns that compare a setting's success with the baseline's.
+
+    Args:
+        counts: Outcomes of the pairs.
+        difference: Success rate of the setting minus the baseline's, with its interval.
+
+    Returns:
+        Column name to value. `mcnemar_p` is NaN if there are no pairs.
+    """
     return {
         "pairs": sum(counts),
         **counts._asdict(),
@@ -107,18 +125,20 @@ def paired_columns(counts: stats.PairedCounts, difference: Estimate) -> Row:
 
 
 def columns_of(name: str, estimate: Estimate) -> dict[str, float]:
-    """Return the columns NAME, NAME_low and NAME_high of an estimate."""
+    """Return an estimate as three columns: `name`, `name`_low and `name`_high."""
     return {name: estimate.value, f"{name}_low": estimate.low, f"{name}_high": estimate.high}
 
 
 def paired(episodes: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
-    """Return the pairs of equal task, seed, repeat, initial state and device, in that order.
+    """Pair the setting's episodes with the baseline's.
 
-    Episodes of another server than kerv name no device. They pair with episodes of any device.
+    Two episodes form a pair if they have the same task, seed, repeat, initial state, device, number format and number
+    of threads. Episodes that were run by a foreign policy server name no device; they pair with episodes of any device.
 
     Returns:
-        Columns task, difficulty, seed, repeat, same_run, same_block; and with the suffixes _baseline and _method: time
-        (seconds per control step), seconds (of the episode), success and block.
+        One row per pair, sorted by task, seed and repeat. Columns: `task`, `difficulty`, `seed`, `repeat`, `same_run`,
+        `same_block`; and, with the endings _baseline and _method: `time` (seconds per control step), `seconds` (of the
+        whole episode), `success`, `block`.
     """
     keys = ["task", "seed", "repeat"]
     columns = [*keys, "difficulty", "run", "block", "success", "seconds", "initial_state", *COMPARABLE]
@@ -135,16 +155,26 @@ def paired(episodes: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
 
 
 def decodes(episodes: pd.DataFrame) -> bool:
-    """Return whether a target decodes at all. A scripted expert has no decoding time."""
+    """Return whether the episodes ran a decoder. A scripted expert runs none and has no decoding time."""
     return bool(episodes["forwards"].sum() or episodes["skipped_decodes"].sum())
 
 
 def is_timed(episodes: pd.DataFrame, column: str = "seconds") -> bool:
-    """Return whether all episodes have times. Episodes of a batch have none (docs/measuring.md)."""
+    """Return whether `column` has a time for every episode.
+
+    Episodes that ran in a batch have no times (docs/measuring.md).
+    """
     return bool(episodes[column].notna().all())
 
 
 def _speedup(pairs: pd.DataFrame, time: str, macro: bool) -> Estimate:
+    """Estimate the speedup over pairs.
+
+    Args:
+        pairs: Table made by `paired`.
+        time: `time` for seconds per control step, `seconds` for seconds per episode.
+        macro: Whether to average times over difficulty groups.
+    """
     blocks = pairs["block_method"].astype(str) + "|" + pairs["block_baseline"].astype(str)
     blocks = blocks.groupby([pairs["task"], pairs["seed"]]).transform("first")  # repeats of a world belong together
     return stats.speedup(
@@ -157,6 +187,7 @@ def _speedup(pairs: pd.DataFrame, time: str, macro: bool) -> Estimate:
 
 
 def _means(episodes: pd.DataFrame) -> dict[str, float]:
+    """Return the measures that need no baseline, pooled over all given episodes. Times are in milliseconds."""
     per_step = 1000.0 / episodes["steps"]
     decode_ms = 1000.0 * np.concatenate(list(episodes["decode_seconds"]))
     middle, late, worst = np.quantile(decode_ms, [0.5, 0.95, 1.0])
@@ -178,11 +209,17 @@ def _means(episodes: pd.DataFrame) -> dict[str, float]:
 
 
 def _mean_of_groups(episodes: pd.DataFrame) -> dict[str, float]:
-    """Return unweighted means over the difficulty groups that have a value."""
+    """Return the same measures as `_means`, averaged over difficulty groups.
+
+    Each measure is an unweighted mean over the groups in which it is not NaN.
+    """
     groups = pd.DataFrame([_means(group) for _, group in episodes.groupby("difficulty", sort=True)])
     return {str(name): float(value) for name, value in groups.mean().items()}
 
 
 def registered_columns() -> Mapping[str, Part]:
-    """Return the columns that a plug-in adds, by name. Each is a function of a setting's episodes."""
+    """Return the table columns that plugins add, by name.
+
+    The `build` function of each computes the column's value from the episodes of a setting.
+    """
     return parts("column")

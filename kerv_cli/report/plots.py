@@ -1,4 +1,7 @@
-"""Figures of a study from its tables, as PNG: no display, the same bytes for the same numbers."""
+"""Draw the figures of a study from its tables, as PNG files.
+
+No display is needed. The same numbers give the same bytes.
+"""
 
 from __future__ import annotations
 
@@ -34,19 +37,19 @@ STYLE: Any = {
 }
 SUCCESS, SPEED = "success", "episode_speedup"
 UNITS = {SUCCESS: "success, % of episodes", SPEED: "speed: time per episode, baseline ÷ setting"}
-"""Columns of a study's table that are drawn, with their 95 % intervals -> their names."""
+"""Columns of a study's table that are drawn -> their axis labels."""
 _ACROSS = 4  # panels beside one another
 
 
 class Panel(NamedTuple):
-    """Lines of a column over a number.
+    """One panel of a figure: lines of a measure against a number.
 
     Attributes:
-        title: Its heading.
-        x: Column of the number.
-        xlabel: Name of the number.
-        y: SUCCESS or SPEED.
-        lines: Name of a line -> its rows. A line of one row is drawn as a level.
+        title: Heading of the panel.
+        x: Table column for the x axis.
+        xlabel: Label of the x axis.
+        y: Table column for the y axis, SUCCESS or SPEED.
+        lines: Name of each line -> its table rows. A single row is drawn as a horizontal line.
     """
 
     title: str
@@ -57,15 +60,19 @@ class Panel(NamedTuple):
 
 
 def study_figures(table: pd.DataFrame, axis: str, title: str) -> dict[str, Figure]:
-    """Return name suffix -> figure; rows pooled over tasks are drawn.
+    """Draw the figures that suit a study, from its rows pooled over tasks.
 
-    A study of stress is drawn as success over the level. A study with settings at several numbers of its axis is drawn
-    as speed and success along the axis, any other as success against speed if it was timed.
+    - A study of stress: success against the level of stress.
+    - A study whose settings differ along `axis`: speed and success against it.
+    - Any other study that was timed: success against speed.
 
     Args:
-        table: A study's table.
-        axis: Column of the x axis, such as `threshold.r`; may be empty.
+        table: The study's table.
+        axis: Table column for the x axis, such as `threshold.r`. Empty: none.
         title: The study's title.
+
+    Returns:
+        Ending of the file's name, such as `_tradeoff` -> figure. Empty if there is nothing to draw.
     """
     rows = table[table["averaging"] == MICRO]
     heading = f"{title}\n{about(rows)}"
@@ -79,7 +86,7 @@ def study_figures(table: pd.DataFrame, axis: str, title: str) -> dict[str, Figur
 
 
 def about(rows: pd.DataFrame) -> str:
-    """Return a figure's subtitle: targets, counts, device."""
+    """Return the subtitle of a figure: policies, number of tasks and episodes, device, number format."""
     first, targets = rows.iloc[0], list(dict.fromkeys(str(name) for name in rows["policy.target"]))
     names = ", ".join(targets) if len(targets) <= 2 else f"{len(targets)} targets"
     counts = f"{rows['tasks'].max()} tasks, {rows['episodes'].max()} episodes per setting"
@@ -87,9 +94,12 @@ def about(rows: pd.DataFrame) -> str:
 
 
 def series_of(rows: pd.DataFrame, axis: str) -> dict[str, list[Row]]:
-    """Return settings that differ only along the axis, in its order: name of the series -> rows.
+    """Group the settings that differ only along the axis, so that each group can be drawn as a line.
 
-    A row without a number on the axis is a series of its own.
+    A row without a number on the axis forms a group of its own.
+
+    Returns:
+        Name of the group -> its rows, sorted along the axis.
     """
     series: dict[str, list[Row]] = {}
     for row in rows_of(rows):
@@ -105,7 +115,7 @@ def series_of(rows: pd.DataFrame, axis: str) -> dict[str, list[Row]]:
 
 @mpl.rc_context(STYLE)
 def lines_figure(panels: Sequence[Panel], heading: str) -> Figure:
-    """Draw panels side by side with one legend; a name has the same colour in all of them."""
+    """Draw panels side by side with one legend. A name has the same colour in every panel."""
     names = list(dict.fromkeys(name for panel in panels for name in panel.lines))
     across = min(_ACROSS, len(panels))
     down = -(-len(panels) // across)
@@ -130,7 +140,7 @@ def lines_figure(panels: Sequence[Panel], heading: str) -> Figure:
 
 @mpl.rc_context(STYLE)
 def _tradeoff(rows: Sequence[Row], heading: str) -> Figure:
-    """Draw success against speed per episode. A setting without a speed is a level of success."""
+    """Draw success against speed per episode. A setting without a speed is a horizontal line at its success."""
     figure = new_figure(11.0, 6.0, heading)
     axes = figure.subplots()
     for number, row in enumerate(rows):
@@ -148,7 +158,12 @@ def _tradeoff(rows: Sequence[Row], heading: str) -> Figure:
 
 
 def latency_figure(table: pd.DataFrame, heading: str) -> Figure:
-    """Draw `latency_table`: success over the time that AR's decode takes, a panel per compensation of the delay."""
+    """Draw success against the time that an AR decode takes, with one panel per kind of delay compensation.
+
+    Args:
+        table: Table made by `latency_table`.
+        heading: Title and subtitle.
+    """
     panels: dict[str, dict[str, list[Row]]] = {}
     for row in rows_of(table[table["ar_latency_ms"] > 0].sort_values("ar_latency_ms", kind="stable")):
         lines = panels.setdefault(f"delay compensation: {row['rollout.delay_compensation']}", {})
@@ -158,7 +173,10 @@ def latency_figure(table: pd.DataFrame, heading: str) -> Figure:
 
 
 def _bar(row: Row, column: str) -> tuple[float, float, float]:
-    """Return a value and the distances to the ends of its interval, success in per cent; NaN if missing."""
+    """Return a value and the lengths of its error bar to below and above.
+
+    Success is in per cent. All three numbers are NaN if the value is missing.
+    """
     if column == SPEED and is_baseline(row):
         return 1.0, 0.0, 0.0  # by definition
     scale = 100.0 if column == SUCCESS else 1.0
@@ -170,29 +188,44 @@ def _bar(row: Row, column: str) -> tuple[float, float, float]:
 
 
 def _look(number: int, baseline: bool) -> dict[str, Any]:
+    """Return the colour and marker of a setting.
+
+    Args:
+        number: Position of the setting in the legend.
+        baseline: Whether it is the baseline, which is drawn in black.
+    """
     colour = INK if baseline else COLOURS[number % len(COLOURS)]
     return {"color": colour, "marker": MARKERS[number // len(COLOURS) % len(MARKERS)]}
 
 
 def new_figure(width: float, height: float, heading: str) -> Figure:
-    """Return an empty figure of that many inches with a heading."""
+    """Return an empty figure with a heading.
+
+    Args:
+        width: In inches.
+        height: In inches.
+        heading: Title and subtitle.
+    """
     figure = Figure(figsize=(width, height), layout="constrained")
     figure.suptitle(heading, x=0.01, ha="left", fontsize=11)
     return figure
 
 
 def png(figure: Figure) -> bytes:
-    """Return a figure as a PNG file without a date."""
+    """Return the figure as a PNG file without metadata, so that the same figure gives the same bytes."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=120, metadata={"Software": None})
     return buffer.getvalue()
 
 
 def read_log(folder: Path) -> pd.DataFrame:
-    """Return the validations of a training, one row each.
+    """Return the log of a training, one row per validation.
+
+    Args:
+        folder: Folder of the trained artifact.
 
     Raises:
-        CheckpointError: The folder has no log, or not one that a training wrote.
+        CheckpointError: The folder has no readable log of a training.
     """
     rows = Curve.of(folder).read() if folder.parent.parent.name == "artifacts" else []
     if rows:
@@ -206,7 +239,7 @@ def read_log(folder: Path) -> pd.DataFrame:
 
 @mpl.rc_context(STYLE)
 def curves_figure(log: pd.DataFrame, title: str) -> Figure:
-    """Draw one panel per measure over steps and mark the best validation."""
+    """Draw every measure of a training's log against the training step. Mark the best validation."""
     best = float(log["step"].to_numpy()[int(log["score"].to_numpy().argmax())])
     names = [str(name) for name in log.columns if name != "step"]
     about = f"{len(log)} validations of the averaged weights; dotted: the saved ones, step {best:.0f}"
@@ -219,10 +252,10 @@ def curves_figure(log: pd.DataFrame, title: str) -> Figure:
 
 
 def save_curves(folder: Path) -> Path:
-    """Write `curves.png` beside a training's log and return its path.
+    """Write `curves.png` into the folder of a trained artifact and return its path.
 
     Raises:
-        CheckpointError: As `read_log`.
+        CheckpointError: The folder has no readable log of a training.
         StorageError: The disk is full or read-only.
     """
     path = folder / "curves.png"

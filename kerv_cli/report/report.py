@@ -1,4 +1,4 @@
-"""Writes the tables, plots and page of each study from its stored episodes."""
+"""Write the tables, plots and web page of each study, from its stored episodes."""
 
 from __future__ import annotations
 
@@ -38,14 +38,18 @@ from kerv_cli.report.tables import (
 from kerv_cli.report.verdict import caution
 
 LOSS = 3.0
-"""Points of success that the page's verdict allows to lose by default."""
+"""Default for the largest loss of success that the page's verdict accepts, in points."""
 
 
 def names_to_report(results: Path | str, study: str | None) -> list[str]:
-    """Return the name of the study; without one, the names of all studies that have an episode.
+    """Return the names of the studies to report.
+
+    Args:
+        results: Results folder.
+        study: Name of one study. None: every study that has at least one episode.
 
     Raises:
-        UsageError: There is none.
+        UsageError: No study has an episode.
     """
     present = [] if study else [one for one in studies(Database(results)) if one.kind != ROLLOUT and one.counts()[0]]
     names = [study] if study else sorted(store.name for store in present)
@@ -56,12 +60,12 @@ def names_to_report(results: Path | str, study: str | None) -> list[str]:
 
 @dataclass
 class Report:
-    """Files and tables of a report.
+    """What `report` wrote and computed.
 
     Attributes:
-        files: In the order of writing.
-        tables: Each study's table.
-        priced: The `repriced_table` of the profiles in `on`.
+        files: Written files, in the order of writing.
+        tables: Name of each study -> its table.
+        priced: The study's speeds on other machines, from `repriced_table`. None if `on` was empty.
     """
 
     files: list[Path]
@@ -76,20 +80,22 @@ def report(
     on: Sequence[str] = (),
     loss: float = LOSS,
 ) -> Report:
-    """Write a study's files, or those of every study that has an episode. The same episodes give the same bytes.
+    """Write the tables, plots and page of one study, or of every study that has an episode.
 
-    The tables are <study>.csv, <study>_per_task.csv, <study>.json and with `on` <study>_on.csv.
+    The tables are <study>.csv, <study>_per_task.csv, <study>.json and, with `on`, <study>_on.csv. The same episodes
+    give the same bytes.
 
     Args:
         results: Results folder.
-        study: Name of the study; all if None.
-        publish: Write tables and plots into the results folder itself instead of its report/.
-        on: Names of profiles at which the study's decodes are priced.
-        loss: Points of success that the verdict of studies/<study>/report.html allows to lose.
+        study: Name of the study. None: all studies.
+        publish: Write tables and plots into the results folder itself instead of its report/. Refused for studies that
+            do not meet the conditions for publishing.
+        on: Names of cost profiles of other machines. The study's speeds on each are estimated (docs/measuring.md).
+        loss: Largest loss of success, in points, that the verdict on the page accepts.
 
     Raises:
-        UsageError: No such study, or nothing to report; the message names what to run.
-        Unpublishable: A study that may not be published; nothing of it is written.
+        UsageError: There is no such study, or nothing to report. The message names what to run.
+        Unpublishable: The study may not be published. None of its files is written.
         CheckpointError: The database is damaged.
         StorageError: The disk is full or read-only.
     """
@@ -109,17 +115,18 @@ def report(
 def write_study(
     store: StudyStore, data: StudyData, loss: float, publish: bool = False, priced: pd.DataFrame | None = None
 ) -> list[Path]:
-    """Write the tables, plots and page of one study and return its files, the page last.
+    """Write the tables, plots and page of one study. Return the files, the page last.
 
     Args:
         store: The study's files.
-        data: The whole study.
-        loss: As in `report`.
-        publish: As in `report`.
-        priced: Its decodes at the costs of other machines, from `repriced_table`.
+        data: The study with all its episodes.
+        loss: Largest loss of success, in points, that the verdict accepts.
+        publish: Write tables and plots into the results folder itself instead of its report/.
+        priced: The study's speeds on other machines, from `repriced_table`. None: leave them out.
 
     Raises:
-        Unpublishable, StorageError: As `report`.
+        Unpublishable: `publish` is set and the study may not be published.
+        StorageError: The disk is full or read-only.
     """
     results, name, title = store.database.results, store.name, data.study.title or store.name
     if publish:
@@ -156,15 +163,15 @@ def render(
     priced: pd.DataFrame | None,
     loss: float,
 ) -> str:
-    """Return the page.
+    """Return the study's page as HTML.
 
     Args:
         store: The study's files and recordings.
         data: The study's episodes and tables.
-        figures: PNG files.
-        tables: The study's CSV files, which the page links.
-        priced: The study's decodes at the costs of other machines, from `repriced_table`.
-        loss: Points of success that the verdict allows to lose.
+        figures: Plots as PNG files, which are embedded.
+        tables: CSV files of the study, which are linked.
+        priced: The study's speeds on other machines, from `repriced_table`. None: leave them out.
+        loss: Largest loss of success, in points, that the verdict accepts.
     """
     template = Environment(
         loader=PackageLoader("kerv_cli.report", "."), autoescape=True, undefined=StrictUndefined
@@ -196,7 +203,10 @@ def render(
 
 
 def _suite(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the table of all settings, pooled over tasks; of several difficulties with their averages."""
+    """Return the page's table of settings, pooled over tasks.
+
+    If the tasks have several difficulty groups, add columns with the unweighted mean of the groups.
+    """
     frame = summary_frame(table, MICRO)
     if table["difficulty"].str.contains(";").any():
         macro = summary_frame(table, MACRO)
@@ -206,13 +216,17 @@ def _suite(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _by_task(per_task: pd.DataFrame) -> pd.DataFrame:
-    """Return successes and speed per episode: tasks down, settings across, or the other way round if they are more."""
+    """Return the page's table of successes and speeds per episode, by task and setting.
+
+    Tasks are rows and settings are columns, unless there are more settings than tasks.
+    """
     cells = per_task.assign(text=[_cell(row) for row in rows_of(per_task)])
     table = cells.pivot(index="task", columns="label", values="text")[per_task["label"].unique()].fillna("–")
     return (table.T.rename_axis("setting") if len(table.columns) > len(table) else table).reset_index()
 
 
 def _cell(row: Row) -> str:
+    """Return successes / episodes and, if measured, the speed per episode, as text."""
     share = f"{int(row['successes'])}/{int(row['episodes'] // max(1, row['repeats']))}"
     if is_baseline(row) or not is_number(row["episode_speedup"]):
         return share
@@ -220,16 +234,16 @@ def _cell(row: Row) -> str:
 
 
 def _href(path: Path, folder: Path) -> str:
-    """Return a file's address, relative to the folder of the page."""
+    """Return the address of a file relative to the page's folder."""
     return quote(Path(os.path.relpath(path, folder)).as_posix())
 
 
 class Unpublishable(KervError):
-    """A study whose table does not meet the conditions for publishing."""
+    """A study does not meet the conditions for publishing."""
 
 
 def refusals(table: pd.DataFrame) -> list[str]:
-    """Return why a study's table may not be published, a clause each; empty if it may."""
+    """Return the reasons why a study's table may not be published, as clauses of an error message. Empty if it may."""
     clauses = []
     commits = values_of(table, "git_commit")
     if any(commit.endswith("+changes") or commit in ("none", "nan", "") for commit in commits):
@@ -246,10 +260,10 @@ def refusals(table: pd.DataFrame) -> list[str]:
 
 
 def check_publishable(data: StudyData) -> None:
-    """Refuse a study that lacks episodes or has `refusals`.
+    """Refuse to publish a study whose episodes are incomplete or for which `refusals` gives a reason.
 
     Raises:
-        Unpublishable: The line lists all reasons.
+        Unpublishable: The message lists all reasons.
     """
     clauses = [f"{len(data.absent)} of its episodes are missing"] if data.absent else []
     clauses += refusals(data.table)

@@ -1,6 +1,6 @@
-"""A study's decodes at the costs of another machine and target.
+"""Estimate what a study's decodes would cost on another machine or with another target (docs/measuring.md).
 
-It is what each setting would cost there if it decoded the same tokens in the same control steps (docs/measuring.md).
+The estimate assumes that each setting would decode the same tokens in the same control steps there.
 """
 
 from __future__ import annotations
@@ -36,24 +36,33 @@ _TIMES = ("time_per_episode_ms", "time_per_step_ms", "latency_p95_ms")
 
 @dataclass(frozen=True)
 class NamedProfile:
-    """A profile, and the name in `on` that chose it."""
+    """A cost profile of a machine and target, from `kerv bench`.
+
+    Attributes:
+        name: The name by which the user chose it (`on=NAME`).
+        profile: The costs.
+    """
 
     name: str
     profile: Profile
 
     @property
     def title(self) -> str:
-        """Target and device, and whether the profile is a projection."""
+        """Target and device. Ends in "projected" if the costs were not measured."""
         about = self.profile.about
         names = [str(about[key]) for key in ("target", "device_name") if about.get(key)]
         return ", ".join(names or [self.name]) + (", projected" if about.get("projected") else "")
 
 
 def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfile]:
-    """Return the profiles of these names: paths, documents in <results>/bench, or profiles that kerv ships.
+    """Read cost profiles.
+
+    Args:
+        results: Results folder.
+        names: Each is a path, the name of a document in <results>/bench, or the name of a profile that kerv ships.
 
     Raises:
-        UsageError: No such document, a document without a profile, or one of another kerv.
+        UsageError: There is no such document, it has no profile, or another version of kerv wrote it.
     """
     folders = (Path(results) / "bench", shipped_dir().parent / "bench")
     profiles = []
@@ -74,13 +83,15 @@ def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfil
 
 
 def repriced_table(data: StudyData, store: StudyStore, profiles: Sequence[NamedProfile]) -> pd.DataFrame:
-    """Return one row per machine and label, pooled over tasks.
+    """Estimate the speed of every setting at the costs of each profile.
 
-    A row has the speeds there with their intervals, times, and the speeds as they were measured.
+    Returns:
+        One row per profile and setting, pooled over tasks: the estimated speeds with their intervals, the estimated
+        times, and the speeds as measured. Settings that run no decoder are left out.
 
     Raises:
-        UsageError: A profile lacks a cost that the study needs, or is for chunks of another length; or a setting has no
-            times of its own.
+        UsageError: A profile lacks a cost that the study needs, or has costs for shorter chunks only; or a setting has
+            no times because its episodes ran in a batch.
     """
     episodes = {str(label): group for label, group in data.episodes.groupby("label", sort=False)}
     labels = [label for label in data.labels if decodes(episodes[label])]
@@ -116,16 +127,17 @@ def repriced_table(data: StudyData, store: StudyStore, profiles: Sequence[NamedP
 
 
 def _speeds(values: Row, prefix: str) -> dict[str, float]:
+    """Return the columns of both speeds and their intervals, with `prefix` before each name."""
     return {f"{prefix}{name}{end}": values[f"{name}{end}"] for name in SPEEDS for end in ("", "_low", "_high")}
 
 
 class _LabelWork(NamedTuple):
-    """The work of a label's decodes.
+    """Operations that all decodes of a setting executed.
 
     Attributes:
-        work: What they did.
-        episode: (decodes,) row of the label's episodes that each belongs to.
-        size: N, tokens per chunk.
+        work: The operations of each decode.
+        episode: (decodes,) position of the decode's episode among the setting's episodes.
+        size: N, number of tokens per chunk.
     """
 
     work: Work
@@ -134,7 +146,7 @@ class _LabelWork(NamedTuple):
 
 
 def _work_of_label(data: StudyData, label: str, store: StudyStore) -> _LabelWork:
-    """Return the decodes of a label, in the order of its episodes."""
+    """Read the decodes of a setting, in the order of its episodes."""
     setting = data.settings[label]
     if (batch := batch_of(setting.settings)) > 1:
         raise UsageError(
@@ -156,7 +168,11 @@ def _work_of_label(data: StudyData, label: str, store: StudyStore) -> _LabelWork
 
 
 def _check(named: NamedProfile, label: str, work: _LabelWork) -> None:
-    """Refuse a profile that cannot price a setting."""
+    """Refuse a profile that lacks the costs to price a setting.
+
+    Raises:
+        UsageError: The message names the missing cost and the command that measures it.
+    """
     command, reason = f"kerv bench target={named.profile.about.get('target', 'TARGET')} tokens=[{work.size}]", ""
     if lacks := named.profile.lacks(work.work.needs):
         reason = f"no cost of '{lacks[0]}', which setting '{label}' needs"
@@ -167,7 +183,7 @@ def _check(named: NamedProfile, label: str, work: _LabelWork) -> None:
 
 
 def _priced(episodes: pd.DataFrame, work: _LabelWork, profile: Profile) -> pd.DataFrame:
-    """Return the episodes with the seconds that their decodes would take there."""
+    """Return the episodes with the seconds that their decodes would take at the profile's costs."""
     seconds = prices(work.work, profile)
     total = np.bincount(work.episode, seconds, len(episodes))
     order = np.argsort(work.episode, kind="stable")
@@ -176,7 +192,10 @@ def _priced(episodes: pd.DataFrame, work: _LabelWork, profile: Profile) -> pd.Da
 
 
 def repriced_summary(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a row per setting as text: speeds as measured, then a pair of columns per machine."""
+    """Return a table of speeds to print: one row per setting.
+
+    Two columns hold the speeds as measured. Two more columns per machine hold the estimated ones.
+    """
     rows: dict[str, dict[str, str]] = {}
     for row in rows_of(table):
         cells = rows.setdefault(row["label"], {"setting": row["label"]})

@@ -1,4 +1,4 @@
-"""Intervals and tests of docs/methods.md §7, on plain arrays."""
+"""Confidence intervals and tests for success rates and speedups, on plain numpy arrays (docs/methods.md §7)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 
 class Estimate(NamedTuple):
-    """A value with its 95 % interval."""
+    """An estimated value with the lower and upper end of its confidence interval (95 % unless said otherwise)."""
 
     value: float
     low: float
@@ -20,7 +20,17 @@ class Estimate(NamedTuple):
 
 
 class PairedCounts(NamedTuple):
-    """Number of pairs by who succeeded from the same initial state. Expected counts may be fractions."""
+    """Counts of the four possible outcomes of a pair.
+
+    A pair is one episode of the baseline and one of the method, from the same initial state. Expected counts may be
+    fractions.
+
+    Attributes:
+        both: Pairs in which both succeeded.
+        only_baseline: Pairs in which only the baseline succeeded.
+        only_method: Pairs in which only the method succeeded.
+        neither: Pairs in which both failed.
+    """
 
     both: float
     only_baseline: float
@@ -30,13 +40,22 @@ class PairedCounts(NamedTuple):
 
 NO_ESTIMATE = Estimate(math.nan, math.nan, math.nan)
 MOST_PAIRS = 10_000
-"""Nobody runs more pairs than this, so messages say only "more than 10,000"."""
+"""Above this number of pairs, messages say only "more than 10,000": nobody runs so many."""
 
 
 def wilson(successes: float, episodes: float, confidence: float = 0.95) -> Estimate:
-    """Return a success rate with its Wilson score interval; NaN without episodes.
+    """Estimate a success rate with its Wilson score interval.
 
-    Newcombe, Statistics in Medicine 17 (1998), method 3. It is written out because `scipy.stats` takes 60 MB of memory.
+    Source: Newcombe, Statistics in Medicine 17 (1998), method 3. The formula is written out here because importing
+    `scipy.stats` takes 60 MB of memory.
+
+    Args:
+        successes: Number of successful episodes.
+        episodes: Number of all episodes.
+        confidence: Coverage of the interval.
+
+    Returns:
+        The rate `successes / episodes` with its interval. All three numbers are NaN if `episodes` is 0.
     """
     if episodes == 0:
         return NO_ESTIMATE
@@ -49,10 +68,16 @@ def wilson(successes: float, episodes: float, confidence: float = 0.95) -> Estim
 
 
 def mean_of(groups: Sequence[Estimate]) -> Estimate:
-    """Return the unweighted mean of independent estimates, such as the success rates of groups of tasks.
+    """Estimate the unweighted mean of independent estimates, such as the success rates of several groups of tasks.
 
-    The interval combines the intervals of the groups by the method of variance estimates recovery (Zou and Donner,
-    Statistics in Medicine 27, 2008). With one group it is the interval of that group.
+    The distance from the mean to an end of its interval is √(sum of the groups' squared distances) / number of groups
+    (method of variance estimates recovery: Zou and Donner, Statistics in Medicine 27, 2008).
+
+    Args:
+        groups: One estimate per group. All must have the same confidence; the result has it, too.
+
+    Returns:
+        The mean with its interval. All three numbers are NaN if there are no groups.
     """
     if not groups:
         return NO_ESTIMATE
@@ -63,16 +88,28 @@ def mean_of(groups: Sequence[Estimate]) -> Estimate:
 
 
 def paired_counts(baseline: np.ndarray, method: np.ndarray) -> PairedCounts:
-    """Count the pairs of two bool arrays (pairs,) of successes from the same initial states."""
+    """Count the four outcomes of pairs.
+
+    Args:
+        baseline: (pairs,) bool. Whether the baseline's episode succeeded.
+        method: (pairs,) bool. Whether the method's episode from the same initial state succeeded.
+    """
     a, b = np.asarray(baseline, dtype=bool), np.asarray(method, dtype=bool)
     return PairedCounts(int((a & b).sum()), int((a & ~b).sum()), int((~a & b).sum()), int((~a & ~b).sum()))
 
 
 def paired_difference(counts: PairedCounts, confidence: float = 0.95) -> Estimate:
-    """Return the method's success rate minus the baseline's with its interval; NaN without pairs.
+    """Estimate the method's success rate minus the baseline's, from pairs of episodes.
 
-    Newcombe's hybrid score interval for paired proportions (Statistics in Medicine 17, 1998, method 10). It combines
-    the two Wilson intervals with the correlation of the pairs.
+    The interval is Newcombe's hybrid score interval for paired proportions (Statistics in Medicine 17, 1998, method
+    10). It combines the Wilson intervals of the two rates and takes their correlation φ into account.
+
+    Args:
+        counts: Outcomes of the pairs.
+        confidence: Coverage of the interval.
+
+    Returns:
+        The difference, from −1 to 1. Negative: the method succeeds less often. All NaN if there are no pairs.
     """
     pairs = sum(counts)
     if not pairs:
@@ -95,10 +132,18 @@ def paired_difference(counts: PairedCounts, confidence: float = 0.95) -> Estimat
 
 
 def pairs_to_settle(counts: PairedCounts, margin: float) -> float:
-    """Return about how many pairs would show non-inferiority if the rates of the four outcomes stayed as they are.
+    """Estimate how many pairs in all would show that the method loses less than `margin` of success (non-inferiority).
 
-    It is the smallest number that brings the lower bound of `paired_difference` above -margin. It is infinite if ten
-    million do not, and NaN without pairs.
+    The estimate assumes that the shares of the four outcomes stay as observed. It is the smallest number of pairs for
+    which the lower end of `paired_difference` is above −margin.
+
+    Args:
+        counts: Observed outcomes of the pairs.
+        margin: Largest acceptable loss of success, as a share of episodes (0.03: three points).
+
+    Returns:
+        The total number of pairs, including those already run. Infinite if ten million pairs would not be enough. NaN
+        if there are no pairs.
     """
     pairs = sum(counts)
     if not pairs:
@@ -113,9 +158,16 @@ def pairs_to_settle(counts: PairedCounts, margin: float) -> float:
 
 
 def mcnemar(counts: PairedCounts) -> float:
-    """Return the exact two-sided p of McNemar's test; 1 if no pair is discordant.
+    """Return the two-sided p-value of McNemar's exact test (McNemar, Psychometrika 12, 1947).
 
-    McNemar, Psychometrika 12 (1947). The hypothesis is that discordant pairs favour either side equally.
+    The test uses only the pairs in which exactly one side succeeded. Null hypothesis: each of them is equally likely to
+    favour the baseline or the method. Then their number is binomial with probability 1/2.
+
+    Args:
+        counts: Outcomes of the pairs.
+
+    Returns:
+        The p-value. It is 1 if no pair has exactly one success.
     """
     from scipy.special import bdtr
 
@@ -130,22 +182,27 @@ def speedup(
     groups: Sequence[str] | None = None,
     blocks: Sequence[str] | None = None,
 ) -> Estimate:
-    """Return the ratio of mean times, baseline over method, with the 95 % interval of its logarithm.
+    """Estimate how many times as fast as the baseline a method is: mean time of the baseline / mean time of the method.
 
-    The interval is that of a linearised ratio in a stratified cluster sample (Cochran, Sampling Techniques, 1977).
-    Blocks are the clusters of a task, because the episodes of a block share the machine's state. If every task has one
-    block, the tasks are the clusters. If there is one block in all, its pairs are the clusters, and the interval says
-    nothing about another state of the machine.
+    The 95 % interval is that of the ratio's logarithm, linearised, in a stratified cluster sample (Cochran, Sampling
+    Techniques, 1977). The strata are the tasks. The clusters are blocks: episodes that ran together in one process and
+    so share the state of the machine. Two cases differ:
+
+    - If every task has only one block, the tasks are the clusters.
+    - If there is only one block in all, its pairs are the clusters. The interval then holds only for the state that the
+      machine was in.
 
     Args:
-        baseline: (pairs,) time of the baseline's episodes, any unit.
-        method: (pairs,) time of the method's episodes from the same initial states.
+        baseline: (pairs,) time of the baseline's episodes, in any unit.
+        method: (pairs,) time of the method's episodes from the same initial states, in the same unit.
         strata: (pairs,) task of each pair.
-        groups: (pairs,) difficulty group of each pair. With it, each mean is the unweighted mean of the groups' means.
-        blocks: (pairs,) block of each pair. Without it, every pair is a block.
+        groups: (pairs,) difficulty group of each pair. If given, each mean time is the unweighted mean of the groups'
+            means. If None, it is the mean of all pairs.
+        blocks: (pairs,) block of each pair. If None, every pair counts as a block of its own.
 
     Returns:
-        NaN without pairs; NaN bounds for a single pair.
+        The speedup with its interval. All three numbers are NaN if there are no pairs. The ends of the interval are NaN
+        if there is only one pair.
     """
     a, b = np.asarray(baseline, dtype=np.float64), np.asarray(method, dtype=np.float64)
     if a.size == 0:
@@ -162,11 +219,20 @@ def speedup(
 
 
 def _spread(effects: np.ndarray, strata: Sequence[str], clusters: Sequence[str]) -> float:
-    """Return half the width of the 95 % interval of a sum of effects (n,) that is 0 at the estimate.
+    """Return half the width of the 95 % interval of a sum over pairs, whose clusters are independent.
 
-    Clusters are independent. The variance of the sum is the variance of the clusters' sums, stratum by stratum, with
-    Student's t; the degrees of freedom are clusters minus strata. Strata of one cluster count together as one stratum
-    (Cochran, Sampling Techniques, section 5A.12). NaN for a single cluster.
+    The variance of the sum is estimated as follows: within each stratum, take the variance of the clusters' sums; then
+    add the strata. Strata with only one cluster are merged into one stratum (Cochran, Sampling Techniques, section
+    5A.12). The half width is the standard deviation times the 97.5 % quantile of Student's t. Its degrees of freedom
+    are the number of clusters minus the number of strata.
+
+    Args:
+        effects: (n,) contribution of each pair to the linearised logarithm of the speedup. They sum to 0.
+        strata: (n,) stratum (task) of each pair.
+        clusters: (n,) cluster (block) of each pair, named within its stratum.
+
+    Returns:
+        The half width. NaN if there are no degrees of freedom, for example with a single cluster.
     """
     from scipy.special import stdtrit
 

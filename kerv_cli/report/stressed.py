@@ -1,4 +1,4 @@
-"""A study of stress: rows along the level, kind by kind, and sums over levels and kinds."""
+"""Tables for studies that compare kinds and levels of stress (disturbed worlds, docs/stress.md)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,18 @@ NONE = "none"
 
 
 def is_stressed(table: pd.DataFrame) -> bool:
-    """Return whether a study's table compares kinds or levels of stress."""
+    """Return whether a study's table compares several kinds or levels of stress."""
     return table["stress"].nunique() > 1 or table["stress_level"].nunique() > 1
 
 
 def by_kind(table: pd.DataFrame) -> dict[str, dict[str, list[Row]]]:
-    """Return kind -> method -> rows along the level, beginning with the method's unstressed row."""
+    """Return the rows of each method, sorted by level of stress, for every kind of stress.
+
+    Each list begins with the method's unstressed row.
+
+    Returns:
+        Kind of stress -> label of the method without stress -> rows.
+    """
     rows = rows_of(table[table["averaging"] == MICRO].sort_values("stress_level", kind="stable"))
     kinds: dict[str, dict[str, list[Row]]] = {}
     for kind in dict.fromkeys(table.loc[table["stress"] != NONE, "stress"]):
@@ -28,14 +34,15 @@ def by_kind(table: pd.DataFrame) -> dict[str, dict[str, list[Row]]]:
 
 
 def summed_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Sum a study's table over the levels of a kind, the kinds of a level, and all stresses.
+    """Pool a study's episodes over the levels of each kind of stress, the kinds at each level, and all stresses.
 
-    Each sum is compared with the baseline in the same worlds under the same stresses. No sum has unstressed rows.
+    Each pooled row is compared with the baseline's episodes in the same worlds under the same stresses. Unstressed
+    episodes are left out.
 
     Returns:
-        Columns study, label (`METHOD SUM`), method (its label without stress), sum (`push`, `level 2`, `all`),
-        baseline, episodes, successes, success, pairs and their counts, mcnemar_p, difference, margin, non_inferior;
-        intervals with the endings _low and _high.
+        Columns: `study`; `label` (METHOD and SUM); `method` (label without stress); `sum` (such as `push`, `level 2` or
+        `all`); `baseline`; `episodes`; `successes`; `success`; `pairs` with the counts of their outcomes; `mcnemar_p`;
+        `difference`; `margin`; `non_inferior`. Intervals are in columns that end in _low and _high.
     """
     rows = [row for row in rows_of(table, MICRO) if row["stress"] != NONE]
     reference = next((str(row["unstressed"]) for row in rows if is_baseline(row)), "")
@@ -51,6 +58,14 @@ def summed_table(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _sum(rows: list[Row], method: str, name: str, reference: str) -> Row:
+    """Return one pooled row.
+
+    Args:
+        rows: Rows of one method to pool.
+        method: The method's label without stress.
+        name: What is pooled, such as `push` or `level 2`.
+        reference: The baseline's label without stress.
+    """
     counts = stats.PairedCounts(*(sum(int(row[count]) for row in rows) for count in stats.PairedCounts._fields))
     episodes, successes = (sum(int(row[column]) for row in rows) for column in ("episodes", "successes"))
     return {

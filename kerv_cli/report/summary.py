@@ -1,4 +1,4 @@
-"""The main columns of a table as text, for the terminal and the page."""
+"""Turn a study's table into text: the columns that matter most, for the terminal and the page."""
 
 from __future__ import annotations
 
@@ -24,20 +24,23 @@ TextOf = Callable[[Row], str]
 
 APART = "*"
 SPEEDS = {"episode_speedup": "speed, per episode", "speedup": "speed, per step"}
-"""Speed against the baseline -> its heading."""
+"""Table column of each kind of speed -> its heading."""
 DIFFERENCE = "change in success"
 NOTE = (
     "Brackets: 95 % intervals. Change in success: points against the baseline, same initial states. Speed: times as "
     "fast as the baseline. Slowest 5 %: time of a decode that 95 % of the decodes stay below."
 )
 _HEADING = 10
-"""Letters of a heading before it is wrapped."""
+"""Width at which a heading is wrapped, in characters."""
 _LABEL = 16
-"""Letters of a label before it is wrapped."""
+"""Width at which a label is wrapped, in characters."""
 
 
 def numbers(name: str) -> TextOf:
-    """Return a column's value with three significant digits and no exponent; `–` if it is missing."""
+    """Return a function that formats a column's value.
+
+    The text has three significant digits and no exponent. It is `–` if the value is missing.
+    """
 
     def text(row: Row) -> str:
         value = row[name]
@@ -49,19 +52,19 @@ def numbers(name: str) -> TextOf:
 
 
 def shares(name: str) -> TextOf:
-    """Return a column's share in per cent."""
+    """Return a function that formats a column's value (a share from 0 to 1) in per cent."""
     return lambda row: f"{100 * row[name]:.0f} %" if is_number(row[name]) else "–"
 
 
 def intervals(name: str, scale: float = 1.0, digits: int = 2, between: str = "–", of_baseline: str = "") -> TextOf:
-    """Return a column's value with its interval in brackets; `–` if it is missing.
+    """Return a function that formats a column's value with its interval in brackets. The text is `–` if it is missing.
 
     Args:
         name: The column.
-        scale: Factor, 100 for per cent.
-        digits: Decimals. With 0 the value still has one, because 99.5 % of success must not read as 100 %.
-        between: Text between the ends of the interval.
-        of_baseline: Text of the baseline, if it is not to be compared with itself.
+        scale: Factor for value and interval; 100 for per cent.
+        digits: Decimals. With 0 the value still has one decimal, because 99.5 % of success must not read as 100 %.
+        between: Text between the two ends of the interval.
+        of_baseline: Text for the baseline's row. Empty: format its value like any other.
     """
 
     def text(row: Row) -> str:
@@ -77,7 +80,11 @@ def intervals(name: str, scale: float = 1.0, digits: int = 2, between: str = "�
 
 
 def _speed(name: str) -> TextOf:
-    """Return a speed as text, marked if some pairs were not measured in turn; 1 for a baseline that was timed."""
+    """Return a function that formats a speed.
+
+    The baseline's speed is 1, or `–` if it was not timed. An asterisk marks a speed for which some pairs were not
+    measured side by side in one block; those pairs do not count.
+    """
 
     def text(row: Row) -> str:
         if is_baseline(row):
@@ -89,7 +96,10 @@ def _speed(name: str) -> TextOf:
 
 
 def _columns() -> dict[str, TextOf]:
-    """Return heading -> cell, the most important first: a narrow terminal leaves out the last ones."""
+    """Return heading -> function that formats a cell, the most important first.
+
+    A narrow terminal leaves out the last columns.
+    """
     return {
         "setting": lambda row: str(row["label"]),
         "success, %": intervals("success", 100.0, 0),
@@ -114,12 +124,12 @@ def _columns() -> dict[str, TextOf]:
 
 
 def lost_won(row: Row) -> str:
-    """Return how many initial states only the baseline and only the setting solved."""
+    """Return in how many pairs only the baseline succeeded (lost), and in how many only the setting (won), as text."""
     return "" if is_baseline(row) or not row["pairs"] else f"{row['only_baseline']} / {row['only_method']}"
 
 
 def summary_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame:
-    """Return the rows of one averaging as text; columns that no row uses are left out."""
+    """Return the rows of one averaging as text. Columns that are empty in every row are left out."""
     rows, columns = rows_of(table, averaging), _columns()
     frame = pd.DataFrame([{title: text(row) for title, text in columns.items()} for row in rows])
     is_used = ~frame.isin(["–", "0 %", ""]).all() | frame.columns.isin(frame.columns[:4])
@@ -128,12 +138,12 @@ def summary_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class SummaryTable:
-    """A study's table for the terminal, pooled over tasks, with all columns that fit."""
+    """A study's table as `rich` prints it, pooled over tasks. It shows as many columns as fit."""
 
     table: pd.DataFrame
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
-        """Yield title, table and notes."""
+        """Yield the title, the table and the notes below it."""
         frame = _fitting(summary_frame(self.table), options.max_width)
         rows = self.table[self.table["averaging"] == MICRO]
         first, tasks = rows.iloc[0], int(rows["tasks"].max())
@@ -162,11 +172,12 @@ def _printed(frame: pd.DataFrame) -> Table:
 
 
 def _heading(name: str) -> str:
+    """Return a heading wrapped into lines."""
     return textwrap.fill(name, _HEADING, break_long_words=False)
 
 
 def _fitting(frame: pd.DataFrame, width: int) -> pd.DataFrame:
-    """Return the first columns that fit into a width of so many characters, at least four."""
+    """Return the first columns that fit into `width` characters, but at least four."""
     widths = [1 + max(map(len, [*_heading(name).split("\n"), *frame[name]])) for name in frame.columns]
     widths[0] = min(widths[0], 1 + max(_LABEL, *map(len, " ".join(frame["setting"]).split())))
     fitting = sum(total - 1 <= width for total in itertools.accumulate(widths))
@@ -174,7 +185,10 @@ def _fitting(frame: pd.DataFrame, width: int) -> pd.DataFrame:
 
 
 def not_in_turn(table: pd.DataFrame) -> list[str]:
-    """Return labels with times but without a speedup, because no pair was measured in turn with the baseline."""
+    """Return labels of settings that were timed but have no speedup.
+
+    They have none because no pair was measured in the same block as its baseline.
+    """
     timed = table["time_per_step_ms"].notna() & (table["forwards_per_step"] + table["skip_rate"] > 0)
     rows = table[timed & (table["label"] != table["baseline"]) & (table["pairs"] > 0) & table["speedup"].isna()]
     of_baseline = table.loc[table["label"] == table["baseline"], "time_per_step_ms"].notna().all()
@@ -185,12 +199,15 @@ _FIGURES = ("forwards_per_step", "AL", "accepted_per_round", "time_per_step_ms")
 
 
 def setting_tables(data: StudyData, per_task: list[Row], whole: Row) -> Iterator[tuple[Any, Any, str]]:
-    """Yield columns, rows and title of the tables of a study with one setting.
+    """Yield the tables of a study with one setting: results per task, and time per phase of a decode.
 
     Args:
         data: The study.
-        per_task: A row per task.
+        per_task: One row per task.
         whole: The row over all tasks.
+
+    Yields:
+        Column names, rows and title of each table.
     """
     episodes, setting = data.episodes, data.study.settings[0]
     by_task = {row["task"]: row for row in per_task}
@@ -213,5 +230,6 @@ def setting_tables(data: StudyData, per_task: list[Row], whole: Row) -> Iterator
 
 
 def _figures(row: Row) -> list[str]:
+    """Return the cells of one row of the first table: successes, steps and measures."""
     successes, steps = f"{row['successes']}/{row['episodes']}", f"{row['steps'] / row['episodes']:.0f}"
     return [successes, steps, *(f"{row[name]:.2f}" if is_number(row[name]) else "–" for name in _FIGURES)]

@@ -1,4 +1,4 @@
-"""Tables of a study from its stored episodes: aggregated and per task, as data frames and CSV files."""
+"""Build a study's tables from its stored episodes: over all tasks and per task, as data frames and CSV files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CSV_COLUMNS = (
     "only_method", "mcnemar_p", "difference", "difference_low", "difference_high", "non_inferior", "pairs_to_settle",
     "steps", "decodes", "steps_to_success",
 )  # fmt: skip
-"""Columns of a study's CSV files. `further_of` holds the rest, in tables/<study>.json."""
+"""Columns of a study's CSV files. The remaining values are in tables/<study>.json (`further_of`)."""
 
 _RUNTIME = ("device", "dtype", "threads")
 _PROVENANCE = (
@@ -40,11 +40,12 @@ _PROVENANCE = (
 
 @dataclass(frozen=True)
 class StudyData:
-    """A study and its episodes that are there. Its tables are computed once.
+    """A study (settings that are compared) with its stored episodes. Each table is computed once.
 
     Attributes:
-        study: Its settings and the episodes that it wants.
-        episodes: A row per label, task, seed and repeat; columns of `StudyStore.frame` and of `_labelled`.
+        study: The settings, and the episodes that the study asks for.
+        episodes: One row per stored episode (label, task, seed and repeat). Columns: those of `StudyStore.frame`, with
+            difficulty, device, number format and threads.
     """
 
     study: Study
@@ -52,27 +53,27 @@ class StudyData:
 
     @functools.cached_property
     def settings(self) -> dict[str, Setting]:
-        """Settings by label."""
+        """Label -> setting."""
         return {setting.label: setting for setting in self.study.settings}
 
     @functools.cached_property
     def labels(self) -> list[str]:
-        """Labels that have episodes, in the study's order."""
+        """Labels of the settings that have episodes, in the study's order."""
         present = set(self.episodes["label"])
         return [label for label in self.study.labels if label in present]
 
     @property
     def absent(self) -> list[Episode]:
-        """Episode episodes that are missing."""
+        """Episodes that the study asks for and that have not been stored yet."""
         names = ("label", "task", "seed", "repeat")
         present = set(zip(*(self.episodes[name] for name in names), strict=True))
         return [one for one in self.study.episodes if (one.setting.label, *one.key[1:]) not in present]
 
     @functools.cached_property
     def references(self) -> dict[str, str]:
-        """Label -> the label that it is compared with.
+        """Label of each setting -> label of the setting that it is compared with.
 
-        It is the baseline under the setting's own stress and clock if the study has it, else the baseline.
+        That is the baseline under the same stress and clock, if the study has it. Otherwise it is the plain baseline.
         """
         same: dict[str, str] = {}
         if baseline := self.settings.get(self.study.baseline):
@@ -82,7 +83,10 @@ class StudyData:
 
     @functools.cached_property
     def unstressed(self) -> dict[str, str]:
-        """Label -> the label of the same setting without stress; without one, the first of its stressed settings."""
+        """Label of each setting -> label of the same setting without stress.
+
+        If the study has no such setting, it is the first stressed setting of the same method.
+        """
         first: dict[str, str] = {}
         for setting in sorted(self.study.settings, key=lambda one: bool(stress_of(one.settings)["level"])):
             first.setdefault(_methods_of(setting), setting.label)
@@ -93,33 +97,37 @@ class StudyData:
 
     @functools.cached_property
     def table(self) -> pd.DataFrame:
-        """Two rows per label: micro over tasks and macro over difficulty groups."""
+        """Two rows per setting: one pools all tasks (micro), one averages over difficulty groups (macro)."""
         return pd.DataFrame(row for averaging in (MICRO, MACRO) for row in _rows(self, self.episodes, averaging))
 
     @functools.cached_property
     def per_task(self) -> pd.DataFrame:
-        """One row per task and label: tasks by name, labels in the study's order."""
+        """One row per task and setting. Tasks are sorted by name, settings are in the study's order."""
         by_task = self.episodes.groupby("task", sort=True)
         return pd.DataFrame(row for _, episodes in by_task for row in _rows(self, episodes, "one task"))
 
 
 def _conditions_of(setting: Setting) -> str:
-    """Return stress and clock, under which methods are compared, as text."""
+    """Return the setting's stress and clock as text, to find settings that ran under the same conditions."""
     return json.dumps([stress_of(setting.settings), setting.settings["rollout"]], sort_keys=True)
 
 
 def _methods_of(setting: Setting) -> str:
-    """Return everything else that determines a setting, as text."""
+    """Return everything that determines a setting's results, except stress and clock, as text."""
     world = without(setting.settings["world"], {"stress"})
     others = without(setting.settings, (NOT_DETERMINING - {"policy"}) | {"world", "rollout"})
     return json.dumps([world, others, dict(setting.identity)], sort_keys=True)
 
 
 def load_study(store: StudyStore, wanted: Sequence[Episode] | None = None) -> StudyData:
-    """Return a study and its episodes; with `wanted`, a study of only those.
+    """Read a study and its stored episodes.
+
+    Args:
+        store: The study's files.
+        wanted: Episodes to read. Settings without any of them are left out. None: read everything.
 
     Raises:
-        UsageError: No such study, or none of its episodes is there.
+        UsageError: There is no such study, or none of its episodes is stored.
     """
     study = store.load()
     if wanted is not None:
@@ -133,7 +141,7 @@ def load_study(store: StudyStore, wanted: Sequence[Episode] | None = None) -> St
 
 
 def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
-    """Return the episodes with difficulty, device, dtype and threads."""
+    """Add the columns difficulty, device, dtype and threads to the episodes."""
     groups = {task: difficulty_of(task) for task in set(episodes["task"])}
     runtime = {setting.label: setting.settings["runtime"] for setting in study.settings}
     columns = {name: episodes["label"].map({k: v[name] for k, v in runtime.items()}) for name in _RUNTIME}
@@ -147,12 +155,18 @@ def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
 
 
 def difficulty_of(task: str) -> str:
-    """Return the task's difficulty group; `other` if no environment has the task."""
+    """Return the task's difficulty group, or `other` if no environment has the task."""
     return next((spec.tasks[task].difficulty for spec in specs().values() if task in spec.tasks), "other")
 
 
 def _rows(data: StudyData, episodes: pd.DataFrame, averaging: str) -> Iterator[Row]:
-    """Yield one row per label that has episodes here."""
+    """Yield one table row per setting that has episodes among `episodes`.
+
+    Args:
+        data: The study.
+        episodes: Episodes to summarise.
+        averaging: MICRO, MACRO, or a name for the column `averaging` if they are of one task.
+    """
     by_label = {str(label): group for label, group in episodes.groupby("label", sort=False)}
     for label in data.study.labels:
         if label in by_label:
@@ -161,7 +175,17 @@ def _rows(data: StudyData, episodes: pd.DataFrame, averaging: str) -> Iterator[R
 
 
 def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> Row:
-    """Return identity, measures, settings and provenance; values that differ are joined by semicolons."""
+    """Return the table row of a setting: its name, measures, settings and provenance.
+
+    If the episodes have different values in a provenance column, the values are joined by semicolons.
+
+    Args:
+        data: The study.
+        label: Label of the setting.
+        episodes: Its episodes.
+        baseline: Episodes of the baseline. May be empty.
+        averaging: MICRO, MACRO, or a name for one task.
+    """
     tasks, setting = sorted(set(episodes["task"])), data.settings[label]
     stress, hashes = stress_of(setting.settings), without(setting.identity, {OBSERVATION})
     varied = [f"{key.split('.')[-1]} {value}" for key, value in setting.varies.items() if key != data.study.axis]
@@ -191,7 +215,10 @@ def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataF
 
 
 def flatten(settings: Plain) -> Row:
-    """Return nested settings with dotted keys, such as `threshold.r`; lists are joined by semicolons."""
+    """Return nested settings as one dictionary with dotted keys, such as `threshold.r`.
+
+    The values of a list become one text, separated by semicolons.
+    """
     return {k: _joined(v) if isinstance(v, list | tuple) else v for k, v in flat(settings).items()}
 
 
@@ -200,15 +227,17 @@ def _joined(values: Iterable[object]) -> str:
 
 
 def values_of(table: pd.DataFrame, column: str) -> set[str]:
-    """Return the values of a column whose rows join several by semicolons."""
+    """Return all values in a column whose cells may hold several values joined by semicolons."""
     return {value for text in table[column].astype(str) for value in text.split(";")}
 
 
 def further_of(data: StudyData) -> dict[str, Any]:
-    """Return what a study's CSV files leave out, as JSON values by label.
+    """Return everything that a study's CSV files leave out, as JSON values.
 
-    A label has `name` and `varies` (of a grid), `overrides`, `settings`, `identity` (hashes of weights and data),
-    `provenance`, and `measures`: averaging or task -> the measures that have no CSV column.
+    Returns:
+        `study` (its name), `axis` (key of the plots' x axis) and `labels`. The last maps each label to `name`, `varies`
+        (values of a grid's keys), `overrides`, `settings`, `identity` (hashes of weights and data), `provenance`, and
+        `measures`: name of an averaging or a task -> measures without a CSV column.
     """
     columns = list(data.table.columns)
     left_out = {*CSV_COLUMNS, "series", "unstressed"}
@@ -233,26 +262,32 @@ def further_of(data: StudyData) -> dict[str, Any]:
 
 
 def _json(value: Any) -> Any:
+    """Return the value, or None if it is NaN or infinite, which JSON cannot hold."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def csv_text(table: pd.DataFrame) -> str:
-    """Return CSV with six significant digits; a cell is empty if its value does not exist."""
+    """Return the table as CSV text with six significant digits. Missing values are empty cells."""
     return table.to_csv(index=False, float_format="%.6g", lineterminator="\n")
 
 
 def is_number(value: Any) -> bool:
-    """Return whether a value is a number: neither text, bool, None nor NaN."""
+    """Return whether a value is a real number other than NaN. Text, bool and None are not."""
     return isinstance(value, Real) and not isinstance(value, bool) and not math.isnan(value)
 
 
 def is_baseline(row: Row) -> bool:
-    """Return whether a row's setting is the one that it is compared with."""
+    """Return whether the row belongs to the baseline itself, which is not compared with anything."""
     return bool(row["label"] == row["baseline"])
 
 
 def rows_of(table: pd.DataFrame, averaging: str | None = None) -> list[Row]:
-    """Return the table's rows, or the rows of one averaging, as dicts by column."""
+    """Return the rows of a table as dictionaries of column to value.
+
+    Args:
+        table: The table.
+        averaging: Keep only rows with this averaging (MICRO or MACRO). None: keep all rows.
+    """
     rows = table if averaging is None else table[table["averaging"] == averaging]
     return [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]
 
@@ -267,9 +302,9 @@ _COLUMNS = (
 
 
 def latency_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of a study's table whose world, and whose baseline's world, goes on during a decode.
+    """Return the rows of settings whose world goes on during a decode (`rollout.clock=real`), for the baseline too.
 
-    Its additional column `ar_latency_ms` is the mean latency of the baseline's decodes.
+    The added column `ar_latency_ms` is the mean latency of the baseline's decodes.
     """
     rows = table[table["averaging"] == MICRO]
     latencies = dict(zip(rows["label"], rows["felt_latency_ms"], strict=True))

@@ -1,7 +1,7 @@
-"""Words for what a study shows. No other module of kerv writes such a sentence.
+"""Write the sentences that say what a study shows. No other module of kerv writes such a sentence.
 
-A sentence says *faster*, *slower* or *loses less than* only if a 95 % interval does. If the baseline solves less than
-`SOLVED` of the episodes, nothing is recommended.
+A sentence says *faster*, *slower* or *loses less than* only if a 95 % interval shows it. If the baseline succeeds in
+less than the share `SOLVED` of its episodes, no setting is recommended.
 """
 
 from __future__ import annotations
@@ -17,25 +17,29 @@ from kerv_cli.report.statistics import MOST_PAIRS
 from kerv_cli.report.tables import is_baseline, is_number, rows_of
 
 SOLVED = 0.20
-"""Smallest success rate at which a baseline counts as solving its tasks."""
+"""Smallest success rate at which the baseline counts as solving its tasks."""
 SMALLER, LARGER, OPEN = "loss is smaller", "loss is larger", "open"
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Which setting to take, for all tasks together or for one.
+    """Which setting to take, for one task or for all tasks together.
 
     Attributes:
-        where: `all tasks`, or the task.
-        pairs: Largest number of pairs of a setting.
+        where: The task, or `all tasks`.
+        pairs: Number of pairs of the setting that has most.
         baseline_success: Success rate of the baseline.
-        front: Settings that no other one beats in both speed and success, the fastest first.
-        chosen: The fastest setting whose loss of success is shown to be below the bound; empty if there is none.
-        loss_at_most: Upper bound on the loss of the chosen one, points of success, 95 % confidence.
-        candidate: The fastest setting that more pairs would show at the present rates; empty if there is none.
-        candidate_pairs: About how many pairs that takes, all in all.
-        tested: Number of settings whose measured speed is above the baseline's, or that nobody timed.
-        episode_speedup: Speed per episode of the chosen one, with its interval.
+        front: Settings that no other setting beats in both speed and success, the fastest first.
+        chosen: Fastest setting that is shown to lose less success than the bound. Empty if there is none.
+        loss_at_most: Upper bound on the chosen setting's loss of success, in points, at 95 % confidence. NaN if no
+            setting is chosen.
+        candidate: Fastest setting that could be shown with more pairs, if the rates stay the same. Empty if there is
+            none, or if a setting is chosen.
+        candidate_pairs: About how many pairs in all the candidate needs. NaN without a candidate.
+        tested: Number of settings that qualify for the test: faster than the baseline, or not timed.
+        episode_speedup: Speed per episode of the chosen setting against the baseline. NaN if it was not timed.
+        episode_speedup_low: Lower end of its 95 % interval.
+        episode_speedup_high: Upper end of its 95 % interval.
     """
 
     where: str
@@ -53,29 +57,31 @@ class Choice:
 
     @property
     def is_shown(self) -> bool:
-        """Whether a setting is shown to be faster at that loss of success."""
+        """Whether a setting is shown both to be faster and to lose less success than the bound."""
         return bool(self.chosen) and self.episode_speedup_low > 1
 
     @property
     def is_unsolved(self) -> bool:
-        """Whether the baseline does not solve its tasks."""
+        """Whether the baseline's success rate is too low for a recommendation."""
         return self.baseline_success < SOLVED
 
     def as_dict(self) -> Row:
-        """Return the choice for JSON."""
+        """Return the choice as JSON values."""
         return {**asdict(self), "front": ";".join(self.front)}
 
 
 @dataclass(frozen=True)
 class Decision:
-    """The answer for a setting at a look (`until=decided`).
+    """Whether a setting's loss of success is shown to be below or above a bound (`until=decided`).
 
     Attributes:
         label: The setting.
         verdict: SMALLER, LARGER or OPEN.
         pairs: Number of its pairs with the baseline.
-        look: Number of the look, from 1.
-        difference: Success of the setting minus the baseline's; low and high: the interval at the look's confidence.
+        look: Number of the look at the results, from 1.
+        difference: Success rate of the setting minus the baseline's.
+        low: Lower end of the difference's interval, at the confidence of one look.
+        high: Upper end of that interval.
     """
 
     label: str
@@ -88,7 +94,13 @@ class Decision:
 
 
 def sentence(choice: Choice, loss: float, baseline: str) -> str:
-    """Return the choice for all tasks in one sentence, for a bound on the loss in points of success."""
+    """Return the choice for all tasks in one sentence.
+
+    Args:
+        choice: The choice.
+        loss: Largest acceptable loss of success, in points.
+        baseline: Label of the baseline.
+    """
     if choice.is_unsolved:
         return (
             f"{baseline} does not solve these tasks ({100 * choice.baseline_success:.0f} % of its episodes succeed), "
@@ -114,6 +126,7 @@ def short_sentence(choice: Choice) -> str:
 
 
 def _speed(choice: Choice) -> str:
+    """Return the clause that says how fast the chosen setting is."""
     if not is_number(choice.episode_speedup):
         return "; its speed was not measured"
     shown = "and is faster" if choice.is_shown else "but is not shown to be faster"
@@ -122,6 +135,7 @@ def _speed(choice: Choice) -> str:
 
 
 def _missing(choice: Choice) -> str:
+    """Return the clause that says how many more pairs would be needed, and for which setting."""
     if not choice.candidate:
         return "at these rates, more pairs would not show one either"
     more = max(1, math.ceil(choice.candidate_pairs - choice.pairs))
@@ -130,7 +144,12 @@ def _missing(choice: Choice) -> str:
 
 
 def under_conditions(rows: Sequence[Row], baseline: str) -> str:
-    """Say which settings succeed less or more often than the baseline under the same stress and clock."""
+    """Say which settings succeed less or more often than the baseline under the same stress and clock.
+
+    Args:
+        rows: The study's rows, pooled over tasks.
+        baseline: Name of the baseline's method.
+    """
     compared = [row for row in rows if row["pairs"] and not is_baseline(row)]
     solved = [row for row in compared if (row["both"] + row["only_baseline"]) / row["pairs"] >= SOLVED]
     less = [str(row["label"]) for row in solved if row["difference_high"] < 0]
@@ -144,7 +163,10 @@ def under_conditions(rows: Sequence[Row], baseline: str) -> str:
 
 
 def caution(table: pd.DataFrame) -> str:
-    """Return what to know before reading the numbers, in one line; empty if there is nothing."""
+    """Return one line that the reader should know before reading the numbers. Empty if there is nothing to say.
+
+    It names policies that are given the positions of object and goal, and settings that verify nothing.
+    """
     rows = rows_of(table, MICRO)
     privileged = sorted({str(row["policy.target"]) for row in rows if "privileged" in str(row["observation"])})
     unverified = [
@@ -157,7 +179,13 @@ def caution(table: pd.DataFrame) -> str:
 
 
 def stopping_rule(loss: float, looks: int, confidence: float) -> str:
-    """Return the stopping rule of `until=decided` in one sentence."""
+    """Describe the stopping rule of `until=decided` in a sentence.
+
+    Args:
+        loss: Largest acceptable loss of success, in points.
+        looks: Number of planned looks at the results.
+        confidence: Confidence of the interval at each look, from 0 to 1.
+    """
     return (
         f"until=decided: at most {looks} looks, one after each block of seeds, each at {100 * confidence:.1f} % "
         "confidence (Pocock's boundary, 95 % over all looks). A setting stops when its loss of success is shown to be "
@@ -166,6 +194,6 @@ def stopping_rule(loss: float, looks: int, confidence: float) -> str:
 
 
 def progress_line(decisions: Sequence[Decision]) -> str:
-    """Return decisions in one line, for progress."""
+    """Return the decisions as one line that shows a sweep's progress."""
     clauses = [f"{one.label}: {one.verdict} after {one.pairs} pairs" for one in decisions if one.verdict != OPEN]
     return "; ".join([*clauses, f"{sum(one.verdict == OPEN for one in decisions)} open"])

@@ -1,4 +1,4 @@
-"""Recordings of episodes for the Rerun viewer. Nothing heavy is imported here."""
+"""Save and show recordings of episodes with the Rerun viewer. Importing this package loads nothing heavy."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from kerv_cli.engine.record import EpisodeRecord
 
 
 def save_recording(record: EpisodeRecord, path: Path, method: str) -> Path:
-    """Write an episode atomically as a recording that carries its own layout, and return the path.
+    """Write an episode as a recording for the Rerun viewer and return the path.
+
+    The file is written atomically. It contains the layout of the viewer.
 
     Args:
-        record: The episode; without frames, the recording has no camera.
-        path: The .rrd file; its folder is created.
+        record: The episode. Without frames, the recording shows no camera.
+        path: The .rrd file. Its folder is created.
         method: Name of the method. Recordings of one method share their layout in the viewer.
 
     Raises:

@@ -1,4 +1,7 @@
-"""A recording as a film for papers and slides: the camera, and below it a cell per token of the current decode."""
+"""Turn a recording into a film for papers and slides.
+
+The film shows the camera and, below it, one cell per token of the current decode.
+"""
 
 from __future__ import annotations
 
@@ -22,15 +25,19 @@ ROW = 22  # pixels of a line of tokens
 BACKGROUND = (13, 16, 17)
 
 Track = list[tuple[int, float, Any]]
-"""(control step, simulated seconds, value) of an entity, in order."""
+"""Values of one entity (a named series in a recording), in order: (control step, simulated seconds, value)."""
 
 
 def save_film(recording: Path, path: Path) -> Path:
-    """Write the film, in simulated time, and return its path, which ends in .gif or .mp4 (H.264).
+    """Write a recording as a film and return the film's path. It plays in simulated time.
+
+    Args:
+        recording: The .rrd file.
+        path: The film, which ends in .gif or .mp4 (H.264).
 
     Raises:
-        UsageError: Another ending, or a recording without a camera.
-        KervError: The recording is damaged, or PyAV is not installed.
+        UsageError: `path` has another ending, or the recording has no camera.
+        KervError: The recording is damaged, or PyAV (needed for .mp4) is not installed.
         StorageError: Writing failed.
     """
     encoders = {".gif": _gif, ".mp4": _mp4}
@@ -48,7 +55,7 @@ def save_film(recording: Path, path: Path) -> Path:
 
 
 def _tracks(recording: Path) -> dict[str, Track]:
-    """Return the tracks of camera, modes, forwards and tokens, by entity."""
+    """Read the values over time of camera, mode, forwards and tokens, by entity (a series' name in the recording)."""
     values = {"camera": "EncodedImage:blob", "mode": "StateChange:state", "decode": "Scalars:scalars"}
     values["tokens"] = values["mode"]
     tracks: dict[str, Track] = {}
@@ -62,13 +69,19 @@ def _tracks(recording: Path) -> dict[str, Track]:
 
 
 def _value(track: Track, step: int) -> Any:
-    """Return the value that holds at a control step; None before the first."""
+    """Return the latest value at a control step, or None before the first value."""
     count = bisect_right(track, step, key=lambda row: row[0])
     return track[count - 1][2] if count else None
 
 
 def _picture(frame: Iterable[int], step: int, tracks: Mapping[str, Track]) -> Image.Image:
-    """Return one picture of the film from the camera's JPEG."""
+    """Return one picture of the film.
+
+    Args:
+        frame: The camera's image, as the bytes of a JPEG file.
+        step: Control step of the image.
+        tracks: Values of the recording, from `_tracks`.
+    """
     view = Image.open(io.BytesIO(bytes(frame))).convert("RGB")
     scale = max(1, -(-PICTURE // max(view.size)))
     view = view.resize((view.width * scale, view.height * scale), Image.Resampling.LANCZOS)
@@ -95,6 +108,7 @@ def _picture(frame: Iterable[int], step: int, tracks: Mapping[str, Track]) -> Im
 
 
 def _gif(pictures: list[Image.Image], seconds: float) -> bytes:
+    """Return the pictures as a GIF file. `seconds` is the duration of each."""
     buffer = io.BytesIO()
     first, *rest = (picture.quantize(128) for picture in pictures)
     first.save(buffer, "GIF", save_all=True, append_images=rest, duration=max(20, round(1000 * seconds)), loop=0)
@@ -102,6 +116,7 @@ def _gif(pictures: list[Image.Image], seconds: float) -> bytes:
 
 
 def _mp4(pictures: list[Image.Image], seconds: float) -> bytes:
+    """Return the pictures as an MP4 file. `seconds` is the duration of each."""
     try:
         import av
     except ImportError as error:

@@ -1,8 +1,8 @@
-"""Encodes an EpisodeRecord as an .rrd file for the Rerun viewer.
+"""Encode an episode as a recording (.rrd file) for the Rerun viewer.
 
-The recording is encoded in memory and written atomically, because Rerun's file sink waits forever on a full disk.
-Timelines: `step` (control steps) and `time` (simulated seconds). A row of a decode is at the control step at which its
-actions begin.
+The recording is encoded in memory and then written atomically, because Rerun's own file writer hangs on a full disk.
+It has two timelines: `step` (control steps) and `time` (simulated seconds). Data about a decode is logged at the
+control step at which its first action is executed.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ _OPEN, _CLOSED = np.array([86.0, 180.0, 233.0]), np.array([230.0, 120.0, 0.0])
 
 Colors = Sequence[int]
 Steps = NDArray[np.int64]
-"""(rows,) control steps."""
+"""(rows,) control step of each row."""
 
 
 class _Log:
-    """A recording that is being written.
+    """Write data to a recording.
 
     Attributes:
         recording: The recording.
@@ -55,17 +55,30 @@ class _Log:
         self.hz = hz
 
     def static(self, path: str, archetype: rr.AsComponents) -> None:
-        """Log what holds for the whole episode."""
+        """Log data that holds for the whole episode. `path` is its name in the viewer."""
         self.recording.log(path, archetype, static=True)
 
     def rows(self, path: str, steps: Steps, columns: Iterable[rr.ComponentColumn]) -> None:
-        """Log a row per control step."""
+        """Log data over time.
+
+        Args:
+            path: Name of the data in the viewer.
+            steps: (rows,) control step of each row.
+            columns: Rerun columns with one value per row.
+        """
         nanoseconds = np.round(steps * (1e9 / self.hz)).astype("timedelta64[ns]")
         times = [rr.TimeColumn(STEP, sequence=steps), rr.TimeColumn(TIME, duration=nanoseconds)]
         self.recording.send_columns(path, times, columns)
 
     def states(self, path: str, steps: Steps, values: Sequence[str], looks: Mapping[str, tuple[str, int]]) -> None:
-        """Log a lane of states. A state lasts until the next one; looks: state -> its label and colour."""
+        """Log a state over time, drawn as a coloured bar. A state lasts until the next one.
+
+        Args:
+            path: Name of the bar in the viewer.
+            steps: (rows,) control step at which each state begins.
+            values: (rows,) the states.
+            looks: State -> label and colour (0xRRGGBBAA).
+        """
         labels, colors = zip(*looks.values(), strict=True)
         style = rr.StateConfiguration(values=list(looks), labels=list(labels), colors=np.array(colors, dtype=np.uint32))
         self.static(path, style)
@@ -74,14 +87,14 @@ class _Log:
     def numbers(
         self, path: str, steps: Steps, names: Sequence[str], values: Iterable[Sequence[float]], colors: Colors = COLORS
     ) -> None:
-        """Log series of numbers, each held until the next one.
+        """Log numbers over time, drawn as step lines.
 
         Args:
-            path: The entity.
+            path: Name of the plot in the viewer.
             steps: Control step of each row.
-            names: Name of each series.
-            values: Per row a number per name, or nothing: then there is no row.
-            colors: Of the series; repeated if they are fewer.
+            names: Name of each line.
+            values: For each row, one number per line. A row that is empty is left out.
+            colors: Colour of each line (0xRRGGBBAA). Repeated if there are more lines.
         """
         present = [(step, value) for step, value in zip(steps, values, strict=True) if len(value)]
         if present:
@@ -94,7 +107,12 @@ class _Log:
 
 @catch_and_log_exceptions(strict=True)  # rerun would turn exceptions into warnings and missing views
 def encode(record: EpisodeRecord, method: str) -> bytes:
-    """Return an episode as the bytes of an .rrd file; arguments as `save_recording`."""
+    """Return an episode as the bytes of an .rrd file.
+
+    Args:
+        record: The episode. Without frames, the recording shows no camera.
+        method: Name of the method.
+    """
     recording = rr.RecordingStream("kerv_" + _part(method))
     memory = recording.memory_recording()
     recording.set_log_time_enabled(False)
@@ -113,6 +131,7 @@ def encode(record: EpisodeRecord, method: str) -> bytes:
 
 
 def _log_camera(log: _Log, record: EpisodeRecord) -> None:
+    """Log the frames of the episode, if there are any."""
     if record.frames:
         steps = np.array(sorted(record.frames), dtype=np.int64)
         blobs = [_jpeg(record.frames[int(step)]) for step in steps]
@@ -121,13 +140,17 @@ def _log_camera(log: _Log, record: EpisodeRecord) -> None:
 
 
 def _jpeg(frame: NDArray[np.uint8]) -> bytes:
+    """Return an image (height, width, 3) as a JPEG file."""
     buffer = io.BytesIO()
     Image.fromarray(frame).save(buffer, "JPEG", quality=JPEG_QUALITY)
     return buffer.getvalue()
 
 
 def _log_world(log: _Log, record: EpisodeRecord) -> None:
-    """Log the end effector's path, its present position coloured by the gripper's opening, object and goal."""
+    """Log the path of the end effector, its position over time, and the positions of object and goal.
+
+    The colour of the position shows how far the gripper is open.
+    """
     steps = np.arange(len(record.path), dtype=np.int64)
     opening = np.clip(record.gripper, 0.0, 1.0)[:, None]
     colors = np.round(_OPEN * opening + _CLOSED * (1 - opening)).astype(np.uint8)
@@ -142,7 +165,7 @@ def _log_world(log: _Log, record: EpisodeRecord) -> None:
 
 
 def _log_tokens(log: _Log, record: EpisodeRecord) -> None:
-    """Log per decode its mode, a lane for each token of the chunk, and a table."""
+    """Log for each decode: its mode, the outcome of each token of its chunk as coloured bars, and a table."""
     starts, names = np.asarray(record.decode_steps, dtype=np.int64), record.space.names
     turns = [str(number % 2) for number in range(len(starts))]  # equal states would melt into one
     log.states("decodes", starts, turns, {"0": ("·", 0x55606BFF), "1": ("·", GREY)})
@@ -168,12 +191,12 @@ def _log_tokens(log: _Log, record: EpisodeRecord) -> None:
 
 
 def _part(name: str) -> str:
-    """Return a name as a part of an entity's path."""
+    """Return the name with every character that Rerun does not allow in a path replaced by an underscore."""
     return re.sub(r"\W+", "_", name, flags=re.ASCII)
 
 
 def _log_numbers(log: _Log, record: EpisodeRecord) -> None:
-    """Log numbers per control step and per decode. A series without values has no entity."""
+    """Log numbers per control step and per decode. Measures without values are left out."""
     decodes, names = record.decodes, list(record.space.names)
     steps, starts = np.arange(record.steps + 1, dtype=np.int64), np.asarray(record.decode_steps, dtype=np.int64)
     log.numbers("actions", steps[:-1], names, record.actions)
@@ -205,11 +228,14 @@ SIGNALS = {
     "deviation": "deviation from AR",
     "delay_steps": "latency that the world felt, control steps",
 }
-"""Optional attributes of DecodeRecord -> titles of their views."""
+"""Optional attributes of DecodeRecord that are plotted -> titles of the plots."""
 
 
 def blueprint(record: EpisodeRecord) -> rrb.Blueprint:
-    """Return the layout: the world and series per decode, a lane per token, the current decode. Playback is paused."""
+    """Return the viewer's layout: the world and plots, a coloured bar per token, and the current decode.
+
+    Playback is paused at first.
+    """
     path = rrb.Spatial3DView(
         origin="/world", name="End effector: orange closed, blue open gripper", line_grid=rrb.LineGrid3D(spacing=0.1)
     )
@@ -245,6 +271,7 @@ def blueprint(record: EpisodeRecord) -> rrb.Blueprint:
 
 
 def _series(name: str, *entities: str) -> rrb.TimeSeriesView:
+    """Return a view that plots some entities over time."""
     return rrb.TimeSeriesView(
         origin="/",
         contents=[f"/{entity}" for entity in entities],

@@ -1,4 +1,4 @@
-"""What became of each token of a decode, from its record."""
+"""Find out what happened to each token of a decode (accepted, rejected, …), from the decode's record."""
 
 from __future__ import annotations
 
@@ -11,7 +11,15 @@ from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
 
 
 class OutcomeStyle(NamedTuple):
-    """How an outcome is drawn. The colours (0xRRGGBBAA) are Okabe and Ito's, for colour-blind readers."""
+    """How the viewer shows an outcome.
+
+    The colours are Okabe and Ito's, for colour-blind readers.
+
+    Attributes:
+        symbol: One character.
+        color: 0xRRGGBBAA.
+        meaning: Explanation for the key.
+    """
 
     symbol: str
     color: int
@@ -33,14 +41,14 @@ OUTCOMES = {
 
 @dataclass(frozen=True)
 class TokenOutcome:
-    """The outcome of one token of a chunk; a field is None if the token has no such value.
+    """What happened to one token of a chunk.
 
     Attributes:
         kind: A key of OUTCOMES.
-        token: What was committed.
-        draft: What was drafted.
-        target: What the target decoded.
-        limit: r of the token's DoF, in bins.
+        token: The committed token. None if no token was committed there.
+        draft: The drafted token. None if nothing was drafted there.
+        target: The target's token. None if the target did not decode it.
+        limit: Acceptance threshold r of the token's DoF, in bins. None if there was none.
     """
 
     kind: str
@@ -51,16 +59,24 @@ class TokenOutcome:
 
 
 Chunks = Sequence[Sequence[TokenOutcome]]
-"""Outcomes of the tokens of each decode's chunk."""
+"""For each decode, the outcomes of the tokens of its chunk."""
 
 
 def threshold_of(decode: DecodeRecord) -> tuple[int, ...]:
-    """Return r per DoF of a decode, in bins; empty if its acceptance rule has no threshold."""
+    """Return the acceptance threshold r of each DoF in a decode, in bins. Empty if the acceptance rule has none."""
     return next((r.threshold for r in decode.rounds if r.threshold), ())
 
 
 def chunk_size(decodes: Sequence[DecodeRecord], dofs: int) -> int:
-    """Return N, the tokens of a chunk; at least what any decode judged, committed or executed, in whole steps."""
+    """Return N, the number of tokens of a chunk, as seen in an episode's decodes.
+
+    N is the largest number of tokens that any decode verified, committed or executed. It is rounded up to whole control
+    steps.
+
+    Args:
+        decodes: Decodes of the episode.
+        dofs: D, tokens per control step.
+    """
     most = 1
     for decode in decodes:
         judged = [r.start + max(len(r.drafted), len(r.target_tokens)) for r in decode.rounds]
@@ -69,9 +85,15 @@ def chunk_size(decodes: Sequence[DecodeRecord], dofs: int) -> int:
 
 
 def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome]:
-    """Return the outcome of each of the chunk's `size` tokens.
+    """Return the outcome of each token of a decode's chunk.
 
-    A rejected token stays `rejected` even if it was filled later. Other tokens that were not executed are `dropped`.
+    A rejected token stays `rejected` even if a prediction replaced it later. All other tokens that were not executed
+    are `dropped`.
+
+    Args:
+        decode: The decode.
+        size: N, tokens per chunk.
+        dofs: D, tokens per control step.
     """
     executed = len(decode.actions) * dofs
     outcomes = [TokenOutcome(_unjudged(decode))] * size
@@ -88,7 +110,7 @@ def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome
 
 
 def _judged(one_round: Round) -> list[tuple[int, TokenOutcome]]:
-    """Return (index in the chunk, outcome) of every token that one round judged."""
+    """Return (index in the chunk, outcome) for every token in one round of a decode."""
     outcomes = []
     drafts, targets, threshold = one_round.drafted, one_round.target_tokens, one_round.threshold
     for i, (draft, target) in enumerate(itertools.zip_longest(drafts, targets)):
@@ -107,14 +129,21 @@ def _judged(one_round: Round) -> list[tuple[int, TokenOutcome]]:
 
 
 def _unjudged(decode: DecodeRecord) -> str:
-    """Return the outcome of a token that is in no round of the decode."""
+    """Return the kind of outcome for tokens that appear in no round of the decode."""
     if not decode.skipped and not decode.rounds and not decode.tokens:
         return "scripted"
     return "skipped" if decode.skipped or not decode.forwards else "target"
 
 
 def acceptance(rounds: Sequence[Round]) -> tuple[float, float]:
-    """Return tokens committed and drafts accepted per verification (docs/methods.md §7), of at least one."""
+    """Return the acceptance length and the accepted drafts per verification (docs/methods.md §7).
+
+    Args:
+        rounds: Rounds of one or more decodes. At least one must be a verification.
+
+    Returns:
+        Mean number of committed tokens, and mean number of accepted draft tokens, per verification.
+    """
     rounds = [r for r in rounds if r.is_verification]
     return sum(r.committed for r in rounds) / len(rounds), sum(r.accepted for r in rounds) / len(rounds)
 
@@ -123,12 +152,15 @@ _SHOWN_SYMBOLS = set("→✓×≈·–…≤≥±αφσ") | {style.symbol for st
 
 
 def readable(text: str) -> str:
-    """Return text on one line, with `?` for characters that the viewer's font lacks: they crash the 0.41 viewer."""
+    """Return the text on one line, with `?` in place of characters that the viewer's font lacks.
+
+    Such characters crash version 0.41 of the viewer.
+    """
     return "".join(c if " " <= c <= "~" or "\xa1" <= c <= "ÿ" or c in _SHOWN_SYMBOLS else "?" for c in text)
 
 
 def facts_of(record: EpisodeRecord, method: str) -> dict[str, str | float]:
-    """Return the episode's totals, which are stored as properties of the recording."""
+    """Return the totals of an episode, which the recording stores as its properties."""
     modes = [decode.mode for decode in record.decodes]
     rounds = [r for decode in record.decodes for r in decode.rounds if r.is_verification]
     facts: dict[str, str | float] = {
@@ -155,7 +187,7 @@ def facts_of(record: EpisodeRecord, method: str) -> dict[str, str | float]:
 
 
 def summary(record: EpisodeRecord, method: str) -> str:
-    """Return the episode as Markdown, with the key to the tokens' colours."""
+    """Return the episode's totals as Markdown, with a key to the symbols of the tokens."""
     facts = facts_of(record, method).items()
     rows = {name.replace("_", " "): f"{value:.4g}" if isinstance(value, float) else value for name, value in facts}
     key = {f"{style.symbol} {name}": style.meaning for name, style in OUTCOMES.items()}
@@ -163,19 +195,20 @@ def summary(record: EpisodeRecord, method: str) -> str:
 
 
 def _table(head: tuple[str, str], rows: Mapping[str, object]) -> list[str]:
+    """Return the lines of a Markdown table with two columns."""
     return [f"| {head[0]} | {head[1]} |", "|:--|:--|", *(f"| {name} | {value} |" for name, value in rows.items())]
 
 
 def decode_table(
     decode: DecodeRecord, number: int, step: int, outcomes: Sequence[TokenOutcome], names: Sequence[str]
 ) -> str:
-    """Return a decode as Markdown: a line of totals and a row per token.
+    """Return a decode as Markdown: a line of totals, then a table with one row per token.
 
     Args:
         decode: The decode.
-        number: Its number in the episode.
-        step: Control step at which its actions begin.
-        outcomes: Of its tokens.
+        number: Its number in the episode, from 0.
+        step: Control step at which its first action is executed.
+        outcomes: Outcome of each token of its chunk.
         names: Names of the D DoFs.
     """
     counts = {

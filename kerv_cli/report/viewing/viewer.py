@@ -1,4 +1,4 @@
-"""Finds, checks, reads and opens recordings. Rerun is imported only to read a file."""
+"""Find, check, read and open recordings. Rerun is imported only when a file is read."""
 
 from __future__ import annotations
 
@@ -19,20 +19,23 @@ if TYPE_CHECKING:
     from rerun.chunk import Chunk, RrdReader
 
 MOST_OPENED = 16
-"""Largest number of recordings that one command opens; more would fill the viewer's memory."""
+"""Largest number of recordings that one command opens. More would fill the viewer's memory."""
 _START_SECONDS = 2.0
 
 
 def recordings_below(folder: Path) -> Iterator[Path]:
-    """Return the .rrd files in a folder and its folders, without hidden ones."""
+    """Return the .rrd files in a folder and its subfolders, except hidden files."""
     return (path for path in folder.rglob("[!.]*.rrd") if path.is_file())
 
 
 def find_recordings(paths: Sequence[Path]) -> list[Path]:
-    """Return the .rrd files among `paths` and in its folders, the newest first.
+    """Return all recordings among some paths, the newest first.
+
+    Args:
+        paths: .rrd files, and folders to search.
 
     Raises:
-        UsageError: A path does not exist or is neither a recording nor a folder, or there is no recording.
+        UsageError: A path does not exist or is neither a recording nor a folder, or no recording was found.
     """
     found: set[Path] = set()
     for path in (Path(p).expanduser() for p in paths):
@@ -49,20 +52,20 @@ def find_recordings(paths: Sequence[Path]) -> list[Path]:
 
 
 def has_display() -> bool:
-    """Return whether a window can be opened here."""
+    """Return whether this machine can open a window."""
     if sys.platform in ("darwin", "win32"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def open_recording(paths: Sequence[Path]) -> str:
-    """Open recordings in the Rerun viewer without waiting for it; without a display, name the commands that do.
+    """Open recordings in the Rerun viewer. Do not wait until the viewer is closed.
 
     Args:
-        paths: One recording or more, the newest first; at most MOST_OPENED are opened.
+        paths: The recordings, the newest first. At most MOST_OPENED are opened.
 
     Returns:
-        A sentence about what was opened, or the commands to type.
+        A sentence about what was opened. Without a display: the commands to type on another machine.
 
     Raises:
         KervError: A recording is damaged, or the viewer did not start.
@@ -81,12 +84,16 @@ def open_recording(paths: Sequence[Path]) -> str:
 
 
 def viewer_command() -> list[str]:
-    """Return the command of the viewer that belongs to this Python."""
+    """Return the command that starts the viewer installed with this Python."""
     return [sys.executable, "-m", "rerun"]
 
 
 def _start(command: list[str]) -> None:
-    """Start the viewer as a process of its own, and see whether it ends at once."""
+    """Start the viewer in a process of its own.
+
+    Raises:
+        KervError: It cannot be started, or ends within two seconds.
+    """
     with tempfile.TemporaryFile() as log:
         try:
             viewer = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True)
@@ -103,10 +110,10 @@ def _start(command: list[str]) -> None:
 
 
 def read_chunks(path: Path) -> tuple[RrdReader, list[Chunk]]:
-    """Return the reader of a recording, and every chunk.
+    """Read a recording. Return Rerun's reader and all data chunks of the file.
 
     Raises:
-        KervError: The file is missing or damaged, or holds no recording.
+        KervError: The file is missing, damaged, or holds no recording.
     """
     from rerun.chunk import RrdReader
 
