@@ -24,7 +24,7 @@ from kerv_cli.methods.calibration import NEVER, Calibration, CalibrationArtifact
 from kerv_cli.methods.heisd.datastore import Datastore, Manifest, Shard
 from kerv_cli.methods.heisd.rules import BoundaryRanges
 from kerv_cli.methods.settings import PolicySettings
-from kerv_cli.training.calibration import CalibrationRun, Matches, lowest_level, match, skip_section, task_levels
+from kerv_cli.training.calibration import LEAST, CalibrationRun, Matches, lowest_level, match, skip_section, task_levels
 from kerv_cli.training.datastore import DatastoreBuild
 from kerv_cli.training.settings import BuildDatastoreSettings, CalibrateSettings
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
@@ -98,6 +98,24 @@ def test_the_lowest_level_is_the_definitions(seed: int, n: int, confidence: floa
         float(s) for s in similarity if (similarity >= s).sum() >= least and good[similarity >= s].mean() >= confidence
     ]
     assert lowest_level(similarity, good, confidence, least) == (min(levels) if levels else None)
+
+
+@hypothesis_settings(deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.5, 0.6, 0.8, 0.9, 0.95, 0.99]), st.floats(0.05, 1.0))
+def test_the_bounds_hold_the_level(seed: int, confidence: float, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    similarity = rng.random(80).astype(np.float32)
+    matches = Matches(similarity, 0.2 * (rng.random(80) > share), rng.random(80) > 0.97)
+    row = task_levels(matches, 0.1, confidence)
+    assert row.low <= row.s_min <= row.high <= NEVER
+    skipped = similarity >= row.s_min
+    assert row.share == pytest.approx(skipped.mean())
+    if row.s_min < 1:
+        assert skipped.sum() >= LEAST
+        assert matches.good(0.1)[skipped].mean() == row.within >= confidence
+        assert row.high <= similarity.max()
+    else:
+        assert (row.low, row.high, row.share, row.error) == (NEVER, NEVER, 0.0, None)
 
 
 def test_the_bounds_are_the_levels_of_twice_and_a_third_of_the_wrong_chunks() -> None:

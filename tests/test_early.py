@@ -81,6 +81,24 @@ def tokens_of(early: EarlyNetwork, features: torch.Tensor, radius: int) -> list[
     return early.draft(features, radius)[0, :-1].long().tolist()
 
 
+def test_a_draft_is_the_argmax_of_the_forward_and_depends_on_all_it_is_shown() -> None:
+    early, target = drafter(), shaped()
+    prompt = torch.randn(1, 10, 16, generator=torch.Generator().manual_seed(1))
+
+    def drafted(prompt: torch.Tensor, radius: int = 0) -> list[int]:
+        return tokens_of(early, target.pooled(prompt), radius)
+
+    logits = early(target.pooled(prompt))
+    assert logits.shape == (1, 8, 255)
+    plain = drafted(prompt)
+    assert plain == logits[0].argmax(-1).tolist()
+    assert drafted(prompt, 9) == choose(logits, 9, STRICT)[0].tolist()
+    for token in range(10):
+        moved = prompt.clone()
+        moved[:, token] += 3.0
+        assert drafted(moved) != plain
+
+
 @pytest.mark.bits
 def test_packed_weights_give_the_same_logits() -> None:
     torch.manual_seed(0)

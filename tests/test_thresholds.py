@@ -118,8 +118,12 @@ def test_the_reference_level_is_the_tasks_where_none_is_given(kind: str) -> None
         ("fixed", {"r": -1}, r"threshold\.r=-1"),
         ("fixed", {"r": 255}, r"threshold\.r=255: bins from 0 to 254"),
         ("kinematic", {"k_s": 0.0}, r"threshold\.k_s=0\.0"),
+        ("kinematic", {"k_s": math.nan}, r"threshold\.k_s=nan"),
         ("kinematic", {"r_min": 16}, r"threshold\.r_min=16 threshold\.r_max=15"),
+        ("change", {"r_min": -1}, r"threshold\.r_min=-1"),
         ("schedule", {"r_max": 255}, r"threshold\.r_max=255"),
+        ("kinematic", {"phi": 0.0}, r"threshold\.phi=0"),
+        ("schedule", {"tau": 0.0}, r"threshold\.tau=0"),
     ],
 )
 def test_bad_values_get_one_line(kind: str, values: dict[str, Any], says: str) -> None:

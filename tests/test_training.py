@@ -10,6 +10,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -265,14 +266,32 @@ def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results
     assert all(torch.equal(a[k], b[k]) for k in a)
 
 
+@pytest.mark.usefixtures("few_validations")
+def test_training_counts_subnormal_numbers_as_zero_and_this_thread_nothing_later(
+    results: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    halves, loss = [], Imitation.loss
+
+    def watched(*given: Any) -> tuple[torch.Tensor, Metrics]:
+        halves.append(float(torch.tensor(1e-39) * 0.5))
+        return loss(*given)
+
+    monkeypatch.setattr(Imitation, "loss", watched)
+    words = ["target=nano", "task=drawer-close", "train.batch=2", "train.steps=2", "train.validate_every=2"]
+    result = CliRunner().invoke(app, ["train", "target", "name=flushed", *words, "demos=few", f"results={results}"])
+    assert result.exit_code == 0, result.output
+    assert halves == [0.0, 0.0]
+    assert float(torch.tensor(1e-39) * 0.5) > 0
+
+
 @pytest.mark.parametrize("tiles", [True, False])
 def test_bfloat16_is_for_cpus_with_tiles(tiles: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(imitation, "has_tiles", lambda: tiles)
-    objective = object.__new__(Imitation)
-    objective.device = torch.device("cpu")
+    lesson = object.__new__(Imitation)
+    lesson.device = torch.device("cpu")
     for asked in (True, False):
-        objective.settings = replace(TINY, bf16=asked)
-        with objective.precision():
+        lesson.settings = replace(TINY, bf16=asked)
+        with lesson.precision():
             assert torch.is_autocast_enabled("cpu") == (asked and tiles)
 
 

@@ -173,12 +173,17 @@ def rerun(
 
     results, (name,) = settings.results, _run_names(names)
     run = find_run(results, name)
+    if run.is_training:
+        from kerv_cli.catalogue.again import again_words
+        from kerv_cli.cli.training import run_training
+        from kerv_cli.training.again import training_again
+
+        command = again_words(run, results)
+        run_training(training_again(run, results), plan, as_json, "reading what it needs", "training again", command)
+        return
     if not run.has_episodes:
-        command = shlex.join(["kerv", *run.command])
         if run.command and run.state != "complete":
-            raise UsageError(f"{run.id} is {run.state}: go on with '{command}'")
-        if run.command and run.is_training:
-            raise UsageError(f"{run.id} was trained by '{command}': type that with another name")
+            raise UsageError(f"{run.id} is {run.state}: go on with '{shlex.join(['kerv', *run.command])}'")
         raise UsageError(f"{run.id} is a {run.kind}: the command that makes it goes on where it is unfinished")
     if run.kind == "import":
         raise UsageError(f"{run.id} was imported: run vla-eval again, then 'kerv runs import'")

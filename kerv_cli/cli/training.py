@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,9 @@ if TYPE_CHECKING:
     from kerv_cli.training.run import TrainingRun
 
 
-def run_training(run: TrainingRun, plan: bool, as_json: bool, loading: str, training: str) -> None:
+def run_training(
+    run: TrainingRun, plan: bool, as_json: bool, loading: str, training: str, command: Sequence[str] = ()
+) -> None:
     """Train with progress, or print the plan.
 
     Args:
@@ -23,6 +26,7 @@ def run_training(run: TrainingRun, plan: bool, as_json: bool, loading: str, trai
         as_json: Print the result as JSON.
         loading: Title of the progress while data are read.
         training: Title of the progress while it trains.
+        command: Words after `kerv` that go on with it; by default those that were typed.
 
     Raises:
         UsageError: Another process trains this.
@@ -31,7 +35,7 @@ def run_training(run: TrainingRun, plan: bool, as_json: bool, loading: str, trai
         print_plan(run.plan(), as_json)
     from kerv_cli.lab.runs import making
 
-    with making(run.settings.results, run.artifact_kind, run.folder) as record:
+    with making(run.settings.results, run.artifact_kind, run.folder, command) as record:
         _train(run, record, as_json, loading, training)
 
 

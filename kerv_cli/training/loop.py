@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Protocol
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -37,11 +37,29 @@ SAME_REQUEST = 2.0
 """Seconds in which a second signal is the same request: schedulers pass on what the process has received already."""
 
 
+class Objective(Protocol):
+    """A module, its training samples and its loss.
+
+    An attribute `weights` (n,), float64, makes sample i be drawn in proportion to `weights[i]`; without it all samples
+    are drawn alike.
+    """
+
+    @property
+    def module(self) -> nn.Module:
+        """What is trained, on its device."""
+
+    def __len__(self) -> int:
+        """Return the number of training samples."""
+
+    def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
+        """Return the scalar loss of the samples `indices` (B,), and numbers to log."""
+
+    def validate(self, module: nn.Module) -> Metrics:
+        """Return metrics of the averaged weights, among them a `score`: higher is better."""
+
+
 class Loop:
     """Optimises a module.
-
-    An objective is like `methods.drafters.Training`: it has a `module`, a length, `loss` and `validate`. An attribute
-    `weights` (n,), float64, makes sample i be drawn in proportion to `weights[i]`; without it all are drawn alike.
 
     Args:
         objective: The module, its samples and its loss.
@@ -54,7 +72,7 @@ class Loop:
 
     def __init__(
         self,
-        objective: Any,
+        objective: Objective,
         save: Callable[[nn.Module, Metrics], None],
         settings: TrainSettings,
         folder: Path,

@@ -16,7 +16,7 @@ from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.lab.runs import Curve
 from kerv_cli.methods.artifacts import removal
 from kerv_cli.targets.provenance import provenance_of
-from kerv_cli.training.loop import Loop, Metrics, stored_identity
+from kerv_cli.training.loop import Loop, Metrics, Objective, stored_identity
 from kerv_cli.training.settings import TrainDrafterSettings, TrainSettings, TrainTargetSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
@@ -43,7 +43,7 @@ class TrainingRun(ABC):
     dataset: DemoDataset
     folder: Path
     device: str
-    objective: Any
+    objective: Objective
 
     @abstractmethod
     def plan(self) -> str:
