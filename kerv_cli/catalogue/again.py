@@ -18,6 +18,11 @@ from kerv_cli.lab.store import ROLLOUT, Plan, StudyStore, plan_study
 from kerv_cli.lab.study import new_name
 
 
+def again_words(run: RunEntry, results: str) -> list[str]:
+    """Return the command-line arguments that repeat a run in a results folder, and go on with its repetition."""
+    return ["runs", "rerun", run.id, *([] if results == CommandSettings().results else [f"results={results}"])]
+
+
 def plan_of(run: RunEntry, results: str) -> Plan:
     """Plan a repetition of a sweep or a rollout, or the rest of one that was interrupted.
 
@@ -29,7 +34,7 @@ def plan_of(run: RunEntry, results: str) -> Plan:
     new = {setting.label: _checked(setting, study.tasks, results) for setting in study.settings}
     episodes = tuple(Episode(new[one.setting.label], one.task, one.seed, one.repeat) for one in study.episodes)
     study = dataclasses.replace(study, settings=tuple(new.values()), episodes=episodes)
-    command = ["runs", "rerun", run.id, *([] if results == CommandSettings().results else [f"results={results}"])]
+    command = again_words(run, results)
     row = unfinished(database, study.kind, command)
     if row is not None:
         name = row.name
