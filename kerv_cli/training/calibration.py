@@ -1,7 +1,11 @@
-"""`kerv calibrate`: one JSON of figures measured on the training demonstrations (docs/methods.md §3, §4).
+"""`kerv calibrate`: measure on demonstrations what KERV and HeiSD need, and write one JSON (docs/methods.md §3, §4).
 
-It holds the noise of the kinematic predictors and their errors on held-out episodes, each task's reference level K_S,
-the ranges of the hybrid boundary, and the similarity from which verification is skipped.
+The JSON holds:
+
+- the noise of the kinematic predictors, and their errors on held-out episodes,
+- each task's K_S, the reference level of the kinematic variability K (how far drafts are from the target's tokens),
+- the ranges that scale the curvature and the path length of the hybrid boundary,
+- the similarity from which a retrieved draft is executed without verification, per task.
 """
 
 from __future__ import annotations
@@ -46,34 +50,42 @@ from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 PRESAMPLED = 6
-"""Episodes per task over which the decodes of pre-sampling are spread, at most."""
+"""Number of episodes per task over which the decodes that measure K_S are spread."""
 
 ENTRIES = 4000
-"""Entries looked up per task, evenly spread. On MT10, levels from 1000 did not hold on other episodes."""
+"""Maximum number of datastore entries looked up per task, evenly spread.
+
+On MT10, skip levels from 1000 entries did not hold on other episodes.
+"""
 LEAST = 20
-"""Entries that must be above a level to support it."""
+"""Minimum number of entries at or above a skip level."""
 LOW, HIGH = 2.0, 1 / 3
-"""The bounds of s_min allow this multiple of the wrong chunks that s_min allows."""
+"""The lower bound of s_min allows twice the share of wrong chunks that s_min allows, the upper bound a third."""
 
 RATIOS = np.logspace(-3, 3, 49)
-"""Ratios q / r that are tried, with r = 1."""
+"""Grid of the Kalman filter's ratio q / r (process noise to measurement noise), with r = 1."""
 DAMPINGS = (0.95, 0.9, 0.85, 0.8, 0.75, 0.7, 0.6, 0.5, 0.3)
-"""Dampings that are tried for the damped filter."""
+"""Grid of the damped filter's damping: the factor of the velocity at each control step."""
 
 Stage = Callable[[str], AbstractContextManager[OnProgress]]
-"""Opens a part of the work by its title and yields what is told its progress."""
+"""Takes the title of a part of the work. Returns a context that yields a progress function (done, total)."""
 
 
 class CalibrationRun:
-    """Checks that a calibration can be made; `run` makes it.
+    """One calibration. The constructor checks that it is possible, and `run` measures and writes it.
 
     Attributes:
-        notes: One line per section that was not measured: why, and whether an earlier one was kept.
+        settings: Settings of the command.
+        dataset: The demonstrations.
+        tasks: Full names of the tasks.
+        path: The JSON to write.
+        chosen: Index of each episode that is used -> whether it is held out.
+        notes: After `run`, one line per section that was not measured: why, and whether an earlier one was kept.
 
     Raises:
-        UsageError: A number out of range, or an unknown task.
-        CheckpointError: No such target or demonstrations, demonstrations of another environment, or a datastore of
-            another target.
+        UsageError: A number is out of range, or a task is unknown.
+        CheckpointError: The target or the demonstrations do not exist. Or the demonstrations are of another
+            environment. Or the datastore is of another target.
     """
 
     def __init__(self, settings: CalibrateSettings) -> None:
@@ -92,11 +104,11 @@ class CalibrationRun:
         if self.has_datastore:
             self.artifacts.check(["datastore"])
         if not (self.has_datastore and self.path.is_file() and read_mapping(self.path).get("skip") is None):
-            check_not_shipped(self.path, "name")  # a shipped one may get the levels of a datastore made since
+            check_not_shipped(self.path, "name")  # a shipped calibration may only be filled with missing skip levels
         self.notes: list[str] = []
 
     def plan(self) -> str:
-        """Return one line for --plan: demonstrations, decodes, boundary windows, skip levels and the file."""
+        """Return one line that `--plan` prints: demonstrations, decodes, boundary windows, skip levels and the file."""
         held_out, proposer = sum(self.chosen.values()), self.settings.proposer.kind
         skip = f"skip levels from {self.datastore}"
         if not self.has_datastore:
@@ -110,12 +122,16 @@ class CalibrationRun:
     def run(self, stage: Stage) -> Calibration:
         """Measure everything and write the calibration.
 
-        A section that is not measured now is taken from an earlier calibration of the same target.
+        K_S is not measured if `decodes` is 0, and skip levels are not measured without a datastore. Both are then taken
+        from an earlier calibration of the same target, if there is one.
+
+        Args:
+            stage: Called with the title of each part of the work, to show its progress.
 
         Raises:
-            CheckpointError: Frames of another size, or no path bends.
-            KervError: No decode of a task compared a draft.
-            StorageError: The disk refused.
+            CheckpointError: The images have another size than the target takes, or no path in them bends.
+            KervError: All decodes of a task ended without comparing a draft with the target, so K_S is unknown.
+            StorageError: The disk cannot be written.
         """
         space, chunk, settings = self.description.actions, self.description.chunk, self.settings
         with stage("reading demonstrations") as progress:
@@ -145,7 +161,7 @@ class CalibrationRun:
         return calibration
 
     def skip(self, stage: Stage) -> SkipSection | None:
-        """Return the skip levels of the tasks, from the target's datastore; None without a datastore."""
+        """Return the similarities from which verification is skipped, per task; None without a datastore."""
         if not self.has_datastore:
             return None
         store = self.artifacts.load("datastore")
@@ -153,12 +169,16 @@ class CalibrationRun:
             return skip_section(store, self.tasks, self.settings.epsilon, self.settings.confidence, progress)
 
     def presample(self, stage: Stage) -> dict[str, Variability]:
-        """Return each task's K_S and percentiles of K, from decodes of training observations; empty for decodes=0."""
+        """Measure how far drafts are from the target's tokens, by decoding observations of training episodes.
+
+        Returns:
+            Task -> its reference level K_S (the median K) and percentiles of K. Empty if `decodes` is 0.
+        """
         decodes = self.settings.decodes
         if not decodes:
             return {}
         decoder, actions = self.decoder(), self.description.actions
-        # the smallest K above 0: one token of a chunk is off by one bin
+        # the smallest possible K above 0: one token of a chunk is off by one bin
         least = 2.0 / actions.tokens / (self.description.chunk * int((~actions.is_strict).sum()))
         variability = {}
         with stage("pre-sampling") as progress:
@@ -175,15 +195,21 @@ class CalibrationRun:
         return variability
 
     def decoder(self) -> Decoder:
-        """Return the decoder of pre-sampling: the settings' proposer, acceptance and threshold."""
+        """Return the decoder that measures K_S, with the proposer, acceptance and threshold of the settings."""
         s = self.settings
         method = RolloutSettings(proposer=s.proposer, acceptance=s.acceptance, threshold=s.threshold)
         return Method.of(method).decoder(self.artifacts.target, self.artifacts.load)
 
     def episode_levels(self, decoder: Decoder, index: int, decodes: int) -> list[float]:
-        """Return K of up to `decodes` decodes, spread evenly over a demonstration's observations.
+        """Decode observations that are spread evenly over one demonstration, and return the K of each decode.
 
-        The decoder sees every executed action in between, because some methods have a history.
+        The decoder also gets every executed action in between, because some methods use a history. Decodes without a
+        K, because no draft was compared, are left out.
+
+        Args:
+            decoder: The decoder.
+            index: Index of the episode in the dataset.
+            decodes: Maximum number of observations to decode.
         """
         episode = self.dataset.load(index)
         rows = np.unique(np.linspace(0, len(episode.frame_steps) - 1, decodes).round().astype(int))
@@ -200,10 +226,17 @@ class CalibrationRun:
         return levels
 
     def _with_earlier(self, sections: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Fill empty sections from an earlier calibration -> (sections, section -> provenance of its measurement)."""
+        """Fill empty sections from an earlier calibration in the same file, and write `notes` about them.
+
+        Args:
+            sections: Name of a section -> its content; empty or None if it was not measured now.
+
+        Returns:
+            The filled sections, and name -> provenance of each section that was kept from an earlier calibration.
+        """
         try:
             earlier = CalibrationArtifact().checked(self.path, self.description)
-        except CheckpointError:  # missing, damaged or of another target: there is nothing to keep
+        except CheckpointError:  # the file is missing, damaged or of another target: keep nothing
             earlier = None
         reasons = {
             "variability": f"reference levels K_S: decodes={self.settings.decodes}",
@@ -221,33 +254,45 @@ class CalibrationRun:
 
 
 def distribution(levels: Sequence[float], least: float) -> Variability:
-    """Return percentiles of K and its median K_S; K is divided by K_S, which is therefore at least `least`."""
+    """Return the median K_S and percentiles of a task's measured K.
+
+    Args:
+        levels: The K of each decode, normalised action units.
+        least: Minimum of K_S, because decoding divides by K_S.
+    """
     low, high, top = np.percentile(levels, [25, 75, 90]).tolist()
     return Variability(max(float(np.median(levels)), least), len(levels), low, high, top)
 
 
 @dataclass(frozen=True)
 class Windows:
-    """n moments of demonstrations, with the expert's actions before and after each, normalised."""
+    """The expert's normalised actions before and after n moments of the demonstrations (D DoFs, H control steps)."""
 
     past: np.ndarray  # (n, window, D)
     future: np.ndarray  # (n, H, D)
     task: np.ndarray  # (n,) index into `tasks`
-    held_out: np.ndarray  # (n,) bool, by whole episodes
+    held_out: np.ndarray  # (n,) bool, the same for all moments of an episode
     tasks: tuple[str, ...]
-    episodes: dict[str, dict[str, int]]  # task -> {"training": episodes, "held_out": episodes}
-    paths: list[np.ndarray]  # (T, 3) metres, of the end effector in every training episode
+    episodes: dict[str, dict[str, int]]  # task -> {"training": number of episodes, "held_out": number}
+    paths: list[np.ndarray]  # end effector in each training episode, (T, 3) metres
 
 
 def episode_windows(
     episode: DemoEpisode, actions: ActionSpace, window: int, horizon: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return past (n, window, D) and future (n, horizon, D) of every moment with a full window before it.
+    """Cut an episode into windows: one for each control step with `window` control steps before it.
 
-    Both are the clean labels.
+    Args:
+        episode: A demonstration.
+        actions: The action space, to normalise actions.
+        window: Number of control steps before the moment.
+        horizon: Number of control steps after the moment.
+
+    Returns:
+        The expert's undisturbed actions before each moment (n, window, D), and after it (n, horizon, D).
 
     Raises:
-        CheckpointError: Too few labels were recorded after the episode's end.
+        CheckpointError: The recording holds too few labels after the episode's end.
     """
     steps = len(episode.executed)
     check_tail(episode, horizon, f"predictions of {horizon} steps")
@@ -267,10 +312,18 @@ def read_windows(
     horizon: int,
     progress: OnProgress,
 ) -> Windows:
-    """Return the windows of the episodes `chosen`: index in the dataset -> whether it is held out.
+    """Read the windows of the chosen episodes.
+
+    Args:
+        dataset: The demonstrations.
+        chosen: Index of the episode in the dataset -> whether it is held out.
+        actions: The action space, to normalise actions.
+        window: Number of control steps before each moment.
+        horizon: Number of control steps after each moment.
+        progress: Called with the numbers of episodes read and of all.
 
     Raises:
-        KervError: A task's training or held-out episodes are all shorter than the window.
+        KervError: All training episodes of a task, or all its held-out episodes, are shorter than the window.
     """
     tasks = tuple(dict.fromkeys(dataset.episodes[i].task for i in chosen))
     counts = {task: {"training": 0, "held_out": 0} for task in tasks}
@@ -291,9 +344,18 @@ def read_windows(
 
 
 def choose_episodes(dataset: DemoDataset, tasks: Sequence[str], limit: int, share: float) -> dict[int, bool]:
-    """Return index -> whether it is held out, for the first `limit` episodes of each task (0: all).
+    """Choose the first episodes of each task, and hold some of them out.
 
-    Of a task's plain and of its perturbed episodes, every k-th is held out.
+    Every k-th of a task's plain episodes is held out, and every k-th of its perturbed episodes.
+
+    Args:
+        dataset: The demonstrations.
+        tasks: Full names of the tasks.
+        limit: Maximum number of episodes per task; 0: all.
+        share: Share of the episodes to hold out.
+
+    Returns:
+        Index of the episode in the dataset -> whether it is held out.
 
     Raises:
         CheckpointError: A task has no demonstration.
@@ -310,12 +372,15 @@ def choose_episodes(dataset: DemoDataset, tasks: Sequence[str], limit: int, shar
 
 
 def fit_noise(past: np.ndarray, future: np.ndarray, dampings: Sequence[float]) -> tuple[float, float]:
-    """Return (q, damping) with the smallest mean absolute error, for r = 1, on the grid RATIOS x `dampings`.
+    """Fit the Kalman filter of one DoF on a grid: the smallest mean absolute error of its predictions.
 
     Args:
-        past: (n, window) of one DoF.
-        future: (n, H) of the same DoF.
-        dampings: Those to try.
+        past: (n, window) normalised actions before each moment.
+        future: (n, H) normalised actions after each moment.
+        dampings: Dampings to try. (1,) is the filter with constant velocity.
+
+    Returns:
+        The process noise q, for a measurement noise r = 1, and the damping.
     """
     window, steps = past.shape[1], future.shape[1]
 
@@ -327,9 +392,15 @@ def fit_noise(past: np.ndarray, future: np.ndarray, dampings: Sequence[float]) -
 
 
 def fit_filters(windows: Windows, steps: int, held: np.ndarray) -> dict[str, Noise]:
-    """Return each filter's noise per DoF, fitted on the training episodes to the next `steps` actions.
+    """Fit the Kalman filters `kalman` and `damped` on the training episodes.
 
-    DoFs where `held` (D,) is true keep their value and are not fitted.
+    Args:
+        windows: Actions before and after each moment.
+        steps: Number of actions after each moment that a filter should predict well.
+        held: (D,) bool. True: predictions hold this DoF at its last value, so it is not fitted.
+
+    Returns:
+        Name of the filter -> its noise and damping per DoF.
     """
     past, future = windows.past[~windows.held_out], windows.future[~windows.held_out]
     noise = {}
@@ -344,7 +415,11 @@ def fit_filters(windows: Windows, steps: int, held: np.ndarray) -> dict[str, Noi
 
 
 def prediction_errors(windows: Windows, noise: Mapping[str, Noise], space: ActionSpace) -> Errors:
-    """Return predictor -> task -> DoF -> H mean absolute errors on the held-out episodes, normalised units."""
+    """Measure the mean absolute error of every predictor on the held-out episodes.
+
+    Returns:
+        Predictor -> task -> DoF -> errors 1 to H control steps ahead, in normalised action units.
+    """
     window, horizon = windows.past.shape[1], windows.future.shape[1]
     errors: Errors = {}
     for kind, predictor_class in PREDICTORS.items():
@@ -358,32 +433,37 @@ def prediction_errors(windows: Windows, noise: Mapping[str, Noise], space: Actio
 
 
 def moving_errors(errors: Errors, kind: str, space: ActionSpace) -> np.ndarray:
-    """Return (tasks, H) errors of a predictor, averaged over the DoFs that are not strict."""
+    """Average a predictor's errors over the DoFs that are not strict (a strict DoF, such as a gripper, is held).
+
+    Returns:
+        (tasks, H) mean absolute errors, in normalised action units.
+    """
     moving = [name for name in space.names if name not in space.strict]
     return np.array([[rows[name] for name in moving] for rows in errors[kind].values()]).mean(1)
 
 
 @dataclass(frozen=True)
 class Matches:
-    """n entries of one task and their best neighbours in other episodes."""
+    """n datastore entries of one task, each compared with the most similar entry of another episode."""
 
     similarity: np.ndarray  # (n,) float32, cosine
     error: np.ndarray  # (n,) mean absolute difference of the two chunks, normalised action units
     strict: np.ndarray  # (n,) bool, whether a token of a strict DoF differs
 
     def good(self, epsilon: float) -> np.ndarray:
-        """Return (n,) bool: the error is at most epsilon, and all tokens of strict DoFs are the expert's.
+        """Return (n,) bool: whether executing the similar entry's chunk would have been good.
 
-        The gripper is judged apart: a wrong one hardly changes the mean over all DoFs, but drops the object.
+        A chunk is good if its error is at most `epsilon` and all its tokens of strict DoFs are equal. Strict DoFs count
+        separately, because a wrong gripper hardly changes the mean error but drops the object.
         """
         return (self.error <= epsilon) & ~self.strict
 
 
 def match(store: Datastore, task: str) -> Matches:
-    """Compare up to ENTRIES entries of a task with their best neighbours in other episodes; none for one episode.
+    """Look up each of up to ENTRIES entries of a task in the task's other episodes (docs/methods.md §4.3).
 
-    Each entry is looked up among the other episodes of its task. The best neighbour's chunk, which would have been
-    executed without verification, is compared with the entry's own: the expert's next actions (docs/methods.md §4.3).
+    The best neighbour's chunk is the one that would be executed without verification. It is compared with the entry's
+    own chunk, the expert's next actions. With a single episode of the task there are no matches.
     """
     shard = store.shards[task]
     count = min(ENTRIES, shard.stop - shard.start) if len(np.unique(store.seeds[shard])) > 1 else 0
@@ -399,18 +479,16 @@ def match(store: Datastore, task: str) -> Matches:
 
 
 def lowest_level(similarity: np.ndarray, good: np.ndarray, confidence: float, least: int = LEAST) -> float | None:
-    """Return the lowest similarity s such that at least the share `confidence` of the entries from s on is good.
-
-    Entries of equal similarity count together.
+    """Find the lowest similarity s such that enough of the entries with similarity ≥ s are good.
 
     Args:
-        similarity: (n,) of the entries.
-        good: (n,) bool.
-        confidence: Share of good entries.
-        least: Entries that a level needs.
+        similarity: (n,) similarity of each entry to its best neighbour.
+        good: (n,) bool, whether the neighbour's chunk is good.
+        confidence: Minimum share of good entries among those with similarity ≥ s.
+        least: Minimum number of entries with similarity ≥ s.
 
     Returns:
-        The similarity; None if no level has that many good entries.
+        The similarity s; None if there is none.
     """
     order = np.argsort(-similarity, kind="stable")
     ranked = similarity[order]
@@ -421,10 +499,17 @@ def lowest_level(similarity: np.ndarray, good: np.ndarray, confidence: float, le
 
 
 def task_levels(matches: Matches, epsilon: float, confidence: float) -> SkipLevel:
-    """Return a task's s_min, the bounds between which feedback may move it, and the share of decodes it would skip.
+    """Return a task's s_min, the similarity from which verification is skipped, and the bounds of its feedback.
 
-    The bounds low ≤ s_min ≤ high allow twice and a third of the wrong chunks: 0.8 and 0.967 for a confidence of 0.9. If
-    no level is good enough for high, it is the largest similarity seen. If none is for s_min, all three are NEVER.
+    Feedback after each episode may move s_min between `low` and `high`. `low` allows twice the share of wrong chunks
+    that s_min allows, and `high` a third: for a confidence of 0.9, at least 0.8 and 0.967 of the chunks are good.
+    If no similarity is that good, `high` is the largest similarity seen. If none is good enough for s_min, all three
+    are NEVER, and the task never skips.
+
+    Args:
+        matches: The task's entries and their best neighbours.
+        epsilon: Largest mean absolute error of a good chunk, in normalised action units.
+        confidence: Minimum share of good chunks among the skipped ones.
     """
     good, wrong = matches.good(epsilon), 1 - confidence
     s_min = lowest_level(matches.similarity, good, confidence)
@@ -446,7 +531,18 @@ def task_levels(matches: Matches, epsilon: float, confidence: float) -> SkipLeve
 def skip_section(
     store: Datastore, tasks: Sequence[str], epsilon: float, confidence: float, progress: OnProgress
 ) -> SkipSection | None:
-    """Return the levels of those tasks that the datastore holds; None if it holds none of them."""
+    """Return the similarities from which verification is skipped, for each of `tasks` that the datastore holds.
+
+    Args:
+        store: The datastore.
+        tasks: Full names of the tasks.
+        epsilon: Largest mean absolute error of a good chunk, in normalised action units.
+        confidence: Minimum share of good chunks among the skipped ones.
+        progress: Called with the numbers of tasks done and of all.
+
+    Returns:
+        None if the datastore holds none of the tasks.
+    """
     levels = {}
     for done, task in enumerate(tasks, 1):
         if task in store.shards:

@@ -1,7 +1,8 @@
-"""The optimisation loop that the target and the drafters share: schedule, EMA, validation, exact resume.
+"""The optimisation loop of targets and drafters: schedule, averaged weights, validation, exact resume.
 
-The batch of step s is a function of (seed, s), and one file holds weights, EMA, moments, best score and history. So a
-resumed run writes the same bytes as an uninterrupted one, on the same machine with the same number of threads.
+A resumed run writes the same bytes as an uninterrupted run, on the same machine with the same number of threads. For
+this, the batch of step s depends only on the seed and s. One file holds the weights, their average, the optimiser's
+state and the metrics of all validations.
 """
 
 from __future__ import annotations
@@ -34,40 +35,43 @@ from kerv_cli.training.settings import TrainSettings
 Metrics = dict[str, float]
 _UNREADABLE = (SafetensorError, OSError, KeyError, TypeError, ValueError)
 SAME_REQUEST = 2.0
-"""Seconds in which a second signal is the same request: schedulers pass on what the process has received already."""
+"""A second signal within this many seconds counts as the same request.
+
+A scheduler may pass on a Ctrl-C that the process has received already.
+"""
 
 
 class Objective(Protocol):
-    """A module, its training samples and its loss.
+    """What a training optimises: a network, its training samples and its loss.
 
-    An attribute `weights` (n,), float64, makes sample i be drawn in proportion to `weights[i]`; without it all samples
-    are drawn alike.
+    An optional attribute `weights` (n,) float64 makes sample i as likely to be drawn as `weights[i]`. Without it all
+    samples are equally likely.
     """
 
     @property
     def module(self) -> nn.Module:
-        """What is trained, on its device."""
+        """The network to train, on its device."""
 
     def __len__(self) -> int:
         """Return the number of training samples."""
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Return the scalar loss of the samples `indices` (B,), and numbers to log."""
+        """Return the loss (a scalar) of the samples `indices` (B,) at optimisation step `step`, and metrics to log."""
 
     def validate(self, module: nn.Module) -> Metrics:
-        """Return metrics of the averaged weights, among them a `score`: higher is better."""
+        """Return metrics of a network on held-out samples. The metric `score` chooses the best weights: higher is better."""
 
 
 class Loop:
-    """Optimises a module.
+    """Trains a network: draws batches, updates the weights, validates, and saves the best weights.
 
     Args:
-        objective: The module, its samples and its loss.
-        save: Called with the module and its metrics when a validation is the best so far.
+        objective: The network, its training samples and its loss.
+        save: Called with the module and its metrics after each validation with the best score so far.
         settings: Optimisation settings.
-        folder: Gets `resume.safetensors` and `log.csv`.
-        identity: Hash of everything that determines the run, for the resume file.
-        keep: Called with the metrics of all validations after each one, and when a run goes on.
+        folder: Folder for `resume.safetensors` and `log.csv`.
+        identity: Hash of everything that determines the training. It goes into the resume file.
+        keep: Called with the metrics of all validations so far, after each validation and when a training resumes.
     """
 
     def __init__(
@@ -92,13 +96,16 @@ class Loop:
         self.cumulative = None if weights is None else weights.cumsum(0)
 
     def run(self, on_step: Callable[[int, Metrics], None] = lambda step, metrics: None) -> Metrics:
-        """Train to `settings.steps`, from the resume file if there is one; return the metrics of the best checkpoint.
+        """Train to `settings.steps`, from the resume file if there is one, and return the metrics of the best weights.
+
+        Args:
+            on_step: Called after each step and after each validation, with the number of steps done and the metrics.
 
         Raises:
-            CheckpointError: The folder holds a damaged run, or no step is left and no validation was made.
+            CheckpointError: The resume file is damaged. Or its training ended at the last step without a validation.
             KervError: The training diverged.
-            StorageError: The disk refused.
-            Interrupted: Ctrl-C. The step that ran was finished and the run's state is stored.
+            StorageError: The disk cannot be written.
+            Interrupted: The process got Ctrl-C or SIGTERM. The current step was finished and the state is saved.
         """
         self.restore()
         settings = self.settings
@@ -112,7 +119,7 @@ class Loop:
                     on_step(self.step, self.history[-1])
                 if stop.is_set() and self.step < settings.steps:
                     self.store()
-                    raise Interrupted(f"interrupted: step {self.step} is saved, the same command goes on from there")
+                    raise Interrupted(f"interrupted: step {self.step} is saved. The same command resumes from there")
         if not self.history:
             raise CheckpointError(
                 f"{self.folder} was interrupted at step {self.step}, before its first validation: set train.steps "
@@ -121,7 +128,7 @@ class Loop:
         return max(self.history, key=lambda metrics: metrics["score"])
 
     def update(self) -> Metrics:
-        """Make one optimiser step and return its loss and logged numbers.
+        """Do one optimiser step on one batch, and return its loss and the other metrics to log.
 
         Raises:
             KervError: The loss is not finite.
@@ -146,11 +153,14 @@ class Loop:
         return {"loss": value, **metrics}
 
     def validate(self, training_loss: float) -> None:
-        """Validate the averaged weights, save them if they are the best, and write the resume file.
+        """Validate the averaged weights, save them if their score is the best so far, and write the resume file.
+
+        Args:
+            training_loss: Loss of the last step, to log beside the metrics.
 
         Raises:
             KervError: A metric is not finite.
-            StorageError: The disk refused.
+            StorageError: The disk cannot be written.
         """
         module = self.module
         live = {k: v.detach().clone() for k, v in module.state_dict().items()}
@@ -168,7 +178,7 @@ class Loop:
         self.store()
 
     def store(self) -> None:
-        """Write the resume file, then the log."""
+        """Write the resume file with the present state, then `log.csv`."""
         tensors = {f"model.{k}": v for k, v in self.module.state_dict().items()}
         tensors |= {f"ema.{k}": v for k, v in self.ema.items()}
         for i, moments in self.optimiser.state_dict()["state"].items():
@@ -177,7 +187,10 @@ class Loop:
         self.log()
 
     def log(self) -> None:
-        """Keep the curve and write `log.csv`, a row per validation; no file before the first."""
+        """Pass the metrics of all validations to `keep`, and write them to `log.csv`, one row per validation.
+
+        Before the first validation no file is written.
+        """
         import pandas as pd
 
         self.keep(self.history)
@@ -185,14 +198,14 @@ class Loop:
             write_text(self.folder / "log.csv", pd.DataFrame(self.history).to_csv(index=False, float_format="%.6g"))
 
     def restore(self) -> None:
-        """Go on from the folder's resume file, if there is one.
+        """Load weights, optimiser and progress from the folder's resume file. Without a file, change nothing.
 
         Raises:
-            CheckpointError: It is damaged.
+            CheckpointError: The resume file is damaged.
         """
         path = self.folder / RESUME
         if not path.is_file():
-            self.keep([])  # forget the curve of a run that was here before
+            self.keep([])  # forget the curve of an earlier training in this folder
             return
         tensors, progress = read_state(path)
         self.module.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("model.")})
@@ -205,17 +218,20 @@ class Loop:
         groups = self.optimiser.state_dict()["param_groups"]
         self.optimiser.load_state_dict({"state": state, "param_groups": groups})
         self.step, self.history = progress.step, progress.history
-        self.log()  # the run may have ended before it wrote the log
+        self.log()  # the process may have ended before it wrote the log
 
 
 def draw_samples(count: int, size: int, generator: torch.Generator, cumulative: Tensor | None = None) -> Tensor:
-    """Draw `size` of `count` sample indices, int64, with replacement.
+    """Draw the sample indices of a batch, with replacement.
 
     Args:
         count: Number of samples.
-        size: Number of draws.
+        size: Number of indices to draw.
         generator: Source of randomness.
-        cumulative: (count,) float64, cumulative sum of the samples' weights; None: all samples alike.
+        cumulative: (count,) float64, cumulative sum of the samples' weights. None: all samples are equally likely.
+
+    Returns:
+        (size,) int64.
     """
     if cumulative is None:
         return torch.randint(count, (size,), generator=generator)
@@ -224,9 +240,9 @@ def draw_samples(count: int, size: int, generator: torch.Generator, cumulative: 
 
 
 def schedule(step: int, settings: TrainSettings) -> float:
-    """Return the factor of the learning rate: linear warm-up, then cosine to 2 % of the peak.
+    """Return the learning rate of a step as a share of `settings.lr`: linear warm-up, then a cosine down to 2 %.
 
-    It runs once over the first `scene_steps` and once over the rest.
+    The schedule runs once over the first `scene_steps` steps and starts again for the remaining steps.
     """
     begin, end = (0, settings.scene_steps) if step < settings.scene_steps else (settings.scene_steps, settings.steps)
     if step - begin < settings.warmup:
@@ -237,10 +253,10 @@ def schedule(step: int, settings: TrainSettings) -> float:
 
 @contextmanager
 def without_subnormals() -> Iterator[None]:
-    """Treat numbers below 1e-38 as zero, if the CPU can.
+    """Make the CPU treat subnormal numbers (below about 1e-38) as zero, if it can.
 
-    The soft-argmax of image points leaves many of them in the backward pass, and some CPUs are a hundred times slower
-    with them. Threads that start inside keep the mode.
+    The backward pass of the vision encoder's spatial softmax makes many subnormal numbers, and some CPUs compute a
+    hundred times slower with them. A thread that starts inside the context keeps this mode afterwards.
     """
     torch.set_flush_denormal(True)
     try:
@@ -251,9 +267,13 @@ def without_subnormals() -> Iterator[None]:
 
 @contextmanager
 def until_interrupted() -> Iterator[threading.Event]:
-    """Yield an event that the first SIGINT or SIGTERM sets; a later one of the same kind raises KeyboardInterrupt.
+    """Turn the first Ctrl-C (SIGINT) or SIGTERM into an event, so that the training can finish its step.
 
-    Outside the main thread nothing sets it. A signal that is ignored stays ignored.
+    A second signal of the same kind raises KeyboardInterrupt. A signal that the process ignores stays ignored. Outside
+    the main thread, signals are not caught.
+
+    Yields:
+        The event. The first signal sets it.
     """
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -282,12 +302,12 @@ def until_interrupted() -> Iterator[threading.Event]:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a run is.
+    """Progress of a training, as stored in its resume file.
 
     Attributes:
-        identity: Hash of everything that determines the run.
-        step: Steps done.
-        history: Metrics of every validation.
+        identity: Hash of everything that determines the training.
+        step: Number of steps done.
+        history: Metrics of every validation so far.
     """
 
     identity: str
@@ -296,7 +316,10 @@ class Progress:
 
 
 def stored_identity(folder: Path) -> str | None:
-    """Return the identity of the run in the folder without reading its tensors; None if there is none to read."""
+    """Return the identity hash in the folder's resume file, without reading the tensors.
+
+    None means that there is no resume file, or that it cannot be read.
+    """
     try:
         return str(json.loads(_state(folder / RESUME)["progress"])["identity"])
     except _UNREADABLE:
@@ -304,14 +327,17 @@ def stored_identity(folder: Path) -> str | None:
 
 
 def write_state(path: Path, tensors: Mapping[str, Tensor], progress: Progress) -> None:
-    """Write tensors and progress into one file."""
+    """Write the tensors and the progress of a training into one resume file."""
     text = json.dumps(asdict(progress), allow_nan=False)
-    # one key: safetensors orders several at random, and equal states must be equal bytes
+    # one metadata key: safetensors orders several keys at random, and equal states must give equal bytes
     save_tensors(path, tensors, {"state": json.dumps({"progress": text, "sha256": digest(tensors, text)})})
 
 
 def read_state(path: Path) -> tuple[dict[str, Tensor], Progress]:
-    """Read what `write_state` wrote.
+    """Read a resume file that `write_state` wrote.
+
+    Returns:
+        The tensors by name, and the progress.
 
     Raises:
         CheckpointError: The file is damaged, or holds numbers that are not finite.
@@ -334,7 +360,7 @@ def _state(path: Path) -> dict[str, str]:
 
 
 def digest(tensors: Mapping[str, Tensor], text: str) -> str:
-    """Return the SHA-256 over names, types, shapes and bytes of tensors, and a text."""
+    """Return the SHA-256 of `text` and of the tensors' names, number formats, shapes and bytes."""
     hasher = hashlib.sha256(text.encode())
     for name in sorted(tensors):
         tensor = tensors[name].detach().cpu().contiguous()

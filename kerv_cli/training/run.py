@@ -1,4 +1,4 @@
-"""What `kerv train target` and `kerv train drafter` have in common: identity, resuming and provenance."""
+"""The base of `kerv train target` and `kerv train drafter`: check the folder, load, train, resume, save."""
 
 from __future__ import annotations
 
@@ -21,20 +21,23 @@ from kerv_cli.training.settings import TrainDrafterSettings, TrainSettings, Trai
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
 NOT_IDENTITY = ("steps", "validate_every", "init", "stored")
-"""Settings that a resumed run may change. `init` counts by the hash of its weights, not by its name."""
+"""Optimisation settings that may change when a training resumes.
+
+`init` is among them because the hash of its weights counts instead of its name.
+"""
 
 
 class TrainingRun(ABC):
-    """One training, from settings to a folder.
-
-    The constructor checks that the run is possible, `load` reads the data, and `train` optimises and saves.
+    """One training. The constructor checks the settings, `load` reads the data, and `train` optimises and saves.
 
     Attributes:
-        kind: The word after `kerv train`.
-        artifact_kind: Kind of the artifact that is made.
-        folder: Where the weights, their description and the resume file go.
-        device: Set by `load`.
-        objective: What is optimised; set by `load`.
+        kind: The word after `kerv train`: `target` or `drafter`.
+        artifact_kind: Kind of the trained artifact, such as `target`, `drafter` or `early`.
+        settings: Settings of the command.
+        dataset: The demonstrations.
+        folder: Folder for the weights, their description and the resume file.
+        device: Device of the training, such as `cuda`. `load` sets it.
+        objective: The network, its samples and its loss, as `loop.Loop` takes them. `load` sets it.
     """
 
     kind: str
@@ -47,30 +50,35 @@ class TrainingRun(ABC):
 
     @abstractmethod
     def plan(self) -> str:
-        """Return one line for --plan: data, steps and folder."""
+        """Return one line that `--plan` prints: the data, the number of steps and the folder."""
 
     @abstractmethod
     def load(self, progress: OnProgress) -> None:
-        """Read the data and make the module and its objective."""
+        """Read the data, and set `device` and `objective`."""
 
     @abstractmethod
     def identity(self) -> dict[str, Any]:
-        """Return what determines the run besides the optimisation settings and the demonstrations."""
+        """Return everything that determines the weights, except the optimisation settings and the demonstrations."""
 
     @abstractmethod
     def write(self, module: nn.Module, provenance: dict[str, Any]) -> None:
-        """Write the weights and their description."""
-
-    def train(self, on_step: Callable[[int, Metrics], None]) -> Metrics:
-        """Train, from the folder's resume file if there is one, and return the metrics of the best checkpoint.
+        """Write the weights and their description into the folder.
 
         Args:
-            on_step: Called after each step and each validation with the number of steps done and the metrics.
+            module: The network with the best weights so far.
+            provenance: How it was made: command, settings, versions, demonstrations and metrics.
+        """
+
+    def train(self, on_step: Callable[[int, Metrics], None]) -> Metrics:
+        """Train, from the folder's resume file if there is one, and return the metrics of the best weights.
+
+        Args:
+            on_step: Called after each step and each validation, with the number of steps done and the metrics.
 
         Raises:
-            CheckpointError: The folder holds a damaged run.
+            CheckpointError: The resume file is damaged.
             KervError: The training diverged.
-            StorageError: The disk refused.
+            StorageError: The disk cannot be written.
         """
         self.objective.module.train()
         keep = Curve.of(self.folder, self.settings.results).write
@@ -84,10 +92,13 @@ class TrainingRun(ABC):
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
     def check_folder(self, setting: str) -> None:
-        """Refuse a folder that holds another run. `setting` names the folder.
+        """Refuse a folder that holds a training with other settings or data.
+
+        Args:
+            setting: The setting that names the folder, for the error message.
 
         Raises:
-            CheckpointError: It holds one.
+            CheckpointError: The folder holds another training.
         """
         if stored_identity(self.folder) not in (None, self.hash):
             raise CheckpointError(
@@ -96,7 +107,7 @@ class TrainingRun(ABC):
             )
 
     def save(self, module: nn.Module, metrics: Metrics) -> None:
-        """Write the weights with their provenance and the metrics of their validation."""
+        """Write the weights, with their provenance and the metrics of their validation."""
         figures = {
             "demos": {"sha256": self.dataset.sha256, "config": self.dataset.manifest.config},
             "validation": metrics,
@@ -106,22 +117,22 @@ class TrainingRun(ABC):
 
 
 def optimisation_identity(train: TrainSettings) -> dict[str, Any]:
-    """Return the optimisation settings that identify a run."""
+    """Return the optimisation settings that must stay the same when a training resumes."""
     settings = {key: value for key, value in asdict(train).items() if key not in NOT_IDENTITY}
     settings["closed_loop"] = train.closed_loop > 0  # scores with and without success do not compare
     return settings
 
 
 def refuse_unused(train: TrainSettings, keys: Sequence[str], why: str) -> None:
-    """Refuse settings that the run would ignore.
+    """Refuse optimisation settings that the training would ignore.
 
     Args:
-        train: The settings.
-        keys: Those that the run does not read.
-        why: Completes the message after `train.KEY=VALUE`.
+        train: The optimisation settings.
+        keys: Names of the settings that this training does not read.
+        why: End of the error message, after `train.KEY=VALUE`.
 
     Raises:
-        UsageError: One of them is not its default.
+        UsageError: One of the settings in `keys` differs from its default.
     """
     for key in keys:
         if (value := getattr(train, key)) != getattr(TrainSettings(), key):

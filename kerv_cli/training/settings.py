@@ -1,4 +1,4 @@
-"""Settings of demonstrations, trainings and what is built or calibrated from them."""
+"""Settings of the commands that record demonstrations, train, build or calibrate."""
 
 from __future__ import annotations
 
@@ -13,53 +13,56 @@ from kerv_cli.methods.settings import POLICY, MethodSettings, PolicySettings
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.worlds.settings import WorldSettings
 
-DEMOS = "demonstrations, by name"
-TARGET_DEMOS = f"{DEMOS}; empty: those that the target was trained on"
+DEMOS = "name of the demonstrations"
+TARGET_DEMOS = f"{DEMOS}; empty: the ones that the target was trained on"
 TRACKERS = ("none", "trackio", "wandb", "tensorboard")
-LOG = "where the curves are drawn while it trains"
-FIRST_EPISODES = "per task, the first ones by seed; 0: all"
+LOG = "tracker that shows the curves during training"
+FIRST_EPISODES = "episodes used per task, lowest seeds first; 0: all"
 
 
 @dataclass
 class TrainSettings:
-    """Optimisation. The batch of step s depends only on (seed, s), so a resumed run repeats the uninterrupted one."""
+    """Settings of the optimisation.
+
+    The batch of step s depends only on the seed and s. So a resumed run gives the same weights as an uninterrupted run.
+    """
 
     steps: int = number(20_000, 1, 10**9, help="optimisation steps")
     batch: int = number(64, 1, 65_536, help="samples per step")
     lr: float = number(1e-3, 0, 10, help="highest learning rate")
-    warmup: int = number(300, 0, 10**9, help="first steps, while the learning rate rises")
-    weight_decay: float = number(0.02, 0, 100, help="AdamW's")
-    clip: float = number(1.0, above=0, most=1e9, help="largest norm of the gradient")
-    ema: float = number(0.999, 0, 0.999999, help="decay of the moving average of the weights, which is what is saved")
-    init: str | None = setting(None, "target whose weights it begins with; its chunk may be shorter or longer")
-    label_sigma: float = number(1.0, 0, 1000, help="bins over which a label is spread (Gaussian); 0: one-hot")
-    balance: float = number(0.0, 0, 1, help="0 draws all samples alike, 1 all tasks")
-    scene_weight: float = number(1.0, 0, 1e6, help="weight of the position loss (vision only)")
+    warmup: int = number(300, 0, 10**9, help="number of first steps in which the learning rate rises")
+    weight_decay: float = number(0.02, 0, 100, help="weight decay of AdamW")
+    clip: float = number(1.0, above=0, most=1e9, help="maximum norm of the gradient")
+    ema: float = number(0.999, 0, 0.999999, help="decay of the moving average of the weights; the average is saved")
+    init: str | None = setting(None, "target whose weights training starts from; its chunk length may differ")
+    label_sigma: float = number(1.0, 0, 1000, help="Gaussian label smoothing: standard deviation in bins; 0: one-hot")
+    balance: float = number(0.0, 0, 1, help="0: all samples are equally likely; 1: all tasks are")
+    scene_weight: float = number(1.0, 0, 1e6, help="weight of the loss on estimated positions (vision only)")
     places: str = choice(
         "state",
         "state",
         "path",
-        help="positions learnt: state: of object and goal; path: of the hand, later in the episode",
+        help="positions to estimate: state: of object and goal; path: of the hand later in the episode",
     )
-    colour: float = number(0.0, 0, 3, help="random light on the images: spread of its logarithm")
+    colour: float = number(0.0, 0, 3, help="random light on training images: largest spread of log brightness; 0: none")
     scene_steps: int = number(0, 0, 10**9, help="first steps, which train only the vision encoder, on positions")
     held_out: float = number(0.1, above=0, most=0.5, help="share of episodes kept for validation")
     validate_every: int = number(2_000, 1, 10**9, help="steps between two validations")
-    closed_loop: int = number(0, 0, 100_000, help="closed-loop episodes per task at every validation")
-    seed: int = number(0, 0, 2**31 - 1, help="of initial weights and order of samples")
-    bf16: bool = setting(True, "training forward in bfloat16, on a GPU or a CPU with AMX")
+    closed_loop: int = number(0, 0, 100_000, help="simulated episodes per task at every validation; 0: none")
+    seed: int = number(0, 0, 2**31 - 1, help="seed of the initial weights and of the order of samples")
+    bf16: bool = setting(True, "train in bfloat16 on a GPU or a CPU with AMX; other CPUs use float32")
     stored: str = choice("float32", "float32", "float16", "int8", help="number format of the weights on disk")
 
 
 @dataclass
 class TrainTargetSettings(TaskSettings):
-    """`kerv train target`."""
+    """Settings of `kerv train target`, which trains a policy on demonstrations."""
 
     groups: ClassVar = {"target": "small", "train": "target", "world": "default", "runtime": "auto"}
 
     name: str = setting("mt10-vision", "folder below <results>/artifacts/target, or a path")
-    task: list[str] = setting([], "tasks and suites; empty: those of the demonstrations")
-    demos: str = setting("", f"{DEMOS}; empty: those that `kerv demos` makes of the same tasks")
+    task: list[str] = setting([], "tasks and suites; empty: all tasks of the demonstrations")
+    demos: str = setting("", f"{DEMOS}; empty: the name that `kerv demos` gives to these tasks")
     log: str = choice("none", *TRACKERS, help=LOG)
     target: TargetSettings = setting(TargetSettings, "shapes: nano, tiny, small, base, … (conf/target)")
     train: TrainSettings = setting(TrainSettings, "optimisation")
@@ -68,23 +71,27 @@ class TrainTargetSettings(TaskSettings):
 
 @dataclass
 class DemosSettings(MethodSettings, TaskSettings):
-    """`kerv demos`. policy: what acts; expert, or a policy that the expert labels (DAgger)."""
+    """Settings of `kerv demos`, which records demonstrations.
+
+    `policy` acts in the environment. The default is the scripted expert. Any other policy visits its own states, and
+    the expert labels them (DAgger).
+    """
 
     groups: ClassVar = {"policy": "expert", "world": "default", "runtime": "workers", "method": "ar"}
 
     task: list[str] = setting(DEFAULT_TASKS, "tasks and suites: reach, drawer-open, MT10, …")
-    name: str | None = setting(None, "default: the tasks' names, in small letters")
+    name: str | None = setting(None, "name of the demonstrations; default: the names in `task`, in small letters")
     episodes: int = number(100, 1, 100_000, help="episodes per task")
-    seed: int = number(0, 0, 2**31 - 1, help="first seed")
+    seed: int = number(0, 0, 2**31 - 1, help="first seed of every task; must be a training seed")
     perturbed: float = number(0.5, 0, 1, help="share of episodes in which the expert is disturbed")
-    expert_share: float = number(0.3, 0, 1, help="share of a policy's chunks in which the expert acts")
-    frame_stride: int = number(2, 1, 10_000, help="control steps between two images that are kept")
+    expert_share: float = number(0.3, 0, 1, help="if a policy acts: share of chunks in which the expert acts instead")
+    frame_stride: int = number(2, 1, 10_000, help="control steps between two stored images")
     world: WorldSettings = setting(WorldSettings, "camera and length of an episode")
 
 
 @dataclass(kw_only=True)
 class DemonstrationSettings(TaskSettings):
-    """Settings of every command that makes something of a target and its demonstrations."""
+    """Settings shared by commands that make an artifact from a target and its demonstrations."""
 
     groups: ClassVar = {"policy": "vision", "runtime": "cpu"}
 
@@ -94,72 +101,99 @@ class DemonstrationSettings(TaskSettings):
 
 @dataclass
 class TrainDrafterSettings(DemonstrationSettings):
-    """`kerv train drafter`: policy.target is imitated; policy.artifacts.KIND: name of the new one."""
+    """Settings of `kerv train drafter`.
 
-    # after train, because drafter=early has optimisation settings of its own
+    The drafter learns to imitate `policy.target`. `policy.artifacts.KIND` names the new drafter, for example
+    `policy.artifacts.drafter`.
+    """
+
+    # drafter comes after train, because drafter=early overrides some of train's settings
     groups: ClassVar = {"policy": "vision", "train": "drafter", "drafter": "eagle", "runtime": "auto"}
 
     log: str = choice("none", *TRACKERS, help=LOG)
-    drafter: Any = setting(chosen("drafter", "eagle"), "its shapes and loss: eagle, early, scout")
+    drafter: Any = setting(chosen("drafter", "eagle"), "kind of drafter, with its shapes and loss: eagle, early, scout")
     train: TrainSettings = setting(TrainSettings, "optimisation")
 
 
 @dataclass
 class PrepareSettings(DemonstrationSettings):
-    """`kerv prepare`: everything that methods need of policy.target."""
+    """Settings of `kerv prepare`, which makes every missing artifact that the methods need for `policy.target`."""
 
     groups: ClassVar = {"policy": "vision", "runtime": "auto"}
 
-    methods: list[str] = setting([], "their names; empty: all")
-    steps: int = number(0, 0, 10**9, help="optimisation steps of each drafter; 0: those of kerv train drafter")
+    methods: list[str] = setting([], "names of the methods; empty: all")
+    steps: int = number(0, 0, 10**9, help="optimisation steps of each drafter; 0: as kerv train drafter")
 
 
 @dataclass
 class BuildDrafterSettings(RunSettings):
-    """`kerv build drafter`: a drafter in the public EAGLE or Spec-VLA layout, named policy.artifacts.drafter."""
+    """Settings of `kerv build drafter`, which imports a published EAGLE or Spec-VLA drafter.
+
+    `policy.artifacts.drafter` names the imported drafter.
+    """
 
     groups: ClassVar = {"policy": "vision", "runtime": "cpu"}
 
     policy: PolicySettings = setting(PolicySettings, POLICY)
-    checkpoint: str = setting("", "folder with config.json and model.safetensors")
-    positions: str = choice("sequence", "sequence", "text", help="docs/methods.md §2.2")
-    mask: str = choice("causal", "causal", "prompt", help="docs/methods.md §2.2")
+    checkpoint: str = setting("", "folder of the published drafter, with config.json and model.safetensors")
+    positions: str = choice(
+        "sequence", "sequence", "text", help="text: vision tokens get no position number (docs/methods.md §2.2)"
+    )
+    mask: str = choice(
+        "causal", "causal", "prompt", help="prompt: tokens see only the prompt without its last token (§2.2)"
+    )
 
 
 @dataclass
 class BuildDatastoreSettings(DemonstrationSettings):
-    """`kerv build datastore` (docs/methods.md §4.1): policy.target gives the features and the tokens."""
+    """Settings of `kerv build datastore`, which stores demonstrated chunks for retrieval (docs/methods.md §4.1).
+
+    `policy.target` encodes the observations, which become the search keys. Its action tokens are stored.
+    """
 
     groups: ClassVar = {"policy": "vision", "runtime": "cpu"}
 
-    name: str | None = setting(None, "default: datastore/ beside the target")
+    name: str | None = setting(None, "name of the datastore; default: the one beside the target")
     episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)
-    stride: int = number(1, 1, 10_000, help="observations between two entries")
+    stride: int = number(1, 1, 10_000, help="store every n-th observation")
     half: bool = setting(False, "store keys in float16, half the size")
-    components: int = number(0, 0, 65_536, help="directions onto which keys are projected; 0: none")
-    key: list[str] = setting(["scene"], "pooled parts of the prompt: scene, vision, proprioception")
+    components: int = number(0, 0, 65_536, help="project keys onto this many leading directions; 0: no projection")
+    key: list[str] = setting(["scene"], "parts of the prompt that make the key: scene, vision, proprioception")
 
 
 @dataclass
 class CalibrateSettings(DemonstrationSettings):
-    """`kerv calibrate` (docs/methods.md §3, §4): noise of the predictors, K_S, boundary ranges and skip levels."""
+    """Settings of `kerv calibrate`, which measures on demonstrations what KERV and HeiSD need (docs/methods.md §3, §4).
 
-    name: str | None = setting(None, "default: beside the target")
+    That is the noise of the kinematic predictors, each task's reference level K_S of motion variability, the ranges
+    that scale the hybrid boundary, and the similarities from which a retrieved draft is executed without verification.
+    """
+
+    name: str | None = setting(None, "name of the calibration; default: the one beside the target")
     episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)
-    held_out: float = number(0.1, above=0, most=0.5, help="share of episodes that the errors are measured on")
-    window: int = number(10, 4, 10_000, help="control steps of history; predictors need four")
+    held_out: float = number(0.1, above=0, most=0.5, help="share of episodes kept for measuring the predictors' errors")
+    window: int = number(10, 4, 10_000, help="control steps of history that the predictors see")
     epsilon: float = number(
         0.1, above=0, most=1e6, help="verify-skip: largest mean absolute error of a good chunk, normalised units"
     )
     confidence: float = number(0.9, 0.5, 0.999999, help="verify-skip: share of skipped chunks that must be good")
-    boundary_windows: list[int] = setting([5, 15, 30], "positions; each has ranges of its own", **limits(3, 10_000))
-    decodes: int = number(60, 0, 100_000, help="per task: decodes whose median variability is K_S; 0: none")
-    proposer: Any = part("proposer", "drafter", "of the pre-sampling's decodes")
-    acceptance: Any = part("acceptance", "relaxed", "of the pre-sampling's decodes")
-    threshold: Any = part("threshold", "fixed", "of the pre-sampling's decodes")
+    boundary_windows: list[int] = setting(
+        [5, 15, 30], "window lengths w of the boundary, in positions", **limits(3, 10_000)
+    )
+    decodes: int = number(60, 0, 100_000, help="decodes per task from which K_S is measured; 0: no K_S")
+    proposer: Any = part("proposer", "drafter", "proposer of the decodes that measure K_S")
+    acceptance: Any = part("acceptance", "relaxed", "acceptance rule of the decodes that measure K_S")
+    threshold: Any = part("threshold", "fixed", "threshold of the decodes that measure K_S")
 
     def check_together(self, prefix: str) -> None:
-        """Refuse a calibration without a window, or pre-sampling that drafts nothing."""
+        """Refuse an empty `boundary_windows`, and decodes without a proposer.
+
+        Args:
+            prefix: Text before a setting's name in the error message.
+
+        Raises:
+            UsageError: One of the two.
+        """
         if not self.boundary_windows:
             raise UsageError(f"{prefix}boundary_windows=[]: name at least one number of positions")
         if self.decodes and self.proposer.kind == "none":
@@ -168,7 +202,10 @@ class CalibrateSettings(DemonstrationSettings):
 
 @dataclass
 class CalibrateSuccessSettings(SweepSettings):
-    """`kerv calibrate success` (docs/methods.md §4.6): all words but these go to the study's settings."""
+    """Settings of `kerv calibrate success`, which certifies that a method loses little success (docs/methods.md §4.6).
+
+    All other command-line arguments are settings of the rollouts in `conf/study/certify.yaml`.
+    """
 
     groups: ClassVar = {"study": "certify"}
 

@@ -1,4 +1,4 @@
-"""`kerv train target`: a compact policy, cloned from demonstrations."""
+"""`kerv train target`: train a compact policy by behaviour cloning."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ from kerv_cli.worlds import resolve_tasks, settled, spec_of
 from kerv_cli.worlds.demos.dataset import OnProgress
 
 STATE_EPISODES = 200
-"""Episodes from which the range of states is taken, at most."""
+"""Maximum number of episodes from which the range of the states is measured."""
 
 
 class TargetRun(TrainingRun):
-    """`kerv train target`.
+    """The training of a compact policy, by `kerv train target`.
 
     Raises:
-        UsageError: Settings that do not fit together.
-        CheckpointError: No such demonstrations or `train.init`; demonstrations of another environment, camera or
-            tasks; or another run in the folder.
+        UsageError: Some settings contradict each other.
+        CheckpointError: The demonstrations or the target `train.init` do not exist. Or the demonstrations have another
+            environment, camera or other tasks. Or the folder holds another training.
     """
 
     kind = artifact_kind = "target"
@@ -70,15 +70,16 @@ class TargetRun(TrainingRun):
         if settings.target.observation == "vision":
             shown = "the policy would be shown"
             self.dataset = seen_by(self.dataset, camera, shown, "set world.camera.name, or record again")
-        # {"init": hash of its weights}; empty for a fresh run
+        # {"init": hash of the initial weights}; empty without train.init
         self.init_hash = {"init": read_target(self.init).sha256} if self.init else {}
         self.check_folder("name")
 
     def check_places(self) -> None:
-        """Refuse what the position loss cannot learn from, and settings of images for a policy that sees none.
+        """Refuse demonstrations without the positions to learn, and image settings for a policy without images.
 
         Raises:
-            UsageError: The first of them.
+            UsageError: The demonstrations name no positions of object and goal. Or `train.places=path` is chosen but
+                a policy acted in some demonstrations. Or a setting needs images and the policy has none.
         """
         train, manifest = self.settings.train, self.dataset.manifest
         if not manifest.observation.places:
@@ -96,11 +97,11 @@ class TargetRun(TrainingRun):
             )
 
     def find_init(self) -> Path | None:
-        """Return the folder of the target `train.init`; None for a fresh run.
+        """Return the folder of the target whose weights training starts from; None without `train.init`.
 
         Raises:
-            UsageError: The run would overwrite it, or has other shapes.
-            CheckpointError: No such target.
+            UsageError: The training would overwrite that target, or its shapes differ.
+            CheckpointError: That target does not exist.
         """
         name = self.settings.train.init
         if name is None:
@@ -112,20 +113,20 @@ class TargetRun(TrainingRun):
         return folder
 
     def plan(self) -> str:
-        """Return one line for --plan: demonstrations, tasks, steps and folder."""
+        """Return one line that `--plan` prints: demonstrations, tasks, number of steps and folder."""
         target, train = self.settings.target, self.settings.train
         episodes = [episode for episode in self.dataset.episodes if episode.task in self.tasks]
         return (
             f"{self.folder}: {target.size} on {target.observation}, {len(episodes)} demonstrations of "
             f"{len(self.tasks)} tasks, {train.steps} steps of {train.batch} samples"
-            + (f", beginning with {self.init}" if self.init else "")
+            + (f", starting from {self.init}" if self.init else "")
         )
 
     def load(self, progress: OnProgress) -> None:
-        """Read the demonstrations and the weights of `train.init` into memory, and make the target.
+        """Read the demonstrations into memory, and make the network, from the weights of `train.init` if it is set.
 
         Raises:
-            CheckpointError: One of them is damaged or of another environment.
+            CheckpointError: The demonstrations or the target `train.init` are damaged or of another environment.
         """
         self.device, _ = set_up(self.settings.runtime)
         settings, camera, init = self.settings, self.world.camera.name, None
@@ -146,19 +147,22 @@ class TargetRun(TrainingRun):
         self.objective = Imitation(target.to(self.device), samples, settings.train, success)
 
     def identity(self) -> dict[str, Any]:
-        """Return shapes, tasks, views and the hash of the initial weights."""
+        """Return the shapes, the tasks, the camera views and the hash of the initial weights."""
         shapes = asdict(self.settings.target)
         return {"target": shapes, "tasks": self.tasks, "views": self.dataset.views, **self.init_hash}
 
     def write(self, module: nn.Module, provenance: dict[str, Any]) -> None:
-        """Write the target's folder."""
+        """Write the weights and their description into the target's folder."""
         assert isinstance(module, CompactTarget)
         environment, stored = self.dataset.manifest.environment, self.settings.train.stored
         save_target(self.folder, module, environment, provenance | self.init_hash, stored, self.state_range)
 
     @functools.cached_property
     def state_range(self) -> list[list[float]]:
-        """[low, high], each (s,): percentiles 0.1 and 99.9 of the states, over at most STATE_EPISODES episodes."""
+        """Range [low, high] of each of the s state numbers, each (s,): their percentiles 0.1 and 99.9.
+
+        They are measured on at most STATE_EPISODES episodes.
+        """
         count = len(self.dataset.episodes)
         chosen = range(0, count, -(-count // STATE_EPISODES))
         states = np.concatenate([self.dataset.load(index).states for index in chosen])

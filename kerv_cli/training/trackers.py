@@ -1,4 +1,4 @@
-"""Draw the curves of a training in a tracker while it trains."""
+"""Send the curves of a training to an experiment tracker: Trackio, Weights & Biases or TensorBoard."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from pathlib import Path
 from kerv_cli.base.errors import UsageError
 
 MOST_POINTS = 1000
-"""Maximum number of points of a curve, so that training does not wait for its tracker. Validations do not count."""
+"""Maximum number of points per training curve, so that training does not wait for its tracker.
+
+All validations are logged as well.
+"""
 _MODULES = {"trackio": "trackio", "wandb": "wandb", "tensorboard": "torch.utils.tensorboard"}
 
 
@@ -18,14 +21,17 @@ _MODULES = {"trackio": "trackio", "wandb": "wandb", "tensorboard": "torch.utils.
 def tracked(
     tracker: str, name: str, folder: Path, steps: int, config: Mapping[str, object]
 ) -> Iterator[Callable[[int, Mapping[str, float]], None]]:
-    """Yield a function that logs the numbers of a training step. Numbers with a `step` among them are a validation's.
+    """Open a tracker for one training.
 
     Args:
-        tracker: trackio, wandb, tensorboard or none.
+        tracker: `trackio`, `wandb`, `tensorboard` or `none`.
         name: Name of the run in the tracker.
-        folder: Folder of the training, where TensorBoard's files go.
+        folder: Folder of the training. TensorBoard's files go there.
         steps: Number of steps of the whole training.
         config: Settings to show beside the curves.
+
+    Yields:
+        A function that logs metrics by name at a step. Metrics with a key `step` are those of a validation.
 
     Raises:
         UsageError: The tracker is not installed.
