@@ -129,8 +129,8 @@ class CalibrationRun:
             stage: Called with the title of each part of the work, to show its progress.
 
         Raises:
-            CheckpointError: The images have another size than the target takes, or no path in them bends.
-            KervError: All decodes of a task ended without comparing a draft with the target, so K_S is unknown.
+            CheckpointError: The images have another size than the target takes. Or no end-effector path is curved.
+            KervError: No decode of a task compared a draft with the target, so K_S is unknown.
             StorageError: The disk cannot be written.
         """
         space, chunk, settings = self.description.actions, self.description.chunk, self.settings

@@ -1,7 +1,8 @@
-"""What `kerv demos` records: the scripted expert, or a policy whose states the expert labels.
+"""Who acts while `kerv demos` records: the scripted expert, or a policy.
 
-The latter is DAgger (Ross, Gordon, Bagnell 2011). The policy may decode by any method. `method=scout_unverified`
-records the states that a drafter's unverified chunks lead to, to train the drafter on.
+If a policy acts, the expert labels the states that it visits (DAgger; Ross, Gordon, Bagnell 2011). The policy may
+decode with any method. For example, `method=scout_unverified` records the states that a drafter's unverified chunks
+lead to, so that the drafter can be trained on them.
 """
 
 from __future__ import annotations
@@ -29,30 +30,35 @@ from kerv_cli.worlds.spec import EnvironmentSpec, World
 
 
 class PolicyActor:
-    """Executes whole chunks of a policy, and for a share of the chunks, drawn by task and seed, the expert's actions.
+    """Chooses the actions of a recording: whole chunks of a policy, or the expert's actions for some chunks.
 
-    The decoder is never told that an episode has ended, so that no episode depends on those before it.
+    Task and seed determine which chunks are the expert's. The decoder is never told whether an episode succeeded, so
+    no episode depends on earlier episodes.
 
     Args:
-        decoder_of: Makes the decoder of a task.
-        expert_share: Share of chunks in which the expert acts.
+        decoder_of: Makes the decoder of a task, by the task's name.
+        expert_share: Share of the chunks in which the expert acts.
     """
 
     def __init__(self, decoder_of: Callable[[str], Decoder], expert_share: float) -> None:
         self.decoder_of, self.share = functools.cache(decoder_of), expert_share
 
     def reset(self, world: World, seed: int) -> None:
-        """Begin an episode in a world that was reset."""
+        """Begin an episode. The world must have been reset already."""
         self.world = world
         self.random = np.random.default_rng([seed, *world.task.encode()])
-        self.actions: deque[NDArray[np.float64]] = deque()  # of the current chunk, not executed yet
+        self.actions: deque[NDArray[np.float64]] = deque()  # actions of the current chunk that are not executed yet
         self.expert_steps = 0
         self.executed: NDArray[np.float32] | None = None
         self.decoder = self.decoder_of(world.task)
         self.decoder.reset(world.task, seed, world.end_effector)
 
     def act(self, label: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the action (D,) to execute now: the policy's or, in the expert's chunks, the expert's `label`."""
+        """Return the action (D,) to execute now.
+
+        Args:
+            label: (D,) the expert's action. It is returned during the expert's chunks.
+        """
         if self.executed is not None:
             self.decoder.observe(self.executed, self.world.end_effector)
         if not self.actions and not self.expert_steps:
@@ -71,11 +77,11 @@ class PolicyActor:
 
 @dataclass(frozen=True)
 class PolicyActs:
-    """Makes the actor of a recording, in the process that records.
+    """Makes the `PolicyActor` of a recording, inside the process that records.
 
     Attributes:
         settings: Settings of the recording.
-        sha256: Hash of the target if it decodes as it was trained to, else of the method and of all weights.
+        sha256: Hash of the target's weights, if no method was chosen. Otherwise hash of the method and all its weights.
     """
 
     settings: DemosSettings
@@ -83,12 +89,17 @@ class PolicyActs:
 
     @classmethod
     def of(cls, settings: DemosSettings, spec: EnvironmentSpec) -> PolicyActs:
-        """Check the settings' policy for worlds of an environment.
+        """Check that the policy of the settings can act in an environment.
 
-        The recording may show further views after those that the target sees, for a target that will see them.
+        The recording may contain more camera views than the target sees, to train another target on them.
+
+        Args:
+            settings: Settings of the recording.
+            spec: The environment.
 
         Raises:
-            UsageError: No such target, frames of another camera, or a method that does not fit.
+            UsageError: The target does not exist, the recording shows another camera than the target sees, or the
+                method does not work with the target.
             CheckpointError: An artifact is missing or damaged, or the policy is of another environment.
         """
         name, world = settings.policy.target, settings.world
@@ -106,10 +117,10 @@ class PolicyActs:
         return cls(settings, _hash(settings))
 
     def __call__(self, config: DemoConfig) -> PolicyActor:
-        """Return the actor.
+        """Make the actor of a recording.
 
         Raises:
-            CheckpointError: The weights are not those that the recording began with.
+            CheckpointError: The policy's weights have changed since the recording began.
         """
         torch.set_num_threads(1)
         if _hash(self.settings) != self.sha256:
@@ -127,7 +138,7 @@ class PolicyActs:
 
 
 def _is_plain(settings: DemosSettings) -> bool:
-    """Return whether the target decodes as it was trained to: no method and no chunk was chosen."""
+    """Return whether no method and no chunk length was chosen, so that the target decodes as it was trained to."""
     return not settings.chunk and settings.parts() == DemosSettings().parts()
 
 
@@ -143,12 +154,12 @@ def _hash(settings: DemosSettings) -> str:
 
 
 def recording_of(settings: DemosSettings) -> tuple[DemoConfig, PolicyActs | None]:
-    """Return what is recorded, and the policy that moves the robot; None if the expert does.
+    """Return the description of a recording, and the policy that acts in it. The policy is None if the expert acts.
 
     Raises:
-        UnknownName: No such task.
-        UsageError: A target without a policy that acts.
-        CheckpointError: No such policy.
+        UnknownName: A task does not exist.
+        UsageError: `policy.target` is set although the expert acts.
+        CheckpointError: The policy does not exist.
     """
     tasks = resolve_tasks(settings.task)
     actor = _actor(settings, tasks[0])
@@ -168,7 +179,7 @@ def recording_of(settings: DemosSettings) -> tuple[DemoConfig, PolicyActs | None
 
 
 def _actor(settings: DemosSettings, task: str) -> PolicyActs | None:
-    """Return the policy that moves the robot instead of the expert; None for the expert."""
+    """Return the policy that acts instead of the expert; None if the expert acts."""
     target = settings.policy.target
     if settings.policy.kind != EXPERT:
         return PolicyActs.of(settings, spec_of(task))

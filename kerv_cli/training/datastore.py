@@ -1,4 +1,4 @@
-"""`kerv build datastore`: encode the demonstrations with the target (docs/methods.md §4.1)."""
+"""`kerv build datastore`: store demonstrated chunks, keyed by encoded observations (docs/methods.md §4.1)."""
 
 from __future__ import annotations
 
@@ -39,18 +39,21 @@ from kerv_cli.worlds.demos.dataset import OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 BATCH = 128
-"""Observations encoded together, at most."""
+"""Maximum number of observations that are encoded together."""
 KEYS = ("vision", "scene", "proprioception")
-"""Parts of the prompt that a key can have. The instruction is the same for all entries of a task."""
+"""Parts of the prompt from which a search key can be made.
+
+The instruction is not among them, because all entries of a task share it.
+"""
 
 
 class DatastoreBuild:
-    """Checks that a datastore can be built; `build` builds it.
+    """One datastore to build. The constructor checks that it is possible, and `build` writes the datastore.
 
     Raises:
-        CheckpointError: No such target or demonstrations, demonstrations of another environment or with evaluation
-            seeds, or a task without an episode.
-        UsageError: An unknown part of the prompt, or a folder that holds something else.
+        CheckpointError: The target or the demonstrations do not exist. Or the demonstrations are of another
+            environment, contain evaluation seeds, or have no episode of a task.
+        UsageError: `key` names an unknown part of the prompt. Or the folder holds something else than a datastore.
     """
 
     def __init__(self, settings: BuildDatastoreSettings) -> None:
@@ -81,7 +84,7 @@ class DatastoreBuild:
             raise UsageError(f"{self.folder} exists and is no datastore: give the new one another name")
 
     def plan(self) -> str:
-        """Return one line for --plan: episodes, tasks, target and folder."""
+        """Return one line that `--plan` prints: episodes, tasks, target and folder."""
         episodes = [self.dataset.episodes[i] for chosen in self.chosen.values() for i in chosen]
         return (
             f"{self.folder}: {len(episodes)} demonstrations of {len(self.chosen)} tasks, "
@@ -90,11 +93,14 @@ class DatastoreBuild:
         )
 
     def build(self, progress: OnProgress = lambda done, total: None) -> Datastore:
-        """Write the datastore atomically, in the place of an older one.
+        """Write the datastore and open it. An older datastore in the same folder is replaced at the end.
+
+        Args:
+            progress: Called with the numbers of episodes done and of all.
 
         Raises:
-            CheckpointError: Too few labels, or frames of another size than the target takes.
-            StorageError: The disk refused.
+            CheckpointError: An episode has too few labels, or images of another size than the target takes.
+            StorageError: The disk cannot be written.
         """
         total, parts, shards, rows = sum(map(len, self.chosen.values())), list[dict[str, np.ndarray]](), {}, 0
         for name, chosen in self.chosen.items():
@@ -110,9 +116,11 @@ class DatastoreBuild:
 
     @torch.inference_mode()
     def _entries(self, episode: DemoEpisode) -> dict[str, np.ndarray]:
-        """Return the columns of an episode's entries: one for every `stride`-th observation.
+        """Make the entries of an episode: one for every `stride`-th observation.
 
-        The key is the encoded observation; the tokens are the expert's next H clean actions.
+        Returns:
+            Column -> values, one row per entry. The column `keys` holds the encoded observations, and `tokens` the
+            expert's next H undisturbed actions.
         """
         target: Any = self.artifacts.target
         steps = steps_of(episode, bool(target.cameras))[:: self.settings.stride]
@@ -130,10 +138,15 @@ class DatastoreBuild:
         }
 
     def _contents(self, columns: dict[str, np.ndarray], shards: Mapping[str, Shard]) -> dict[str, Any]:
-        """Return file name -> its array or table."""
+        """Return the files to write: file name -> array or table.
+
+        Args:
+            columns: Column -> values, one row per entry of all tasks.
+            shards: Task -> its rows and seeds.
+        """
         keys, tokens, files = columns.pop("keys"), columns.pop("tokens"), {}
         if self.settings.components:
-            # the orthonormal directions with most of the keys' squared length
+            # the orthonormal directions that keep most of the keys' squared length
             values, vectors = np.linalg.eigh(keys.T.astype(np.float64) @ keys)
             files[PROJECTION] = vectors[:, np.argsort(-values)[: self.settings.components]].astype(np.float32)
             keys = projected(keys, files[PROJECTION])
@@ -149,7 +162,7 @@ class DatastoreBuild:
 
     def _write(self, folder: Path, files: Mapping[str, Any], shards: dict[str, Shard]) -> None:
         for name, content in files.items():
-            # in memory first: numpy and pyarrow report a full disk without its errno
+            # write to memory first: on a full disk, numpy and pyarrow raise errors without an errno
             buffer = io.BytesIO()
             if name == PAYLOAD:
                 pq.write_table(content, buffer, compression="zstd")

@@ -1,4 +1,4 @@
-"""The demonstrations that a command learns from: one dataset or several joined ones, of all tasks or some."""
+"""Open and check the demonstrations that a command uses: one dataset or several joined datasets."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ S = TypeVar("S", bound=DemonstrationSettings)
 
 
 def name_of(tasks: Sequence[str]) -> str:
-    """Return the default name of demonstrations of these tasks and suites."""
+    """Return the name that demonstrations of these tasks and suites get by default, such as `mt10`."""
     return "-".join(tasks or DEFAULT_TASKS).lower()
 
 
 def open_demos(results: str, names: str, tasks: Sequence[str] = (), episodes: int = 0) -> DemoDataset:
-    """Open a dataset, or several joined ones such as `mt50+mt50-dagger`.
+    """Open a dataset, or join several datasets, such as `mt50+mt50-dagger`.
 
     Args:
         results: The results folder.
-        names: The name; a folder of exactly this name comes first.
-        tasks: For the command that records what is missing; empty: its default.
-        episodes: Per task, for the same command; 0: its default.
+        names: Name of a dataset, or several names joined by `+`.
+        tasks: Tasks to record if the dataset is missing, for the error message. Empty: the default tasks.
+        episodes: Episodes per task to record, for the error message. 0: the default number.
 
     Raises:
-        UsageError: No folder name.
-        CheckpointError: One is missing, unfinished or damaged, or they do not fit together.
+        UsageError: A name cannot be the name of a folder.
+        CheckpointError: A dataset is missing, unfinished or damaged, or the datasets cannot be joined.
     """
     whole = artifact(results, "demos", names)
     folders = [whole] if whole.is_dir() else [artifact(results, "demos", name) for name in names.split("+")]
@@ -51,7 +51,7 @@ def open_demos(results: str, names: str, tasks: Sequence[str] = (), episodes: in
             command = command_to_go_on(results, "demos", folder)
             if command and not (folder / "manifest.json").exists():
                 line = shlex.join(["kerv", *command])
-                raise CheckpointError(f"the demonstrations in {folder} are unfinished: go on with '{line}'") from error
+                raise CheckpointError(f"the demonstrations in {folder} are unfinished: run '{line}'") from error
             if folder.is_dir():
                 raise
             remedy = _remedy(results, folder, tasks, episodes)
@@ -70,21 +70,23 @@ def _remedy(results: str, folder: Path, tasks: Sequence[str], episodes: int) -> 
 
 
 def demos_for(settings: S) -> tuple[S, DemoDataset]:
-    """Open the demonstrations from which something is made for a target: by default those it was trained on.
+    """Open the demonstrations named in the settings, or by default the ones that the target was trained on.
 
     Returns:
-        The settings with the demonstrations' name, and with the tasks that the target knows if the demonstrations hold
-        more; and the demonstrations.
+        settings: The settings with `demos` filled in. If `task` is empty and the demonstrations contain tasks that the
+            target was not trained on, `task` becomes the tasks that it was trained on.
+        dataset: The demonstrations.
 
     Raises:
-        UsageError: No such target.
-        CheckpointError: As `open_demos`, or they are of another environment, or show a compact target other views.
+        UsageError: The target does not exist.
+        CheckpointError: The demonstrations are missing, unfinished, damaged, of another environment, or show other
+            camera views than the target sees.
     """
     target = described(find_target(settings.results, settings.policy.target), "target", TargetDescription)
     name, tasks = settings.demos or target.demos or name_of(()), settings.task
     if settings.demos:
         dataset = open_demos(settings.results, name, tasks or target.tasks)
-    else:  # the target's own are recorded whole
+    else:  # a missing dataset is recorded with all tasks of the target
         config = target.provenance.get("demos", {}).get("config", {})
         dataset = open_demos(settings.results, name, target.tasks, config.get("episodes", 0))
     check_spaces(dataset, target.actions, target.observation, "the target")
@@ -101,10 +103,14 @@ def demos_for(settings: S) -> tuple[S, DemoDataset]:
 
 
 def check_tasks(dataset: DemoDataset, names: Sequence[str]) -> None:
-    """Refuse demonstrations that lack one of these tasks, by their full names.
+    """Refuse demonstrations that have no episode of one of these tasks.
+
+    Args:
+        dataset: The demonstrations.
+        names: Full names of the tasks.
 
     Raises:
-        CheckpointError: The first one without an episode.
+        CheckpointError: A task has no episode. The message names the first such task.
     """
     recorded = list(dict.fromkeys(entry.task for entry in dataset.episodes))
     for task in names:
@@ -116,22 +122,34 @@ def check_tasks(dataset: DemoDataset, names: Sequence[str]) -> None:
 
 
 def check_spaces(dataset: DemoDataset, actions: ActionSpace, observation: ObservationSpace, owner: str) -> None:
-    """Refuse demonstrations with other spaces than those of `owner`, e.g. "the target".
+    """Refuse demonstrations with another action space or observation space than expected.
+
+    Args:
+        dataset: The demonstrations.
+        actions: Expected action space.
+        observation: Expected observation space.
+        owner: What has the expected spaces, such as "the target", for the error message.
 
     Raises:
-        CheckpointError: Other actions or observations.
+        CheckpointError: The actions or the observations differ.
     """
     where = f"the demonstrations in {dataset.path}"
     dataset.manifest.actions.check_same(actions, where, owner)
-    if observation.state and observation != dataset.manifest.observation:  # without a state it reads images alone
+    if observation.state and observation != dataset.manifest.observation:  # a target without a state reads only images
         raise CheckpointError(f"{where} have other observations than {owner}: they are of another environment")
 
 
 def seen_by(dataset: DemoDataset, camera: str, who: str, remedy: str) -> DemoDataset:
-    """Return the dataset with the views of `camera` alone, if it recorded further ones after them.
+    """Return the dataset with only the views of `camera`. Further recorded views after them are left out.
+
+    Args:
+        dataset: The demonstrations.
+        camera: Camera name. Several views are joined by `+`.
+        who: Who needs this camera, such as "the target sees", for the error message.
+        remedy: What to do, for the error message.
 
     Raises:
-        CheckpointError: Its frames begin with other views; `who` and `remedy` complete the message.
+        CheckpointError: The first recorded views are not those of `camera`.
     """
     recorded = dataset.manifest.config["camera"]["name"]
     if recorded == camera:

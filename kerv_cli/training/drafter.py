@@ -1,4 +1,4 @@
-"""`kerv train drafter`: weights that draft for a target, trained on demonstrations that the target has decoded."""
+"""`kerv train drafter`: train a drafter to imitate how the target decodes the demonstrations."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import OnProgress
 
 OF_TARGETS = ("init", "balance", "closed_loop", "colour", "places")
-"""Optimisation settings that only the training of a target has."""
+"""Optimisation settings that only the training of a target reads."""
 
 
 class DrafterRun(TrainingRun):
-    """`kerv train drafter`.
+    """The training of a drafter, by `kerv train drafter`.
 
     Raises:
-        UnknownName: No such kind of drafter.
-        UsageError: Settings of another kind of drafter, or of targets only.
-        CheckpointError: No such target or demonstrations, or another run in the folder.
+        UnknownName: The kind of drafter does not exist.
+        UsageError: A setting belongs to another kind of drafter, or only to the training of targets.
+        CheckpointError: The target or the demonstrations do not exist, or the folder holds another training.
     """
 
     kind = "drafter"
@@ -58,7 +58,7 @@ class DrafterRun(TrainingRun):
         self.check_folder(f"policy.artifacts.{self.artifact_kind}")
 
     def plan(self) -> str:
-        """Return one line for --plan: target, observations, steps and folder."""
+        """Return one line that `--plan` prints: target, number of observations, number of steps and folder."""
         drafter, train = asdict(self.settings.drafter), self.settings.train
         layers = f"{drafter['layers']}-layer " if "layers" in drafter else ""
         samples = f", greedy decodes of {drafter['samples']} observations" if "samples" in drafter else ""
@@ -68,23 +68,23 @@ class DrafterRun(TrainingRun):
         )
 
     def load(self, progress: OnProgress) -> None:
-        """Load the target and decode the demonstrations with it.
+        """Load the target, decode the demonstrations with it, and make the drafter.
 
         Raises:
-            CheckpointError: Target or demonstrations are damaged.
-            UsageError: No such device.
+            CheckpointError: The target or the demonstrations are damaged.
+            UsageError: The device does not exist.
         """
         self.device, _ = set_up(self.settings.runtime)
         target: Any = load_target(self.target_folder, self.device)[0]
         self.objective = self.artifact.objective(target, self.dataset, self.settings, progress)
 
     def identity(self) -> dict[str, Any]:
-        """Return the shapes, the target's weights and the tasks."""
+        """Return the drafter's settings, the hash of the target's weights and the tasks."""
         task = self.settings.task
         tasks = list(resolve_tasks(task)) if task else []
         return {"drafter": asdict(self.settings.drafter), "target": self.description.sha256, "task": tasks}
 
     def write(self, module: nn.Module, provenance: dict[str, Any]) -> None:
-        """Write the drafter's folder."""
+        """Write the weights and their description into the drafter's folder."""
         made_for, stored = MadeFor.of(self.description), self.settings.train.stored
         self.artifact.save(self.folder, module, made_for, provenance, stored, settings=asdict(self.settings.drafter))

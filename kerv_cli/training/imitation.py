@@ -1,8 +1,8 @@
-"""Behaviour cloning of a compact target: samples, losses, validation, and the network to begin with.
+"""Behaviour cloning of a compact target: samples, losses, validation and initial weights.
 
-One sample is one recorded control step: the observation, and the expert's next H clean actions as tokens. Validation
-uses held-out episodes. Token accuracy does not show success: two policies with the same accuracy can differ by half of
-the tasks. So success in closed-loop episodes dominates the score if the settings ask for it.
+One sample is one recorded control step: the observation, and the expert's next H undisturbed actions. Validation uses
+held-out episodes. Token accuracy does not show success: two policies with the same accuracy can differ by half of the
+tasks. So with `train.closed_loop`, the success in simulated episodes dominates the score.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 WITHIN = 9
-"""Validation reports the share of tokens that are off by at most this many bins: Spec-VLA's relaxed radius."""
+"""Validation reports the share of tokens at most this many bins from the label: Spec-VLA's acceptance radius."""
 VALIDATED = 2048
-"""Samples of a validation, at most."""
+"""Maximum number of samples in a validation."""
 
 
 @dataclass(frozen=True)
 class Samples(Observations):
-    """The training data of a policy: observations and the expert's chunks."""
+    """The n samples that a policy is trained on: observations and the expert's chunks."""
 
-    chunks: Tensor  # (n, H, D) float32, the expert's clean actions, environment units
-    places: Tensor  # (n, K, 3) float32, the positions that are learnt, metres
+    chunks: Tensor  # (n, H, D) float32, the expert's undisturbed actions, environment units
+    places: Tensor  # (n, K, 3) float32, the positions that the target learns to estimate, metres
     episodes: Tensor  # (n,) int64, index of the sample's episode
     tasks: Tensor  # (n,) int64, index of the sample's task
 
@@ -58,10 +58,18 @@ def load_samples(
     progress: OnProgress = lambda done, total: None,
     places: str = "state",
 ) -> Samples:
-    """Read the tasks' episodes into memory; `places` as in `TrainSettings`.
+    """Read the episodes of some tasks into memory.
+
+    Args:
+        dataset: The demonstrations.
+        settings: Shapes of the target.
+        words: Tokenizer of the instructions.
+        task_names: Full names of the tasks.
+        progress: Called with the numbers of episodes read and of all.
+        places: Positions to learn. `state`: object and goal. `path`: where the hand will be later in the episode.
 
     Raises:
-        CheckpointError: Too few labels or frames of another size.
+        CheckpointError: An episode has too few labels, or images of another size.
     """
     chosen = [i for i, entry in enumerate(dataset.episodes) if entry.task in task_names]
     parts = []
@@ -85,15 +93,16 @@ def load_samples(
 
 
 def waypoints(episode: DemoEpisode, steps: np.ndarray, count: int, actions: ActionSpace) -> Tensor:
-    """Return where the hand will be when the gripper changes, and at the episode's end.
+    """Return where the hand will be at the next gripper changes, and at the episode's end.
 
-    The demonstration itself shows these positions, without a simulator's state. The gripper changes when a strict DoF
-    of the expert's command moves by more than an eighth of its range in one control step.
+    These positions come from the demonstration alone. No simulator state is needed. A gripper change is a control step
+    in which the expert's command of a strict DoF (the gripper) moves by more than an eighth of its range.
 
     Args:
         episode: A demonstration.
         steps: (n,) control steps.
-        count: K positions: of the next K − 1 changes after a step, and of the end. A missing change is the end.
+        count: Number K of positions per step: the next K − 1 gripper changes after it, and the end. If fewer changes
+            follow, the end takes their place.
         actions: The action space.
 
     Returns:
@@ -109,13 +118,16 @@ def waypoints(episode: DemoEpisode, steps: np.ndarray, count: int, actions: Acti
 
 
 def task_weights(tasks: Tensor, balance: float) -> Tensor | None:
-    """Return the weights (n,) float64 by which samples are drawn; None if all are drawn alike.
+    """Return how likely each sample is to be drawn.
 
-    A task with the share p of the samples is drawn in proportion to p^(1 − balance).
+    A task that has the share p of the samples is drawn in proportion to p^(1 − balance).
 
     Args:
         tasks: (n,) index of each sample's task.
-        balance: 0 draws all samples alike, 1 all tasks.
+        balance: 0: all samples are equally likely. 1: all tasks are equally likely.
+
+    Returns:
+        (n,) float64 weights; None if all samples are equally likely.
     """
     if balance == 0:
         return None
@@ -125,10 +137,19 @@ def task_weights(tasks: Tensor, balance: float) -> Tensor | None:
 
 
 def lit(images: Tensor, indices: Tensor, step: int, spread: float) -> Tensor:
-    """Return images (B, 3, h, w) uint8 under random light, a function of the samples' indices (B,) and the step.
+    """Change the light on images at random, as data augmentation.
 
-    Each colour is multiplied by the exponential of a smooth field, with a standard deviation drawn from 0 to `spread`
-    per image. Nothing moves.
+    Each colour channel is multiplied by the exponential of a smooth random field. The field's standard deviation is
+    drawn uniformly from 0 to `spread` for each image.
+
+    Args:
+        images: (B, 3, h, w) uint8.
+        indices: (B,) indices of the samples. With `step`, they determine the random fields.
+        step: The optimisation step.
+        spread: Largest standard deviation of the field.
+
+    Returns:
+        (B, 3, h, w) uint8.
     """
     draws = [np.random.default_rng((step, index)) for index in indices.tolist()]
     fields = np.stack([spread * r.uniform() * r.normal(size=(3, 3, 3)) for r in draws])
@@ -138,13 +159,14 @@ def lit(images: Tensor, indices: Tensor, step: int, spread: float) -> Tensor:
 
 
 class Imitation:
-    """The objective of a target.
+    """The objective of a target's training: its samples, its loss and its validation.
 
     Args:
-        target: The module to train, on its device.
-        samples: All samples; whole episodes of them are held out.
+        target: The network to train, already on its device.
+        samples: All samples. Some whole episodes are held out for validation.
         settings: Optimisation settings.
-        closed_loop: Measures a target's success in [0, 1], which then dominates the score.
+        closed_loop: Runs simulated episodes and returns a target's success in [0, 1], which then dominates the score.
+            None: success is not measured.
     """
 
     def __init__(
@@ -164,15 +186,16 @@ class Imitation:
         return len(self.training)
 
     def tokens(self, samples: Samples, indices: Tensor) -> Tensor:
-        """Return the chunks at `indices` (B,) as tokens (B, N) int64."""
+        """Return the action tokens (B, N) int64 of the samples `indices` (B,), on the target's device."""
         encoded = self.module.actions.encode(samples.chunks[indices].numpy())
         return torch.from_numpy(encoded).flatten(1).to(self.device)
 
     @contextlib.contextmanager
     def precision(self) -> Iterator[None]:
-        """Compute in bfloat16 if the settings ask for it, on a GPU or a CPU with AMX; other CPUs are slower with it.
+        """Compute in bfloat16 inside this context, if `train.bf16` is set and the device is a GPU or a CPU with AMX.
 
-        With AMX the attention is computed by its formula: the fused kernel's backward pass takes four times as long.
+        Other CPUs are slower in bfloat16. With AMX, attention runs without a fused kernel, because the fused kernel's
+        backward pass takes four times as long.
         """
         gpu = self.device.type != "cpu"
         bf16 = self.settings.bf16 and (gpu or has_tiles())
@@ -183,7 +206,15 @@ class Imitation:
             yield
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Return token loss plus weighted position loss; in the first `scene_steps` the position loss alone."""
+        """Return the loss of a batch, and the metrics to log.
+
+        The loss is the token loss plus the weighted position loss. In the first `train.scene_steps` steps it is the
+        position loss alone.
+
+        Args:
+            indices: (B,) indices of the samples.
+            step: The optimisation step.
+        """
         inputs = self.training.inputs(indices, self.device)
         if self.settings.colour and inputs.images is not None:
             inputs = replace(inputs, images=lit(inputs.images, indices, step, self.settings.colour))
@@ -204,9 +235,10 @@ class Imitation:
 
     @torch.no_grad()
     def validate(self, module: nn.Module) -> Metrics:
-        """Return teacher-forced metrics on held-out episodes.
+        """Return metrics on the held-out episodes, with teacher forcing.
 
-        The score is minus the mean action L1, plus ten times the success if that is measured.
+        The score is minus the mean absolute error of the actions. If closed-loop success is measured, ten times the
+        success is added.
         """
         assert isinstance(module, CompactTarget)
         chosen = torch.linspace(0, len(self.held_out) - 1, min(VALIDATED, len(self.held_out))).long()
@@ -242,12 +274,18 @@ class Imitation:
 
 
 def check_init(settings: TargetSettings, camera: str, description: TargetDescription, folder: Path) -> None:
-    """Refuse a target in `folder` that cannot be trained on with these settings and frames of `camera`.
+    """Refuse initial weights whose shapes differ from the new target's.
 
-    Only the name, the chunk length, the norm and `parallel` may differ, and `camera` may add views.
+    Only `size`, `chunk`, `norm` and `parallel` may differ. The new target may see further views after the old ones.
+
+    Args:
+        settings: Shapes of the new target.
+        camera: Camera of the new target. Several views are joined by `+`.
+        description: Description of the target with the initial weights.
+        folder: Its folder, for the error message.
 
     Raises:
-        UsageError: The first shape that differs.
+        UsageError: A shape or the camera differs. The message names the first difference.
     """
     for name, value in asdict(settings).items():
         stored = description.settings.get(name)
@@ -264,10 +302,15 @@ def check_init(settings: TargetSettings, camera: str, description: TargetDescrip
 
 
 def continued_target(settings: TargetSettings, init: CompactTarget, camera: str) -> CompactTarget:
-    """Return a policy of `settings` that begins with the weights, statistics and words of `init`.
+    """Make a target that starts from the weights, action statistics and words of another target.
 
-    Only the queries of a parallel target are fresh. An added view of `camera` begins with the first one's encoder, and
-    the estimated positions do not depend on it yet.
+    Only the query embeddings of a parallel target are newly initialised. The encoder of an added view is a copy of the
+    first view's, and weights of zero keep the estimated positions independent of the added view at first.
+
+    Args:
+        settings: Shapes of the new target.
+        init: The target with the initial weights.
+        camera: Camera of the new target. Several views are joined by `+`.
     """
     target = CompactTarget(replace(settings), init.actions, init.observation, init.words, camera)
     fresh = {k: v for k, v in target.state_dict().items() if k == "queries"}
@@ -285,5 +328,5 @@ def continued_target(settings: TargetSettings, init: CompactTarget, camera: str)
 
 
 def vocabulary(environment: str) -> WordTokenizer:
-    """Return a tokenizer of the words in the instructions of all tasks of an environment."""
+    """Return a word tokenizer whose vocabulary is all words in the instructions of an environment's tasks."""
     return WordTokenizer.build(t.instruction for t in specs()[environment].tasks.values())

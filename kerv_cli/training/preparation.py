@@ -1,4 +1,4 @@
-"""What `kerv prepare` makes for a target: which artifacts, in which order, by which command."""
+"""`kerv prepare`: find out which artifacts the methods need for a target, and the commands that make them, in order."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ THERE, MISSING = "there", "missing"
 
 @dataclass(frozen=True)
 class Step:
-    """An artifact that a target needs.
+    """One artifact that the methods need for a target.
 
     Attributes:
-        kind: Kind of the artifact.
-        state: `there`, `missing`, `unfinished`, `step 300 of 4000`, …
-        command: The words after `kerv` that make it, without those that all steps share.
+        kind: Kind of the artifact, such as `drafter` or `datastore`.
+        state: `there`, `missing`, `unfinished`, `of other artifacts` or, while it trains, `step 300 of 4000`.
+        command: Command-line arguments after `kerv` that make the artifact, without the arguments that all steps share.
     """
 
     kind: str
@@ -39,11 +39,12 @@ class Step:
 
 
 def plan(settings: PrepareSettings) -> list[Step]:
-    """Return all steps in order, also those that are done; nothing is loaded or made.
+    """Return all steps in order, including finished ones. No weights are loaded and nothing is made.
 
     Raises:
-        UsageError: No such target or method, or a target that drafts nothing.
-        CheckpointError: No such demonstrations, or another target's artifact is where one would be trained.
+        UsageError: The target or a method does not exist, or the target does not decode autoregressively and so needs
+            no artifacts.
+        CheckpointError: The demonstrations do not exist, or a folder for a new artifact holds another target's.
     """
     artifacts = Artifacts(settings.results, settings.policy)
     description = artifacts.description
@@ -65,16 +66,16 @@ def plan(settings: PrepareSettings) -> list[Step]:
 
 @functools.cache
 def needs(methods: tuple[str, ...], sees: bool, runnable: bool = True) -> tuple[str, ...]:
-    """Return the kinds of artifacts that methods need, in the order in which they are made.
+    """Return the kinds of artifacts that the methods need, in the order in which they must be made.
 
     Args:
-        methods: Names of methods; empty: all that the target can have.
+        methods: Names of methods. Empty: all methods that work with the target.
         sees: Whether the target has cameras.
-        runnable: Whether its environment can be run; some exist only as a recording.
+        runnable: Whether episodes can run in the target's environment. Some environments exist only as recordings.
 
     Raises:
-        UnknownName: No such method.
-        UsageError: One needs what a target without cameras cannot have.
+        UnknownName: A method does not exist.
+        UsageError: A method needs an artifact that only a target with cameras can have.
     """
     names = groups()["method"]
     for name in methods:
@@ -102,10 +103,15 @@ def needs(methods: tuple[str, ...], sees: bool, runnable: bool = True) -> tuple[
 
 
 def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
-    """Return whether the artifact is there, missing, half trained or made from other artifacts.
+    """Return the state of an artifact, as in `Step.state`.
+
+    Args:
+        artifacts: The artifacts of the policy.
+        kind: Kind of the artifact.
+        kinds: All kinds that the methods need, in the order in which they are made.
 
     Raises:
-        CheckpointError: A trained one is of another target.
+        CheckpointError: The artifact is a trained drafter of another target or made from other artifacts.
     """
     files, path = kind_of(kind), artifacts.path(kind)
     if not files.json(path).is_file():
