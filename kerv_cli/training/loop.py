@@ -59,7 +59,7 @@ class Objective(Protocol):
         """Return the loss (a scalar) of the samples `indices` (B,) at optimisation step `step`, and metrics to log."""
 
     def validate(self, module: nn.Module) -> Metrics:
-        """Return metrics of a network on held-out samples. The metric `score` chooses the best weights: higher is better."""
+        """Return metrics of a network on held-out samples. The best weights are those with the highest `score`."""
 
 
 class Loop:
