@@ -1,7 +1,7 @@
-"""Which drafts are good enough (docs/methods.md §2.1). This file imports nothing heavy.
+"""Acceptance rules: which draft tokens are good enough (docs/methods.md §2.1). This file imports nothing heavy.
 
-The longest accepted path wins. Of equally long ones the one with the smaller summed distance to the target tokens wins,
-and of those the one that was proposed first.
+The longest accepted path wins. Ties go to the path with the smaller summed distance to the target tokens, then to the
+path that was proposed first.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ class Accepted(NamedTuple):
     """Result of an acceptance rule.
 
     Attributes:
-        path: Nodes of the best accepted path, from depth 0 down.
-        rejected: The child of the path's last node that is nearest to the target token; None if it has no children.
+        path: Indices of the accepted nodes, from depth 0 down. Empty if none was accepted.
+        rejected: Index of the rejected node after the path. Of several children, the one nearest to the target token.
+            None if the path ends at a leaf.
     """
 
     path: tuple[int, ...]
@@ -32,13 +33,13 @@ class Accepted(NamedTuple):
 
 
 def accept_by_distance(tree: TokenTree, target_tokens: Sequence[int], start: int, limits: Sequence[int]) -> Accepted:
-    """Accept a node if its parent is accepted and its token is within its DoF's limit of the target token.
+    """Return the longest path on which every token is close enough to the target token.
 
     Args:
         tree: The draft, n nodes.
         target_tokens: 1 + n tokens: the target's after the last committed token, then after each node.
-        start: Index in the chunk of the nodes of depth 0.
-        limits: Largest accepted distance per DoF, in bins. All zero is strict acceptance.
+        start: Index in the chunk of the nodes at depth 0.
+        limits: Largest accepted distance per DoF, in bins. With all zeros, tokens must be equal.
     """
     alone = [(dof, dof + 1) for dof in range(len(limits))]  # every DoF is a group of its own
     return accept_by_group(tree, target_tokens, start, limits, group_limit=max(limits), bounds=alone)
@@ -53,20 +54,22 @@ def accept_by_group(
     group_limit: int,
     bounds: Bounds,
 ) -> Accepted:
-    """Accept or reject a kinematic group of one control step as a whole (HeiSD's `sequence` rule).
+    """Return the longest path of whole kinematic groups, such as position or rotation (HeiSD's `sequence` rule).
 
-    A group is accepted if each of its tokens is within its DoF's limit of the target token after its parent, and if
-    these distances sum to at most `group_limit`. A group that is rejected, or that the tree holds only in part, ends
-    the path at its first token. `start` may be inside a group. Its remaining tokens are then a group of their own: the
-    committed ones are target tokens, because accepted paths end with a whole group and only a bonus begins another.
+    The tokens of one group in one control step are accepted together or not at all. They are accepted if each is within
+    its DoF's limit of the target token after its parent, and if these distances sum to at most `group_limit`. A path
+    ends before a group that is rejected or that is only partly in the tree.
+
+    `start` may be inside a group. Its remaining tokens are then judged as a group. Its committed tokens count with
+    distance 0: accepted paths end with whole groups, so these tokens came from the target, as bonus.
 
     Args:
         tree: The draft, n nodes.
         target_tokens: 1 + n tokens: the target's after the last committed token, then after each node.
-        start: Index in the chunk of the nodes of depth 0.
+        start: Index in the chunk of the nodes at depth 0.
         limits: Largest accepted distance per DoF, in bins.
         group_limit: Largest accepted sum of a group's distances, in bins.
-        bounds: The group of each DoF.
+        bounds: Per DoF, the first DoF of its group and one past the last.
     """
     alive = [False] * len(tree)  # whether no limit is broken on the path to this node
     in_group = [0] * len(tree)  # distances summed within the node's group
@@ -88,33 +91,46 @@ def accept_by_group(
 
 
 def nearest_child(tree: TokenTree, node: int, target_tokens: Sequence[int]) -> int | None:
-    """Return the child of `node` (or of ROOT) that is nearest to the target token after it; None without children."""
+    """Return the child of `node` whose token is nearest to the target token; None if there are no children.
+
+    Args:
+        tree: The draft, n nodes.
+        node: Index of the parent, or −1 (ROOT) for the last committed token.
+        target_tokens: 1 + n tokens: the target's after the last committed token, then after each node.
+    """
     children = [i for i, parent in enumerate(tree.parents) if parent == node]
     return min(children, key=lambda i: abs(tree.tokens[i] - target_tokens[node + 1]), default=None)
 
 
 @dataclass(frozen=True)
 class DistanceRule:
-    """Base of acceptance rules: accepts a draft token within its DoF's largest distance to the target's token."""
+    """Base class of acceptance rules. Accepts a draft token within a largest distance, per DoF, to the target token."""
 
     space: ActionSpace
 
     def of_drafts_from(self, proposer: str) -> DistanceRule:
-        """Return the rule for drafts of `proposer`: this one."""
+        """Return the rule that judges drafts of the proposer with this name. By default the rule itself."""
         return self
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """Return the largest accepted distance per DoF at radius r, in bins (D,)."""
+        """Return the largest accepted distance per DoF (D,) at acceptance radius `r`, both in bins."""
         raise NotImplementedError
 
     def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
-        """Return the longest accepted path at radius r. The other arguments are those of `accept_by_distance`."""
+        """Return the longest accepted path.
+
+        Args:
+            tree: The draft, n nodes.
+            target_tokens: 1 + n tokens: the target's after the last committed token, then after each node.
+            start: Index in the chunk of the nodes at depth 0.
+            r: Acceptance radius, in bins.
+        """
         return accept_by_distance(tree, target_tokens, start, self.limits(r))
 
 
 class StrictRule(DistanceRule):
-    """Accepts a draft token that equals the target's: lossless."""
+    """Accepts only draft tokens that equal the target's. Decoding is then lossless."""
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """Return zero for every DoF (D,)."""
+        """Return zero for every DoF (D,), whatever `r` is."""
         return (0,) * self.space.dofs

@@ -1,6 +1,6 @@
-"""Decodes the observations of several episodes at once, for runs that ask for success and not for times.
+"""Decodes the observations of several episodes at once, for runs that measure success but no times.
 
-Only methods whose decodes are all the same sequence of forwards can be batched (docs/measuring.md).
+Only methods whose decodes all run the same sequence of forwards can be batched (docs/measuring.md).
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from kerv_cli.engine.record import UNTIMED, DecodeRecord
 
 
 class BatchDecoder:
-    """Decodes one chunk for each of several episodes, with the target and the parts of a decoder.
+    """Decodes one chunk for each of several episodes, with the target and the method of a decoder.
 
-    In float32 its tokens are the decoder's, except for ties that another order of summation rounds differently. Its
-    records have no times.
+    In float32 the tokens are the decoder's own, except where rounding decides between two equal logits. The records
+    have no times.
     """
 
     def __init__(self, decoder: Decoder) -> None:
-        """Build it from the decoder of a method that `Method.check` accepts for a batch."""
+        """Build it from a decoder whose method can be batched (`Method.check` tests this)."""
         self.decoder, self.target = decoder, decoder.target
         self.limits = decoder.acceptance.limits(decoder.threshold.radius())
         self.skip = decoder.parts.skip
         self._caches: dict[int, Cache] = {}
 
     def new_episode(self) -> EpisodeState:
-        """Return the state of one more episode of the batch."""
+        """Return the state of a further episode in the batch: its executed actions and positions."""
         return EpisodeState(self.target.actions, self.target.cameras)
 
     @torch.inference_mode()
     def decode(self, episodes: Sequence[EpisodeState], observations: Sequence[Observation]) -> list[DecodeRecord]:
-        """Return the actions and the record for one observation of each episode."""
-        prompts = functools.cache(lambda: self._encode(observations))  # drafts that read no prompt never pay for it
+        """Decode one observation per episode. Return one record per episode, which holds its actions."""
+        prompts = functools.cache(lambda: self._encode(observations))  # encoded only if some part reads a prompt
 
         def prompt(i: int) -> Tensor:
             return prompts()[i]
@@ -75,7 +75,10 @@ class BatchDecoder:
         return records
 
     def _encode(self, observations: Sequence[Observation]) -> list[Tensor]:
-        """Return the prompts (1, P, E). On a CPU packed weights are fastest with one image after the other."""
+        """Return each prompt's embeddings (1, P, E).
+
+        On a CPU the observations are encoded one by one: with packed weights this is faster.
+        """
         if isinstance(self.target, EncodesMany) and self.target.device.type != "cpu":
             return list(self.target.encode_many(observations).split(1))
         return [self.target.encode(observation) for observation in observations]
@@ -89,7 +92,7 @@ class BatchDecoder:
                 chunk.commit_token(token)
 
     def _tokens(self, chunks: Sequence[Chunk]) -> list[list[int]]:
-        """Return the N tokens of each chunk. Prompts of one length run together, so that none is padded."""
+        """Return the N greedy tokens of each chunk. Prompts of equal length are decoded together, without padding."""
         tokens: dict[int, list[int]] = {}
         for length in dict.fromkeys(chunk.prompt_length for chunk in chunks):
             group = [i for i, chunk in enumerate(chunks) if chunk.prompt_length == length]
@@ -103,7 +106,10 @@ class BatchDecoder:
         return self.decoder.steps * self.target.actions.dofs
 
     def _cache(self, rows: int) -> Cache:
-        """Return an empty cache of `rows` rows. Only the latest size stays allocated, as episodes end one by one."""
+        """Return an empty cache for `rows` sequences.
+
+        Only the cache of the latest size stays allocated, because the size changes each time an episode ends.
+        """
         if rows not in self._caches:
             self._caches = {rows: self.target.new_cache(rows, self.target.max_prompt + self._size)}
         self._caches[rows].length = 0
@@ -112,13 +118,13 @@ class BatchDecoder:
 
 @torch.inference_mode()
 def greedy(target: Target, prompt: Tensor, cache: Cache | None = None, size: int = 0) -> tuple[Tensor, Tensor]:
-    """Decode a batch autoregressively.
+    """Decode a batch of prompts autoregressively.
 
     Args:
         target: The policy.
-        prompt: (B, P, E).
-        cache: An empty cache with room for prompt and tokens; None for a new one.
-        size: N; 0 for the target's own chunk.
+        prompt: The prompts' embeddings (B, P, E).
+        cache: An empty cache with room for P + N tokens; None for a new one.
+        size: Number of tokens N; 0 for as many as the target's chunk has.
 
     Returns:
         Greedy tokens (B, N), and the hidden states (B, P + N − 1, E) that predict them.

@@ -1,4 +1,4 @@
-"""The chunk that a decode fills, and what a decoder remembers of the running episode."""
+"""The chunk of actions that a decode fills, and what a decoder remembers of the running episode."""
 
 from __future__ import annotations
 
@@ -20,10 +20,14 @@ WINDOW = 10  # KERV's action context AC, control steps
 
 
 def steps_of(chunk: int, trained: int) -> int:
-    """Return the control steps of a chunk: `chunk`, or `trained` if it is 0.
+    """Return the number of control steps to decode at once.
+
+    Args:
+        chunk: The setting; 0 for `trained`.
+        trained: Number of control steps that the target was trained for.
 
     Raises:
-        UsageError: `chunk` is more than the target was trained for.
+        UsageError: `chunk` is larger than `trained`.
     """
     if not 0 <= chunk <= trained:
         raise UsageError(f"chunk={chunk}: the target was trained for {trained} control steps")
@@ -31,21 +35,21 @@ def steps_of(chunk: int, trained: int) -> int:
 
 
 class ActionHistory:
-    """The last `window` executed actions, normalised and continuous."""
+    """The last `window` executed actions, normalised to [−1, 1] and not rounded to tokens."""
 
     def __init__(self, dofs: int, window: int = WINDOW) -> None:
         self.window, self._actions = window, np.zeros((0, dofs))
 
     def append(self, action: np.ndarray) -> None:
-        """Add an executed action (D,) in [-1, 1]."""
+        """Add an executed action (D,), normalised to [−1, 1]."""
         self._actions = np.concatenate([self._actions, action[None]])[-self.window :]
 
     def values(self, pending: np.ndarray | None = None) -> np.ndarray:
-        """Return the actions (m, D) with m ≤ window, oldest first.
+        """Return the latest actions (m, D), m ≤ window, oldest first.
 
         Args:
-            pending: Steps (k, D) of the present chunk that are decided but not executed yet. They count as executed, so
-                that the next step is one step ahead instead of k + 1.
+            pending: Actions (k, D) of the current chunk that are decided but not executed yet. They count as executed,
+                so that a prediction looks one step ahead instead of k + 1. None if there are none.
         """
         if pending is None or not len(pending):
             return self._actions
@@ -54,44 +58,55 @@ class ActionHistory:
 
 @dataclass(frozen=True)
 class Situation:
-    """The running episode, as the parts of a method see it."""
+    """The running episode as a method's parts see it: task, executed actions, measured positions."""
 
     task: str
     history: ActionHistory
     path: list[np.ndarray] = field(default_factory=list)  # measured end-effector positions (3,), metres
-    random: np.random.Generator = field(default_factory=np.random.default_rng)  # the boundary's, seeded per episode
+    random: np.random.Generator = field(default_factory=np.random.default_rng)  # for the boundary, seeded per episode
 
 
 class EpisodeState:
-    """What a decoder remembers of the running episode: its actions, its positions, and how often it decoded."""
+    """What a decoder remembers of the running episode: its actions, its positions, and the number of decodes."""
 
     def __init__(self, space: ActionSpace, cameras: tuple[str, ...]) -> None:
         self.space, self.cameras, self.decodes = space, cameras, 0
         self.situation = Situation("", ActionHistory(space.dofs))
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
-        """Begin an episode, with the end effector at (3,) metres."""
+        """Start a new episode.
+
+        Args:
+            task: Name of the task.
+            seed: Seed of the episode's random number generator.
+            end_effector: Initial position (3,), metres.
+        """
         random = np.random.default_rng(seed)
         self.situation = Situation(task, ActionHistory(self.space.dofs), [np.asarray(end_effector)], random)
         self.decodes = 0
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
-        """Note an executed action (D,), after which the end effector is at (3,) metres."""
+        """Note an action that was executed.
+
+        Args:
+            action: (D,), environment units.
+            end_effector: Position (3,) after the action, metres.
+        """
         self.situation.history.append(self.space.normalise(action))
         self.situation.path.append(np.asarray(end_effector))
 
     def finish(self, success: bool) -> None:
-        """End the episode."""
+        """End the episode. `success` says whether the task was solved."""
 
 
 @dataclass(frozen=True)
 class Rejection:
-    """What a verification computed after the accepted path.
+    """What a verification computed beyond the accepted path, after a rejected token.
 
     Attributes:
-        draft: Tokens of the rejected draft after its rejected token.
-        target: Target tokens after the rejected token and after each of `draft`. They are right only if the tokens
-            before them are.
+        draft: The draft's tokens after the rejected one.
+        target: The target's tokens after the rejected one and after each of `draft`. They are its predictions as if the
+            rejected token and `draft` had been committed.
     """
 
     draft: tuple[int, ...] = ()
@@ -100,83 +115,86 @@ class Rejection:
 
 @dataclass(frozen=True)
 class Choice:
-    """A boundary's decision: the name of the proposer that drafts."""
+    """A boundary's decision: which proposer drafts the next chunk."""
 
-    mode: str
-    metric: float | None = None  # F (docs/methods.md §4.4), if the decision used it
+    mode: str  # the proposer's name
+    metric: float | None = None  # F (docs/methods.md §4.4); None if the decision does not use it
 
 
 @dataclass(eq=False)
 class Chunk:
-    """The N tokens of one decode. Parts of a method read it; only its own methods commit tokens.
+    """The N tokens of one decode, filled step by step.
 
-    The cache holds the prompt and every committed token but the last.
+    Parts of a method may read it. They change it only through its methods. The cache holds the prompt and all committed
+    tokens except the last.
     """
 
     encoding: Tensor | Callable[[], Tensor]  # the prompt, or a function that encodes it
-    steps: int  # H
+    steps: int  # H, control steps
     space: ActionSpace
     cache: Cache
     situation: Situation
-    limits: tuple[int, ...] = ()  # r per DoF, bins; early drafters choose their tokens by it
+    limits: tuple[int, ...] = ()  # largest accepted distance per DoF, bins; early drafters choose their tokens by it
     choice: Choice | None = None  # None: the method has no boundary
     observation: Observation | None = None
     tokens: list[int] = field(default_factory=list)  # committed
     rounds: list[Round] = field(default_factory=list)
-    rejection: Rejection = Rejection()  # of the last round
+    rejection: Rejection = Rejection()  # of the last round's verification
     hidden: Tensor = field(default_factory=lambda: torch.empty(0))  # (1, P + c − 1, E) after a prefill of c tokens
-    # vectors (n,) that are read together with the next forward's target tokens, and who receives them
+    # vectors (n,) on the GPU to read together with the next forward's target tokens, and the function that gets each
     reads: list[tuple[Tensor, Callable[[np.ndarray], None]]] = field(default_factory=list)
     forwards: int = 0
-    similarity: float | None = None  # cosine of the best stored chunk, if one was looked up
+    similarity: float | None = None  # cosine of the best match in the datastore, if it was searched
     reason: str | None = None  # as in `DecodeRecord`
-    closed: np.ndarray | None = None  # (steps, D) normalised actions, once a rectifier ended the chunk
-    _differences: list[float] = field(default_factory=list)  # |draft − target| of judged tokens, normalised units
+    closed: np.ndarray | None = None  # (steps, D) normalised actions, if a rectifier ended the chunk
+    _differences: list[float] = field(default_factory=list)  # |draft − target| of compared tokens, normalised units
 
     @property
     def dofs(self) -> int:
-        """D."""
+        """Number of DoFs D."""
         return self.space.dofs
 
     @property
     def size(self) -> int:
-        """N."""
+        """Number of tokens N in the complete chunk."""
         return self.steps * self.space.dofs
 
     @property
     def prompt(self) -> Tensor:
-        """The prompt (1, P, E), encoded when it is first read. Skipped chunks never pay for encoding."""
+        """The prompt's embeddings (1, P, E), computed when first read. A skipped chunk may never pay for encoding."""
         if not isinstance(self.encoding, Tensor):
             self.encoding = self.encoding()
         return self.encoding
 
     @property
     def prompt_length(self) -> int:
-        """P."""
+        """Number of prompt tokens P. Reading it encodes the prompt."""
         return self.prompt.shape[1]
 
     @property
     def remaining(self) -> int:
-        """Tokens still to be decoded; 0 after a rectifier closed the chunk."""
+        """Number of tokens still to be decoded; 0 after a rectifier ended the chunk."""
         return 0 if self.closed is not None else self.size - len(self.tokens)
 
     @property
     def compensated(self) -> int:
-        """Number of the actions' values that a rectifier predicted."""
+        """Number of action values that a rectifier predicted."""
         return 0 if self.closed is None else max(0, self.closed.size - len(self.tokens))
 
     @property
     def variability(self) -> float | None:
-        """K: mean difference of draft and target tokens, normalised action units; None if none was judged.
+        """Kinematic variability K: the mean difference of draft and target tokens, in normalised action units.
 
-        Strict DoFs are left out: one flip would outweigh all others (docs/methods.md §3.2).
+        None if no draft token was compared. Strict DoFs (those that must equal the target's token, such as a gripper)
+        are left out, because one wrong gripper token would outweigh all other differences (docs/methods.md §3.2).
         """
         return float(np.mean(self._differences)) if self._differences else None
 
     def distance(self, tokens: Sequence[int], others: Sequence[int]) -> float:
-        """Return the mean absolute difference of two beginnings of this chunk, in normalised action units.
+        """Return the mean absolute difference of two token sequences, in normalised action units.
 
-        It is infinite if a strict DoF's tokens differ.
+        Both begin at the chunk's first token and have the same length. The result is infinite if they differ in a
+        strict DoF (one that must equal the target's token, such as a gripper).
         """
         first, second = np.array(tokens), np.array(others)
         if (first != second)[self.space.strict_tokens(len(first))].any():
@@ -184,10 +202,16 @@ class Chunk:
         return float(np.abs(self.space.values_of(first) - self.space.values_of(second)).mean())
 
     def targets_along(self, chain: Sequence[int]) -> list[int] | None:
-        """Return the target's tokens along a drafted chain, from the chunk's first verification.
+        """Return the target's tokens along a drafted chain, as computed by the chunk's first verification.
 
-        None if that verification judged another draft, or fewer than all but the last token of the chain. Call it
-        before the next round, which forgets what follows the rejection.
+        Call it before the next round, which discards the tokens after the rejection.
+
+        Args:
+            chain: A draft of the whole chunk.
+
+        Returns:
+            One target token per compared token. None if there was no verification, if it judged another draft, or if it
+            covered fewer than N − 1 tokens.
         """
         if not self.rounds:
             return None
@@ -198,12 +222,12 @@ class Chunk:
         return [*verification.target_tokens[: len(verification.drafted)], *rejection.target[: len(rejection.draft)]]
 
     def commit(self, record: Round, tokens: Sequence[int], rejection: Rejection | None = None) -> None:
-        """Commit the tokens of one forward.
+        """Commit the tokens that one forward decided.
 
         Args:
-            record: The forward's round.
-            tokens: What is committed.
-            rejection: What the forward computed after a rejected token.
+            record: Record of the forward's round.
+            tokens: The tokens to commit.
+            rejection: What the forward computed after a rejected token; None if it rejected none.
         """
         self.forwards += 1
         self.tokens += tokens
@@ -216,16 +240,20 @@ class Chunk:
             self._differences += np.abs(drafted - targets)[moving].tolist()
 
     def commit_token(self, token: int) -> None:
-        """Commit the one token of a forward without a draft."""
+        """Commit the single token of a forward that verified no draft."""
         mode, start = "decode" if self.tokens else "prefill", len(self.tokens)
         self.commit(Round(mode, start=start, target_tokens=(token,), committed=1), [token])
 
     def commit_at_once(self, tokens: Sequence[int]) -> None:
-        """Commit all N tokens of a parallel target's one pass."""
+        """Commit all N tokens of a parallel target, which computes them in one forward."""
         self.commit(Round(PARALLEL, target_tokens=tuple(tokens), committed=self.size), tokens)
 
     def skip(self, tokens: Sequence[int], proposer: str) -> None:
-        """Take all N tokens from `proposer`, without a verification.
+        """Complete the chunk with the N tokens of a draft, without verification.
+
+        Args:
+            tokens: The draft.
+            proposer: Name of the proposer that drafted it.
 
         Raises:
             KervError: A token is out of range.
@@ -239,8 +267,8 @@ class Chunk:
         """End the chunk with actions that are partly predicted.
 
         Args:
-            values: Normalised actions (steps, D): the committed tokens' values, then predictions.
-            with_target_token: Whether the target token at the rejected position stays committed.
+            values: Normalised actions (steps, D): those of the committed tokens, then predicted ones.
+            with_target_token: Whether the target's token at the rejected position stays committed.
         """
         if not with_target_token:
             del self.tokens[-1]
@@ -249,13 +277,13 @@ class Chunk:
         self.closed = values
 
     def actions(self) -> np.ndarray:
-        """Return the complete chunk's actions (steps, D), float32, environment units."""
+        """Return the actions (steps, D) of the complete chunk, float32, environment units."""
         if self.closed is None:
             return actions_of(self.space, self.tokens)
         return self.space.unnormalise(self.closed).astype(np.float32)
 
     def record(self, actions: np.ndarray, seconds: float, phases: dict[str, float]) -> DecodeRecord:
-        """Return the record of the complete chunk. The arguments are those of `DecodeRecord`."""
+        """Return the record of the complete chunk. The arguments are attributes of `DecodeRecord`."""
         modes = [one.mode for one in self.rounds]
         drafters = (one.mode if one.mode in ("skip", PARALLEL) else one.proposer for one in self.rounds)
         return DecodeRecord(
@@ -277,17 +305,17 @@ class Chunk:
 
 
 def actions_of(space: ActionSpace, tokens: Sequence[int]) -> np.ndarray:
-    """Return the actions (steps, D) of whole control steps' tokens, float32, environment units."""
+    """Convert the tokens of whole control steps to actions (steps, D), float32, environment units."""
     return space.decode(np.array(tokens).reshape(-1, space.dofs)).astype(np.float32)
 
 
 def deviation(space: ActionSpace, actions: np.ndarray, autoregressive: np.ndarray) -> float:
-    """Return the mean absolute difference of two chunks, in normalised action units.
+    """Return the mean absolute difference between two chunks of actions, in normalised action units.
 
     Args:
         space: The action space.
-        actions: The executed actions (h, D).
-        autoregressive: Autoregressive decoding's actions (H, D). Only the first h ≤ H count.
+        actions: The method's actions (h, D), environment units.
+        autoregressive: The actions of autoregressive decoding (H, D), h ≤ H. Only the first h are compared.
     """
     gap = space.normalise(actions) - space.normalise(autoregressive[: len(actions)])
     return float(np.abs(gap).mean())

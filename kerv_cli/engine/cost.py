@@ -1,4 +1,4 @@
-"""The cost model of a decode: the forwards of its rounds, priced by a latency profile (docs/measuring.md)."""
+"""The cost model: predicts a decode's seconds from its forwards and a measured latency profile (docs/measuring.md)."""
 
 from __future__ import annotations
 
@@ -16,20 +16,23 @@ from kerv_cli.base.registry import DRAFTING, parts
 from kerv_cli.engine.record import PARALLEL, DecodeRecord
 
 FORWARDS = ("encode", "prefill", "verify", "feed", DRAFTING, "tree")
-"""Kinds of costs that follow the target's shape (docs/measuring.md). The others are proposers' own."""
+"""Kinds of costs that depend on the target's size (docs/measuring.md). Each other kind belongs to proposers."""
 
 FORMAT = 2
-"""Format of a profile's file."""
+"""Version of the profile's file format."""
 
 READ_PHASES = ("vision", "propose", "accept", "rectify", "other")
-"""Phases whose recorded seconds the model reads. Of vision it only reads whether there were any."""
+"""Phases whose recorded seconds the cost model reads. For `vision` it only matters whether they are zero."""
 
-_WIDE = 32  # nodes from which a draft of unknown settings counts as a tree
-_LEVELS = 5  # of such a tree
+_WIDE = 32  # a draft of at least so many nodes counts as a tree, if the drafter's settings are unknown
+_LEVELS = 5  # assumed depth of such a tree
 
 
 def source_costs() -> dict[str, list[str]]:
-    """Return the proposers of each kind of cost. Other proposers cost the seconds that were recorded."""
+    """Return the proposers by kind of cost: kind -> names.
+
+    A proposer that is not listed costs the seconds that were recorded for its drafts.
+    """
     costs: dict[str, list[str]] = {}
     for name, part in parts("proposer").items():
         if "cost" in part.traits:
@@ -39,13 +42,13 @@ def source_costs() -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class Profile:
-    """Seconds of every kind of forward and draft, by the number of its rows.
+    """Measured seconds of every kind of forward and draft, depending on the number of rows (tokens) it processes.
 
     Attributes:
-        prompt: P.
-        phases: Kind of a cost -> its measured numbers of rows, increasing, and their seconds.
-        tokens: N of the chunks.
-        about: Target, machine, versions.
+        prompt: Number of prompt tokens P.
+        phases: Kind of cost -> the measured numbers of rows, increasing, and the seconds of each.
+        tokens: Number of tokens N in a chunk.
+        about: What was measured: target, machine, versions.
     """
 
     prompt: int
@@ -54,17 +57,17 @@ class Profile:
     about: Mapping[str, Any] = field(default_factory=dict)
 
     def lacks(self, kinds: Iterable[str]) -> list[str]:
-        """Return those kinds of costs that the profile does not have."""
+        """Return those of `kinds` (kinds of costs) that the profile has no times for."""
         return [kind for kind in kinds if not self.phases.get(kind, ((), ()))[0]]
 
     def seconds(self, kind: str, rows: int) -> float:
-        """Return the seconds of one forward or draft."""
+        """Return the seconds of one forward or draft of this kind, over `rows` rows."""
         return float(self.times(kind, np.array([rows]))[0])
 
     def times(self, kind: str, rows: np.ndarray) -> np.ndarray:
-        """Return the seconds (n,) of several numbers of rows (n,).
+        """Return the seconds (n,) for each of several numbers of rows (n,).
 
-        They are interpolated between measured rows and continued in a straight line after the last ones.
+        Times between measured numbers are interpolated linearly. Beyond the largest one they are extrapolated linearly.
         """
         measured, times = self.phases[kind]
         seconds: np.ndarray = np.interp(rows, measured, times)
@@ -74,21 +77,21 @@ class Profile:
         return seconds
 
     def decode(self, tokens: int) -> float:
-        """Return the seconds of an autoregressive decode of N tokens."""
+        """Return the seconds of one autoregressive decode of `tokens` tokens."""
         first = self.seconds("encode", 1) + self.seconds("prefill", self.prompt)
         return first + (tokens - 1) * self.seconds("verify", 1)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the profile as JSON values."""
+        """Return the profile as a dictionary that JSON can store."""
         phases = {kind: {"rows": list(rows), "seconds": list(seconds)} for kind, (rows, seconds) in self.phases.items()}
         return {"format": FORMAT, "prompt": self.prompt, "tokens": self.tokens, "phases": phases}
 
 
 def read_profile(path: Path) -> Profile:
-    """Read the profile in a document of `kerv bench`.
+    """Read the latency profile from a JSON file that `kerv bench` has written.
 
     Raises:
-        CheckpointError: No such document, one of another format, or times that cannot be.
+        CheckpointError: The file is missing, holds no profile, has another format, or holds impossible times.
     """
     document = read_json(path)
     try:
@@ -112,12 +115,12 @@ def read_profile(path: Path) -> Profile:
 
 
 class Calls(NamedTuple):
-    """All m forwards or drafts of one kind in some decodes.
+    """All m forwards, or all m drafts, of one kind in a number of decodes.
 
     Attributes:
-        decode: (m,) index of the decode.
-        rows: (m,) number of rows, without the prompt's.
-        with_prompt: (m,) bool, whether the prompt's rows come on top.
+        decode: (m,) index of the decode that each belongs to.
+        rows: (m,) number of tokens processed, without the prompt's.
+        with_prompt: (m,) bool, whether the prompt's tokens are processed too.
     """
 
     decode: np.ndarray
@@ -127,13 +130,13 @@ class Calls(NamedTuple):
 
 @dataclass(frozen=True)
 class Work:
-    """What some decodes did.
+    """What a number of decodes computed, as far as it costs time.
 
     Attributes:
-        calls: Kind of a cost that follows the target's shape -> its calls.
-        sources: Kind of a proposer's own cost -> (decodes,) bool, whether there was such a draft.
+        calls: Kind of cost -> its calls, for the kinds that depend on the target's size (`FORWARDS`).
+        sources: Kind of cost -> (decodes,) bool, whether the decode used a proposer with this kind of cost.
         host: (decodes,) recorded seconds that do not depend on the target's size, without proposing.
-        propose: (decodes,) recorded seconds of proposing; 0 if the drafter drafted, which follows the target's shape.
+        propose: (decodes,) recorded seconds of proposing. 0 if the drafter drafted: `calls` has its cost.
     """
 
     calls: Mapping[str, Calls]
@@ -143,7 +146,7 @@ class Work:
 
     @property
     def needs(self) -> list[str]:
-        """The kinds of costs that price it."""
+        """Kinds of costs that a profile needs to price this work."""
         return [*self.calls, *self.sources]
 
 
@@ -155,15 +158,17 @@ def work_of(
     size: int,
     drafter: tuple[int, int] | None = None,
 ) -> Work:
-    """Return the work of some decodes.
+    """Return what a number of decodes computed, from the columns of their records.
 
     Args:
-        rounds: Mode, proposer, start, tree_size and accepted of the rounds of all decodes, (n,) each.
+        rounds: Name of a `Round` attribute -> its values (n,) over all rounds of all decodes: mode, proposer, start,
+            tree_size and accepted.
         counts: Number of rounds of each decode, (decodes,).
         phases: Recorded seconds of each of `READ_PHASES`, (decodes,).
-        looked_up: Whether something was retrieved, (decodes,) bool.
-        size: N.
-        drafter: The proposer's `depth` and `top_k`; None if unknown. A draft of many nodes is then a tree.
+        looked_up: Whether the decode searched the datastore, (decodes,) bool.
+        size: Number of tokens N in a chunk.
+        drafter: The drafter's settings `depth` and `top_k`. None if unknown: then a draft of many nodes counts as a
+            tree.
     """
     decodes, decode = len(counts), np.repeat(np.arange(len(counts)), counts)
     mode, proposer, start = rounds["mode"], rounds["proposer"], rounds["start"]
@@ -202,7 +207,7 @@ def work_of(
 
 
 def work_of_record(decode: DecodeRecord) -> Work:
-    """Return the work of a decode that was just recorded."""
+    """Return what a single decode computed, from its record."""
     names = ("mode", "proposer", "start", "tree_size", "accepted")
     return work_of(
         {name: np.array([getattr(one, name) for one in decode.rounds]) for name in names},
@@ -216,8 +221,8 @@ def work_of_record(decode: DecodeRecord) -> Work:
 def prices(work: Work, profile: Profile) -> np.ndarray:
     """Return the seconds (decodes,) of each decode by the cost model.
 
-    Forwards, drafts and the states fed to the drafter cost what the profile says, all else the recorded seconds. If the
-    profile lacks a proposer's own cost, its drafts cost the recorded seconds too.
+    Forwards, drafts and the hidden states fed to the drafter cost what the profile says. Everything else costs the
+    recorded seconds. So do the drafts of other proposers, if the profile has no times for them.
     """
     total = np.array(work.host, dtype=float)
     for kind, (decode, rows, with_prompt) in work.calls.items():

@@ -1,4 +1,4 @@
-"""The one decode loop: propose, verify, accept, commit, rectify (docs/methods.md §2)."""
+"""The decode loop of all methods: propose, verify, accept, commit, rectify (docs/methods.md §2)."""
 
 from __future__ import annotations
 
@@ -26,24 +26,26 @@ from kerv_cli.engine.tree import TokenTree
 
 @dataclass(frozen=True)
 class Parts:
-    """The parts of a method. The defaults are autoregressive decoding."""
+    """The parts of a decoding method. With the defaults, the target decodes autoregressively."""
 
-    acceptance: DistanceRule | None = None  # None: strict
+    acceptance: DistanceRule | None = None  # None: draft tokens must equal the target's
     threshold: Threshold | None = None  # None: r = 0
-    prefill_draft: Proposer | None = None  # drafts before the prefill, which verifies the draft (§5)
-    proposer: Proposer | None = None  # drafts after committed tokens
+    prefill_draft: Proposer | None = None  # drafts before the prefill, which then verifies the draft (§5)
+    proposer: Proposer | None = None  # drafts in every later round
     rectifier: Rectifier | None = None  # ends a chunk after a rejection; None: the target decodes on
-    boundary: Boundary | None = None  # chooses the side of a hybrid proposer that drafts
-    skip: Skip | None = None  # executes a chunk without verification
+    boundary: Boundary | None = None  # chooses between retrieval and drafter
+    skip: Skip | None = None  # may execute a draft without verification
 
 
 class Verified(NamedTuple):
-    """Result of one verification.
+    """Result of one verification, a forward of the target over a draft of n nodes.
 
     Attributes:
-        hidden: The target's states of the forwarded tokens, (1, before + rows, E).
-        tree: The nodes to judge, on the CPU.
-        target_tokens: 1 + n tokens, on the CPU: the target's after the last committed token, then after each node.
+        hidden: The target's hidden states (1, before + n, E). The first `before` belong to tokens that were not in the
+            cache yet: the prompt, or the last committed token. The others belong to the draft's nodes.
+        tree: The draft's n nodes, on the CPU.
+        target_tokens: 1 + n tokens, on the CPU: the target's prediction after the last committed token, then its
+            prediction after each node.
     """
 
     hidden: Tensor
@@ -52,18 +54,18 @@ class Verified(NamedTuple):
 
 
 class Decoder(EpisodeState):
-    """Decodes chunks with one target and one method, one episode at a time."""
+    """Decodes chunks of actions with one target and one method, one episode at a time."""
 
     def __init__(self, target: Target, parts: Parts | None = None, chunk: int = 0) -> None:
         """Build the decoder and its cache.
 
         Args:
-            target: The policy that verifies.
-            parts: The method; None for autoregressive decoding.
-            chunk: H, control steps decoded at once; 0 for as many as the target was trained for.
+            target: The policy that decodes and verifies.
+            parts: The method's parts; None for autoregressive decoding.
+            chunk: Number of control steps H to decode at once; 0 for as many as the target was trained for.
 
         Raises:
-            UsageError: A longer chunk than the target was trained for.
+            UsageError: `chunk` is longer than the target was trained for.
         """
         super().__init__(target.actions, target.cameras)
         self.target, self.parts = target, parts or Parts()
@@ -73,15 +75,21 @@ class Decoder(EpisodeState):
         size = self.steps * target.actions.dofs
         nodes = max(p.nodes if p is not None else 0 for p in (self.parts.prefill_draft, self.parts.proposer))
         self.cache = target.new_cache(1, target.max_prompt + size + max(nodes, size) + 1)
-        self.deviation_every = 0  # decode every so many observations of an episode autoregressively too; 0: none
+        self.deviation_every = 0  # every this many decodes, measure the deviation from autoregressive actions; 0: never
 
     @cached_property
     def autoregressive(self) -> Decoder:
-        """The decoder that deviations are measured from."""
+        """An autoregressive decoder of the same target. Deviations are differences from its actions."""
         return Decoder(self.target, chunk=self.steps)
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
-        """Begin an episode, with the end effector at (3,) metres."""
+        """Start a new episode.
+
+        Args:
+            task: Name of the task.
+            seed: Seed of the episode, for parts that draw random numbers.
+            end_effector: Initial position (3,), metres.
+        """
         super().reset(task, seed, end_effector)
         parts = self.parts
         if parts.boundary is not None:
@@ -93,15 +101,15 @@ class Decoder(EpisodeState):
             parts.skip.begin(task, seed)
 
     def finish(self, success: bool) -> None:
-        """End the episode."""
+        """End the episode. `success` says whether the task was solved."""
         if self.parts.skip is not None:
             self.parts.skip.finish(success)
 
     @torch.inference_mode()
     def decode(self, observation: Observation) -> DecodeRecord:
-        """Return the chunk's actions and the record of its decode.
+        """Decode one observation, and return a record that holds the actions to execute.
 
-        The record's seconds go from the observation to the actions, with the device synchronised at both ends.
+        Its `seconds` are measured from the observation to the actions, with the device synchronised at both ends.
         """
         stopwatch = Stopwatch(self.target.device)
         chunk = self.decode_prompt(self._encoding(observation, stopwatch), stopwatch, observation)
@@ -118,7 +126,7 @@ class Decoder(EpisodeState):
 
     def _encoding(self, observation: Observation, stopwatch: Stopwatch) -> Callable[[], Tensor]:
         def encode() -> Tensor:
-            stopwatch.lap("propose")  # the first part that reads the prompt drafts from it
+            stopwatch.lap("propose")  # time until now was spent by the part that reads the prompt first
             prompt = self.target.encode(observation)
             stopwatch.lap("vision")
             return prompt
@@ -132,12 +140,12 @@ class Decoder(EpisodeState):
         stopwatch: Stopwatch | None = None,
         observation: Observation | None = None,
     ) -> Chunk:
-        """Return a chunk that is complete, or that the rectifier closed.
+        """Decode the chunk for one prompt. A rectifier may have ended the returned chunk with predicted actions.
 
         Args:
-            prompt: The prompt (1, P, E), or a function that encodes it.
-            stopwatch: Takes the laps.
-            observation: For drafts that look at it themselves.
+            prompt: The prompt's embeddings (1, P, E), or a function that computes them when they are first needed.
+            stopwatch: Measures the phases; None for a new one.
+            observation: Needed only by drafters that read images or states themselves.
         """
         stopwatch = stopwatch or Stopwatch(self.target.device)
         chunk = self._new_chunk(prompt, observation)
@@ -158,7 +166,7 @@ class Decoder(EpisodeState):
         return Chunk(prompt, self.steps, self.space, self.cache, self.situation, limits, choice, observation)
 
     def _skips(self, chunk: Chunk, stopwatch: Stopwatch) -> bool:
-        """Let the skip rule complete the chunk without a verification."""
+        """Let the skip rule complete the chunk without verification, and return whether it did."""
         skip = self.parts.skip
         if skip is None:
             return False
@@ -167,7 +175,7 @@ class Decoder(EpisodeState):
         return taken
 
     def prefill(self, chunk: Chunk, stopwatch: Stopwatch) -> None:
-        """Run the first round: its forward reads the prompt, and verifies the in-prefill draft if there is one."""
+        """Run the first round. Its forward reads the prompt and verifies the in-prefill draft, if there is one."""
         proposer, skip = self.parts.proposer, self.parts.skip
         chunk.cache.length = 0
         draft = self.propose(chunk, self.parts.prefill_draft, stopwatch)
@@ -186,7 +194,7 @@ class Decoder(EpisodeState):
             stopwatch.lap("propose")
 
     def round(self, chunk: Chunk, stopwatch: Stopwatch) -> None:
-        """Run one round: propose, verify, accept, commit, rectify."""
+        """Run a round after the first one: propose, verify, accept, commit, rectify."""
         proposer, first = self.parts.proposer, len(chunk.tokens) - 1
         draft = self.propose(chunk, proposer, stopwatch)
         verified = self.verify(chunk, draft)
@@ -200,7 +208,7 @@ class Decoder(EpisodeState):
             stopwatch.lap("propose")
 
     def decode_plainly(self, chunk: Chunk, stopwatch: Stopwatch) -> None:
-        """Decode the remaining tokens without a proposer: in one call if the target can, else by one forward each."""
+        """Decode the remaining tokens without drafts: in one call if the target can, else one forward per token."""
         tokens = None
         if isinstance(self.target, ContinuesGreedily):
             tokens = self.target.continue_greedily(chunk.tokens[-1], chunk.remaining, chunk.cache)
@@ -211,9 +219,9 @@ class Decoder(EpisodeState):
         stopwatch.lap("accept")
 
     def forward_singly(self, chunk: Chunk, stopwatch: Stopwatch) -> list[int]:
-        """Return the remaining tokens, decoded by one forward each.
+        """Decode the remaining tokens with one forward each, and return them.
 
-        Each token goes from the device into the next forward. The CPU reads all of them after the last one.
+        Each token stays on the device as the input of the next forward. The CPU reads all tokens after the last one.
         """
         target, first = self.target, chunk.cache.length
         positions = torch.arange(first, first + chunk.remaining, device=target.device).split(1)
@@ -225,7 +233,9 @@ class Decoder(EpisodeState):
         return torch.cat(tokens[1:]).tolist()
 
     def propose(self, chunk: Chunk, proposer: Proposer | None, stopwatch: Stopwatch) -> Draft:
-        """Return a draft at most one token shorter than what is missing: the bonus is always the chunk's last token.
+        """Return the proposer's draft. It is empty if there is no proposer or only one token is left to decode.
+
+        A draft is at most `remaining − 1` tokens deep, because the bonus token fills the chunk's last place.
 
         Raises:
             KervError: A drafted token is out of range.
@@ -238,7 +248,10 @@ class Decoder(EpisodeState):
         return draft
 
     def verify(self, chunk: Chunk, draft: Draft) -> Verified:
-        """Forward the draft after what the cache lacks: at first the prompt, later the last committed token."""
+        """Run the target over the draft, and over the tokens before it that are not in the cache yet.
+
+        In the first round these are the prompt, later the last committed token.
+        """
         target, cache = self.target, chunk.cache
         if chunk.tokens:
             before, x = 1, target.embed(draft.tokens_after(chunk.tokens[-1], target.device)[None])
@@ -250,7 +263,10 @@ class Decoder(EpisodeState):
         return self._read(chunk, draft, hidden, target.head(hidden[0, before - 1 :]).argmax(-1))
 
     def _read(self, chunk: Chunk, draft: Draft, hidden: Tensor, argmax: Tensor) -> Verified:
-        """Read the target tokens (1 + rows,) and what else the CPU needs. A round waits for the device nowhere else."""
+        """Copy the target tokens (1 + n,), and other values that parts asked for, to the CPU.
+
+        This is the only place in a round where the CPU waits for the GPU.
+        """
         reads, chunk.reads = chunk.reads, []
         remote = draft.remote
         targets, *vectors = read(argmax, *remote, *(tensor for tensor, _ in reads))
@@ -259,17 +275,17 @@ class Decoder(EpisodeState):
         return Verified(hidden, draft.judged(vectors[: len(remote)]), targets.astype(np.int64).tolist())
 
     def accept(self, chunk: Chunk, verified: Verified, proposer: Proposer | None) -> Accepted:
-        """Return the best path of the draft, by the acceptance rule."""
+        """Return the path of the draft that the acceptance rule chooses; an empty one without a proposer."""
         if proposer is None:
             return Accepted((), None)
         rule, r = self.acceptance.of_drafts_from(proposer.name), self.threshold.radius()
         return rule.judge(verified.tree, verified.target_tokens, len(chunk.tokens), r)
 
     def commit(self, chunk: Chunk, verified: Verified, accepted: Accepted, proposer: Proposer | None) -> Tensor:
-        """Commit the accepted path and, if the chunk has room, the bonus.
+        """Commit the accepted path and, if the chunk has room, the bonus: the target's next token.
 
         Returns:
-            The target's states of what stays in the cache, (1, before + path, E).
+            The target's hidden states of the tokens that stay in the cache, (1, before + accepted, E).
         """
         tree, target_tokens, (path, rejected) = verified.tree, verified.target_tokens, accepted
         if proposer is None or not len(tree):
@@ -298,10 +314,16 @@ class Decoder(EpisodeState):
         return self._keep(chunk, verified, list(path))
 
     def _keep(self, chunk: Chunk, verified: Verified, rows: list[int]) -> Tensor:
-        """Drop all rows of the draft but `rows` from the cache, and return the states of what stays."""
+        """Remove rejected draft tokens from the cache, and return the hidden states of the tokens that stay.
+
+        Args:
+            chunk: The chunk, whose cache is changed.
+            verified: Result of the verification.
+            rows: Indices of the accepted nodes.
+        """
         cache, hidden = chunk.cache, verified.hidden
         end, before = cache.length - len(verified.tree), hidden.shape[1] - len(verified.tree)
-        if rows == list(range(len(rows))):  # a chain's rows are where they belong
+        if rows == list(range(len(rows))):  # the first nodes of a chain are already in their places
             cache.length = end + len(rows)
             return hidden[:, : before + len(rows)]
         kept = upload(rows, hidden.device)
@@ -309,11 +331,11 @@ class Decoder(EpisodeState):
         return torch.cat([hidden[:, :before], hidden[:, before + kept]], 1)
 
     def rectify(self, chunk: Chunk, stopwatch: Stopwatch) -> None:
-        """After a rejection, let the rectifier end the chunk if it can predict what is missing."""
+        """After a rejection, let the rectifier end the chunk if it can predict the missing actions."""
         last, rectifier = chunk.rounds[-1], self.parts.rectifier
         if rectifier is None or last.accepted == len(last.drafted):
             return
-        # a chunk whose last token is the target's lacks nothing, unless the rectifier may not use that token
+        # a full chunk whose last token is the target's is complete, unless the rectifier may not use that token
         if chunk.remaining or not rectifier.uses_target_token:
             rectifier.close(chunk)
         stopwatch.lap("rectify")

@@ -1,4 +1,4 @@
-"""What a proposer drafts: tokens that may still be on the GPU, with the positions and mask of their verification."""
+"""A draft: tokens, possibly still on the GPU, and the positions and attention mask for verifying them."""
 
 from __future__ import annotations
 
@@ -20,11 +20,13 @@ HOST = torch.device("cpu")
 
 @dataclass(frozen=True)
 class Draft:
-    """n tokens to verify. Those on the GPU are read together with the target's tokens, so that the CPU waits once.
+    """n draft tokens to verify.
+
+    Tokens on the GPU are copied to the CPU together with the target's tokens, so that the CPU waits only once.
 
     Attributes:
         tokens: (n,) int64.
-        parents: (n,) int64; None for a chain.
+        parents: Index of each token's parent, (n,) int64; −1 is the last committed token. None for a chain.
         levels: Maximum depth of the tree. Needed only when `parents` is on the GPU.
     """
 
@@ -34,44 +36,64 @@ class Draft:
 
     @classmethod
     def of(cls, tokens: Sequence[int], parents: Sequence[int] | None = None) -> Draft:
-        """Return a draft of numbers on the CPU. The arguments are those of `TokenTree.build`."""
+        """Build a draft on the CPU.
+
+        Args:
+            tokens: The n tokens.
+            parents: Index of each token's parent, −1 for the last committed token. None for a chain.
+        """
         return cls(_vector(tokens), None if parents is None else _vector(parents))
 
     def __len__(self) -> int:
         return self.tokens.shape[0]
 
     def check(self, vocabulary: int, proposer: str) -> None:
-        """Refuse tokens out of range; see `check_tokens`. Tokens on the GPU come from a head and are in range."""
+        """Refuse tokens out of range. Tokens on the GPU are not checked: they come from a head and are always in range.
+
+        Args:
+            vocabulary: Number of action tokens.
+            proposer: Name of the proposer, for the error message.
+
+        Raises:
+            KervError: A token is out of range.
+        """
         if self.tokens.device == HOST:
             check_tokens(self.tokens.numpy(), vocabulary, proposer)
 
     @cached_property
     def tree(self) -> TokenTree:
-        """The tree of a draft on the CPU."""
+        """The draft as a tree. Only for drafts on the CPU."""
         return TokenTree.build(self.tokens.tolist(), None if self.parents is None else self.parents.tolist())
 
     @property
     def remote(self) -> list[Tensor]:
-        """Tokens and parents that are on the GPU."""
+        """Those of `tokens` and `parents` that are on the GPU, in this order. Empty for drafts on the CPU."""
         return [x for x in (self.tokens, self.parents) if x is not None and x.device != HOST]
 
     def judged(self, remote: Sequence[np.ndarray]) -> TokenTree:
-        """Return the tree to judge, given what was read of `remote`."""
+        """Return the draft as a tree on the CPU, for the acceptance rule.
+
+        Args:
+            remote: The values of `Draft.remote`, copied to the CPU.
+        """
         return TokenTree.build(*(vector.astype(np.int64).tolist() for vector in remote)) if remote else self.tree
 
     def tokens_on(self, device: torch.device) -> Tensor:
-        """Return the tokens (n,) on a device."""
+        """Return the tokens (n,) as a tensor on `device`."""
         return upload(self.tokens, device) if self.tokens.device == HOST else self.tokens
 
     def tokens_after(self, token: int, device: torch.device) -> Tensor:
-        """Return `token` and the draft's tokens, (1 + n,) int64."""
+        """Return `token`, the last committed one, and then the draft's tokens: (1 + n,) int64 on `device`."""
         if self.tokens.device == HOST:
             return upload(np.concatenate([[token], self.tokens.numpy()]), device)
         return torch.cat([torch.full_like(self.tokens[:1], token), self.tokens])
 
     @cached_property
     def ancestors(self) -> np.ndarray | Tensor | None:
-        """Whether row j is row i or an ancestor of it, (n, n) bool, where the parents are; None for a chain."""
+        """Mask (n, n) bool: entry [i, j] says whether token j is token i or one of its ancestors.
+
+        It is on the device of `parents`. None for a chain.
+        """
         if self.parents is None:
             return None
         if self.parents.device != HOST:
@@ -80,7 +102,13 @@ class Draft:
         return None if parents == list(range(ROOT, len(self) - 1)) else ancestors_of(parents)
 
     def positions(self, start: int, before: int, device: torch.device) -> Tensor:
-        """Return the positions (before + n,) of `before` tokens from position `start`, and of the rows after them."""
+        """Return the positions (before + n,) of all tokens of a verification.
+
+        Args:
+            start: Position of the first of these tokens.
+            before: Number of tokens that are forwarded before the draft: the prompt, or the last committed token.
+            device: Where the tensor goes.
+        """
         stop, seen = start + before, self.ancestors
         if seen is None:
             return torch.arange(start, stop + len(self), device=device)
@@ -90,9 +118,10 @@ class Draft:
         return torch.cat([torch.arange(start, stop, device=device), stop + depths])
 
     def visible(self, before: int) -> np.ndarray | Tensor | None:
-        """Return which new tokens each new token attends to; None if all are causal.
+        """Return the attention mask of a verification, (before + n, before + n) bool; None if it is causal.
 
-        The new tokens are `before` causal ones and then the n rows: (before + n, before + n) bool.
+        Args:
+            before: Number of tokens that are forwarded before the draft. Their attention is causal.
         """
         seen, size = self.ancestors, before + len(self)
         if seen is None:
@@ -112,7 +141,12 @@ EMPTY = Draft.of(())
 
 
 def check_tokens(tokens: np.ndarray, vocabulary: int, proposer: str) -> None:
-    """Refuse drafted tokens (n,) that are out of range.
+    """Refuse drafted tokens that are out of range.
+
+    Args:
+        tokens: (n,) integers.
+        vocabulary: Number of action tokens.
+        proposer: Name of the proposer, for the error message.
 
     Raises:
         KervError: A token is negative, or not below `vocabulary`.
@@ -123,8 +157,8 @@ def check_tokens(tokens: np.ndarray, vocabulary: int, proposer: str) -> None:
 
 
 def ancestors_of(parents: Sequence[int]) -> np.ndarray:
-    """Return `Draft.ancestors` of n parents on the CPU."""
-    paths: list[int] = []  # bit j of number i: node i sees node j
+    """Compute `Draft.ancestors`, (n, n) bool, from n parents on the CPU."""
+    paths: list[int] = []  # bit j of number i: node j is node i or its ancestor
     for i, parent in enumerate(parents):
         paths.append(1 << i | (paths[parent] if parent != ROOT else 0))
     n, width = len(paths), (len(paths) + 7) // 8
@@ -133,9 +167,14 @@ def ancestors_of(parents: Sequence[int]) -> np.ndarray:
 
 
 def ancestors_on_device(parents: Tensor, levels: int) -> Tensor:
-    """Return `Draft.ancestors` of parents (n,) on their device, for a tree of at most `levels` levels."""
+    """Compute `Draft.ancestors`, (n, n) bool, on the GPU.
+
+    Args:
+        parents: Index of each token's parent, (n,), on the GPU.
+        levels: Maximum depth of the tree.
+    """
     n, nodes = parents.shape[0], torch.arange(parents.shape[0], device=parents.device)
     reached = ((parents[:, None] == nodes) | (nodes[:, None] == nodes)).float()
-    for _ in range((levels - 1).bit_length() if n else 0):  # paths of 1, 2, 4, … steps
+    for _ in range((levels - 1).bit_length() if n else 0):  # doubles the path length: 1, 2, 4, … steps
         reached = (reached @ reached).clamp_max_(1.0)
     return reached > 0

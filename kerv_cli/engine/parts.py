@@ -1,6 +1,6 @@
-"""What the decode loop asks of a threshold, a rectifier, a boundary and a skip rule. This file imports nothing heavy.
+"""Interfaces of the parts of a method that the decode loop calls: threshold, rectifier, boundary and skip rule.
 
-Proposers are in `proposer.py`, acceptance rules in `acceptance.py`.
+Proposers are in `proposer.py`, acceptance rules in `acceptance.py`. This file imports nothing heavy.
 """
 
 from __future__ import annotations
@@ -17,84 +17,109 @@ if TYPE_CHECKING:
 
 
 class Threshold(Protocol):
-    """Chooses the acceptance radius r of every decode, from the variability K of the decodes before it."""
+    """Chooses the acceptance radius r of every decode (docs/methods.md §3.2).
+
+    r is the largest accepted distance, in bins, between a draft token and the target's token.
+    """
 
     def reset(self) -> None:
-        """Begin an episode."""
+        """Start a new episode."""
 
     def radius(self) -> int:
-        """Return r of the next decode, in bins."""
+        """Return the radius r for the next decode, in bins."""
 
     def update(self, variability: float | None) -> None:
-        """End a decode, whose kinematic variability K is in normalised action units; None if nothing was compared."""
+        """Learn from a decode that has ended.
+
+        Args:
+            variability: The decode's kinematic variability K: the mean difference between draft and target tokens, in
+                normalised action units. None if no draft token was compared.
+        """
 
 
 class Fixed:
-    """One radius r for all decodes (Spec-VLA)."""
+    """A threshold that keeps one radius r for all decodes (Spec-VLA)."""
 
     def __init__(self, r: int) -> None:
         self.r = r
 
     def reset(self) -> None:
-        """Do nothing."""
+        """Do nothing: r is constant."""
 
     def radius(self) -> int:
-        """Return r, in bins."""
+        """Return the constant radius r, in bins."""
         return self.r
 
     def update(self, variability: float | None) -> None:
-        """Do nothing."""
+        """Do nothing: r is constant."""
 
 
 class Rectifier(Protocol):
-    """Ends a chunk after a rejection, with what it predicts."""
+    """Completes a chunk by prediction after a rejected draft token (docs/methods.md §3.1)."""
 
     @property
     def uses_target_token(self) -> bool:
-        """Whether the target's token at the rejected position stays committed."""
+        """Whether the target's own token at the rejected position is executed. If not, it is predicted too."""
 
     def reset(self) -> None:
-        """Begin an episode."""
+        """Start a new episode."""
 
     def next_decode(self) -> None:
-        """End a decode."""
+        """Note that a decode has ended."""
 
     def close(self, chunk: Chunk) -> bool:
-        """End the chunk after a rejection if what is missing can be predicted, and return whether it did."""
+        """End the chunk with predicted actions after a rejection, if the missing values can be predicted.
+
+        Returns:
+            Whether the chunk ended. If not, the target decodes on.
+        """
 
 
 class Boundary(Protocol):
-    """Chooses the side of a hybrid proposer that drafts the next chunk."""
+    """Decides whether retrieval or the drafter drafts the next chunk (docs/methods.md §4.4)."""
 
     def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
-        """Choose by the measured positions (n, 3) of the episode up to now, metres, oldest first."""
+        """Return the decision for the next chunk.
+
+        Args:
+            path: Positions (n, 3) of the end effector measured in this episode so far, metres, oldest first.
+            rng: The episode's generator, from `numbers`.
+        """
 
     def numbers(self, task: str, seed: int) -> np.random.Generator:
-        """Return the generator of an episode. It depends on the boundary's seed, the task and the seed alone."""
+        """Return the random number generator of an episode.
+
+        It depends only on the boundary's own seed setting, the task, and `seed`, the seed of the episode.
+        """
 
 
 class Skip(ABC):
-    """Decides before the prefill whether a chunk is executed without a verification."""
+    """Decides before the target runs whether a draft is executed without verification (docs/methods.md §4.3)."""
 
-    phase = "propose"  # of `PHASES`, for the time of `take`
+    phase = "propose"  # entry of `PHASES` that the time of `take` counts for
 
     def begin(self, task: str, seed: int) -> None:  # noqa: B027 - most rules keep nothing between decodes
-        """Begin an episode."""
+        """Start a new episode."""
 
     def finish(self, success: bool) -> None:  # noqa: B027
-        """End the episode."""
+        """End the episode. `success` says whether the task was solved."""
 
     @abstractmethod
     def take(self, chunk: Chunk) -> bool:
-        """Complete the chunk if it may be executed unverified, and return whether it did."""
+        """Complete the chunk with an unverified draft if the rule allows it, and return whether it did."""
 
     def verified(self, chunk: Chunk) -> None:  # noqa: B027
-        """Learn from the verdict, after the prefill has verified a draft that was not skipped."""
+        """Learn from a verification. Called after the prefill has verified a draft that was not skipped."""
 
 
 @runtime_checkable
 class TakesMany(Protocol):
-    """A skip rule that can complete the chunks of several episodes together."""
+    """A skip rule that completes all chunks of a batch of episodes together."""
 
     def take_many(self, chunks: Sequence[Chunk], cache: Callable[[int], Cache]) -> None:
-        """Complete B chunks. `cache` returns an empty cache of so many rows."""
+        """Complete B chunks.
+
+        Args:
+            chunks: One chunk per episode, without committed tokens.
+            cache: Function that returns an empty cache for a given number of sequences.
+        """

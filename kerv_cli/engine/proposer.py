@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
 
 class Proposer:
-    """Drafts a tree of the tokens after the committed ones.
+    """Base class of proposers: drafts a tree of tokens that continue the committed ones.
 
     Attributes:
-        name: Name in the record, e.g. `drafter`.
-        needs_states: Whether it reads the target's hidden states. It then cannot draft before the prefill.
-        nodes: Maximum number of rows in a draft, for which the cache has room; 0 for as many as the chunk has tokens.
+        name: Name in the records, e.g. `drafter`.
+        needs_states: Whether it reads the target's hidden states. If so, it cannot draft before the prefill.
+        nodes: Maximum number of tokens in a draft, for which the cache reserves room; 0 for as many as a chunk has.
     """
 
     name = ""
@@ -26,47 +26,55 @@ class Proposer:
     nodes = 0
 
     def reset(self) -> None:
-        """Begin an episode."""
+        """Start a new episode."""
 
     def prepare(self, chunk: Chunk) -> None:
-        """Prepare for the prefill: add the vectors that the CPU needs to `chunk.reads`."""
+        """Prepare for the prefill, which is about to run.
+
+        A proposer that needs values from the GPU adds them to `chunk.reads`. The CPU reads them with the prefill's
+        tokens.
+        """
 
     def begin(self, chunk: Chunk) -> None:
-        """Begin a chunk, after its prefill has committed the first tokens."""
+        """Begin a chunk. Called after its prefill has committed the first tokens."""
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """Return a draft of at most `depth` levels, or an empty one."""
+        """Return a draft with at most `depth` tokens on any path. It may be empty."""
         raise NotImplementedError
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
-        """Learn from a round.
+        """Learn from a round that has ended.
 
         Args:
-            chunk: The chunk, with the round's tokens committed.
-            first: Chunk index of the last token that was committed before the round.
-            hidden: The target's states (1, T, E) at chunk indices first … first + T − 1.
-            target_tokens: The round's 1 + n target tokens, those after rejected nodes included.
+            chunk: The chunk, which already holds the round's committed tokens.
+            first: Index in the chunk of the last token that was committed before the round.
+            hidden: The target's hidden states (1, T, E) of the chunk's tokens first … first + T − 1.
+            target_tokens: The round's 1 + n target tokens: after the last committed token, then after each node,
+                rejected ones included.
         """
 
 
 class ChainProposer(Proposer):
-    """Drafts chains on the CPU. If it drafts before the prefill, it can be merged or executed unverified."""
+    """Base class of proposers that draft plain sequences (chains) on the CPU.
+
+    If it drafts before the prefill, its chains can be merged with those of others, or executed without verification.
+    """
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """Return the first chain, or an empty draft."""
+        """Return the best chain as a draft; an empty draft if there is no chain."""
         from kerv_cli.engine.draft import EMPTY, Draft
 
         chains = self.chains(chunk, depth)
         return Draft.of(chains[0]) if chains else EMPTY
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Return drafts of the tokens after the committed ones, best first, of at most `depth` tokens each."""
+        """Return token sequences that continue the committed tokens, best first, at most `depth` tokens each."""
         raise NotImplementedError
 
     def tokens_of(self, chunks: Sequence[Chunk]) -> list[list[int]]:
-        """Return the first chains of B chunks of which nothing is committed, N tokens each."""
+        """Draft complete chunks without committed tokens: return each chunk's best chain, N tokens."""
         return [self.chains(chunk, chunk.size)[0] for chunk in chunks]
 
     def is_sure(self, chunk: Chunk) -> bool:
-        """Return whether it expects its first chain to be accepted whole."""
+        """Return whether the proposer expects its best chain to be accepted whole. By default, never."""
         return False

@@ -1,6 +1,6 @@
-"""The protocol of a target: every decoding method runs on a policy that implements it.
+"""The interface of a target: the policy that every decoding method runs on.
 
-Shapes: B batch (1 while decoding), P prompt tokens, T new tokens, S cached tokens, E width, V action tokens.
+Shapes: B sequences in the batch (1 while decoding), P prompt tokens, T new tokens, E width, V action tokens.
 """
 
 from __future__ import annotations
@@ -16,52 +16,54 @@ from kerv_cli.base.spaces import ActionSpace, Observation
 
 
 class Cache(Protocol):
-    """The keys and values of forwarded tokens, in buffers of `capacity` slots.
+    """Keys and values of the tokens that the target has processed, in buffers of `capacity` slots.
 
-    Slots 0 … length − 1 are valid. `forward` writes its new tokens after them and raises `length`.
+    Slots 0 … length − 1 are filled. `Target.forward` writes its new tokens after them and increases `length`.
     """
 
     length: int
     capacity: int
 
     def compact(self, start: int, slots: Tensor) -> None:
-        """Commit a path: move the entries at `slots` to start, start + 1, … and set `length` to start + n.
+        """Keep the accepted draft tokens and remove the rejected ones.
+
+        The entries at `slots` move to start, start + 1, …, and `length` becomes start + n.
 
         Args:
-            start: First slot after the committed tokens.
-            slots: The path's slots (n,), increasing, none before `start`.
+            start: First slot after the prompt and the committed tokens, which stay where they are.
+            slots: Slots (n,) of the tokens to keep, increasing, none below `start`.
         """
 
 
 class Target(Protocol):
-    """A policy that decodes actions as tokens."""
+    """A policy that decodes actions as tokens and verifies drafts."""
 
     @property
     def actions(self) -> ActionSpace:
-        """Action space with the policy's own normalisation."""
+        """Action space: the DoFs, their limits, and the normalisation that the policy was trained with."""
 
     @property
     def chunk(self) -> int:
-        """H, the control steps that it was trained to decode at once."""
+        """Number of control steps H in a chunk that the policy was trained on."""
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras whose images `encode` reads. No others are drawn."""
+        """Names of the cameras whose images `encode` reads. No other camera is rendered."""
 
     @property
     def width(self) -> int:
-        """E."""
+        """Width E of the embeddings and hidden states."""
 
     @property
     def max_prompt(self) -> int:
-        """Largest P that `encode` returns."""
+        """Largest prompt length P, in tokens, that `encode` can return."""
 
     @property
     def device(self) -> torch.device:
         """Device of the weights."""
 
     def encode(self, observation: Observation) -> Tensor:
-        """Return the prompt's embeddings (1, P, E). P may differ between observations.
+        """Return the prompt's embeddings (1, P, E) for an observation. P may differ between observations.
 
         The hidden state of the prompt's last token predicts the chunk's first token.
         """
@@ -70,83 +72,93 @@ class Target(Protocol):
         """Return the embeddings (B, T, E) of action tokens (B, T) int64."""
 
     def new_cache(self, batch: int, capacity: int) -> Cache:
-        """Return an empty cache for `capacity` tokens."""
+        """Return an empty cache of keys and values.
+
+        Args:
+            batch: Number of sequences B.
+            capacity: Number of tokens that fit into each sequence.
+        """
 
     def forward(
         self, x: Tensor, positions: Tensor, cache: Any = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
-        """Return the hidden states (B, T, E) of new tokens after the cached ones.
+        """Process T new tokens that follow the cached ones, and return their hidden states (B, T, E).
 
         Args:
             x: Embeddings of the new tokens (B, T, E).
-            positions: Their positions (T,).
-            cache: From `new_cache`, or None. All new tokens attend to every cached one.
-            seen: Which new tokens each new token attends to, (T, T) bool; None if they are causal. An array, or on a
-                GPU also a tensor.
+            positions: Position of each new token in the sequence (T,), for the positional encoding.
+            cache: From `new_cache`. The new tokens attend to all cached tokens and are added. None: no earlier tokens.
+            seen: Attention mask (T, T) bool: whether new token i attends to new token j. None for a causal mask. An
+                array, or on a GPU possibly a tensor.
         """
 
     def head(self, hidden: Tensor) -> Tensor:
-        """Return the logits over the action tokens (..., V) of hidden states (..., E)."""
+        """Return the logits (..., V) over the action tokens for hidden states (..., E)."""
 
 
 @runtime_checkable
 class EncodesMany(Protocol):
-    """A target that encodes several observations faster together than one after the other."""
+    """A target that encodes several observations together, faster than one after the other."""
 
     def encode_many(self, observations: Sequence[Observation]) -> Tensor:
-        """Return the prompts (B, P, E) of B observations."""
+        """Return the prompts' embeddings (B, P, E) for B observations."""
 
 
 @runtime_checkable
 class ContinuesGreedily(Protocol):
-    """A target that can decode several tokens in one call."""
+    """A target that can decode several tokens autoregressively in a single, faster call."""
 
     def continue_greedily(self, token: int, count: int, cache: Any) -> list[int] | None:
-        """Decode `count` tokens after `token`, and append to the cache what single forwards would.
+        """Decode `count` tokens greedily. The cache then holds the same tokens as after `count` single forwards.
+
+        Args:
+            token: The last committed token. It is not in the cache yet.
+            count: Number of tokens to decode.
+            cache: Holds all tokens before `token`.
 
         Returns:
-            The tokens; None if the target, as it is loaded, must forward one token after the other.
+            The tokens, or None if the target cannot do this in the way it was loaded.
         """
 
 
 class ReadableTarget(Target, Protocol):
-    """A target whose prompt has named parts and whose layers have known shapes, for drafters and the datastore."""
+    """A target that also tells its prompt's parts and its layers' shapes, for drafters and the datastore."""
 
     @property
     def segments(self) -> Mapping[str, slice]:
-        """Name of a part of the prompt -> its slice."""
+        """Name of each part of the prompt, such as `vision`, and the positions (a slice) of its tokens."""
 
     @property
     def pooled_width(self) -> int:
-        """F of `pooled`."""
+        """Length F of the vectors that `pooled` returns."""
 
     @property
     def heads(self) -> int:
-        """Number of attention heads of a layer."""
+        """Number of attention heads in each layer."""
 
     @property
     def feed_forward(self) -> int:
-        """Hidden width of a layer's feed-forward part."""
+        """Hidden width of each layer's feed-forward network."""
 
     @property
     def dtype(self) -> torch.dtype:
-        """Number format of the weights."""
+        """Floating-point type of the weights."""
 
     def pooled(self, prompt: Tensor) -> Tensor:
-        """Return the prompts (B, P, E) as one vector each, (B, F): the input of the early drafter."""
+        """Summarise each prompt (B, P, E) in one vector (B, F), the input of the early drafter."""
 
 
 class ParallelTarget(Target, Protocol):
-    """A target that decodes all N tokens of a chunk at once, and only so."""
+    """A target that decodes all N tokens of a chunk at once. It cannot decode token by token."""
 
     @property
     def parallel(self) -> bool:
-        """True."""
+        """Always True. It marks the target as parallel."""
 
     def parallel_pass(self, prompt: Tensor, cache: Any = None) -> Tensor:
-        """Return the hidden states (B, N, E) of the chunk's tokens, in one forward.
+        """Return the hidden states (B, N, E) that predict the chunk's N tokens, from one forward.
 
         Args:
-            prompt: (B, P, E).
-            cache: An empty one with room for P + N tokens, or None.
+            prompt: Embeddings of the prompts (B, P, E).
+            cache: An empty cache with room for P + N tokens; None to compute without a cache.
         """

@@ -1,4 +1,4 @@
-"""Records of a decode and of an episode. Rerun files, tables and plots are made from them alone.
+"""Records of a decode and of an episode. Recordings (.rrd), tables and plots are made from these records alone.
 
 Notation (docs/methods.md §0): D degrees of freedom, H control steps in a chunk, N = H·D tokens of a chunk.
 """
@@ -13,31 +13,32 @@ import numpy as np
 from kerv_cli.base.spaces import ActionSpace
 
 PARALLEL = "parallel"
-"""Mode of a round, and of its decode, in which the target decoded all tokens at once."""
+"""Mode of a round, and of its decode, in which a parallel target decoded all tokens at once."""
 
 PHASES = ("vision", "prefill", "propose", "verify", "accept", "rectify", "other")
-"""Phases of a decode. Their seconds add up to `DecodeRecord.seconds`. vision is `Target.encode`."""
+"""Phases of a decode. Their seconds add up to `DecodeRecord.seconds`. `vision` is the time of `Target.encode`."""
 
 UNTIMED = dict.fromkeys(PHASES, math.nan)
-"""Phases of a decode that was computed together with others and has no time of its own."""
+"""Phase seconds of a decode in a batch, which has no time of its own: all NaN."""
 
 
 @dataclass(frozen=True)
 class Round:
-    """One round of a decode: a draft and the target tokens it was compared with.
+    """One round of a decode: a draft, and the target tokens that it was compared with.
 
     Attributes:
-        mode: "prefill" (token 0), "decode" (one token), "verify" (a tree), "skip" (no forward) or PARALLEL.
+        mode: "prefill" (the prompt alone, which gives token 0), "decode" (one token), "verify" (a draft), "skip" (the
+            target did not run) or PARALLEL.
         proposer: Name of the proposer that drafted, or "none".
         start: Number of tokens committed before this round.
-        drafted: The judged path: the accepted tokens and, after a rejection, the rejected candidate that is nearest to
-            the target token.
-        target_tokens: The target's tokens at the same positions. If the whole path was accepted and places are left,
-            one more: the bonus.
+        drafted: The draft tokens that were judged: the accepted ones and, after a rejection, the rejected candidate
+            that is nearest to the target token.
+        target_tokens: The target's tokens at the same positions. If all of the draft was accepted and the chunk is not
+            full, one more: the bonus, the target's next token.
         accepted: Number of accepted draft tokens.
-        committed: Number of committed tokens: accepted ones and the bonus.
-        tree_size: Number of verified nodes.
-        threshold: r per DoF, in bins. Empty if no acceptance rule ran.
+        committed: Number of committed tokens: the accepted ones and the bonus.
+        tree_size: Number of draft tokens in the verified tree.
+        threshold: Largest accepted distance per DoF, in bins. Empty if no acceptance rule ran.
     """
 
     mode: str
@@ -52,28 +53,28 @@ class Round:
 
     @property
     def is_verification(self) -> bool:
-        """Whether the target verified a tree."""
+        """Whether the target verified a draft in this round."""
         return self.tree_size > 0 and self.mode != "skip"
 
 
 @dataclass(frozen=True)
 class Delay:
-    """What the world did while the policy decoded (docs/methods.md §8)."""
+    """Latency of a decode, and what the robot executed meanwhile. For worlds that do not wait (docs/methods.md §8)."""
 
-    seconds: float  # latency
-    steps: int  # the same in control steps, rounded up
+    seconds: float  # latency of the decode
+    steps: int  # latency in control steps, rounded up
     observed: int  # control step at which the observation was taken
-    carried: int = 0  # steps that executed the chunk before; carried + held < steps if the episode ended
+    carried: int = 0  # steps that executed the previous chunk; carried + held < steps if the episode ended
     held: int = 0  # steps that held the last action
-    dropped: int = 0  # first actions of the new chunk that were left out
+    dropped: int = 0  # first actions of the new chunk that are not executed, because they are too old
 
 
 @dataclass(frozen=True)
 class DecodeRecord:
-    """One call of the decoder: from an observation to the actions to execute."""
+    """What the decoder returned for one observation, the actions included, and how it was computed."""
 
     tokens: tuple[int, ...]  # committed tokens in order: N of them, unless the rest of the chunk was dropped
-    actions: np.ndarray  # (steps, D) float32, environment units, what is executed; steps ≤ H
+    actions: np.ndarray  # (steps, D) float32, environment units, to be executed; steps ≤ H
     forwards: int  # target forwards, prefill included
     rounds: tuple[Round, ...]
     mode: str  # proposer of the first round that drafted; "skip": not verified; PARALLEL; "ar": no draft; "expert"
@@ -81,35 +82,38 @@ class DecodeRecord:
     phases: dict[str, float]  # seconds by phase, keys from PHASES
     compensated: int = 0  # tokens filled by a prediction instead of the target
     size: int = 0  # N; 0: as many as `tokens`
-    skipped: bool = False  # executed without a verification
+    skipped: bool = False  # executed without verification
     variability: float | None = None  # K of this decode (§3.2), normalised action units
     similarity: float | None = None  # best retrieval similarity; None: nothing was retrieved
     metric: float | None = None  # F of the hybrid boundary (§4.4)
-    reason: str | None = None  # why a skip rule executed the draft unverified, or had it verified
-    deviation: float | None = None  # mean abs difference to AR's chunk from the same observation; None: not sampled
-    delay: Delay | None = None  # None: the world waited
+    reason: str | None = None  # the skip rule's reason to skip or to verify
+    deviation: float | None = None  # mean |difference| to autoregressive actions; None: not measured
+    delay: Delay | None = None  # None: the world waited for the decode
 
     @property
     def delay_steps(self) -> int | None:
-        """Control steps that the world went on during the decode; None if it waited."""
+        """Number of control steps that passed during the decode; None if the world waited."""
         return None if self.delay is None else self.delay.steps
 
     @property
     def unverified(self) -> int:
-        """Number of executed tokens without a target token on their accepted path.
+        """Number of executed tokens that the target did not verify.
 
-        All of a skipped or parallel decode's, else those that a prediction or a rejected draft filled.
+        All tokens of a skipped or parallel decode. In any other decode, the tokens that a rectifier filled in.
         """
         return len(self.tokens) if self.skipped or self.mode == PARALLEL else self.compensated
 
     @property
     def verifications(self) -> int:
-        """Number of rounds in which the target verified a tree."""
+        """Number of rounds in which the target verified a draft."""
         return sum(r.is_verification for r in self.rounds)
 
     @property
     def first_rejected(self) -> int | None:
-        """Index in the chunk of the first verification's first rejected token; N if none, None if no tree."""
+        """Index in the chunk of the first token that the first verification rejected.
+
+        N if it rejected none. None if the decode had no verification.
+        """
         for r in self.rounds:
             if r.is_verification:
                 return r.start + r.accepted if r.accepted < len(r.drafted) else self.size or len(self.tokens)
@@ -117,13 +121,13 @@ class DecodeRecord:
 
 
 def path_length(points: np.ndarray) -> float:
-    """Return the summed distances between successive points (n, 3), metres; 0 for fewer than two points."""
+    """Return the sum of distances between successive points (n, 3), metres; 0 for fewer than two points."""
     return float(np.linalg.norm(np.diff(points.astype(np.float64), axis=0), axis=1).sum())
 
 
 @dataclass(frozen=True)
 class EpisodeRecord:
-    """One episode: a task, a seed, and everything the decoder did."""
+    """One episode: a task, a seed, and everything that the decoder and the robot did."""
 
     environment: str  # name of the task's environment
     space: ActionSpace  # the environment's
@@ -137,24 +141,24 @@ class EpisodeRecord:
     actions: np.ndarray  # (T, D) float32, executed, environment units, within the space's limits
     path: np.ndarray  # (T + 1, 3) float32, end-effector positions, metres
     gripper: np.ndarray  # (T + 1,) float32, gripper opening, 0..1
-    initial_state: np.ndarray  # (n,) float64, equal for episodes of a task that begin alike
+    initial_state: np.ndarray  # (n,) float64, equal for episodes of a task that start in the same state
     frames: dict[int, np.ndarray] = field(default_factory=dict)  # control step -> (h, w, 3) uint8, if recorded
-    wall_seconds: float = 0.0  # whole episode with simulation and rendering; its share if several ran at once
+    wall_seconds: float = 0.0  # with simulation and rendering; in a batch this episode's share
     places: dict[str, np.ndarray] = field(default_factory=dict)  # object, goal, … -> (T + 1, 3) metres, if recorded
 
     @property
     def seconds(self) -> float:
-        """Inference time of the episode; NaN if it was not timed."""
+        """Inference time of all decodes; NaN if the episode was not timed."""
         return sum(d.seconds for d in self.decodes)
 
     @property
     def timed(self) -> bool:
-        """Whether its decodes have times. Those of a batch have none."""
+        """Whether the decodes have times. Decodes of a batch have none."""
         return not math.isnan(self.seconds)
 
     @property
     def forwards(self) -> int:
-        """Number of target forwards."""
+        """Number of forward passes of the target."""
         return sum(d.forwards for d in self.decodes)
 
     @property
@@ -164,6 +168,6 @@ class EpisodeRecord:
 
     @property
     def jerk(self) -> float:
-        """Root mean square of the third difference of the end effector's positions, m/s³; NaN for under 3 steps."""
+        """Root mean square of the end effector's jerk, m/s³; NaN if the episode has fewer than 3 steps."""
         third = np.diff(self.path.astype(np.float64), n=3, axis=0) * self.space.control_hz**3
         return float(np.sqrt((third**2).sum(axis=1).mean())) if len(third) else math.nan

@@ -1,4 +1,4 @@
-"""The stopwatch of a decode: seconds by phase, on a CPU and on CUDA."""
+"""A stopwatch that measures a decode's seconds by phase, on a CPU and on CUDA."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from kerv_cli.engine.record import PHASES
 
 
 class Stopwatch:
-    """Measures the seconds of each phase of one decode.
+    """Measures the seconds that each phase of one decode takes (`PHASES`).
 
-    On CUDA it waits for the device at its start and at its end only. The laps between are events in the stream and are
-    read at the end, so that measuring does not keep the host from running ahead.
+    On CUDA it records events in the stream and reads them at the end, so that measuring does not slow the decode. The
+    CPU waits for the GPU only at the start and at the end.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -26,7 +26,7 @@ class Stopwatch:
         self.began = self.last = time.perf_counter()
 
     def lap(self, phase: str) -> None:
-        """Add the time since the last lap to `phase`. On CUDA it is added when the stopwatch stops."""
+        """Add the time since the last lap to `phase`, one of `PHASES`. On CUDA, `stop` adds it instead."""
         if self.events is not None:
             self.events.append((phase, _event()))
             return
@@ -35,7 +35,7 @@ class Stopwatch:
         self.last = now
 
     def stop(self) -> float:
-        """Return the seconds since the start. The time since the last lap is added to `other`."""
+        """Stop and return the seconds since the start. The time since the last lap counts as phase `other`."""
         self.lap("other")
         if self.events is not None:
             torch.cuda.synchronize()

@@ -1,4 +1,4 @@
-"""Numbers between CPU and GPU: uploads that do not wait, and reads that wait once for several tensors."""
+"""Copies between CPU and GPU: uploads that do not wait, and reads that wait only once for several tensors."""
 
 from __future__ import annotations
 
@@ -9,11 +9,15 @@ from torch import Tensor
 
 
 def upload(numbers: ArrayLike, device: torch.device) -> Tensor:
-    """Return an array or a nested list of integers as a tensor on the device, without waiting for the copy.
+    """Return integers as a tensor on the device, without waiting for the copy.
 
-    On CUDA the copy is made from pinned memory, which its allocator keeps until the copy has run.
+    On CUDA the copy is made from pinned memory, which PyTorch's allocator keeps until the copy is done.
+
+    Args:
+        numbers: An array, or a nested list.
+        device: Where the tensor goes.
     """
-    host = torch.from_numpy(np.asarray(numbers))  # a fifth of torch.as_tensor's time for a list
+    host = torch.from_numpy(np.asarray(numbers))  # five times as fast as torch.as_tensor for a list
     if device.type == "cpu":
         return host
     if device.type == "cuda":
@@ -22,9 +26,14 @@ def upload(numbers: ArrayLike, device: torch.device) -> Tensor:
 
 
 def read(*parts: Tensor) -> list[np.ndarray]:
-    """Return vectors (n,) of one device as arrays, in one copy, for which the CPU waits.
+    """Copy several vectors from one device to the CPU in a single transfer, and wait for it.
 
-    Integers among floats are returned as float64, exactly.
+    Args:
+        parts: Vectors (n,), which may have different lengths. If their types differ, all are returned as float64, which
+            holds the integers used here exactly.
+
+    Returns:
+        One array per vector.
     """
     together = parts[0]
     if len(parts) > 1:

@@ -1,8 +1,8 @@
 """Draft tokens as a tree, which an acceptance rule judges. This file imports nothing heavy.
 
-Node i has a token, a parent (−1 is the last committed token) and a depth (0 is the first drafted position). Parents
-come before their children. A node at depth d after `committed` tokens is chunk token committed + d, which gives its
-control step and DoF (docs/methods.md §2).
+Node i has a token, a parent and a depth. Parent −1 is the last committed token. Depth 0 is the first drafted position.
+Parents come before their children. After c committed tokens, a node at depth d is token c + d of the chunk. This index
+gives its control step and DoF (docs/methods.md §2).
 """
 
 from __future__ import annotations
@@ -15,7 +15,13 @@ ROOT = -1
 
 @dataclass(frozen=True)
 class TokenTree:
-    """A draft on the CPU: tokens, parents and depths of n nodes."""
+    """A draft as a tree of n nodes, on the CPU.
+
+    Attributes:
+        tokens: Token of each node.
+        parents: Index of each node's parent, smaller than its own; −1 is the last committed token.
+        depths: Depth of each node; 0 is the first drafted position.
+    """
 
     tokens: tuple[int, ...]
     parents: tuple[int, ...]
@@ -23,7 +29,11 @@ class TokenTree:
 
     @classmethod
     def build(cls, tokens: Sequence[int], parents: Sequence[int] | None = None) -> TokenTree:
-        """Build a tree of n tokens and n parents, or a chain if `parents` is None.
+        """Build a tree, and compute the depths.
+
+        Args:
+            tokens: Token of each node.
+            parents: Index of each node's parent, −1 for the last committed token. None builds a chain.
 
         Raises:
             ValueError: A parent does not come before its child.
@@ -42,7 +52,7 @@ class TokenTree:
         return len(self.tokens)
 
     def down_from(self, node: int) -> list[int]:
-        """Return `node` and its first child, that child's first child, and so on to a leaf."""
+        """Follow first children from `node` down to a leaf, and return these nodes, `node` first."""
         nodes = [node]
         for i in range(node + 1, len(self)):
             if self.parents[i] == nodes[-1]:
@@ -50,7 +60,7 @@ class TokenTree:
         return nodes
 
     def path_to(self, node: int) -> list[int]:
-        """Return the nodes from depth 0 to `node`. The path to the root is empty."""
+        """Return the nodes from depth 0 down to `node`, `node` included. Empty if `node` is −1, the root."""
         path: list[int] = []
         while node != ROOT:
             path.append(node)
@@ -59,7 +69,7 @@ class TokenTree:
 
 
 def merge(chains: Sequence[Sequence[int]]) -> TokenTree:
-    """Return the prefix tree of several drafts. Common beginnings become one path."""
+    """Merge several token sequences into one prefix tree. Sequences with a common beginning share its nodes."""
     tokens: list[int] = []
     parents: list[int] = []
     children: dict[tuple[int, int], int] = {}
