@@ -22,14 +22,18 @@ if TYPE_CHECKING:
     from kerv_cli.targets.checkpoint import TargetDescription
 
 CHUNK = "chunk"
-"""Compensation: drop the new chunk's stale actions."""
+"""Value of `rollout.delay_compensation`: do not execute actions of a new chunk that are already too old."""
 
 Latency = Callable[[DecodeRecord], float]
-"""Returns the seconds from a decode's observation to its first action."""
+"""Function that returns the seconds from a decode's observation to its first action."""
 
 
 def steps_of(seconds: float, control_hz: float) -> int:
-    """Return a latency in control steps, rounded up. Float noise around a whole number does not count.
+    """Convert a latency to control steps, rounded up. Rounding errors just above a whole number are ignored.
+
+    Args:
+        seconds: The latency.
+        control_hz: Control steps per second.
 
     Raises:
         KervError: The latency is negative or not finite.
@@ -40,10 +44,10 @@ def steps_of(seconds: float, control_hz: float) -> int:
 
 
 class RealClock:
-    """Tells an episode how long each decode takes the world, and which of its actions are stale.
+    """Tells an episode how long each decode takes, and which of its actions are too old by then.
 
     Attributes:
-        expected: Control steps that the next decode is expected to take: as many as the one before.
+        expected: Number of control steps that the next decode will probably take: as many as the one before.
     """
 
     def __init__(self, latency: Latency, space: ActionSpace, compensation: str = "none") -> None:
@@ -51,7 +55,11 @@ class RealClock:
         self.expected = 0
 
     def delay(self, decode: DecodeRecord, observed: int) -> Delay:
-        """Return the delay of a decode whose observation was taken at control step `observed`.
+        """Return the delay of a decode.
+
+        Args:
+            decode: Record of the decode.
+            observed: Control step at which its observation was taken.
 
         Raises:
             KervError: The latency is negative or not finite.
@@ -66,13 +74,14 @@ def check(settings: RolloutSettings, spec: EnvironmentSpec, target: TargetDescri
     """Refuse settings of the clock that cannot work.
 
     Args:
-        settings: The rollout.
-        spec: Its environment.
+        settings: The rollout's settings.
+        spec: The environment.
         target: The policy's description; None for the expert.
 
     Raises:
-        UsageError: An episode ends before its first action, or all of a chunk is stale. The profile lacks a phase of
-            the method. AR's time is asked for, and there is no AR.
+        UsageError: An episode ends before its first action, or all actions of a chunk are too old when they arrive; the
+            profile lacks a phase of the method; or the time of autoregressive decoding is needed and the policy cannot
+            decode autoregressively.
     """
     timing = settings.rollout
     if timing.clock != REAL:
@@ -103,16 +112,16 @@ def check(settings: RolloutSettings, spec: EnvironmentSpec, target: TargetDescri
 
 
 def calibrates(settings: RolloutSettings) -> bool:
-    """Return whether AR's time on this machine must be measured first."""
+    """Return whether the time of autoregressive decoding must first be measured on this machine."""
     timing = settings.rollout
     return timing.clock == REAL and timing.latency == MEASURED and timing.ar_ms > 0
 
 
 def profile_identity(settings: RolloutSettings) -> dict[str, str]:
-    """Return the hash of the profile that a rollout reads, if it reads one.
+    """Return the hash of the latency profile that a rollout reads, `{"profile": sha256}`; empty if it reads none.
 
     Raises:
-        UsageError: No such profile.
+        UsageError: The profile does not exist.
     """
     timing = settings.rollout
     if timing.clock != REAL or timing.latency != PROFILE:
@@ -121,15 +130,15 @@ def profile_identity(settings: RolloutSettings) -> dict[str, str]:
 
 
 def latency_of(settings: RolloutSettings, target: TargetDescription | None, measured: float) -> Latency:
-    """Return the source of latencies.
+    """Return the function that gives each decode's latency, as `rollout.latency` says.
 
     Args:
-        settings: The rollout.
+        settings: The rollout's settings.
         target: The policy's description; None for the expert.
-        measured: Seconds of AR's decode here, if the rollout `calibrates`.
+        measured: Seconds of an autoregressive decode on this machine. Used only if `calibrates(settings)`.
 
     Raises:
-        UsageError: The profile is missing, impossible, or lacks a phase that the method needs.
+        UsageError: The profile is missing or damaged, or it lacks a phase that the method needs.
     """
     timing = settings.rollout
     ar_seconds = timing.ar_ms / 1000.0
@@ -147,12 +156,12 @@ def latency_of(settings: RolloutSettings, target: TargetDescription | None, meas
 
 
 def profiled(profile: Profile, scale: float = 1.0) -> Latency:
-    """Return a source of latencies by the cost model, all times `scale`."""
+    """Return a latency function that applies the cost model and multiplies the result by `scale`."""
     return lambda decode: scale * float(prices(work_of_record(decode), profile)[0])
 
 
 def _profile_path(settings: RolloutSettings) -> Path:
-    """Return the document of `rollout.profile`: a path, or a name in <results>/bench."""
+    """Return the path of `rollout.profile`, which is a file or a name in <results>/bench."""
     name, results = settings.rollout.profile, settings.results
     for path in (Path(name).expanduser(), results_dir(results) / "bench" / f"{name}.json"):
         if path.is_file():
@@ -161,7 +170,7 @@ def _profile_path(settings: RolloutSettings) -> Path:
 
 
 def _open_profile(settings: RolloutSettings) -> Profile:
-    """Return the rollout's profile, which must have the phases of its method."""
+    """Read the rollout's latency profile, and check that it has all phases of the method."""
     path, name = _profile_path(settings), settings.rollout.profile
     try:
         profile = read_profile(path)

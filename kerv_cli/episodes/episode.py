@@ -1,4 +1,4 @@
-"""Runs one episode of a world with a decoder."""
+"""Runs one episode: a decoder acts in a world (an open environment)."""
 
 from __future__ import annotations
 
@@ -17,38 +17,49 @@ from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import World
 
 OnStep = Callable[[int], object]
-"""Called after each control step with the number of those executed. Its time does not count."""
+"""Function that is called after each control step with the number of steps executed. Its time is not measured."""
 
 
 class Follower(Protocol):
-    """Follows an episode: it is told of the beginning, of every executed action and of the end."""
+    """Follows an episode: is told when it starts, which actions are executed, and when it ends."""
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras whose images it reads. No others are drawn for it."""
+        """Names of the cameras whose images it reads. No other camera is rendered."""
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
-        """Begin an episode, with the end effector at (3,) metres."""
+        """Start a new episode.
+
+        Args:
+            task: Name of the task.
+            seed: Seed of the episode.
+            end_effector: Initial position (3,), metres.
+        """
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
-        """Note an executed action (D,), environment units, after which the end effector is at (3,) metres."""
+        """Note an action that was executed.
+
+        Args:
+            action: (D,), environment units.
+            end_effector: Position (3,) after the action, metres.
+        """
 
     def finish(self, success: bool) -> None:
-        """End the episode."""
+        """End the episode. `success` says whether the task was solved."""
 
 
 class ActionDecoder(Follower, Protocol):
-    """Follows an episode and decodes its observations."""
+    """Follows an episode and decodes actions from its observations."""
 
     def decode(self, observation: Observation) -> DecodeRecord:
-        """Return the actions to execute, and their record, for an observation with the images of `cameras`."""
+        """Return a record with the actions to execute. The observation has the images of `cameras`."""
 
 
 class _Execution:
-    """Executes one action per control step, and collects what an episode's record needs.
+    """Executes actions in the world, and collects the data for the episode's record.
 
-    The actions are those of the current chunk. When it is used up, the last action is executed again. Before the first
-    chunk the robot stands still.
+    It executes the current chunk, one action per control step. When the chunk is used up, its last action is repeated.
+    Before the first chunk the robot stands still.
     """
 
     def __init__(self, world: World, follower: Follower, camera: CameraSettings | None, on_step: OnStep | None) -> None:
@@ -84,12 +95,19 @@ class _Execution:
             self.on_step(len(self.actions))
 
     def until(self, rest: int) -> None:
-        """Execute the chunk until `rest` of its steps are left, or the episode ends."""
+        """Execute the chunk until only `rest` of its actions are left, or the episode ends."""
         while len(self.chunk) > rest and not self.world.done:
             self.step()
 
     def during(self, delay: Delay) -> Delay:
-        """Let the world go on for a decode's delay. Return the delay, with what was executed."""
+        """Let the world go on while a decode runs.
+
+        Args:
+            delay: How long the decode takes.
+
+        Returns:
+            The delay, with the numbers of steps that executed the previous chunk and that held the last action.
+        """
         before, in_chunk = len(self.actions), len(self.chunk)
         while len(self.actions) < before + delay.steps and not self.world.done:
             self.step()
@@ -105,17 +123,17 @@ def run_episode(
     clock: RealClock | None = None,
     on_step: OnStep | None = None,
 ) -> EpisodeRecord:
-    """Run one episode until success or the horizon.
+    """Run one episode until the task is solved or the horizon is reached, and return its record.
 
-    Simulation and rendering happen outside the decoder and are no part of inference time.
+    Simulation and rendering do not count as inference time.
 
     Args:
-        world: Where the episode runs.
-        decoder: Decodes its observations.
-        seed: Of the initial state.
-        camera: The view whose frames the record keeps, one per control step; None for no frames.
-        clock: Of a world that goes on during decodes (docs/methods.md §8); None if it waits.
-        on_step: Shows progress.
+        world: The environment, opened for one task.
+        decoder: Decodes the observations.
+        seed: Seed of the initial state.
+        camera: View to record, one image per control step; None to record no images.
+        clock: Latency of decodes, if the world goes on meanwhile (docs/methods.md §8); None if the world waits.
+        on_step: Called after each control step, e.g. to show progress.
     """
     steps = episode(world, decoder, seed, camera, clock, on_step)
     decode: Any = None
@@ -136,9 +154,10 @@ def episode(
     clock: RealClock | None = None,
     on_step: OnStep | None = None,
 ) -> Generator[Observation, DecodeRecord, EpisodeRecord]:
-    """Run the episode of `run_episode`, but let the caller decode.
+    """Run one episode like `run_episode`, but let the caller decode.
 
-    Yields each observation, is sent its decode, and returns the record.
+    This is a generator. It yields each observation, expects the decode's record from `send`, and returns the episode's
+    record at the end.
     """
     began = time.perf_counter()
     world.reset(seed)

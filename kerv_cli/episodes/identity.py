@@ -1,7 +1,7 @@
 """What determines an episode's result: settings that have an effect, weights and data, task, seeds and `ENGINE`.
 
-Code, versions, machine, workers and file layout are provenance and are stored beside it. So results stay valid when
-something is renamed or added, and settings that give the same tokens are the same work in any study.
+Code, versions, machine, workers and file layout do not belong to it; they are stored beside the result. So results stay
+valid when something is renamed or added, and studies share the episodes of settings that give the same tokens.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from kerv_cli.episodes.settings import CONSTANT, PROFILE, WAITS, RolloutSettings
 from kerv_cli.methods.settings import EXPERT
 
 ENGINE = 1
-"""Version of the tokens that the code gives. A change that alters tokens or actions raises it; tests/test_golden.py
-checks that."""
+"""Version of the tokens that the code gives. Increase it with every change that alters tokens or actions.
+tests/test_golden.py checks this."""
 
 Plain = Mapping[str, Any]
-"""RolloutSettings as nested plain values, as they are stored."""
+"""A rollout's settings as nested dictionaries, lists and plain values, as they are stored."""
 
 Identity = Mapping[str, str]
-"""Hashes of the weights and data behind a setting, e.g. {"target": sha256, "drafter": sha256}."""
+"""Hashes of the weights and data that a setting uses, e.g. {"target": sha256, "drafter": sha256}."""
 
 OBSERVATION = "observation"
 """Key of the identity's only entry that is not a hash: what the target observes."""
 
-# Fields of RolloutSettings that do not change an episode's result (folders, recording, names), or that count otherwise
-# (task and seed on their own, the policy by its hashes). All others count, so that a new setting makes new episodes.
+# Fields of RolloutSettings that are no part of a setting's hash: they do not change a result (folders, recording,
+# names), or are stored separately (task and seed; the policy by its hashes). All other fields are part of it.
 NOT_DETERMINING = frozenset(
     {"task", "episodes", "seed", "policy", "method", "results", "store", "record", "record_size"}
 )
@@ -45,11 +45,11 @@ NOT_DETERMINING_RUNTIME = frozenset({"workers", "executor", "executor_options"})
 
 
 def hash_of(value: object) -> str:
-    """Return the first 16 hex digits of the SHA-256 of canonical JSON.
+    """Return a short hash of a JSON value: the first 16 hexadecimal digits of the SHA-256 of its canonical JSON text.
 
     Raises:
-        ValueError: NaN or infinity, which JSON lacks.
-        TypeError: A value that JSON lacks.
+        ValueError: The value contains NaN or infinity.
+        TypeError: The value contains an object that JSON cannot hold.
     """
     return hashlib.sha256(_canonical(value).encode("ascii")).hexdigest()[:16]
 
@@ -59,7 +59,13 @@ def _canonical(value: object) -> str:
 
 
 def work_of(settings: Plain, identity: Identity, engine: int = ENGINE) -> str:
-    """Return the hash of what determines the results of a setting, apart from task, seeds and repeat."""
+    """Return the hash of everything that determines a setting's results, except task, seed and repetition.
+
+    Args:
+        settings: The rollout's settings as nested plain values.
+        identity: Hashes of its weights and data, as `policy.check` returns them.
+        engine: Version of the tokens that the code gives.
+    """
     determining = without(settings, NOT_DETERMINING - {"policy", "method"})
     policy = settings["policy"]["kind"]
     return _work(_canonical(determining), _canonical(dict(identity)), policy, engine)
@@ -73,10 +79,10 @@ def _work(settings: str, identity: str, policy: str, engine: int) -> str:
 
 
 def effective(settings: Plain) -> dict[str, Any]:
-    """Return the settings that determine a result: all of them, without those that have no effect."""
+    """Return the settings that determine a result, without those that have no effect in this combination."""
     try:
         complete = settings_from(settings)
-    except KervError:  # a part that is not registered here, such as somebody else's
+    except KervError:  # the settings name a part of a plugin that is not installed here
         return without(settings, NOT_DETERMINING)
     determining = without(asdict(complete), NOT_DETERMINING)
     for key in idle_keys(complete) if complete.policy.kind != EXPERT else ():
@@ -94,26 +100,32 @@ def _drop(settings: dict[str, Any], path: Sequence[str]) -> None:
 
 
 def depends_on_order(settings: Plain) -> bool:
-    """Return whether an episode's result depends on those before it in its block: feedback moves a skip level."""
+    """Return whether an episode's result depends on the episodes before it in its block.
+
+    This is so if a skip rule adapts its similarity threshold after each episode (`skip.up`, `skip.down`).
+    """
     skip = settings["skip"]
     return any(skip.get(name) for name in ("up", "down"))
 
 
 def stress_of(settings: Plain) -> dict[str, Any]:
-    """Return kind and level of a setting's stress. At level 0 the kind is `none`."""
+    """Return the kind and level of a setting's stress, a disturbance of the world (docs/stress.md).
+
+    At level 0 the kind is `none`.
+    """
     stress = settings["world"]["stress"]
     level = int(stress["level"])
     return {"kind": stress["kind"] if level else "none", "level": level}
 
 
 def stress_text(settings: Plain) -> str:
-    """Return a setting's stress as text after its label: `, stress push 2`; empty without stress."""
+    """Return text to put after a setting's label: `, stress push 2`. Empty without stress."""
     stress = stress_of(settings)
     return f", stress {stress['kind']} {stress['level']}" if stress["level"] else ""
 
 
 def batch_of(settings: Plain) -> int:
-    """Return how many episodes a setting runs at the same time. With more than one they have no times."""
+    """Return how many episodes of a setting run at the same time. Above 1, episodes have no times."""
     return int(settings["rollout"]["batch"])
 
 
@@ -126,17 +138,17 @@ def flat(settings: Plain, prefix: str = "") -> dict[str, Any]:
 
 
 def without(settings: Plain, names: Collection[str]) -> dict[str, Any]:
-    """Return the settings without the keys `names`."""
+    """Return the settings without the keys in `names`. Only the top level is searched."""
     return {key: value for key, value in settings.items() if key not in names}
 
 
 def without_effect(settings: RolloutSettings, overrides: Iterable[str], sweep: bool = False) -> dict[str, str]:
-    """Return those overrides `key=value` that have no effect on the rollout, and why.
+    """Return those overrides that have no effect on the rollout, each with the reason.
 
     Args:
-        settings: The rollout's. The expert refuses the settings of a method, so that none of its own is idle.
-        overrides: As written.
-        sweep: Whether the rollout is part of a sweep.
+        settings: The rollout's settings. For the expert the result is empty, because it refuses unused settings.
+        overrides: `key=value`, as typed.
+        sweep: Whether the rollout is part of a sweep. Outside a sweep, settings of workers have no effect either.
     """
     if settings.policy.kind == EXPERT:
         return {}
@@ -167,7 +179,7 @@ def _idle_timing(timing: TimingSettings) -> dict[str, str]:
 
 
 def idle_keys(settings: RolloutSettings) -> dict[str, str]:
-    """Return the keys of settings that have no effect, and why."""
+    """Return the keys of settings that have no effect in this combination, each with the reason."""
     method = settings.parts()
     parts = {kind: part_of(kind, method[kind].kind) for kind in METHOD_KINDS}
     draft, proposer, skip, acceptance = (parts[k] for k in ("prefill_draft", "proposer", "skip", "acceptance"))
@@ -196,15 +208,15 @@ def idle_keys(settings: RolloutSettings) -> dict[str, str]:
 
 
 _COMPUTING = ("base", "engine", "methods", "targets", "worlds", "episodes")
-"""Rooms whose code an episode runs."""
+"""Packages of kerv_cli whose code runs during an episode."""
 
 
 @functools.cache
 def code_hash() -> str:
-    """Return the hex SHA-256 over the names and syntax trees of the files that compute an episode.
+    """Return a hash of the code that computes episodes, as hexadecimal SHA-256.
 
-    It is provenance: it tells which episodes other code computed. The files are kerv's own and those of registered
-    plugins. Comments, docstrings and layout do not count.
+    It is stored with episodes to tell later which of them other code computed. It covers the syntax trees of kerv's own
+    files and of registered plugins. Comments, docstrings and formatting do not change it.
     """
     root, digest = Path(kerv_cli.__file__).parent, hashlib.sha256()
     own = sorted(path for room in _COMPUTING for path in (root / room).rglob("*.py"))
@@ -215,7 +227,7 @@ def code_hash() -> str:
 
 
 def _meaning(source: bytes) -> bytes:
-    """Return the syntax tree as text, without docstrings."""
+    """Return the syntax tree of Python source as text, without docstrings."""
     return ast.dump(_WithoutDocstrings().visit(ast.parse(source))).encode()
 
 

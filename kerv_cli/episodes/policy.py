@@ -1,4 +1,4 @@
-"""The policy of a rollout: checks that its parts and files fit together, its identity, and its decoder."""
+"""Builds the policy of a rollout: checks that its parts and files fit together, and returns its decoder."""
 
 from __future__ import annotations
 
@@ -34,26 +34,30 @@ from kerv_cli.worlds.views import frame_shape
 PRIVILEGED = "state (privileged)"
 WARM_UP_DECODES = 6
 CALIBRATION_DECODES = 15
-"""Autoregressive decodes whose median `rollout.ar_ms` scales."""
+"""Number of autoregressive decodes that are timed. Their median is scaled to `rollout.ar_ms`."""
 
 
 def artifacts_of(settings: MethodSettings) -> Artifacts:
-    """Return the policy's files on its device. All settings of this process share the loaded objects."""
+    """Return the policy's files (weights, datastore, …), to be loaded onto its device when needed.
+
+    All settings in this process share the loaded objects.
+    """
     device, _ = set_up(settings.runtime)
     return Artifacts(settings.results, settings.policy, settings.datastore, device, settings.runtime.dtype)
 
 
 def check(settings: RolloutSettings) -> dict[str, str]:
-    """Refuse settings that cannot run, before anything heavy starts.
+    """Refuse settings that cannot run, before anything slow starts.
 
     Returns:
-        The identity of their results: what is observed, and hashes of all that determines the results beside the
-        settings.
+        Everything besides the settings that determines the results: a hash for each file with weights or data, and
+        under
+        `observation` what the target observes.
 
     Raises:
         UsageError: A number out of range, training seeds, a camera that the policy was not trained on, or parts that do
             not fit together.
-        CheckpointError: No such policy, a damaged one, or an artifact of another target or action space.
+        CheckpointError: The policy is missing or damaged, or a file belongs to another target or action space.
     """
     tasks = tasks_of(settings)
     spec = spec_of(tasks[0])
@@ -74,17 +78,17 @@ def check(settings: RolloutSettings) -> dict[str, str]:
     clock.check(settings, spec, target)
     world = dataclasses.asdict(settings.world)
     hashes = artifacts.check(method.needs, Use(method.settings, settings.runtime.dtype, spec.name, tasks, world))
-    # every row of a table has it, so that a privileged policy is recognised
+    # stored with every episode, so that tables show which policies read the privileged state
     observation = str(target.settings.get(OBSERVATION, "vision"))
     observation = PRIVILEGED if observation == "state" else observation
     return {**hashes, **clock.profile_identity(settings), OBSERVATION: observation}
 
 
 def tasks_of(settings: RolloutSettings) -> tuple[str, ...]:
-    """Return the full names of a rollout's tasks: by default those that its target was trained on.
+    """Return the full names of a rollout's tasks. By default they are the tasks that its target was trained on.
 
     Raises:
-        UnknownName: No such task.
+        UnknownName: A task does not exist.
         CheckpointError: The target's description is damaged.
     """
     return resolve_tasks(settings.task or list(trained_tasks(settings)) or DEFAULT_TASKS)
@@ -93,7 +97,7 @@ def tasks_of(settings: RolloutSettings) -> tuple[str, ...]:
 def trained_tasks(settings: RolloutSettings) -> tuple[str, ...]:
     """Return the full names of the tasks that a rollout's target was trained on.
 
-    There are none for the expert, for a target that does not say, and for one that is missing, which `check` refuses.
+    Empty for the expert, for a target that does not name its tasks, and for a missing target (`check` reports that).
 
     Raises:
         CheckpointError: The target's description is damaged.
@@ -109,7 +113,7 @@ def trained_tasks(settings: RolloutSettings) -> tuple[str, ...]:
 
 
 def unseen_tasks(settings: RolloutSettings, tasks: Iterable[str]) -> list[str]:
-    """Return those of the tasks that the target was not trained on; none if its description names no tasks."""
+    """Return the tasks that the target was not trained on. Empty if the target does not name its training tasks."""
     trained = trained_tasks(settings)
     return [task for task in tasks if trained and task not in trained]
 
@@ -124,7 +128,7 @@ def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
 
 
 def _check_expert(settings: RolloutSettings) -> None:
-    """Refuse what needs a decoding method."""
+    """Refuse settings that need a decoding method, because the expert decodes nothing."""
     plain, default = (
         {"rollout.batch": each.rollout.batch, "deviation_every": each.deviation_every, "chunk": each.chunk}
         | each.parts()
@@ -137,11 +141,11 @@ def _check_expert(settings: RolloutSettings) -> None:
 
 
 def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
-    """Return the decoder of one setting on one task, warmed up.
+    """Return the decoder for one setting and one task, warmed up.
 
     Raises:
-        UsageError: As `check`.
-        CheckpointError: As `check`.
+        UsageError: As in `check`.
+        CheckpointError: As in `check`.
     """
     spec = spec_of(task)
     expert = settings.policy.kind == EXPERT
@@ -151,7 +155,7 @@ def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
 
 
 def batch_decoder_for(settings: RolloutSettings) -> BatchDecoder:
-    """Return the decoder of one setting for several episodes, of any tasks."""
+    """Return a decoder for one setting that decodes several episodes at once, of any tasks."""
     return BatchDecoder(_method_decoder(settings))
 
 
@@ -163,7 +167,7 @@ def _method_decoder(settings: RolloutSettings, task: str = "") -> Decoder:
 
 
 def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:
-    """Return the clock of one setting on one task; None if the world waits."""
+    """Return the clock for one setting and one task; None if the world waits for decodes."""
     if settings.rollout.clock == WAITS:
         return None
     target, measured = None, 0.0
@@ -180,7 +184,18 @@ def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:
 
 @functools.cache
 def ar_seconds(target: Any, chunk: int, task: str, pixels: int, threads: int) -> float:
-    """Return the median seconds of a target's autoregressive decode here, measured once per process."""
+    """Measure how long the target's autoregressive decode takes on this machine. The result is cached in the process.
+
+    Args:
+        target: The loaded target.
+        chunk: Control steps to decode at once; 0 for as many as the target was trained for.
+        task: Name of a task, for its observation space.
+        pixels: Width and height of the images.
+        threads: CPU threads. Not used, but results for different numbers must not share a cache entry.
+
+    Returns:
+        Median seconds of a decode.
+    """
     decoder, space = Decoder(target, chunk=chunk), spec_of(task).observation
     warm_up(decoder, task, space, pixels)
     still = still_observation(decoder, space, pixels)
@@ -188,7 +203,7 @@ def ar_seconds(target: Any, chunk: int, task: str, pixels: int, threads: int) ->
 
 
 def still_observation(decoder: ActionDecoder, space: ObservationSpace, pixels: int) -> Observation:
-    """Return zeros for everything that the decoder reads, images of `pixels` pixels included."""
+    """Return an observation of zeros for everything the decoder reads. Images have `pixels` × `pixels` pixels."""
     images = {name: np.zeros(frame_shape(name, pixels), dtype=np.uint8) for name in decoder.cameras}
     return Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
 
@@ -196,9 +211,16 @@ def still_observation(decoder: ActionDecoder, space: ObservationSpace, pixels: i
 def warm_up(
     decoder: ActionDecoder, task: str, space: ObservationSpace, pixels: int, decodes: int = WARM_UP_DECODES
 ) -> None:
-    """Run a few decodes before anything is timed: first calls allocate memory and choose kernels.
+    """Run a few decodes before anything is timed, because first calls allocate memory and choose kernels.
 
-    The hand is moved, so that parts that need a history or a path run too.
+    The simulated hand moves, so that parts that need past actions or positions run, too.
+
+    Args:
+        decoder: The decoder.
+        task: Name of the task.
+        space: The task's observation space.
+        pixels: Width and height of the images.
+        decodes: Number of decodes.
     """
     still = still_observation(decoder, space, pixels)
     decoder.reset(task, 0, np.array([0.0, 0.0, 0.1]))
@@ -208,10 +230,10 @@ def warm_up(
 
 
 class ExpertDecoder:
-    """Decodes one control step at a time with the environment's scripted controller of the task.
+    """Returns one action at a time from the environment's scripted controller of the task.
 
-    It reads the privileged state, as `observation=state` does. It has no target: its records have no forwards, rounds
-    and tokens. Its time is not compared with a decoding method's.
+    The controller reads the privileged simulator state, as policies with `observation=state` do. It is no neural
+    policy: records have no forwards, rounds or tokens, and its time is not compared with a decoding method's.
     """
 
     cameras: tuple[str, ...] = ()
@@ -222,16 +244,16 @@ class ExpertDecoder:
         self.dofs = 0
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
-        """Begin an episode."""
+        """Start a new episode of `task`. The other arguments are not used."""
         if self.expert is None or task != self.task:
             spec = spec_of(task)
             self.task, self.expert, self.dofs = task, spec.expert(task), spec.actions.dofs
 
     def decode(self, observation: Observation) -> DecodeRecord:
-        """Return one control step's action (1, D), environment units.
+        """Return a record with the action of one control step, (1, D), environment units.
 
         Raises:
-            KervError: There was no reset, or the expert's answer is not D finite numbers.
+            KervError: `reset` was not called, or the expert did not return D finite numbers.
         """
         if self.expert is None:
             raise KervError("the expert does not know its task yet: reset it before decoding")
@@ -251,7 +273,7 @@ class ExpertDecoder:
         )
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
-        """Do nothing: it needs no history."""
+        """Do nothing: the expert needs no history."""
 
     def finish(self, success: bool) -> None:
-        """Do nothing: it does not learn."""
+        """Do nothing: the expert does not learn."""

@@ -1,4 +1,4 @@
-"""Composes the settings of a study and of a rollout, from presets and the command line."""
+"""Composes the settings of a study or of a rollout, from preset files and the command line."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from kerv_cli.episodes.settings import RolloutSettings, StudySettings, SweepSett
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
 
 MOST_SEEDS = 10_000
-"""Seeds of a block. The settings of a rollout take turns in a single block."""
+"""Seeds of a block for rollouts, large enough that all their episodes form a single block."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """One setting as it is written.
+    """One setting of a study as it is written: its overrides. A comma list expands into a grid of several points.
 
     Attributes:
-        name: What all settings of its grid share.
-        overrides: Its overrides.
-        varies: The grid's keys and this setting's values.
+        name: Name of the grid, which all its points share.
+        overrides: This point's overrides, `key=value`.
+        varies: Keys that differ within the grid, and this point's values.
     """
 
     name: str
@@ -37,20 +37,26 @@ class Point:
 
     @classmethod
     def of(cls, name: str, overrides: Sequence[str], varied: Collection[str]) -> Point:
-        """Return the point of a grid over the keys `varied`."""
+        """Build one point of a grid.
+
+        Args:
+            name: Name of the grid.
+            overrides: The point's overrides, `key=value`.
+            varied: Keys that differ within the grid.
+        """
         pairs = (override.lstrip("+").split("=", 1) for override in overrides)
         return cls(name, tuple(overrides), {key: value for key, value in pairs if key in varied})
 
     @property
     def label(self) -> str:
-        """The name and the grid's values: `spec_vla r=3`."""
+        """The grid's name and the point's values, such as `spec_vla r=3`."""
         values = (f"{key.rpartition('.')[2]}={value}" for key, value in self.varies.items())
         return check_label(" ".join([self.name, *values]))
 
 
 @dataclass(frozen=True)
 class ResolvedStudy:
-    """A study whose settings are composed and checked."""
+    """A study (a comparison of several settings) whose settings are composed and checked."""
 
     sweep: SweepSettings
     settings: Mapping[str, RolloutSettings]  # by label, in the study's order
@@ -59,28 +65,29 @@ class ResolvedStudy:
 
     @property
     def study(self) -> StudySettings:
-        """Which settings are compared."""
+        """The study's own settings, such as its baseline and block size."""
         return self.sweep.study
 
     @property
     def first(self) -> RolloutSettings:
-        """The first setting, for what all have in common: results folder, processes."""
+        """The first setting. Used for values that all settings share, such as the results folder."""
         return next(iter(self.settings.values()))
 
     @property
     def tasks(self) -> tuple[str, ...]:
-        """Full names of the tasks, which all settings have in common."""
+        """Full names of the tasks. They are the same for all settings."""
         return resolve_tasks(self.first.task)
 
 
 def resolve(overrides: Sequence[str]) -> ResolvedStudy:
-    """Return the chosen study with its settings composed.
+    """Compose all settings of the study that the command line chooses.
 
     Args:
-        overrides: Those of the sweep and its `study`; all others, and `results`, go to each setting.
+        overrides: The command line's `key=value` arguments. Those of `kerv sweep` and `study` configure the sweep. All
+            others, and `results`, apply to every setting.
 
     Raises:
-        UsageError: An unknown key or name; a key on the command line that the study itself varies; too many settings.
+        UsageError: An unknown key or name; a key on the command line that the study varies itself; a bad label.
     """
     of_sweep = [o for o in overrides if _key(o).split(".")[0] in SweepSettings.__dataclass_fields__]
     of_settings = [o for o in overrides if o not in of_sweep or o.startswith("results=")]
@@ -107,7 +114,7 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
 
 
 def _points(study: StudySettings, path: Path) -> dict[str, Point]:
-    """Return the points of all grids of a study, by label."""
+    """Expand every entry of the study's `settings` into the points of its grid. Return label -> point."""
     points: dict[str, Point] = {}
     for name, text in study.settings.items():
         with _line_of(path, (), f"settings.{name}"):
@@ -119,7 +126,7 @@ def _points(study: StudySettings, path: Path) -> dict[str, Point]:
 
 
 def _check_points(study: StudySettings, points: Mapping[str, Point], typed: Collection[str]) -> None:
-    """Refuse a study without settings or baseline, and typed keys that it sets itself."""
+    """Refuse a study without settings or without its baseline, or one that sets keys of the command line (`typed`)."""
     if not points:
         raise UsageError(f"study '{study.name}' has no settings: see conf/study/demo.yaml for some")
     varied = {_key(override) for point in points.values() for override in point.overrides} & set(typed)
@@ -134,13 +141,13 @@ def _check_points(study: StudySettings, points: Mapping[str, Point], typed: Coll
 
 @contextmanager
 def _line_of(path: Path, typed: Collection[str], place: str, others: Mapping[str, str] = {}) -> Iterator[None]:
-    """Put a study's file and line before the message of a UsageError.
+    """Put the study's file and line before the message of a UsageError.
 
     Args:
         path: The study's file.
-        typed: Keys on the command line; a mistake in these has no line.
-        place: The key in the file of what is read.
-        others: Key of a setting -> key in the file, for settings that are written elsewhere.
+        typed: Keys on the command line. An error about one of these gets no file and line.
+        place: Key in the file whose value is being read, such as `settings.ar`.
+        others: Maps a setting's key to the key in the file where it is written, if that is not `place`.
     """
     try:
         yield
@@ -152,13 +159,17 @@ def _line_of(path: Path, typed: Collection[str], place: str, others: Mapping[str
 
 
 def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
-    """Return the settings of `kerv rollout`: one, or with -m every point of the grid that comma lists form.
+    """Compose the settings of `kerv rollout`: one, or with -m one for each combination of the comma lists' values.
 
-    Every point runs on all tasks. The first point without a drafter is the baseline. A label is the method's name, the
-    parts that replace the method's, and the grid's values.
+    Every setting runs on all tasks. The first autoregressive setting is the baseline, or else the first of all. A label
+    consists of the method's name, the parts that replace the method's own, and the values that vary.
+
+    Args:
+        overrides: The command line's `key=value` arguments.
+        multirun: Whether -m was given.
 
     Raises:
-        UsageError: An unknown key or name, a value that cannot be, a grid over `results`.
+        UsageError: An unknown key or name, an impossible value, or several values of `results`.
     """
     tasks = [override for override in overrides if override.startswith("task=")]
     others = [override for override in overrides if override not in tasks]
@@ -179,9 +190,13 @@ def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
 
 
 def _settle(settings: Iterable[RolloutSettings], baseline: RolloutSettings, narrows: bool = False) -> None:
-    """Fill in tasks, camera and horizon, as the baseline has them.
+    """Fill in tasks, camera and horizon of all settings, as the baseline has them.
 
-    If `narrows`, only those tasks stay that the baseline's target was trained on, or all that it was trained on.
+    Args:
+        settings: The settings to change.
+        baseline: The baseline's settings.
+        narrows: Whether to keep only tasks that the baseline's target was trained on. If none is left, all tasks that
+            it was trained on are used.
     """
     tasks = list(tasks_of(baseline))
     trained = list(trained_tasks(baseline)) if narrows else []
@@ -197,7 +212,11 @@ def _is_ar(settings: RolloutSettings) -> bool:
 
 
 def idle_overrides(resolved: ResolvedStudy) -> dict[str, str]:
-    """Return why overrides have no effect: a setting's own, and those of the command line that no setting reads."""
+    """Return overrides that have no effect, each with the reason.
+
+    An override of a single setting is listed with the setting's label. One of the command line is listed if no setting
+    reads it.
+    """
     reasons: dict[str, str] = {}
     for label, settings in resolved.settings.items():
         idle = without_effect(settings, resolved.points[label].overrides, sweep=True)
@@ -207,10 +226,13 @@ def idle_overrides(resolved: ResolvedStudy) -> dict[str, str]:
 
 
 def study_name(study: str) -> str:
-    """Return the name under which `kerv sweep study=…` stores a study: for a file its `name:`, else its stem.
+    """Return the name under which the results of `kerv sweep study=STUDY` are stored.
+
+    Args:
+        study: Name of a preset, or path of a file. For a file the name is its `name:` entry, or else its file name.
 
     Raises:
-        UsageError: A file that is there and is no study.
+        UsageError: The file exists but is not a study.
     """
     path = Path(study).expanduser()
     if path.suffix not in (".yaml", ".yml"):
@@ -219,7 +241,7 @@ def study_name(study: str) -> str:
 
 
 def _outranked(overrides: Iterable[str], by: Sequence[str]) -> list[str]:
-    """Return `overrides` without the keys that `by` sets, then `by`."""
+    """Combine two lists of overrides. For keys in both lists, `by` wins."""
     keys = {_key(override) for override in by}
     return [*(override for override in overrides if _key(override) not in keys), *by]
 

@@ -1,4 +1,4 @@
-"""Episodes and decodes as rows of the database."""
+"""Converts records of episodes and decodes to rows of the database."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from kerv_cli.engine.record import PHASES, DecodeRecord, EpisodeRecord, Round
 
 INT, FLOAT, TEXT, FLAG = pa.int64(), pa.float64(), pa.string(), pa.bool_()
 Fields = dict[str, tuple[pa.DataType, Callable[..., Any]]]
-"""Column -> its type, and the function that takes its value from a record."""
+"""Column -> its type, and the function that reads its value from a record."""
 
 
 def _summed(value: Callable[[DecodeRecord], Any]) -> Callable[[EpisodeRecord], Any]:
-    """Sum over an episode's decodes. None counts as 0."""
+    """Return a function that sums a value over an episode's decodes. None counts as 0."""
     return lambda episode: sum(value(decode) or 0 for decode in episode.decodes)
 
 
 def _judged(value: Callable[[Round], int]) -> Callable[[EpisodeRecord], int]:
-    """Sum over an episode's verifications."""
+    """Return a function that sums a value over an episode's verifications."""
     return _summed(lambda decode: sum(value(one) for one in decode.rounds if one.is_verification))
 
 
 def _delay(name: str) -> Callable[[DecodeRecord], Any]:
-    """Return an attribute of a decode's delay, None if the world waited."""
+    """Return a function that reads an attribute of a decode's delay; None if the world waited."""
     return lambda decode: getattr(decode.delay, name, None)
 
 
@@ -57,30 +57,30 @@ _EPISODE: Fields = {
     **{f"seconds.{phase}": (FLOAT, _summed(_phase(phase))) for phase in PHASES},
     **_attributes("forwards"),
     "verifications": (INT, _judged(lambda one: 1)),
-    "tokens": (INT, _summed(lambda decode: len(decode.tokens))),  # committed, by whatever round
-    "committed": (INT, _judged(lambda one: one.committed)),  # by verifications, bonus included
-    "accepted": (INT, _judged(lambda one: one.accepted)),  # draft tokens, by verifications
+    "tokens": (INT, _summed(lambda decode: len(decode.tokens))),  # committed in all rounds
+    "committed": (INT, _judged(lambda one: one.committed)),  # in verifications, bonus included
+    "accepted": (INT, _judged(lambda one: one.accepted)),  # draft tokens accepted in verifications
     "first_rejected_sum": (INT, _summed(lambda decode: decode.first_rejected)),  # over chunks that had a verification
     "first_rejected_count": (INT, _summed(lambda decode: decode.first_rejected is not None)),
     "compensated_tokens": (INT, _summed(lambda decode: decode.compensated)),
     "compensated_decodes": (INT, _summed(lambda decode: decode.compensated > 0)),
     "skipped_decodes": (INT, _summed(lambda decode: decode.skipped)),
-    "unverified_tokens": (INT, _summed(lambda decode: decode.unverified)),  # executed without a target token
-    "executed_tokens": (INT, _summed(lambda decode: int(decode.actions.size))),  # steps times DoFs handed over
+    "unverified_tokens": (INT, _summed(lambda decode: decode.unverified)),  # executed but not verified by the target
+    "executed_tokens": (INT, _summed(lambda decode: int(decode.actions.size))),  # control steps × DoFs returned
     "retrieval_decodes": (INT, _summed(lambda decode: any(_looks_up(r.proposer) for r in decode.rounds))),
     "deviation_sum": (FLOAT, _summed(lambda decode: decode.deviation)),  # normalised action units, over sampled decodes
     "deviation_count": (INT, _summed(lambda decode: decode.deviation is not None)),
     "delay_decodes": (INT, _summed(lambda decode: decode.delay is not None)),  # during which the world went on
-    "delay_seconds": (FLOAT, _summed(_delay("seconds"))),  # of those: latency that the world felt
-    "delay_steps": (INT, _summed(_delay("steps"))),  # the same in control steps
-    # of those: on the chunk before; on the last action; actions of new chunks left out as stale
+    "delay_seconds": (FLOAT, _summed(_delay("seconds"))),  # sum over these decodes of the latency
+    "delay_steps": (INT, _summed(_delay("steps"))),  # the sum in control steps
+    # of these: steps on the previous chunk, steps on the last action, and actions that were too old to execute
     **{f"{name}_steps": (INT, _summed(_delay(name))) for name in ("carried", "held", "dropped")},
     **_attributes("path_length", "jerk", kind=FLOAT),  # of the end effector: metres; m/s³
     **_attributes("wall_seconds", kind=FLOAT),
     "initial_state": (pa.list_(FLOAT), lambda episode: np.asarray(episode.initial_state, np.float64).ravel().tolist()),
 }
 EPISODE_SCHEMA = pa.schema((name, kind) for name, (kind, _) in _EPISODE.items())
-"""Columns of an episode's record. The database adds its identity and when it ran."""
+"""Columns from an episode's record. The database adds the settings that it belongs to and when it ran."""
 
 _TOKENS = pa.list_(pa.int32())
 _COUNTS = ("start", "accepted", "committed", "tree_size")
@@ -103,7 +103,7 @@ _DECODE: Fields = {
     **_attributes("compensated"),
     **_attributes("skipped", kind=FLAG),
     **_attributes("variability", "similarity", "metric", "deviation", kind=FLOAT),
-    **_attributes("reason", kind=TEXT),  # of a skip rule: trusted, streak; null if it says none
+    **_attributes("reason", kind=TEXT),  # given by a skip rule: trusted, streak; null if none
     "delay_seconds": (FLOAT, _delay("seconds")),  # this and the next: null if the world waited
     "delay_steps": (INT, _delay("steps")),
     **{name: (INT, _delay(name)) for name in ("observed", "carried", "held", "dropped")},
@@ -114,7 +114,7 @@ DECODE_SCHEMA = pa.schema({**_POSITION, **{name: kind for name, (kind, _) in _DE
 
 
 def episode_row(record: EpisodeRecord) -> dict[str, Any]:
-    """Return the columns of one episode, as JSON values. NaN becomes None."""
+    """Return the columns of one episode as values that JSON can store. NaN becomes None."""
     return {name: _plain(value(record)) for name, (_, value) in _EPISODE.items()}
 
 
@@ -124,7 +124,7 @@ def _plain(value: Any) -> Any:
 
 
 def decodes_table(record: EpisodeRecord) -> pa.Table:
-    """Return the decodes of one episode, with the columns of DECODE_SCHEMA."""
+    """Return the decodes of one episode as a table with the columns of DECODE_SCHEMA, one row per decode."""
     rows = [
         {"index": index, "step": step, **{name: value(decode) for name, (_, value) in _DECODE.items()}}
         for index, (decode, step) in enumerate(zip(record.decodes, record.decode_steps, strict=True))
@@ -133,17 +133,22 @@ def decodes_table(record: EpisodeRecord) -> pa.Table:
 
 
 def table_blob(table: pa.Table) -> bytes:
-    """Return a table as a compressed Parquet file."""
+    """Return a table as the bytes of a compressed Parquet file."""
     buffer = io.BytesIO()
     pq.write_table(table, buffer, compression="zstd")
     return buffer.getvalue()
 
 
 def read_decodes(blob: bytes, columns: Sequence[str] | None = None) -> pa.Table:
-    """Return the decodes in a blob of `table_blob`, or only `columns`."""
+    """Return the table of decodes in the bytes that `table_blob` wrote.
+
+    Args:
+        blob: A Parquet file.
+        columns: Columns to read; None for all.
+    """
     return pq.read_table(io.BytesIO(blob), columns=columns, use_threads=False)
 
 
 def seconds_blob(seconds: Iterable[float]) -> bytes:
-    """Return the seconds of each decode as little-endian float64."""
+    """Return the seconds of each decode as bytes, little-endian float64."""
     return np.asarray(list(seconds), dtype="<f8").tobytes()

@@ -1,7 +1,7 @@
-"""Runs episodes in the worlds of this process: one after the other, or several at once.
+"""Runs episodes in the worlds (open environments) of this process: one after the other, or several at once.
 
-All settings of a process share weights, datastores and worlds. They do not share frames and decoders: a setting with
-the frames of another would decode with warm caches, and a skip's level may follow the episodes of its own block.
+All settings in a process share weights, datastores and worlds, but each has its own rendered images and decoder.
+Shared images would give a setting warm caches, and a skip rule's threshold may depend on the episodes before it.
 """
 
 from __future__ import annotations
@@ -35,16 +35,19 @@ OpenWorld = Callable[[str], World]
 """Opens a new world for a task."""
 
 TOGETHER = 16
-"""Episodes that a training's validation decodes together. Their worlds take 1.5 GB if they are drawn."""
+"""Episodes that run at once in the validation of a training. With rendering, their worlds take 1.5 GB."""
 
-_WORLDS = 4  # kept open per process; one that is drawn takes about 90 MB
+_WORLDS = 4  # kept open per process; one with rendering takes about 90 MB
 _opened: OrderedDict[tuple[str, CameraSettings, int], World] = OrderedDict()  # the most recently used one is last
 
 
 def open_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) -> World:
-    """Return this process's world for a task, camera and horizon, with the stress of its next episodes.
+    """Return this process's world for a task. It is opened if needed; the most recently used worlds stay open.
 
-    The worlds used last stay open.
+    Args:
+        task: Name of the task.
+        settings: Camera and horizon.
+        stress: Disturbance in the next episodes.
     """
     spec = spec_of(task)
     key = task, spec.camera(settings.camera), settings.horizon
@@ -58,22 +61,22 @@ def open_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) -
 
 
 def new_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) -> World:
-    """Return a new world for a task, which the caller closes."""
+    """Open a further world for a task. The caller must close it."""
     world = spec_of(task).open_world(task, settings.camera, settings.horizon)
     world.stress = stress
     return world
 
 
 def close_worlds() -> None:
-    """Close every open world."""
+    """Close every world that `open_world` keeps open."""
     while _opened:
         _opened.popitem()[1].close()
 
 
 class Runner:
-    """One setting on one task, with its decoder built and warmed up.
+    """Runs episodes of one setting on one task. Its decoder is built and warmed up once.
 
-    Episodes may alternate with those of other runners: decoders share no state.
+    Its episodes may alternate with those of other runners, because decoders share no state.
     """
 
     def __init__(self, settings: RolloutSettings, task: str) -> None:
@@ -84,34 +87,46 @@ class Runner:
         self._recording = dataclasses.replace(settings.world.camera, size=settings.record_size, supersample=1)
 
     def episode(self, seed: int, recorded: bool = False, on_step: OnStep | None = None) -> EpisodeRecord:
-        """Run the episode of a seed. Its record has frames if `recorded`."""
+        """Run one episode, and return its record.
+
+        Args:
+            seed: Seed of the initial state.
+            recorded: Whether the record keeps images.
+            on_step: Called after each control step.
+        """
         world = open_world(self.task, self.settings.world, self.stress)  # another runner may have closed it since
         return run_episode(world, self.decoder, seed, self._recording if recorded else None, self.clock, on_step)
 
 
 @dataclass(frozen=True)
 class Request(Generic[K]):
-    """An episode to run."""
+    """An episode to run: a task and a seed, with a key by which the caller recognises it."""
 
-    key: K  # tells the caller whose it is
+    key: K  # the caller's, returned with the result
     task: str
     seed: int
 
 
 EpisodeEnd = tuple[Request[K], EpisodeRecord | Exception]
-"""A request, and its record or the error that its world raised.
+"""A request, with the record of its episode or the error that its world raised.
 
-The record's wall_seconds are its share: a decode's time is divided by the episodes that were decoded together.
+The record's `wall_seconds` contain only the episode's share of a batch: a decode's time divided by its episodes.
 """
 
 
 def run_together(
     decoder: BatchDecoder, requests: Iterable[Request[K]], batch: int, open_world: OpenWorld
 ) -> Iterator[EpisodeEnd[K]]:
-    """Run the episodes, at most `batch` at a time, and yield each as it ends.
+    """Run several episodes at once. Yield each request when its episode ends, with the record or the error.
 
-    A world is opened when an episode needs one and closed when its task has no episode left. The slots of a batch go to
-    different tasks while there are enough of them, because opening a world costs more than resetting one.
+    A world is opened when an episode needs one, and closed when its task has no episodes left. The places in the batch
+    go to different tasks if possible, because opening a world takes longer than resetting one.
+
+    Args:
+        decoder: Decodes the observations of all running episodes together.
+        requests: The episodes to run.
+        batch: Maximum number of episodes that run at the same time.
+        open_world: Opens a world for a task.
     """
     waiting = list(requests)
     slots: list[_Slot[K]] = [_Slot(decoder.new_episode(), open_world) for _ in range(min(batch, len(waiting)))]
@@ -138,14 +153,14 @@ def run_together(
 
 
 def _take(waiting: list[Request[K]], task: str) -> Request[K]:
-    """Take the next request of a task. If it has none left, take one of the task with the most."""
+    """Remove and return a request of `task`. If it has none, take one of the task with the most requests."""
     counts = Counter(request.task for request in waiting)
     wanted = task if counts[task] else counts.most_common(1)[0][0]
     return waiting.pop(next(i for i, request in enumerate(waiting) if request.task == wanted))
 
 
 class _Slot(Generic[K]):
-    """A slot of the batch: its open world and the episode that runs in it."""
+    """One place in the batch: an open world and the episode that runs in it."""
 
     def __init__(self, state: EpisodeState, open_world: OpenWorld) -> None:
         self.state, self.open_world = state, open_world
@@ -163,7 +178,11 @@ class _Slot(Generic[K]):
         return (yield from episode(self.world, self.state, request.seed))
 
     def advance(self, decode: DecodeRecord | None) -> Iterator[EpisodeEnd[K]]:
-        """Execute a decode, None at the beginning, until the next observation. Yield the episode if it ends."""
+        """Execute a decode's actions until the next observation. Yield the request and its result if the episode ends.
+
+        Args:
+            decode: Record with the actions; None to start the episode.
+        """
         began, request = time.perf_counter(), self.request
         assert request is not None
         try:
@@ -186,7 +205,12 @@ class _Slot(Generic[K]):
 
 
 def run_batch(settings: RolloutSettings, requests: Iterable[Request[K]]) -> Iterator[EpisodeEnd[K]]:
-    """Run episodes of one setting on any tasks, `rollout.batch` at a time. None is recorded."""
+    """Run episodes of one setting, `rollout.batch` at a time, without recording images.
+
+    Args:
+        settings: The rollout's settings.
+        requests: The episodes to run, of any tasks.
+    """
     decoder, world = batch_decoder_for(settings), settings.world
     return run_together(
         decoder, requests, settings.rollout.batch, lambda task: new_world(task, world, build_stress(world.stress))
@@ -194,17 +218,17 @@ def run_batch(settings: RolloutSettings, requests: Iterable[Request[K]]) -> Iter
 
 
 def is_recorded(settings: RolloutSettings, seed: int) -> bool:
-    """Return whether the episode of a seed keeps its frames.
+    """Return whether the episode with this seed keeps its images.
 
-    The first `settings.record` do, or all if it is negative; none of a batch does.
+    The first `settings.record` episodes of a task do, or all if it is negative. Episodes of a batch never do.
     """
     return settings.rollout.batch == 1 and (settings.record < 0 or seed - settings.seed < settings.record)
 
 
 def success_of(target: Target, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:
-    """Return the share in [0, 1] of successful episodes over tasks and seeds.
+    """Return the share in [0, 1] of successful episodes, over all pairs of a task and a seed.
 
-    The target decodes as it was trained to: autoregressively or in parallel.
+    The target decodes as it was trained to, autoregressively or in parallel.
     """
     decoder = BatchDecoder(native_decoder(target))
     requests = [Request(None, task, seed) for task in tasks for seed in seeds]

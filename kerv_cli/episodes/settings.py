@@ -1,4 +1,4 @@
-"""Settings of rollouts and studies."""
+"""Settings of rollouts and of studies, which compare several settings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MEASURED, CONSTANT, PROFILE = "measured", "constant", "profile"
 
 @dataclass
 class TimingSettings:
-    """What the world does while the policy decodes (docs/methods.md §8)."""
+    """Settings `rollout.*`: what the world does while the policy decodes (docs/methods.md §8)."""
 
     clock: str = choice(WAITS, WAITS, REAL, help="whether the world waits while the policy decodes, or goes on")
     latency: str = choice(MEASURED, MEASURED, CONSTANT, PROFILE, help="how long a decode takes for the world")
@@ -33,8 +33,12 @@ class TimingSettings:
     def check_together(self, prefix: str) -> None:
         """Refuse settings that exclude each other.
 
+        Args:
+            prefix: Text before each setting's name in the error message: `rollout.`.
+
         Raises:
-            UsageError: latency=profile without a profile, or a batch, which has no times, with clock=real.
+            UsageError: latency=profile without a profile, or a batch with clock=real (decodes of a batch have no
+                times).
         """
         if self.batch > 1 and self.clock == REAL:
             raise UsageError(
@@ -47,18 +51,18 @@ class TimingSettings:
 
 
 DEFAULT_TASKS = ["MT10"]
-"""Default tasks, if the target names none."""
+"""Default tasks, if the target's description names none."""
 
 
 @dataclass
 class RolloutSettings(MethodSettings, TaskSettings):
-    """`kerv rollout`: episodes of one method."""
+    """Settings of `kerv rollout`: episodes of one method."""
 
-    # a method's file overrides its parts, so it comes last
+    # last, because a method's file overrides the parts chosen before
     groups: ClassVar = {"policy": "vision", "world": "default", "runtime": "cpu", "method": "ar"}
 
     episodes: int = number(3, 1, 1_000_000, help="episodes per task")
-    # the same in every setting, so that episodes are paired
+    # equal in all settings of a study, so that episodes with the same start are compared
     seed: int = number(EVALUATION_SEED, 0, 2**31 - 1, help="first seed; episode i has seed + i")
     world: RolloutWorldSettings = setting(RolloutWorldSettings, "camera, length of an episode, stress")
     rollout: TimingSettings = setting(TimingSettings, "what the world does while the policy decodes")
@@ -68,12 +72,12 @@ class RolloutSettings(MethodSettings, TaskSettings):
 
     def __post_init__(self) -> None:
         if self.policy.kind == EXPERT:
-            self.method = EXPERT  # it decodes nothing, so no method's name fits
+            self.method = EXPERT  # the expert uses no decoding method
 
 
 @dataclass
 class StudySettings:
-    """`conf/study/*.yaml`: which settings are compared."""
+    """Contents of a study's file, `conf/study/*.yaml`: which settings are compared with which baseline."""
 
     name: str = setting("", "name in the results; empty: the file's")
     title: str = setting("", "title of its tables and plots")
@@ -88,7 +92,10 @@ class StudySettings:
 
 @dataclass
 class SweepSettings(CommandSettings):
-    """`kerv sweep`: a study. Everything else on the command line goes to each of its settings."""
+    """Settings of `kerv sweep`, which runs a study: a comparison of several settings.
+
+    All other overrides on the command line apply to every setting of the study.
+    """
 
     groups: ClassVar = {"study": "threshold"}
 
@@ -96,11 +103,11 @@ class SweepSettings(CommandSettings):
     until: str = choice(
         "done", "done", "decided", help="run every planned episode, or stop a setting once its question is answered"
     )
-    # timed: settings whose times were not taken in turn with the baseline's; changed: episodes of other code
+    # timed: settings that were not timed alternately with the baseline; changed: episodes that other code ran
     rerun: str = choice("never", "never", "timed", "changed", "all", help="which existing episodes run again")
     loss: float = number(3.0, above=0, most=99.9, help="until=decided: is the loss of success below so many points?")
 
 
 def settings_from(plain: Mapping[str, Any]) -> RolloutSettings:
-    """Return the settings of a rollout from nested dicts and lists."""
+    """Build a rollout's settings from nested dictionaries and lists, as they are stored."""
     return read_settings(RolloutSettings, plain)
