@@ -1,13 +1,16 @@
-"""Execute the operations of a `Program` on one CPU core: `run`, compiled by numba.
+"""Kernels that execute a recorded `Program` on one CPU core. numba compiles `run` and everything that it calls.
 
-Each row of a batch has a frame of float32 numbers that operations read and write. Weights stay as they are stored (half
-precision, or int8 and a scale per output): registers expand them, sums are float32.
+- A *frame* is the float32 memory of one row of a batch. Operations read and write it. A *place* is an index in a frame.
+- A *panel* is a block of 64 outputs of a weight matrix, whose weights are stored side by side.
+- Weights stay in their stored format (half precision, or int8 and a scale per output). They become float32 in the CPU's
+  vector registers. All sums are float32.
 
-A row has the same bits alone and among many rows: a product adds its terms in the order of the inputs, one output per
-vector lane, and a softmax does not depend on slots that a row does not see. So a verification of sixteen tokens gives
-the very logits of sixteen single forwards, and strict acceptance equals autoregressive decoding even in near ties. With
-another kernel for many rows they would matter: this file's logits and torch's differ by up to 2e-5 (mt10-vision), and
-in 1 of 2,550 tokens the two best logits lie closer than twice that. So processors may decode differently in rare ties.
+The result of a row has the same bits whether it is computed alone or with other rows. For this, a matrix multiplication
+adds its terms in the order of the inputs, one output per vector lane, and a softmax does not depend on slots that are
+hidden from the row. A verification of 16 tokens therefore gives exactly the logits of 16 single forwards, and strict
+acceptance equals autoregressive decoding even if two logits are almost equal. With a different kernel for many rows it
+would not: the logits of this file and of torch differ by up to 2e-5 (mt10-vision), and in 1 of 2,550 tokens the two
+best logits are closer than twice that. For the same reason two types of CPU may decode such a token differently.
 
 Measured on an AMD EPYC (Zen 5), 3.5 M weights with 192 inputs: 1 row 0.06 ms, 16 rows 0.42 ms, 31 rows 0.84 ms. oneDNN
 takes 0.78 ms and 1.21 ms for 16 and 31 rows, OpenBLAS 1.19 ms and 2.44 ms.
@@ -32,19 +35,28 @@ from kerv_cli.targets.compact.recording import FLOAT, HALF, INT8, PANEL
 
 FEATURES = (numba.config.CPU_FEATURES or get_host_cpu_features()).split(",")
 EXPANDS_HALF = "+f16c" in FEATURES or platform.machine() in ("aarch64", "arm64")
-"""Whether the CPU expands half precision in registers; else `Program` stores float32."""
+"""Whether the CPU can convert half precision to float32 in registers. If not, such weights are stored as float32."""
 LANES = PANEL if "+avx512f" in FEATURES else 16
-"""Outputs that several rows compute at once: their sums must fit into the vector registers."""
+"""Number of outputs whose sums are computed at once for several rows. The sums must fit into the vector registers."""
 FAST = {"contract", "reassoc", "nsz"}
 compiled = numba.njit(error_model="numpy", fastmath=FAST)
 NUMBER, WORD, LANE, VOID, ADDRESS = ir.FloatType(), ir.IntType(64), ir.IntType(32), types.void, types.intp
 
 
 def _tile(rows: int, kind: int, lanes: int) -> Callable[..., None]:
-    """Make the innermost loop: some rows times a panel of weights, all sums of `lanes` outputs in registers.
+    """Generate the innermost loop of a matrix multiplication: y = (x · weights) · scale + bias.
 
-    Its arguments are addresses: weights (inputs, PANEL); factors, a scale and a bias per output; x and y, the rows and
-    their results, `stride` and `step` bytes apart. y = (x · weights) · scale + bias.
+    It multiplies `rows` rows with `lanes` outputs of one panel (a block of 64 outputs). All sums stay in registers.
+
+    Args:
+        rows: Number of rows that are multiplied at once.
+        kind: Number format of the weights: HALF, INT8 or FLOAT.
+        lanes: Number of outputs that are computed at once.
+
+    Returns:
+        A function of (weights, factors, inputs, x, stride, y, step). `inputs` is a count. `weights` (inputs, PANEL),
+        `factors` (2, PANEL; scales, then biases), `x` and `y` are memory addresses. The rows of x are `stride` bytes
+        apart, those of y `step` bytes.
     """
     stored, size = {HALF: (ir.HalfType(), 2), INT8: (ir.IntType(8), 1), FLOAT: (NUMBER, 4)}[kind]
     vector, fused = ir.VectorType(NUMBER, lanes), {"flags": ("contract",)}
@@ -91,7 +103,14 @@ def _tile(rows: int, kind: int, lanes: int) -> Callable[..., None]:
 
 
 def _product(kind: int, size: int) -> Callable[..., None]:
-    """Make the product of rows with a matrix of panels, whose weights have `size` bytes; arguments as of `_tile`."""
+    """Return a function that multiplies any number of rows with a whole matrix.
+
+    Its arguments are those of a `_tile`, with the number of panels and of rows. Addresses are those of the first panel.
+
+    Args:
+        kind: Number format of the weights: HALF, INT8 or FLOAT.
+        size: Bytes of one weight.
+    """
     one, two, four = _tile(1, kind, PANEL), _tile(2, kind, LANES), _tile(4, kind, LANES)
 
     @compiled
@@ -132,7 +151,10 @@ def _shift(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 get = intrinsic(lambda typing, address, index: (types.float32(ADDRESS, ADDRESS), _read))
 put = intrinsic(lambda typing, address, index, value: (VOID(ADDRESS, ADDRESS, types.float32), _write))
 times_two_to = intrinsic(lambda typing, x, power: (types.float32(types.float32, types.float32), _shift))
-"""Read or write the float32 number at an index after an address; x · 2^power, for a whole power from −126 to 127."""
+"""`get` reads and `put` writes the float32 number at an index after a memory address.
+
+`times_two_to` returns x · 2^power for an integer power from −126 to 127.
+"""
 
 _LOG2_E, _LN_2, _LN_2_REST = np.float32(math.log2(math.e)), np.float32(0.693359375), np.float32(-2.12194440e-4)
 _T2, _T3, _T4, _T5, _T6, _T7 = (np.float32(1 / math.factorial(n)) for n in range(2, 8))
@@ -141,7 +163,7 @@ _ZERO, _ONE, _TWO, _LOWEST = np.float32(0), np.float32(1), np.float32(2), np.flo
 
 @compiled
 def exponential(x):
-    """Return e^x with an error of two or three units in the last place. Loops over it become vectors."""
+    """Return e^x with an error of two or three units in the last place. The compiler can vectorise loops over it."""
     x = min(max(x, np.float32(-87)), np.float32(88))
     power = np.rint(x * _LOG2_E)
     x = (x - power * _LN_2) - power * _LN_2_REST
@@ -151,14 +173,22 @@ def exponential(x):
 
 @compiled
 def copy(x, to, count):
-    """Copy numbers from one address to another."""
+    """Copy `count` float32 numbers from address `x` to address `to`."""
     for i in range(count):
         put(to, i, get(x, i))
 
 
 @compiled
 def rotate(x, to, cos, sin, channels):
-    """Rotate a head's channels; the sign of the swapped half is in the sines."""
+    """Apply rotary position embedding to one head of one token.
+
+    Args:
+        x: Address of the head's `channels` numbers.
+        to: Address of the result.
+        cos: Address of the cosines.
+        sin: Address of the sines. Those of the first half are negative.
+        channels: C, size of the head.
+    """
     half = channels // 2
     for c in range(half):
         first, second = get(x, c), get(x, c + half)
@@ -168,9 +198,16 @@ def rotate(x, to, cos, sin, channels):
 
 @numba.njit(error_model="numpy", fastmath=FAST - {"reassoc"} | {"nnan"})
 def softmax(scores, slots, scale, mask, stop):
-    """Turn scores into weights; slots from `stop` on, and those whose mask is not 0, weigh exactly nothing.
+    """Turn attention scores into weights, in place. Hidden slots get exactly 0, whatever they hold.
 
-    The sum has 16 parts that hidden slots do not change. mask: an address, or 0: none.
+    The sum is added up in 16 parts, so that hidden slots change no rounding.
+
+    Args:
+        scores: Address of the scores, one per slot of the cache.
+        slots: Number of slots.
+        scale: Factor of the scores, 1/√C.
+        mask: Address of a number per slot. A slot is hidden if it is not 0. The address 0 hides none.
+        stop: Slots from this index on are hidden.
     """
     for s in range(stop, slots):
         put(scores, s, _LOWEST)
@@ -195,15 +232,19 @@ def softmax(scores, slots, scale, mask, stop):
 
 @compiled
 def attention(frames, out, qkv, tables, cache, start, filled, mask, keys, values):
-    """Rotate the queries and keys of all rows, append keys and values to a layer's cache, and attend.
+    """Compute one layer's attention for T new tokens of B sequences, and append their keys and values to the cache.
 
     Args:
-        frames: (B · T, size); `out` and `qkv` are places in a frame.
-        tables: (T, 2, C) cosines and sines of the rows' positions.
-        cache: (2, B, A, slots, C), of which `start` slots are valid. `filled` of them are in `keys` and `values`.
-        mask: (T, start + T), 0 for the slots that a row sees; (0, 1): all before it.
-        keys: (B · A, panels, C, PANEL) the cache's keys, a matrix with an output per slot.
-        values: (B · A, panels, slots, PANEL) the cache's values, a matrix with an output per channel.
+        frames: (B · T, size), one frame (memory) per token.
+        out: Place (index in a frame) of the result, E numbers.
+        qkv: Place of queries, keys and values, 3 E numbers, not yet rotated.
+        tables: (T, 2, C) rotary cosines and sines of the tokens' positions.
+        cache: (2, B, A, slots, C) keys and values of this layer, for A heads of C channels.
+        start: Number of valid slots in the cache. The new tokens get the next T slots.
+        filled: Number of slots that `keys` and `values` hold already.
+        mask: (T, start + T), 0 for slots that a token sees. Shape (0, 1) means that attention is causal.
+        keys: (B · A, panels, C, PANEL) the cache's keys as weights of a matrix with one output per slot.
+        values: (B · A, panels, slots, PANEL) the cache's values as weights of a matrix with one output per channel.
     """
     tokens, heads, channels = tables.shape[0], cache.shape[2], tables.shape[2]
     stop, size, panels, parts = start + tokens, 4 * frames.shape[1], keys.shape[1], values.shape[1]
@@ -241,7 +282,15 @@ def attention(frames, out, qkv, tables, cache, start, filled, mask, keys, values
 
 @compiled
 def elementwise(code, frame, columns, numbers, indices):
-    """Execute an operation other than LINEAR and ATTEND on one frame."""
+    """Execute one operation on one frame, the memory of a row. LINEAR and ATTEND are executed elsewhere.
+
+    Args:
+        code: The operation, such as ADD.
+        frame: (size,) float32.
+        columns: Its line in the table of operations, see `recording.COLUMNS`.
+        numbers: Constants of all operations.
+        indices: Places that GATHER operations copy from.
+    """
     out, a, b = columns[1], columns[2], columns[3]
     rows, width, stride, first = columns[4], columns[5], columns[6], columns[7]
     size = rows * width
@@ -292,17 +341,22 @@ SIGNATURE = types.void(*_TABLES, _F[:, ::1], _I[::1], _I, _F[:, :, :, :, :, ::1]
 
 @numba.njit(SIGNATURE, error_model="numpy", fastmath=FAST, cache=True)
 def run(ops, times, last, indices, numbers, frames, positions, start, cache, mask, results):
-    """Execute the operations `times` times, the last time only the first `last` of them.
+    """Execute a table of operations on all frames, `times` times.
+
+    After each execution the rotary positions and the number of cached tokens grow by one.
 
     Args:
-        ops: (operations, columns) as in `recording.COLUMNS`.
-        indices, numbers: What the operations refer to.
-        frames: (B · T, size) memory, a frame per row.
-        positions: (T,) rotary positions; they and the cache move on by one each time.
-        start: Slots of the cache that are valid.
-        cache: (layers, 2, B, A, slots, C).
-        mask: (T, start + T), 0 for the slots that a row sees; (0, 1): all before it.
-        results: (times, B · T) what ARGMAX found, each time.
+        ops: (operations, columns) int64, see `recording.COLUMNS`.
+        times: Number of executions.
+        last: Number of operations in the last execution, which needs none after the ARGMAX.
+        indices: Places (indices in a frame) that GATHER operations copy from.
+        numbers: Constants of all operations.
+        frames: (B · T, size) float32, one frame (memory) per row. They hold the inputs, and afterwards the outputs.
+        positions: (T,) rotary positions of the first execution.
+        start: Number of valid slots in the cache at the beginning.
+        cache: (layers, 2, B, A, slots, C) keys and values, to which new ones are appended.
+        mask: (T, start + T), 0 for slots that a row sees. Shape (0, 1) means that attention is causal.
+        results: (times, B · T), filled with the result of ARGMAX in each execution.
     """
     rows, size = frames.shape
     tokens, memory, held = len(positions), frames.ctypes.data, cache.shape[0] if times > 1 else 1
@@ -317,7 +371,7 @@ def run(ops, times, last, indices, numbers, frames, positions, start, cache, mas
             if code == op.LINEAR:
                 weights, factors, panels, kind = columns[9], columns[10], columns[11], columns[12]
                 many, each, stride, step = lines, rows, 4 * columns[6], 4 * columns[8]
-                if lines == 1:  # the rows of all frames together
+                if lines == 1:  # one row per frame: multiply those of all frames together
                     many, each, stride, step = rows, 1, 4 * size, 4 * size
                 for r in range(each):
                     x, y = memory + 4 * (r * size + a), memory + 4 * (r * size + out)

@@ -1,7 +1,10 @@
-"""Compiled networks: what a torch module computes, recorded once and executed by `kernels.run` in one call.
+"""Run a torch module on a CPU as a `Program`: operations that are recorded once and executed by one compiled call.
 
-numba compiles the kernels on their first use on a machine and keeps them in `__pycache__`, in a folder of the user's if
-that cannot be written, or in NUMBA_CACHE_DIR.
+A program computes in *frames*: the float32 memory of one row of a batch. A *place* is the index of a number in a frame.
+`recording.py` explains both, and how a module becomes a table of operations.
+
+numba compiles the kernels when they are first used on a machine. It stores the machine code in NUMBA_CACHE_DIR if that
+is set, else in `__pycache__`. If that cannot be written it takes the user's cache folder, else a temporary folder.
 """
 
 from __future__ import annotations
@@ -29,7 +32,10 @@ _LOG = logging.getLogger("kerv")
 
 @functools.lru_cache(maxsize=1)
 def kernels() -> ModuleType:
-    """Return the compiled kernels. The first process on a machine compiles them and says so; others wait for it."""
+    """Return the module of compiled kernels.
+
+    The first process on a machine compiles them and logs a warning that this takes ten seconds. Others wait for it.
+    """
     import numba
     from numba.core import event
 
@@ -53,18 +59,27 @@ def kernels() -> ModuleType:
 
 
 class Matrix:
-    """A linear layer's weights in panels of 64 outputs, in the smallest format that holds them without loss.
+    """The weights of a linear layer, stored panel by panel: a panel is a block of 64 outputs that lie side by side.
+
+    The format is the smallest that holds the weights without loss: int8 with a scale per output, float16 or float32.
+
+    Args:
+        weight: (outputs, inputs) float32.
+        bias: (outputs,) float32. None means zeros.
 
     Attributes:
-        columns: Its columns of an operation.
+        values: (panels, inputs, PANEL) weights.
+        factors: (panels, 2, PANEL) scale and bias of every output.
+        columns: Entries of the table of operations that locate this matrix (see `recording.COLUMNS`).
         nbytes: Bytes of the weights.
     """
 
     def __init__(self, weight: Tensor, bias: Tensor | None) -> None:
         outputs, inputs = weight.shape
-        steps = weight.abs().amax(1, keepdim=True).div(127).clamp_min(1e-30)  # as `checkpoint.compact` has them
+        steps = weight.abs().amax(1, keepdim=True).div(127).clamp_min(1e-30)  # the scales of `checkpoint.compact`
         whole, scale, panels = (weight / steps).round(), torch.ones(outputs), -(-outputs // PANEL)
-        if weight.any() and torch.equal(whole * steps, weight):  # zeros of a grown layer cost what others cost
+        # zeros would fit into int8, but a grown layer's zeros must cost as much as trained weights
+        if weight.any() and torch.equal(whole * steps, weight):
             kind, values, scale = INT8, whole.to(torch.int8), steps[:, 0]
         elif kernels().EXPANDS_HALF and torch.equal(weight.half().float(), weight):
             kind, values = HALF, weight.half()
@@ -79,11 +94,11 @@ class Matrix:
 
 
 _MATRICES = WeakIdKeyDictionary()
-"""The matrices of weights, so that programs with the same layer share them."""
+"""Weight tensor -> its `Matrix`. Programs with the same layer share it."""
 
 
 def matrix_of(weight: Tensor, bias: Tensor | None) -> Matrix:
-    """Return the matrix of a parameter."""
+    """Return the `Matrix` of a linear layer. It is built once per weight tensor."""
     if weight not in _MATRICES:
         _MATRICES[weight] = Matrix(weight.detach(), bias)
     found: Matrix = _MATRICES[weight]
@@ -91,26 +106,29 @@ def matrix_of(weight: Tensor, bias: Tensor | None) -> Matrix:
 
 
 def stored_bytes(module: torch.nn.Module) -> float:
-    """Return the bytes of a module's parameters: of its matrices as they are stored, four each of the others."""
+    """Return how many bytes a module's parameters take in its program.
+
+    A weight with a `Matrix` counts in its stored format. Every other parameter counts as float32.
+    """
     return sum(_MATRICES[p].nbytes if p in _MATRICES else 4.0 * p.numel() for p in module.parameters())
 
 
 def forget(module: torch.nn.Module) -> None:
-    """Forget the matrices of a module, whose weights may have changed."""
+    """Discard the stored matrices of a module, whose weights may have changed."""
     for parameter in module.parameters():
         _MATRICES.pop(parameter, None)
 
 
 class Program:
-    """A function of tensors, compiled. It copies and pickles as None, because its table holds addresses."""
+    """A compiled function of tensors. It is copied and pickled as None, because it holds memory addresses."""
 
     def __init__(self, function: Callable[..., Any], *shapes: Sequence[int], repeats: bool = False) -> None:
-        """Record a function.
+        """Record a function as a table of operations.
 
         Args:
-            function: Takes float32 tensors and returns one or a tuple of them.
-            shapes: Of its inputs; the first dimension is 1 and stands for any number of rows.
-            repeats: Whether `repeat` is wanted: the outputs then become the next inputs.
+            function: Takes float32 tensors and returns a tensor or a tuple of tensors.
+            shapes: Shape of each input. Its first dimension is 1 and stands for any number of rows.
+            repeats: Whether `repeat` will be called. Each output then becomes the input of the same index.
         """
         tape = Tape()
         with torch.no_grad():
@@ -139,13 +157,17 @@ class Program:
     def __call__(
         self, *inputs: Tensor, positions: Tensor | None = None, cache: Cache | None = None, mask: Tensor | None = None
     ) -> list[Tensor]:
-        """Return the outputs, each with as many rows as the inputs have.
+        """Compute the outputs. Each has one row per row of the inputs.
 
         Args:
-            inputs: (B, …); B sequences of T tokens where the program attends, (B, T, …).
-            positions: (T,) rotary positions.
-            cache: The keys and values of earlier tokens; the new ones are written behind them.
-            mask: From `attention_mask`.
+            inputs: (rows, …). With attention (B, T, …), which are B · T rows: B sequences of T tokens.
+            positions: (T,) rotary positions. None if the program has no attention.
+            cache: Keys and values of earlier tokens. Those of the new tokens are written after them, but `cache.length`
+                stays as it is. None: there are no earlier tokens.
+            mask: Result of `attention_mask`. None: attention is causal.
+
+        Returns:
+            The outputs, (rows, …) each.
         """
         frames, _ = self._execute(inputs, 1, positions, cache, mask)
         found = []
@@ -155,7 +177,16 @@ class Program:
         return found
 
     def repeat(self, times: int, *inputs: Tensor, cache: Cache) -> np.ndarray:
-        """Execute it `times` times, its outputs the next inputs -> (times, B) what ARGMAX gave each time."""
+        """Execute the program several times in one call. The outputs of one execution are the inputs of the next.
+
+        Args:
+            times: Number of executions.
+            inputs: Inputs of the first execution, one token of each of B sequences.
+            cache: Keys and values of earlier tokens. Each execution appends those of one token.
+
+        Returns:
+            (times, B) float32, the result of the ARGMAX operation in each execution.
+        """
         return self._execute(inputs, times, torch.tensor([cache.length]), cache, None)[1]
 
     def _execute(

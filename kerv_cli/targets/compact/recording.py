@@ -1,7 +1,15 @@
-"""Record what a torch module computes as a table of operations: run it on a stand-in for a tensor.
+"""Record the computation of a torch module as a table of operations, so that a network is defined once, in torch.
 
-So a network is defined once, in torch. A `Recorded` value knows the place of each of its elements in a frame of
-numbers. Views (slices, reshapes, concatenations) only move these places; everything else becomes an operation.
+The module runs once on `Recorded` values, which stand for tensors. Every operation on them is appended to a tape.
+
+- A *frame* is the float32 memory of one row of a batch: all inputs, intermediate values and outputs of that row.
+- A *place* is the index of one number in a frame.
+- A *register* is a contiguous range of places that holds the elements of one tensor.
+- A *tape* is the list of the operations that were recorded so far, with their constants.
+- A *panel* is a block of 64 outputs of a weight matrix, whose weights are stored together.
+
+A `Recorded` value knows the place of each of its elements. A view (slice, reshape, concatenation) only selects or
+reorders these places. Everything else becomes an operation.
 """
 
 from __future__ import annotations
@@ -15,19 +23,36 @@ import torch.nn.functional as F
 from torch import Tensor
 
 LINEAR, NORM, SILU, TANH, ADD, MULTIPLY, AFFINE, CLAMP, GATHER, EMBED, ARGMAX, ATTEND = range(12)
-"""What an operation computes."""
+"""Codes of the operations."""
 HALF, INT8, FLOAT = range(3)
-"""How the weights of a product are stored."""
+"""Number formats in which the weights of a matrix can be stored: float16, int8 with a scale per output, float32."""
 PANEL = 64
-"""Outputs of a matrix that lie side by side."""
+"""Number of outputs in a panel. A matrix is stored panel by panel."""
 COLUMNS = ["code", "out", "a", "b", "rows", "width", "stride", "first", "step", "weights", "factors", "panels", "kind"]
-"""Columns of a table of operations. out, a, b: places in a frame. first: a place in the table's numbers or indices."""
-_ALIGNED = 16
+"""Columns of the table of operations, all int64. A column that an operation does not use is 0.
+
+code: The operation, `LINEAR` to `ATTEND`.
+out, a, b: Place of the first element of the result, of the first input and of the second input.
+rows, width: Number of rows of the input, and of elements per row.
+stride: Distance between two input rows in elements. For ATTEND the index of the layer in the cache.
+first: Index of the operation's first constant in `Tape.numbers`; for GATHER of its first index in `Tape.indices`.
+step: Distance between two result rows in elements.
+weights, factors: Memory addresses of a matrix's weights, and of its scales and biases.
+panels: Number of panels of the matrix.
+kind: Number format of the weights, HALF, INT8 or FLOAT.
+"""
+_ALIGNED = 16  # registers begin at multiples of this place
 _VIEWS = frozenset({"view", "flatten", "unflatten", "chunk", "split", "expand"})
 
 
 class Recorded:
-    """Stands for a float32 tensor of batch 1 on a CPU. place: of each element in a frame, a tensor of its shape."""
+    """Stand-in for a float32 tensor of batch size 1 on a CPU. Operations on it are recorded, not computed.
+
+    Attributes:
+        tape: The tape that records its operations.
+        place: Integer tensor of the same shape. It holds the place of each element, its index in a frame.
+        shape: The shape of the tensor.
+    """
 
     requires_grad = is_cuda = False
     dtype, device = torch.float32, torch.device("cpu")
@@ -53,7 +78,7 @@ class Recorded:
         return Recorded(self.tape, self.place[index])
 
     def to(self, *_: Any) -> Recorded:
-        """Return itself: a recording knows one number format."""
+        """Return the value unchanged. Recorded values are always float32 on a CPU."""
         return self
 
     def __add__(self, other: Any) -> Recorded:
@@ -69,29 +94,38 @@ class Recorded:
         return self.affine(1.0 / other, 0.0)
 
     def affine(self, factor: Any, offset: Any) -> Recorded:
-        """Return self · factor + offset, of constants."""
+        """Return self · factor + offset. Both are constants: numbers, or tensors that broadcast with this value."""
         constants = [torch.as_tensor(x, dtype=torch.float32) for x in (factor, offset)]
         shape = torch.broadcast_shapes(self.shape, *(x.shape for x in constants))
         numbers = torch.cat([x.expand(shape).flatten() for x in constants])
         return self.tape.elementwise(AFFINE, self.expand(shape), numbers=numbers)
 
     def clamp(self, low: float, high: float) -> Recorded:
-        """Limit all elements."""
+        """Limit every element to low … high."""
         return self.tape.elementwise(CLAMP, self, numbers=[low, high])
 
     def mean(self, dim: int) -> Recorded:
-        """Average over dimension 1."""
+        """Average over dimension 1, the only one that is supported."""
         assert dim == 1
         first, *others = (self[:, i] for i in range(self.shape[1]))
         return sum(others, start=first) / self.shape[1]
 
     def argmax(self, dim: int) -> Recorded:
-        """Return the index (1,) of the greatest of all elements."""
+        """Return the index (1,) of the greatest element among all of them. `dim` must be -1."""
         assert dim == -1
         return self.tape.emit(ARGMAX, (1,), [self], self.place.numel())
 
     def attend(self, heads: int, cos: Tensor, sin: Tensor) -> Recorded:
-        """Attend over the cache of the next layer: q, k and v (…, 3 E) -> (…, E). cos, sin: (positions, 1, C)."""
+        """Record the attention of the next layer. This value holds q, k and v (…, 3 E), not yet rotated.
+
+        Args:
+            heads: Number of attention heads.
+            cos: (positions, 1, C) rotary cosines, for every position that can occur.
+            sin: (positions, 1, C) rotary sines.
+
+        Returns:
+            The attention's output (…, E).
+        """
         tape, width = self.tape, self.shape[-1] // 3
         layer, tables = tape.cache[0], torch.cat([cos, sin], 1)
         tape.cache = layer + 1, heads, width // heads
@@ -99,19 +133,27 @@ class Recorded:
 
 
 class Tape:
-    """The operations recorded so far, and the numbers and indices that they refer to."""
+    """The operations that were recorded so far, and their constants.
+
+    Attributes:
+        ops: One dictionary per operation, with the names in COLUMNS as keys.
+        numbers: Constant arrays, such as norm gains.
+        indices: Places that GATHER operations copy from.
+        begins: The first place of every register, then the place where the next register will begin.
+        cache: Number of layers that attend, heads of a layer, channels of a head.
+    """
 
     def __init__(self) -> None:
         self.ops: list[dict[str, Any]] = []
         self.numbers: list[np.ndarray] = []
         self.indices: list[int] = []
-        self.begins = [0]  # of the registers; the last one is where the next register will begin
-        self.cache = 0, 1, 1  # layers that attend, heads, channels
+        self.begins = [0]
+        self.cache = 0, 1, 1
 
     def register(self, *shape: int) -> Recorded:
-        """Return a new place for a tensor of this shape."""
+        """Reserve a register (a contiguous range of places in the frame) for a tensor of this shape, and return it."""
         first, size = self.begins[-1], int(np.prod(shape))
-        self.begins.append(first + size + 1)  # a gap: elements of two registers are never side by side
+        self.begins.append(first + size + 1)  # one unused place, so that `lined` never takes two registers for one
         return Recorded(self, torch.arange(first, first + size).view(shape))
 
     def emit(
@@ -123,7 +165,19 @@ class Tape:
         numbers: Any = (),
         **columns: Any,
     ) -> Recorded:
-        """Append an operation on rows of `width` elements. out: where its result goes, or the shape of a new place."""
+        """Append an operation.
+
+        Args:
+            code: What it computes, such as LINEAR.
+            out: Value that receives the result, or the shape of a new register for it.
+            inputs: Up to two values that the operation reads.
+            width: Number of elements in each row of the inputs.
+            numbers: Constants that the operation reads, such as a norm's gain.
+            **columns: Further entries of the operation, with the names in COLUMNS.
+
+        Returns:
+            The result.
+        """
         out = out if isinstance(out, Recorded) else self.register(*out)
         lined = [self.lined(x, width) for x in inputs]
         first = [int(x.place.flatten()[0]) for x in (out, *(x for x, _, _ in lined))]
@@ -133,8 +187,15 @@ class Tape:
         return out
 
     def lined(self, x: Recorded, width: int) -> tuple[Recorded, int, int]:
-        """Return x with contiguous rows of `width` elements at equal distances (a copy if necessary), their number and
-        distance."""
+        """Make the rows of a value contiguous and equally spaced in the frame, with a copy if necessary.
+
+        Args:
+            x: The value.
+            width: Number of elements in a row.
+
+        Returns:
+            The value or its copy, the number of rows, and the distance between the starts of two rows in elements.
+        """
         rows = x.place.reshape(-1, width)
         stride = int(rows[1, 0] - rows[0, 0]) if len(rows) > 1 else width
         if torch.equal(rows, rows[0, 0] + torch.arange(len(rows))[:, None] * stride + torch.arange(width)):
@@ -142,7 +203,7 @@ class Tape:
         return self.copied(x, self.register(*x.shape)), len(rows), width
 
     def copied(self, x: Recorded, out: Recorded) -> Recorded:
-        """Copy the elements of x, one after the other."""
+        """Append an operation that copies the elements of `x`, in order, into the register of `out`. Return `out`."""
         places = x.place.flatten().tolist()
         op = {"code": GATHER, "rows": 1, "width": len(places), "first": len(self.indices), "reads": [x.place]}
         self.ops.append(op | {"out": int(out.place.flatten()[0])})
@@ -150,13 +211,19 @@ class Tape:
         return out
 
     def elementwise(self, code: int, *inputs: Recorded, numbers: Any = ()) -> Recorded:
-        """Append an operation on all elements, of inputs that are broadcast."""
+        """Append an elementwise operation on inputs, which are broadcast to one shape. Return the result.
+
+        Args:
+            code: What it computes, such as ADD.
+            inputs: One or two values.
+            numbers: Constants that the operation reads.
+        """
         shape = torch.broadcast_shapes(*(x.shape for x in inputs))
         inputs = tuple(x.expand(shape) for x in inputs)
         return self.emit(code, shape, inputs, shape.numel(), numbers) if shape.numel() else inputs[0]
 
     def placed(self, values: Any) -> int:
-        """Store constants, equal ones once, and return their place."""
+        """Store constants, and return the index of the first one among all `numbers`. Equal arrays are stored once."""
         array, first = torch.as_tensor(values, dtype=torch.float32).detach().flatten().numpy(), 0
         for known in self.numbers:
             if np.array_equal(known, array):
@@ -166,10 +233,13 @@ class Tape:
         return first
 
     def arrange(self, kept: Sequence[Recorded]) -> int:
-        """Let registers that are not needed at the same time share their place, and return the size of a frame.
+        """Move the registers so that those that are never needed at the same time share memory. Ends a recording.
 
         Args:
-            kept: Inputs and outputs, which keep a place of their own.
+            kept: Inputs and outputs of the recorded function. Nothing else is ever stored in their registers.
+
+        Returns:
+            The size of a frame, in numbers.
         """
         begins, sizes = np.array(self.begins), np.diff(self.begins)
 
