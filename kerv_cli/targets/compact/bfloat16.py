@@ -1,9 +1,10 @@
 """Decoder layers in bfloat16 on a CPU that multiplies it in hardware (AMX, AVX512-BF16).
 
-Weights lie in oneDNN's blocked layout. One row and thirty cost almost the same there, because reading the weights takes
-the time. The residual stream, norms, rotations, attention and the cache are float32: they cost little, and rounding
-them would make near ties of the argmax more frequent. oneDNN sums in another order for one row than for many, so the
-last bit of a product depends on the number of rows (docs/measuring.md).
+Weights are stored in the blocked layout of oneDNN, the library that torch uses for matrix multiplications on a CPU. One
+row and thirty rows then take almost the same time, because most of it is spent on reading the weights. The residual
+stream, norms, rotations, attention and the cache stay float32. They are cheap, and rounding them would make almost
+equal logits more frequent. oneDNN adds in a different order for one row than for many, so the last bit of a result
+depends on the number of rows (docs/measuring.md).
 """
 
 from __future__ import annotations
@@ -16,36 +17,40 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-ROWS = 32  # for which the layout is chosen; measured, 154 M weights: one row 27 ms, 31 rows 33 ms, 47 rows 41 ms
+ROWS = 32  # oneDNN chooses the layout for so many rows; 154 M weights take 27 ms for 1 row, 33 ms for 31, 41 ms for 47
 
 
 @lru_cache(maxsize=1)
 def multiplies_bfloat16() -> bool:
-    """Whether this CPU has products of bfloat16, and this build of torch the layouts for them."""
+    """Return whether this CPU and this build of torch can multiply bfloat16 matrices in blocked layout."""
     supported = torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
     return bool(supported) and (has_tiles() or torch.cpu._is_avx512_bf16_supported())
 
 
 def has_tiles() -> bool:
-    """Whether this CPU multiplies tiles of bfloat16 (AMX)."""
+    """Return whether this CPU has AMX, instructions that multiply bfloat16 tiles."""
     return bool(torch.cpu._is_amx_tile_supported())
 
 
 class BlockedLinear(nn.Module):
-    """x (…, I) -> (…, O) in the format of x, by a bfloat16 weight (O, I) in oneDNN's layout; sums in float32."""
+    """A linear layer without bias, whose weight is bfloat16 in oneDNN's blocked layout. Sums are float32.
+
+    Args:
+        weight: (outputs, inputs).
+    """
 
     def __init__(self, weight: Tensor) -> None:
         super().__init__()
         self.blocked = torch.ops.mkldnn._reorder_linear_weight(weight.to(torch.bfloat16).contiguous(), ROWS)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Multiply."""
+        """Map inputs (…, inputs) to outputs (…, outputs) in the number format of `x`."""
         product = torch.ops.mkldnn._linear_pointwise(x.to(torch.bfloat16), self.blocked, None, "none", [], "")
         return product.to(x.dtype)
 
 
 def blocked(layer: nn.Module) -> nn.Module:
-    """Return a layer with the same parts, its products blocked and its norms in float32."""
+    """Return a copy of a decoder layer with blocked bfloat16 weights (see `BlockedLinear`) and float32 norms."""
     twin = copy.copy(layer)
     twin._modules = {
         name: BlockedLinear(part.weight) if isinstance(part, nn.Linear) else copy.deepcopy(part).float()
@@ -55,10 +60,18 @@ def blocked(layer: nn.Module) -> nn.Module:
 
 
 class Bfloat16Layers:
-    """The blocked layers of a stack, whose caches are float32. It copies and pickles as None, as oneDNN's layouts."""
+    """Decoder layers with blocked bfloat16 weights and a float32 cache.
+
+    It is copied and pickled as None, because oneDNN's layout cannot be.
+    """
 
     def __init__(self, rotary: tuple[Tensor, Tensor], layers: Iterable[nn.Module]) -> None:
-        """Block layers one by one, so that a generator never holds two of them. rotary: cos and sin."""
+        """Convert layers one after the other.
+
+        Args:
+            rotary: Cosines and sines of all positions.
+            layers: Decoder layers. A generator saves memory: only one unconverted layer exists at a time.
+        """
         self.rotary = [table.float() for table in rotary]
         self.layers = [blocked(layer) for layer in layers]
 
@@ -66,7 +79,7 @@ class Bfloat16Layers:
         return type(None), ()
 
     def __call__(self, x: Tensor, positions: Tensor, cache: Any, slots: Any, mask: Tensor | None) -> Tensor:
-        """x (B, T, E) bfloat16 -> output of the last layer; the rest as in `LayerStack.run_layers`."""
+        """Return the output of the last layer for bfloat16 inputs x (B, T, E); arguments as `LayerStack.run_layers`."""
         rotary = [table[positions] for table in self.rotary]
         hidden, mask = x.float(), None if mask is None else mask.float()
         for i, layer in enumerate(self.layers):

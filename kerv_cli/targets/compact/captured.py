@@ -1,8 +1,8 @@
-"""One CUDA graph per number of tokens: a forward over a cache of fixed shapes as a single launch.
+"""CUDA graphs that replay a whole forward as one launch. For this the key/value cache has fixed shapes.
 
-A forward of T tokens runs in the graph of the next larger bucket. The rows behind T read zeros and write to the cache's
-spare slot, which no other row attends to. On a device without graphs the same computation runs call by call: that is
-how it is tested on a CPU.
+A graph takes a fixed number of tokens, called its bucket (1, 2, 4, 8, 16, 32, 48, …). A forward of T tokens runs in the
+smallest bucket that holds them. The unused rows read zeros and write to a spare slot of the cache, which no other row
+attends to. On a CPU the same computation runs without graphs, for tests.
 """
 
 from __future__ import annotations
@@ -14,34 +14,46 @@ from torch import Tensor
 
 from kerv_cli.targets.attention import Cache
 
-_AT_ONCE = (1, 2, 4, 8, 16, 32, 64)  # buckets of verifications; those of prefills follow with the first ones
-_WARM_UP = 3  # runs before a capture: libraries choose kernels and allocate workspaces
+_AT_ONCE = (1, 2, 4, 8, 16, 32, 64)  # buckets that are captured together with the first one
+_WARM_UP = 3  # runs before a capture, in which libraries choose kernels and allocate workspaces
 
 
 def bucket(tokens: int) -> int:
-    """Tokens of the graph that runs a forward of `tokens`: powers of two up to 16, then multiples of 16."""
+    """Return the rows of the graph that runs so many tokens: a power of two up to 16, then a multiple of 16."""
     if tokens <= 16:
         return 1 << (tokens - 1).bit_length()
     return -(-tokens // 16) * 16
 
 
 Compute = Callable[[Tensor, Tensor, Cache, Tensor, Tensor], Tensor]
-"""What a graph captures, `LayerStack.compute`: (x, positions, cache, slots, mask) -> output of the last layer."""
+"""The function that a graph captures, `LayerStack.run_layers`."""
 
 
 class CapturedCache(Cache):
-    """A cache of fixed shapes. steps: bucket -> the graph that writes to it, from the first forward that runs in one;
-    every forward over a cache is of one stack and of batch 1."""
+    """A key/value cache of fixed shapes, with the CUDA graphs that write to it. It serves one stack, with batch size 1.
+
+    Attributes:
+        steps: Number of rows of a graph (its bucket) -> the graph. Empty before the first forward.
+    """
 
     def __init__(self, layers: int, batch: int, heads: int, capacity: int, channels: int, like: Tensor) -> None:
         super().__init__(layers, batch, heads, capacity, channels, like, fixed=True)
         self.steps: dict[int, _Step] = {}
 
     def run(self, compute: Compute, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
-        """The layers in a graph: x (1, T, E) at `positions` (T,), mask (T, slots) as `attention_mask` -> output of the
-        last layer (1, T, E), valid until the next forward of the same bucket; the new tokens lie behind the cached
-        ones."""
-        if self.buffer.is_cuda and not self.steps:  # in the warm-up: a capture in the middle of an episode is timed
+        """Run the layers for T new tokens that follow the cached ones.
+
+        Args:
+            compute: The layers' computation, `LayerStack.run_layers`.
+            x: (1, T, width) input of the first layer.
+            positions: (T,) rotary positions.
+            mask: (T, slots) result of `attention_mask`.
+
+        Returns:
+            Output of the last layer (1, T, width). The next forward in the same graph overwrites it.
+        """
+        # captured now, in the warm-up: later a capture would count in an episode's time
+        if self.buffer.is_cuda and not self.steps:
             self.steps = {size: _Step(compute, self, size, x.shape[2]) for size in _AT_ONCE if size <= self.capacity}
         size = bucket(x.shape[1])
         if size not in self.steps:
@@ -50,7 +62,7 @@ class CapturedCache(Cache):
 
 
 class _Step:
-    """The buffers of one bucket, and its graph."""
+    """A CUDA graph for a fixed number of tokens, with its input buffers."""
 
     def __init__(self, compute: Compute, cache: Cache, size: int, width: int) -> None:
         self.compute, self.cache = compute, cache
@@ -59,7 +71,7 @@ class _Step:
         self.positions = torch.zeros(size, dtype=torch.long, device=like.device)
         self.index = torch.full((size,), slots - 1, dtype=torch.long, device=like.device)
         self.mask = like.new_full((size, slots), -torch.inf)
-        self.mask[:, -1] = 0.0  # a row that attends to nothing would be NaN, and so would its value for all others
+        self.mask[:, -1] = 0.0  # a row that attends to nothing would be NaN, which would spread to all others
         self.graph = self._captured() if like.is_cuda else None
 
     def _captured(self) -> torch.cuda.CUDAGraph:
@@ -78,7 +90,7 @@ class _Step:
         return self.compute(self.x, self.positions, self.cache, self.index, self.mask)
 
     def run(self, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
-        """Copies the inputs to the graph's buffers and replays it, see `CapturedCache.run`."""
+        """Copy the inputs to the graph's buffers and replay the graph; arguments as `CapturedCache.run`."""
         tokens, start = x.shape[1], self.cache.length
         self.x.zero_()[:, :tokens].copy_(x)
         self.positions[:tokens].copy_(positions)

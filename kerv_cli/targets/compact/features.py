@@ -1,4 +1,7 @@
-"""Features of the scene and of the privileged state, as numbers of order one, and the layers that read them.
+"""Features of the scene and of the privileged state, scaled to about 1 (docs/methods.md §0.1).
+
+A place is a position that the task is about, such as that of the object or the goal. The privileged state is what only
+the simulator knows.
 
 Shapes: B batch, p numbers of proprioception, K places, s numbers of privileged state.
 """
@@ -13,14 +16,14 @@ from torch import Tensor, nn
 
 from kerv_cli.base.spaces import ObservationSpace, Place
 
-COARSE, FINE = 0.1, 0.02  # metres per unit of the linear and of the saturating features of a vector
-STEP = 0.01  # metres (or units of the state) per control step that count as a velocity of one
+COARSE, FINE = 0.1, 0.02  # metres: a vector is divided by COARSE, and before a tanh by FINE
+STEP = 0.01  # metres (or units of the state) per control step: velocities are divided by it
 
 Saturate = Callable[[Tensor], Tensor]
 
 
 def mlp(*widths: int) -> nn.Sequential:
-    """Linear layers from each width to the next, with SiLU between them."""
+    """Return linear layers from each width to the next, with SiLU between them."""
     parts: list[nn.Module] = []
     for inputs, outputs in itertools.pairwise(widths):
         parts += [nn.Linear(inputs, outputs), nn.SiLU()]
@@ -28,37 +31,64 @@ def mlp(*widths: int) -> nn.Sequential:
 
 
 def relative(vector: Tensor, saturate: Saturate = torch.tanh) -> Tensor:
-    """vector (…, 3) metres -> (…, 6): it in coarse units, and in fine units that saturate."""
+    """Return the features (…, 6) of vectors (…, 3) in metres: vector / 0.1 m, then tanh(vector / 0.02 m).
+
+    Args:
+        vector: The vectors.
+        saturate: Replaces tanh.
+    """
     return torch.cat([vector / COARSE, saturate(vector / FINE)], -1)
 
 
 def hand_features(proprioception: Tensor, centre: Tensor) -> Tensor:
-    """proprioception (B, p) -> (B, p): the end effector relative to the workspace's centre, the rest unchanged."""
+    """Return the proprioception (B, p) with the end effector's position relative to the centre, in units of 0.1 m.
+
+    Args:
+        proprioception: (B, p), its first three numbers are the end effector's position in metres.
+        centre: (3,) middle of the workspace in metres.
+    """
     return torch.cat([(proprioception[:, :3] - centre) / COARSE, proprioception[:, 3:]], -1)
 
 
 def scene_features(proprioception: Tensor, places: Tensor, centre: Tensor, saturate: Saturate = torch.tanh) -> Tensor:
-    """proprioception (B, p), places (B, K, 3) metres -> (B, p + 15 K − 6): positions, vectors from the hand to every
-    place and from each place to the next. Affine except for `saturate`."""
+    """Return the scene features (B, p + 15 K − 6).
+
+    They hold all positions, the vectors from the hand to every place, and the vectors from each place to the next. They
+    are affine functions of the inputs, except for the columns that `saturate` computes.
+
+    Args:
+        proprioception: (B, p).
+        places: (B, K, 3) positions in metres.
+        centre: (3,) middle of the workspace in metres.
+        saturate: Replaces the tanh of `relative`.
+    """
     vectors = torch.cat([places - proprioception[:, None, :3], places[:, 1:] - places[:, :-1]], 1)
     positions = ((places - centre) / COARSE).flatten(1)
     return torch.cat([hand_features(proprioception, centre), positions, relative(vectors, saturate).flatten(1)], -1)
 
 
 def scene_width(space: ObservationSpace) -> int:
-    """Number of columns of `scene_features`."""
+    """Return the number of columns of `scene_features`."""
     return len(space.proprioception) + 15 * len(space.places) - 6
 
 
 def saturating_columns(space: ObservationSpace) -> list[int]:
-    """Indices of the columns of `scene_features` that saturate."""
+    """Return the indices of the columns of `scene_features` that a tanh limits."""
     first = len(space.proprioception) + 3 * len(space.places)
     return [first + 6 * vector + 3 + axis for vector in range(2 * len(space.places) - 1) for axis in range(3)]
 
 
 def privileged_features(proprioception: Tensor, states: Tensor, space: ObservationSpace) -> Tensor:
-    """proprioception (B, p), states (B, s) -> (B, `privileged_width`): further numbers of the state, velocities, and
-    the extra places relative to hand and last place."""
+    """Return the features (B, `privileged_width`) that only a policy with access to the simulator's state reads.
+
+    They hold the state's extra numbers, its velocities, and for each extra place the vectors to it from the hand and
+    from it to the last place.
+
+    Args:
+        proprioception: (B, p).
+        states: (B, s) privileged states.
+        space: Says which numbers of the state these are.
+    """
     hand, last = proprioception[:, :3], position(states, space.places[-1])
     parts = [states[:, list(space.extra)]]
     if space.previous is not None:
@@ -72,15 +102,15 @@ def privileged_features(proprioception: Tensor, states: Tensor, space: Observati
 
 
 def privileged_width(space: ObservationSpace) -> int:
-    """Number of columns of `privileged_features`."""
+    """Return the number of columns of `privileged_features`."""
     return len(space.extra) + (space.previous[0] if space.previous else 0) + 12 * len(space.extra_places)
 
 
 def position(states: Tensor, place: Place) -> Tensor:
-    """Position of one place, from states (B, s) -> (B, 3) metres."""
+    """Return the position (B, 3) of one place in metres, read from states (B, s)."""
     return states[:, place.first : place.first + 3]
 
 
 def places_of(states: Tensor, space: ObservationSpace) -> Tensor:
-    """Positions of the space's places, from states (B, s) -> (B, K, 3) metres."""
+    """Return the positions (B, K, 3) of all places in metres, read from states (B, s)."""
     return torch.stack([position(states, place) for place in space.places], 1)

@@ -1,4 +1,4 @@
-"""The folder of a compact target: `save_target` writes it, `build` reads it."""
+"""Write and read the folder of a compact target: its weights and `target.json`."""
 
 from __future__ import annotations
 
@@ -25,8 +25,16 @@ def save_target(
     stored: str = FLOAT32,
     state_range: Sequence[Sequence[float]] | None = None,
 ) -> str:
-    """Writes the folder of a target -> sha256 of its weights. environment: that of its demonstrations. stored: as in
-    `save_module`. state_range: as in `TargetDescription`."""
+    """Write a target's weights and `target.json`. Return the SHA-256 of the weights.
+
+    Args:
+        folder: Folder to write to.
+        target: The target.
+        environment: Name of the environment that its demonstrations come from.
+        provenance: How the target was made, see `provenance_of`.
+        stored: Number format of the stored weights: float32, float16 or int8.
+        state_range: The 0.1th and the 99.9th percentile of the demonstrations' states. None: not recorded.
+    """
     others: dict[str, Any] = {"cameras": target.cameras, "words": target.words.words, "provenance": provenance}
     if state_range:
         others["state_range"] = state_range
@@ -36,10 +44,16 @@ def save_target(
 
 
 def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> CompactTarget:
-    """The target in `folder`, frozen and packed for inference.
+    """Load a compact target for inference. It is frozen, and compiled if the device is a CPU.
+
+    Args:
+        folder: Folder with the weights.
+        description: The content of its `target.json`.
+        device: Device to load it to.
+        dtype: Number format to convert the weights to.
 
     Raises:
-        CheckpointError: the description is not a compact target's, or the weights do not fit it.
+        CheckpointError: The description does not belong to a compact target, or the weights do not fit it.
     """
     settings = read(TargetSettings, description.settings, str(folder / "target.json"))
     camera = description.cameras[0] if description.cameras else ""

@@ -1,4 +1,4 @@
-"""Modules that have a compiled form on a CPU, and `pack`, which makes it once their weights are final."""
+"""Modules that can be compiled for a CPU, and `pack`, which compiles them when their weights are final."""
 
 from __future__ import annotations
 
@@ -16,25 +16,29 @@ M = TypeVar("M", bound=nn.Module)
 
 
 def wants_gradient(x: Tensor) -> bool:
-    """Whether x needs gradients, which compiled forms do not have: then the modules compute."""
+    """Whether gradients of `x` are needed. Compiled modules have none, so then torch computes."""
     return x.requires_grad and torch.is_grad_enabled()
 
 
 class Packable(nn.Module):
-    """A module that can have a compiled form, `packed`, for frozen weights on a CPU.
+    """A module that can be compiled for a CPU while its weights are frozen.
 
-    Moving it, loading weights, unfreezing or training it drops the compiled form; then the module computes. After
-    writing weights in another way (`parameter.data`, a part's own `load_state_dict`) call `pack` again.
+    Moving the module, loading weights into it, unfreezing it or switching to training mode discards the compiled form.
+    Then torch computes as usual. After changing weights in any other way (`parameter.data`, a submodule's own
+    `load_state_dict`), call `pack` again.
+
+    Attributes:
+        packed: The compiled form. None if there is none.
     """
 
     packed: Any = None
 
     def pack_weights(self) -> Any:
-        """Return the compiled form of this module, whose weights are frozen on a CPU; None if there is none."""
+        """Compile this module and return the result, or None if it cannot be compiled. `pack` calls this."""
         return None
 
     def is_packed(self, x: Tensor) -> bool:
-        """Whether the compiled form computes x: not if gradients are wanted."""
+        """Whether to use the compiled form for the input `x`: it exists, and no gradients are needed."""
         return self.packed is not None and isinstance(x, Tensor) and not wants_gradient(x)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
@@ -46,13 +50,13 @@ class Packable(nn.Module):
         super()._load_from_state_dict(*arguments, **keywords)
 
     def train(self, mode: bool = True) -> Self:
-        """Set the mode of `nn.Module.train`; training mode drops the compiled form."""
+        """Set training or evaluation mode. Training mode discards the compiled form."""
         if mode:
             self.packed = None
         return super().train(mode)
 
     def requires_grad_(self, requires_grad: bool = True) -> Self:
-        """Freeze or unfreeze all parameters; unfreezing drops the compiled form of all parts."""
+        """Freeze or unfreeze all parameters. Unfreezing discards all compiled forms, those of submodules too."""
         for part in self.modules():
             if requires_grad and isinstance(part, Packable):
                 part.packed = None
@@ -60,19 +64,22 @@ class Packable(nn.Module):
 
 
 class PackableLinear(Packable, nn.Linear):
-    """A linear layer that is called on its own, such as a head."""
+    """A linear layer that is compiled by itself, not as a part of a larger module. For example an output head."""
 
     def pack_weights(self) -> Any:
-        """Return the compiled product of a float32 layer."""
+        """Compile a float32 layer. Return None for other number formats."""
         return Program(super().forward, (1, self.in_features)) if self.weight.dtype == torch.float32 else None
 
     def forward(self, x: Tensor) -> Tensor:
-        """x (…, I) -> (…, O)."""
+        """Map inputs (…, in_features) to outputs (…, out_features)."""
         return self.packed(x)[0].view(*x.shape[:-1], -1) if self.is_packed(x) else super().forward(x)
 
 
 def pack(module: nn.Module) -> None:
-    """Compile the parts of a module that support it, if all its parameters are frozen on a CPU and of one format."""
+    """Compile every `Packable` submodule of a module.
+
+    Does nothing unless all parameters are frozen, on a CPU and in one number format.
+    """
     parameters = list(module.parameters())
     if all(p.device.type == "cpu" and p.dtype == parameters[0].dtype and not p.requires_grad for p in parameters):
         forget(module)
@@ -84,10 +91,17 @@ def pack(module: nn.Module) -> None:
 
 
 def load_packed(module: M, folder: Path, kind: str, device: str | torch.device, dtype: torch.dtype) -> M:
-    """Load the weights in a folder into a module, move it to its device, freeze and compile it.
+    """Load the weights in a folder into a module. Move it to a device, freeze it, and compile it if that is a CPU.
+
+    Args:
+        module: A module with the shapes of the stored weights.
+        folder: Folder with `model.safetensors`.
+        kind: Kind of artifact, such as `drafter`, for error messages.
+        device: Device to move the module to.
+        dtype: Number format to convert the weights to.
 
     Raises:
-        CheckpointError: As `load_state`.
+        CheckpointError: The weights are missing, damaged, or do not fit the module.
     """
     load_state(module, folder, kind)
     module = module.to(device=device, dtype=dtype).eval().requires_grad_(False)

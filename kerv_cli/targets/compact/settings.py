@@ -10,26 +10,33 @@ from kerv_cli.base.limits import choice, number, setting
 
 @dataclass
 class TargetSettings:
-    """Shapes of the target (docs/methods.md §0). `conf/target/*.yaml` are the sizes."""
+    """Shapes of the compact target (docs/methods.md §0.1). The files in `conf/target` are ready-made sizes."""
 
     size: str = setting("small", "name of these shapes")
-    observation: str = choice("vision", "vision", "state", help="state: privileged, the places' positions are given")
-    width: int = number(192, 2, 65_536, help="of the hidden states")
+    observation: str = choice("vision", "vision", "state", help="read images, or the simulator's state")
+    width: int = number(192, 2, 65_536, help="width E of the embeddings and hidden states")
     layers: int = number(8, 1, 1024, help="decoder layers")
     heads: int = number(6, 1, 1024, help="attention heads")
     feed_forward: int = number(512, 1, 262_144, help="hidden units of a layer's feed-forward part")
     chunk: int = number(4, 1, 1024, help="H, control steps per decode")
     grid: int = number(4, 1, 512, help="vision tokens per side")
-    keypoints: int = number(32, 1, 4096, help="spatial soft-argmax points of the vision encoder")
+    keypoints: int = number(32, 1, 4096, help="points that the vision encoder finds in an image (spatial soft-argmax)")
     channels: int = number(24, 1, 4096, help="width of the vision encoder's first stage")
-    norm: str = choice("group", "group", "instance", help="of the vision encoder; instance: light changes it least")
-    scene_tokens: int = number(4, 1, 1024, help="tokens with the places' positions, estimated or given")
-    instruction_tokens: int = number(10, 1, 1024, help="longest instruction")
-    image_size: int = number(96, 8, 4096, help="pixels of a view, square")
+    norm: str = choice("group", "group", "instance", help="vision encoder's norm; instance: least sensitive to light")
+    scene_tokens: int = number(4, 1, 1024, help="prompt tokens that hold the positions of object and goal")
+    instruction_tokens: int = number(10, 1, 1024, help="longest instruction in words")
+    image_size: int = number(96, 8, 4096, help="pixels per side of a camera view")
     parallel: bool = setting(False, "decode all tokens of a chunk at once (docs/methods.md §6)")
 
     def check_together(self, prefix: str) -> None:
-        """Raises UsageError for a width that the heads do not divide, or an image that the grid does not divide."""
+        """Check settings that depend on each other.
+
+        Args:
+            prefix: Start of the settings' names in error messages, such as `target.`.
+
+        Raises:
+            UsageError: The width is no multiple of twice the heads, or the image no multiple of 8 times the grid.
+        """
         if self.width % (2 * self.heads):
             raise UsageError(f"{prefix}width={self.width} must be a multiple of 2 x {prefix}heads={self.heads}")
         if self.observation == "vision" and self.image_size % (8 * self.grid):

@@ -1,12 +1,12 @@
-"""The compact target: vision + instruction + scene + proprioception tokens -> Llama-style trunk -> action tokens.
+"""The compact target, the policy that kerv trains: prompt tokens -> Llama-style trunk -> action tokens.
 
-Prompt order: [vision grid] [instruction] [scene] [proprioception]; the last prompt position predicts token 0. A frame
-of several views has as many grids.
+The prompt is [vision grid] [instruction] [scene] [proprioception]. The last prompt position predicts token 0. An image
+of several camera views gives one vision grid per view.
 
-Scene tokens carry where the environment's places are (object and goal, say), as positions and as vectors relative to
-the hand. With `observation=vision` the positions are *estimated* from the image points (supervised while training,
-never read from the simulator afterwards); with `observation=state` they are given, together with the rest of the state:
-privileged, to separate decoding from perception.
+Scene tokens encode the places, positions that the task is about, such as object and goal: where each is, and the vector
+to it from the hand. With `observation=vision` these positions are estimated from the image. They are supervised in
+training and never read from the simulator afterwards. With `observation=state` the simulator gives them, together with
+the rest of its state. That is privileged information, and serves to study decoding without perception.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ from kerv_cli.worlds.views import frame_shape, views_of
 
 @dataclass(frozen=True)
 class Inputs:
-    """A batch of observations as tensors; a vision policy does not read the states.
+    """A batch of B observations as tensors.
 
     Attributes:
-        images: (B, 3, size, size · views) uint8, or None.
-        proprioception: (B, p) float32.
-        states: (B, s) float32.
-        words: (B, L) int64.
+        images: (B, 3, size, size · views) uint8. None for a policy that reads the state.
+        proprioception: (B, p) float32, the robot's own measurements.
+        states: (B, s) float32, the simulator's state. A policy that reads images ignores it.
+        words: (B, L) int64, ids of the instruction's words.
     """
 
     images: Tensor | None
@@ -60,7 +60,12 @@ class Inputs:
 
 
 class Compiled(NamedTuple):
-    """The compiled forms of a target: what encodes a prompt, and what decodes one token after another."""
+    """The compiled programs of a target. It is copied and pickled as None.
+
+    Attributes:
+        prompt: Encodes a prompt.
+        step: Decodes one token after another. None if only the prompt's encoder is compiled.
+    """
 
     prompt: Program
     step: Program | None
@@ -70,17 +75,27 @@ class Compiled(NamedTuple):
 
 
 class CompactTarget(Packable):
-    """The compact policy: encoder, trunk and head; implements `ReadableTarget`. Its parameters are float32.
+    """The compact policy: encoders, trunk and head. Implements the protocol `ReadableTarget`.
+
+    Args:
+        settings: Shapes.
+        actions: Action space.
+        observation: Observation space.
+        words: Vocabulary of instructions.
+        camera: Name of the camera. A name that joins several views with `+` means one image of all views.
 
     Attributes:
-        cameras: The camera whose images a vision policy reads. Each of its views has an encoder and vision tokens.
-        frame_shape: Shape of those images.
-        segments: Slice of the prompt by the name of its part.
-        sha256: Of the weights it was loaded with, else empty.
-        chunk: H, control steps it was trained to decode at once.
-        parallel: Whether it decodes by `parallel_pass` alone. It has not learnt to continue action tokens.
-        width: E.
-        heads, feed_forward: Attention heads and hidden units of the trunk's layers, and of a drafter's.
+        cameras: The camera whose images are read. Empty if the policy reads the state.
+        frame_shape: Shape (height, width, 3) of an image.
+        segments: Name of a prompt part -> its slice of the prompt.
+        sha256: Hash of the weights that were loaded. Empty if none were.
+        chunk: H, number of control steps that it was trained to decode at once.
+        parallel: Whether it decodes all tokens in one forward (`parallel_pass`), and only so.
+        width: E, width of the embeddings and hidden states.
+        heads: Attention heads of a layer, also of a drafter's.
+        feed_forward: Hidden units of a layer, also of a drafter's.
+        grown_drafter: Shape of the drafter if the target was enlarged together with it (docs/methods.md §0.2), else
+            None.
     """
 
     centre: Tensor
@@ -97,7 +112,7 @@ class CompactTarget(Packable):
         super().__init__()
         s = self.settings = settings
         self.actions, self.observation, self.words, self.sha256 = actions, observation, words, ""
-        self.grown_drafter: Any = None  # of a grown target: the shape of its drafter, if that grows too
+        self.grown_drafter: Any = None
         self.chunk, self.parallel = s.chunk, s.parallel
         self.width, self.heads, self.feed_forward = s.width, s.heads, s.feed_forward
         self.cameras = (camera,) if s.observation == "vision" else ()
@@ -126,21 +141,24 @@ class CompactTarget(Packable):
 
     @property
     def max_prompt(self) -> int:
-        """P, which is the same for every observation and instruction."""
+        """P, number of prompt tokens. It is the same for every observation and instruction."""
         return self.segments["proprioception"].stop
 
     @property
     def encoders(self) -> tuple[VisionEncoder, ...]:
-        """The encoders of a vision policy's views, from left to right."""
+        """The encoders of a vision policy, one per camera view from left to right."""
         return self.vision, *self.further_views
 
     @property
     def pooled_width(self) -> int:
-        """F of `pooled`."""
+        """F, number of values that `pooled` returns per prompt."""
         return self.width * (self.settings.scene_tokens + (3 if self.cameras else 2))
 
     def pooled(self, prompt: Tensor) -> Tensor:
-        """Pool a prompt (B, P, E) -> (B, F): scene tokens, proprioception, mean word, and mean vision token if any."""
+        """Pool prompts (B, P, E) into fixed vectors (B, F).
+
+        A vector holds the scene tokens, the proprioception, the mean word and, if there are any, the mean vision token.
+        """
         parts = self.segments
         pooled = [prompt[:, parts["scene"]].flatten(1), prompt[:, parts["proprioception"]].flatten(1)]
         pooled += [prompt[:, parts[name]].mean(1) for name in ("instruction", "vision") if name in parts]
@@ -157,10 +175,11 @@ class CompactTarget(Packable):
         return self.head.weight.dtype
 
     def inputs(self, observation: Observation) -> Inputs:
-        """Return one observation as a batch of one.
+        """Return an observation as tensors on this target's device, a batch of one.
 
         Raises:
-            CheckpointError: Numbers or images have another size than in training.
+            CheckpointError: Proprioception, state or image has a different size than in training, or the image is
+                missing.
         """
         proprioception, state = (
             upload(np.asarray(x, dtype=np.float32), self.device)[None]
@@ -187,18 +206,22 @@ class CompactTarget(Packable):
         return Inputs(images, proprioception, state, upload([words], self.device))
 
     def encode(self, observation: Observation) -> Tensor:
-        """Return the prompt's embeddings (1, P, E); errors as `inputs`."""
+        """Encode an observation as a prompt (1, P, E); errors as `inputs`."""
         return self.encode_batch(self.inputs(observation))[0]
 
     def encode_many(self, observations: Sequence[Observation]) -> Tensor:
-        """Return the prompts' embeddings (B, P, E); errors as `inputs`."""
+        """Encode B observations as prompts (B, P, E); errors as `inputs`."""
         batch = [self.inputs(observation) for observation in observations]
         images = [one.images for one in batch if one.images is not None]
         rows = (torch.cat([getattr(one, name) for one in batch]) for name in ("proprioception", "states", "words"))
         return self.encode_batch(Inputs(torch.cat(images) if images else None, *rows))[0]
 
     def encode_batch(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
-        """Return prompt embeddings (B, P, E), and the places' positions (B, K, 3) in metres that they carry."""
+        """Encode a batch of observations.
+
+        Returns:
+            Prompts (B, P, E), and the positions (B, K, 3) in metres of the places, such as object and goal.
+        """
         given = [inputs.words, inputs.proprioception, inputs.states]
         if self.cameras:
             assert inputs.images is not None
@@ -211,7 +234,13 @@ class CompactTarget(Packable):
         return self.prompt(*given)
 
     def prompt(self, words: Tensor, proprioception: Tensor, *seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute `encode_batch` by the modules. seen: states (B, s), or vision tokens and points of all views."""
+        """Compute the result of `encode_batch` in torch, or record it as a program.
+
+        Args:
+            words: (B, L) ids of words.
+            proprioception: (B, p).
+            seen: Vision tokens (B, grid² · views, E) and image points (B, 2 · keypoints · views), or states (B, s).
+        """
         embedded, hand = self.word_embedding(words), hand_features(proprioception, self.centre)
         if self.cameras:
             tokens, points = seen
@@ -227,7 +256,13 @@ class CompactTarget(Packable):
         return torch.cat([*parts, embedded, scene, felt], 1), places
 
     def located(self, points: Tensor, hand: Tensor, words: Tensor) -> Tensor:
-        """Estimate the places' positions (B, K, 3), metres."""
+        """Estimate the positions (B, K, 3) of the places in metres.
+
+        Args:
+            points: (B, 2 · keypoints · views) image points.
+            hand: (B, p) hand features.
+            words: (B, L, E) embedded words.
+        """
         # bfloat16 would round image points to a fifth of a cell: millimetres matter here
         with torch.autocast(points.device.type, enabled=False):
             features = torch.cat([points, hand, words.mean(1)], -1).to(self.head.weight.dtype)
@@ -235,7 +270,7 @@ class CompactTarget(Packable):
         return located.to(torch.float32).unflatten(-1, (-1, 3)) * 0.1 + self.centre
 
     def pack_weights(self) -> Compiled | None:
-        """Return what encodes a prompt and what decodes a token, compiled; None in other formats than float32."""
+        """Compile the prompt's encoder and the decoding of a token for a CPU. None if the weights are not float32."""
         if self.dtype != torch.float32:
             return None
         s, space = self.settings, self.observation
@@ -252,21 +287,30 @@ class CompactTarget(Packable):
         return Compiled(Program(self.prompt, *shapes), Program(step, (1, 1), repeats=True))
 
     def embed(self, tokens: Tensor) -> Tensor:
-        """Action tokens (B, T) int64 -> (B, T, E)."""
+        """Return the embeddings (B, T, E) of action tokens (B, T) int64."""
         return self.embedding(tokens)
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
-        """Return an empty cache. fixed: every forward has the same shapes; default: on CUDA."""
+        """Return an empty key/value cache; arguments as `LayerStack.new_cache`."""
         return self.trunk.new_cache(batch, capacity, fixed)
 
     def forward(
         self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
-        """Return the hidden states (B, T, E) of x (B, T, E) at `positions` (T,), after the cached tokens."""
+        """Return the hidden states (B, T, E) of embeddings x (B, T, E); arguments as `Trunk.forward`."""
         return self.trunk(x, positions, cache, seen)
 
     def continue_greedily(self, token: int, count: int, cache: Cache) -> list[int] | None:
-        """Decode `count` tokens after a token in one call; None if this target is not compiled."""
+        """Decode the next `count` tokens greedily in one compiled call.
+
+        Args:
+            token: The last token, not yet in the cache.
+            count: Number of tokens to decode.
+            cache: Keys and values of everything before `token`. It grows by `count`.
+
+        Returns:
+            The tokens. None if this target is not compiled.
+        """
         step = self.packed.step if self.packed else None
         if step is None or cache.fixed:
             return None
@@ -275,9 +319,13 @@ class CompactTarget(Packable):
         return [int(token) for token in tokens[:, 0]]
 
     def parallel_pass(self, prompt: Tensor, cache: Cache | None = None) -> Tensor:
-        """Return the hidden states (B, N, E) of all tokens in one forward (docs/methods.md §6).
+        """Return the hidden states (B, N, E) of all N tokens of a chunk in one forward (docs/methods.md §6).
 
-        No action token is embedded: learned queries at their positions see the prompt (B, P, E) and each other.
+        Learned queries take the place of action tokens. They attend to the prompt and to each other.
+
+        Args:
+            prompt: (B, P, E).
+            cache: An empty cache. None: no cache is filled.
         """
         x = torch.cat([prompt, self.queries.to(prompt.dtype).expand(len(prompt), -1, -1)], 1)
         visible = np.tri(x.shape[1], dtype=bool)
@@ -285,9 +333,14 @@ class CompactTarget(Packable):
         return self(x, torch.arange(x.shape[1], device=x.device), cache, visible)[:, prompt.shape[1] :]
 
     def teacher_forced(self, inputs: Inputs, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """Return logits (B, N, V) that predict tokens (B, N), and the places' positions (B, K, 3), metres.
+        """Predict every token of a chunk from the true tokens before it, for training.
 
-        A parallel target is shown none of the tokens.
+        Args:
+            inputs: B observations.
+            tokens: (B, N) the true tokens. A parallel target does not read them.
+
+        Returns:
+            Logits (B, N, V), and the positions (B, K, 3) in metres of the places, such as object and goal.
         """
         prompt, places = self.encode_batch(inputs)
         if self.parallel:
@@ -306,7 +359,7 @@ def _segments(settings: TargetSettings, views: int) -> Mapping[str, slice]:
 
 
 def _smooth_table(tokens: int, width: int) -> Tensor:
-    """(V, E) initial embedding that is similar for neighbouring bins: cosines of the bin's value."""
+    """Return an initial embedding (V, E) in which neighbouring tokens are similar: cosines of the token's value."""
     centres = torch.linspace(-1, 1, tokens)[:, None]
     generator = torch.Generator().manual_seed(0)
     frequency = torch.exp(torch.rand(width, generator=generator) * 4.0)  # up to 55 rad per unit

@@ -1,6 +1,6 @@
-"""Instructions -> token ids, one word each, padded to a fixed length.
+"""Turn instructions into token ids, one per word, padded to a fixed length.
 
-The vocabulary travels in the checkpoint. It is built from all instructions of the environment, so a policy trained on
+The vocabulary is stored in the checkpoint. It is built from all instructions of the environment, so a policy trained on
 ten tasks can be fine-tuned on fifty without a new embedding.
 """
 
@@ -17,30 +17,34 @@ PAD, UNKNOWN = 0, 1
 
 @dataclass(frozen=True)
 class WordTokenizer:
-    """A fixed vocabulary of whole words."""
+    """A fixed vocabulary of whole words.
 
-    words: tuple[str, ...]  # word of id i + 2; ids 0 and 1 are padding and unknown
+    Attributes:
+        words: `words[i]` has id i + 2. Id 0 is padding, id 1 an unknown word.
+    """
+
+    words: tuple[str, ...]
 
     @classmethod
     def build(cls, sentences: Iterable[str]) -> WordTokenizer:
-        """The vocabulary of the sentences' lower-case words, sorted."""
+        """Return a tokenizer for all lower-case words of the sentences, in alphabetical order."""
         return cls(tuple(sorted({word for s in sentences for word in s.lower().split()})))
 
     @property
     def size(self) -> int:
-        """Number of ids: words, padding and unknown."""
+        """Number of ids: one per word, padding and unknown."""
         return len(self.words) + 2
 
     @cached_property
     def index(self) -> dict[str, int]:
-        """Word -> id."""
+        """Map from a word to its id."""
         return {word: i + 2 for i, word in enumerate(self.words)}
 
     def encode(self, sentence: str, length: int) -> list[int]:
-        """The sentence as exactly `length` ids, padded.
+        """Return exactly `length` ids for a sentence, with padding at the end.
 
         Raises:
-            UsageError: more words than `length`; truncating could drop the decisive one.
+            UsageError: The sentence has more than `length` words. It is not cut, because a decisive word could be lost.
         """
         ids = [self.index.get(word, UNKNOWN) for word in sentence.lower().split()]
         if len(ids) > length:

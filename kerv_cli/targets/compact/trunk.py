@@ -2,9 +2,12 @@
 
 Shapes: B batch, T new tokens, S cached tokens, E width, A heads, C = E / A.
 
-The implementations give the same numbers up to rounding. On CUDA a cache of fixed shapes is written at a tensor of
-slots and attended to over its whole capacity under a mask, so that one captured graph can serve every step. On a CPU a
-frozen float32 stack is compiled (`program.py`), one in bfloat16 has blocked weights (`bfloat16.py`).
+There are three implementations, whose results are equal up to rounding:
+
+- On CUDA a captured graph replays a forward. For this the cache has fixed shapes: every forward attends to all slots,
+  and a mask hides the unused ones.
+- On a CPU a frozen float32 stack is compiled (`program.py`).
+- On a CPU a frozen bfloat16 stack stores its weights in oneDNN's blocked layout (`bfloat16.py`).
 """
 
 from __future__ import annotations
@@ -22,11 +25,11 @@ from kerv_cli.targets.compact.captured import CapturedCache
 from kerv_cli.targets.compact.packable import Packable, wants_gradient
 from kerv_cli.targets.compact.program import Program
 
-POSITIONS, BASE = 1024, 10_000.0  # of the rotary embedding
+POSITIONS, BASE = 1024, 10_000.0  # of the rotary embedding: number of positions, base of the frequencies
 
 
 class Rotary(nn.Module):
-    """Rotary position embedding, half-split layout; tables are computed once in float32."""
+    """Tables of the rotary position embedding in half-split layout: channel i rotates with channel i + C/2."""
 
     cos: Tensor
     sin: Tensor
@@ -40,12 +43,12 @@ class Rotary(nn.Module):
         self.register_buffer("sin", torch.cat([-angles.sin(), angles.sin()], -1), persistent=False)
 
     def forward(self, positions: Tensor | slice) -> tuple[Tensor, Tensor]:
-        """positions (T,) -> cos and sin (T, 1, C) for all layers."""
+        """Return the cosines and the sines, (T, 1, C) each, at positions (T,)."""
         return self.cos[positions][:, None], self.sin[positions][:, None]
 
 
 class Layer(nn.Module):
-    """One pre-norm decoder layer with fused projections."""
+    """One pre-norm decoder layer. One matrix gives q, k and v, another one both halves of the SwiGLU."""
 
     def __init__(self, width: int, heads: int, feed_forward: int) -> None:
         super().__init__()
@@ -65,11 +68,14 @@ class Layer(nn.Module):
         slots: Slots | None = None,
         mask: Tensor | None = None,
     ) -> Tensor:
-        """Compute x (B, T, E) -> (B, T, E).
+        """Compute the output (B, T, E) of the layer.
 
         Args:
-            cache: (2, B, A, capacity, C) of this layer, written at `slots`.
-            mask: From `attention_mask`; without one attention is causal.
+            x: (B, T, E) input. Also a stand-in for a tensor while a program is recorded.
+            rotary: Cosines and sines, (T, 1, C) each.
+            cache: (2, B, A, capacity, C) keys and values of this layer. None: there are no earlier tokens.
+            slots: Slots of the cache that the new keys and values are written to.
+            mask: Result of `attention_mask`. None: attention is causal.
         """
         qkv = self.qkv(self.attention_norm(x))
         if isinstance(qkv, Tensor):
@@ -87,7 +93,7 @@ class Layer(nn.Module):
         slots: Slots | None,
         mask: Tensor | None,
     ) -> Tensor:
-        """Attention of qkv (B, T, 3 E), not yet rotated -> (B, T, E)."""
+        """Return the attention's result (B, T, E) for q, k and v (B, T, 3 E), not yet rotated; others as `forward`."""
         batch, tokens, width = qkv.shape
         qkv = qkv.view(batch, tokens, 3 * self.heads, self.channels)
         qk = rotate(qkv[:, :, : 2 * self.heads], *rotary)
@@ -102,12 +108,14 @@ class Layer(nn.Module):
 
 
 class LayerStack(Packable):
-    """Decoder layers between an entry and a norm, the base of the trunk and the drafter.
+    """Base class of the trunk and the drafter: an input step, decoder layers and a final norm.
 
     Attributes:
-        inputs: Number of tensors (B, T, E) that it takes.
-        width: Width of the layers.
-        outer: E, the width outside of them. Layers of a grown stack are wider (`targets/grown.py`).
+        inputs: Number of input tensors (B, T, E).
+        width: Width inside the layers.
+        outer: E, width of inputs and outputs. Equals `width` unless the stack was enlarged (`targets/grown.py`).
+        heads: Number of attention heads.
+        depth: Number of layers.
     """
 
     inputs = 1
@@ -120,20 +128,26 @@ class LayerStack(Packable):
         self.norm = nn.RMSNorm(width, eps=1e-5)
 
     def enter(self, *inputs: Tensor) -> Tensor:
-        """Join the inputs (B, T, E) to one tensor (B, T, E)."""
+        """Combine the inputs, (B, T, E) each, into one tensor (B, T, E)."""
         return inputs[0]
 
     def begin(self, *inputs: Tensor) -> Tensor:
-        """Return what the first layer reads, (B, T, width): the inputs, then zeros."""
+        """Return the first layer's input (B, T, width): the combined inputs (B, T, E), padded with zeros."""
         x, rest = self.enter(*inputs), self.width - self.outer
         return x if not rest else torch.cat([x, x[..., :1].expand(*x.shape[:-1], rest) * 0.0], -1)
 
     def finish(self, x: Tensor) -> Tensor:
-        """Return the hidden states (B, T, E) of the last layer's output (B, T, width)."""
+        """Turn the last layer's output (B, T, width) into hidden states (B, T, E)."""
         return self.norm(x if self.width == self.outer else x[..., : self.outer])
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
-        """Return an empty cache. fixed: of fixed shapes; default: on CUDA."""
+        """Return an empty key/value cache.
+
+        Args:
+            batch: Number of sequences.
+            capacity: Maximum number of tokens.
+            fixed: Whether every forward attends to all slots, so that its shapes are fixed. None: only on CUDA.
+        """
         like: Tensor = self.norm.weight
         if isinstance(self.packed, Bfloat16Layers):
             like = like.float()
@@ -142,7 +156,11 @@ class LayerStack(Packable):
         return CapturedCache(*sizes, like) if fixed else Cache(*sizes, like)
 
     def pack_weights(self) -> Program | Bfloat16Layers | None:
-        """Return the compiled stack in float32, blocked layers in bfloat16 where the CPU multiplies that."""
+        """Compile the stack for a CPU. `pack` calls this.
+
+        Returns:
+            A program in float32. In bfloat16 layers with blocked weights, if the CPU can multiply bfloat16. Else None.
+        """
         if self.norm.weight.dtype == torch.float32:
             return Program(self.recorded, *[(1, 1, self.outer)] * self.inputs)
         if self.norm.weight.dtype == torch.bfloat16 and multiplies_bfloat16():
@@ -152,12 +170,13 @@ class LayerStack(Packable):
     def run(
         self, inputs: Sequence[Tensor], positions: Tensor, cache: Cache | None, seen: np.ndarray | Tensor | None
     ) -> Tensor:
-        """Return the hidden states (B, T, E) of new tokens behind the cached ones; the cache grows by T.
+        """Return the hidden states (B, T, E) of T new tokens that follow the cached ones. The cache grows by T.
 
         Args:
             inputs: Tensors (B, T, E).
             positions: (T,) rotary positions.
-            seen: As in `attention_mask`.
+            cache: Keys and values of earlier tokens. None: there are none.
+            seen: Which tokens each new one attends to, as in `attention_mask`. None: attention is causal.
         """
         x = inputs[0]
         mask = attention_mask(seen, x.shape[1], cache, x)
@@ -176,17 +195,25 @@ class LayerStack(Packable):
         return hidden
 
     def captures(self, x: Tensor) -> bool:
-        """Return whether a forward of x (B, T, E) over a cache of fixed shapes runs in a captured graph."""
+        """Return whether a forward of x (B, T, E) can run in a captured graph: batch 1 on CUDA, without gradients."""
         return x.is_cuda and x.shape[0] == 1 and not wants_gradient(x)
 
     def recorded(self, *inputs: Tensor) -> Tensor:
-        """Return the hidden states of stand-ins for tensors, to record a program."""
+        """Compute the hidden states of `Recorded` inputs, stand-ins for tensors (1, 1, E). This records a program."""
         return self.finish(self.run_layers(self.begin(*inputs), slice(None), None, None, None))
 
     def run_layers(
         self, x: Tensor, positions: Tensor | slice, cache: Cache | None, slots: Slots | None, mask: Tensor | None
     ) -> Tensor:
-        """Run the modules of the layers; keys and values go to `slots` of the cache."""
+        """Return the output of the last layer, computed by torch.
+
+        Args:
+            x: (B, T, width) input of the first layer.
+            positions: (T,) rotary positions.
+            cache: Keys and values of earlier tokens. None: there are none.
+            slots: Slots of the cache that the new keys and values are written to.
+            mask: Result of `attention_mask`. None: attention is causal.
+        """
         rotary = self.rotary(positions)
         for i, layer in enumerate(self.layers):
             x = layer(x, rotary, cache.layers[i] if cache is not None else None, slots, mask)
@@ -194,7 +221,7 @@ class LayerStack(Packable):
 
 
 class Trunk(LayerStack):
-    """The stack whose hidden states the head and the drafter read."""
+    """The target's decoder layers. The head and the drafter read its hidden states."""
 
     def __init__(self, width: int, layers: int, heads: int, feed_forward: int) -> None:
         super().__init__(width, layers, heads, feed_forward)
@@ -207,5 +234,12 @@ class Trunk(LayerStack):
     def forward(
         self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
-        """Hidden states (B, T, E) of the new tokens x (B, T, E) at rotary `positions` (T,), behind the cached ones."""
+        """Return the hidden states (B, T, E) of T new tokens that follow the cached ones. The cache grows by T.
+
+        Args:
+            x: (B, T, E) embeddings.
+            positions: (T,) rotary positions.
+            cache: Keys and values of earlier tokens. None: there are none.
+            seen: Which tokens each new one attends to, as in `attention_mask`. None: attention is causal.
+        """
         return self.run((x,), positions, cache, seen)

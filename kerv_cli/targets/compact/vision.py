@@ -1,7 +1,7 @@
-"""Frames -> vision tokens and image points.
+"""The vision encoder: a small convolutional network that turns an image into vision tokens and image points.
 
-A small convolutional stem. Two things leave it: a coarse grid of tokens for the trunk, and K image points by spatial
-soft-argmax (Finn et al. 2016) on the finest map, because success depends on the position of markers of 4 pixels.
+The vision tokens are a coarse grid for the trunk. The K image points are found by spatial soft-argmax (Finn et al.
+2016) on the finest feature map, because success depends on the exact position of markers that are 4 pixels wide.
 """
 
 from __future__ import annotations
@@ -16,8 +16,13 @@ from kerv_cli.targets.compact.packable import Packable
 
 
 class Residual(nn.Module):
-    """Residual block: a norm and two 3 × 3 convolutions. norm: instance (every channel is normalised by itself, which
-    light and colour change least) or group (eight groups of channels); the weights have the same shapes."""
+    """Residual block: a norm and two 3 × 3 convolutions.
+
+    Args:
+        channels: C, number of channels.
+        norm: `group` normalises eight groups of channels. `instance` normalises each channel by itself, which makes the
+            output least sensitive to light and colour. The weights have the same shapes.
+    """
 
     def __init__(self, channels: int, norm: str = "group") -> None:
         super().__init__()
@@ -26,13 +31,21 @@ class Residual(nn.Module):
         self.second = nn.Conv2d(channels, channels, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """x (B, C, h, w) -> the same shape."""
+        """Return the block's output (B, C, h, w) for x (B, C, h, w)."""
         return x + self.second(F.relu(self.first(self.norm(x))))
 
 
 class VisionEncoder(Packable):
-    """The convolutional stem. size: of a view, pixels. grid: vision tokens per side. keypoints: K. channels: of the
-    first stage. width: E. norm: of its residual blocks."""
+    """The vision encoder of one camera view (docs/methods.md §0.1).
+
+    Args:
+        size: Pixels per side of the image.
+        grid: Vision tokens per side.
+        keypoints: K, number of image points.
+        channels: Channels of the first stage. The second has twice, the third four times as many.
+        width: E, width of a vision token.
+        norm: Norm of the residual blocks, `group` or `instance`.
+    """
 
     columns: Tensor
     packed: Callable[[Tensor], list[Tensor]] | None
@@ -52,13 +65,13 @@ class VisionEncoder(Packable):
         self.register_buffer("columns", torch.linspace(-1, 1, size // 2), persistent=False)
 
     def pack_weights(self) -> Callable[[Tensor], list[Tensor]] | None:
-        """Return the encoder of one frame as a graph of ONNX Runtime; None in other formats than float32."""
-        from kerv_cli.targets.compact.vision_graph import PackedVision  # ONNX Runtime, which a GPU does not need
+        """Return this encoder in ONNX Runtime, for one image at a time. None if the weights are not float32."""
+        from kerv_cli.targets.compact.vision_graph import PackedVision  # loads ONNX Runtime, needed only on a CPU
 
         return PackedVision(self, 2 * len(self.columns)) if self.columns.dtype == torch.float32 else None
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """images (B, 3, size, size) uint8 -> tokens (B, grid², E), points (B, 2K) in [-1, 1]."""
+        """Return vision tokens (B, grid², E) and image points (B, 2K) in [-1, 1] of images (B, 3, size, size) uint8."""
         if self.packed is not None and len(images) == 1:
             tokens, points = self.packed(images)
             return tokens, points
@@ -75,7 +88,11 @@ class VisionEncoder(Packable):
         return tokens, self.points(heat)
 
     def points(self, heat: Tensor) -> Tensor:
-        """heat maps (B, K, h, w) -> (B, 2K): each map's expected column and row under its softmax, in [-1, 1]."""
+        """Return the image points of K heat maps (B, K, h, w): the expected column and row under each map's softmax.
+
+        Returns:
+            (B, 2K) in [-1, 1]: all columns, then all rows.
+        """
         batch, keypoints, height, width = heat.shape
         scaled = heat.float() * self.temperature[:, None, None].float()
         weight = scaled.flatten(2).softmax(-1).view(batch, keypoints, height, width)
