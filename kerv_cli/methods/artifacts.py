@@ -1,4 +1,7 @@
-"""The files of a policy: its target and the artifacts that belong to it. Each is loaded and hashed once per process."""
+"""Find, check and load the files of a policy: its target, and artifacts such as drafter, datastore and calibration.
+
+Each file is loaded and hashed once per process.
+"""
 
 from __future__ import annotations
 
@@ -26,19 +29,19 @@ TARGET = "target"
 
 T = TypeVar("T")
 _LOADED: dict[tuple[Any, ...], Any] = {}
-"""Artifacts of this process by everything that they depend on."""
+"""Artifacts that this process has loaded, by everything that they depend on."""
 
 
 @dataclass(frozen=True)
 class Use:
-    """What the artifacts of a method are used for, before anything is loaded.
+    """The use of a method's artifacts, which is checked before anything is loaded.
 
     Args:
-        method: Kind -> settings of the method's parts.
+        method: Kind of a part, such as `proposer` -> settings of the method's part.
         dtype: Number format of the models.
         environment: Name of the policy's environment.
-        tasks: Full names of the tasks; empty if a client names them later.
-        world: Camera and horizon; None if they are a client's.
+        tasks: Full names of the tasks. Empty if a client of `kerv serve` names the tasks later.
+        world: Camera and horizon (maximum episode length). None if a client of `kerv serve` runs the episodes.
     """
 
     method: Mapping[str, Any]
@@ -53,9 +56,9 @@ class MadeFor:
     """The target that an artifact was made for.
 
     Attributes:
-        sha256: Hash of its weights.
-        actions: Its action space.
-        chunk: H; 0 if it does not matter.
+        sha256: Hash of the target's weights.
+        actions: The target's action space.
+        chunk: The target's number of control steps per chunk. 0: the artifact works with any number.
     """
 
     sha256: str
@@ -64,20 +67,20 @@ class MadeFor:
 
     @classmethod
     def of(cls, target: TargetDescription) -> MadeFor:
-        """Return the target of a description."""
+        """Return the target with this description."""
         return cls(target.origin["sha256"], target.actions, target.chunk)
 
     def check_same(self, target: MadeFor, what: str, made: str, again: str) -> None:
-        """Refuse another target.
+        """Refuse an artifact that was made for another target than the policy's.
 
         Args:
-            target: The policy's.
-            what: Names the artifact in messages.
-            made: How it was made, e.g. `trained`.
-            again: The remedy.
+            target: The policy's target.
+            what: Name of the artifact, for the error message.
+            made: How the artifact was made, such as `trained`, for the error message.
+            again: What to do, for the error message.
 
         Raises:
-            CheckpointError: Another action space, normalisation, chunk length or other weights.
+            CheckpointError: The action space, its normalisation, the chunk length or the weights differ.
         """
         self.actions.check_same(target.actions, what, "the target", statistics=True)
         if self.chunk and self.chunk != target.chunk:
@@ -86,16 +89,16 @@ class MadeFor:
 
 
 def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str, again: str) -> None:
-    """Refuse an artifact that was made from other artifacts than those of the policy.
+    """Refuse an artifact that was made from other artifacts than the policy uses.
 
     Args:
-        sources: Kind -> hash of what it was made from. Kinds that the policy does not use do not matter.
+        sources: Kind -> hash of each artifact that it was made from. Kinds that the policy does not use are ignored.
         used: Kind -> hash of the policy's target and artifacts.
-        what: Beginning of the message, e.g. `the early drafter in FOLDER was trained`.
-        again: The remedy.
+        what: Beginning of the error message, such as `the early drafter in FOLDER was trained`.
+        again: What to do, for the error message.
 
     Raises:
-        CheckpointError: The policy uses another artifact of one of these kinds.
+        CheckpointError: The policy uses an artifact of the same kind with another hash.
     """
     for kind, digest in sources.items():
         if used.get(kind, digest) != digest:
@@ -104,20 +107,22 @@ def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str
 
 
 def removal(kind: str, path: Path) -> str:
-    """Return how to make room for a new artifact."""
+    """Return text for an error message: how to remove the artifact in `path`, to make room for a new one."""
     return f"remove it with 'kerv runs rm {kind}/{path.name}'" if path.parent.name == kind else f"move {path} aside"
 
 
 class Artifact(Generic[T]):
-    """A kind of artifact: one JSON of the dataclass `schema`, perhaps with other files beside it, made for one target.
+    """Base of the kinds of artifacts. An artifact is made for one target and read by some methods.
 
-    `TrainableDrafter` (`drafters.py`) is the base of those with weights.
+    Its description is a JSON of the dataclass `schema`. Other files may lie beside the JSON. Drafters with weights
+    derive from the subclass `TrainableDrafter` (`drafters.py`).
 
     Attributes:
-        kind: Its name among the parts.
-        noun: Its name in messages.
-        made: How it is made, e.g. `trained`.
-        command: Words after `kerv` that make one; empty if no command does.
+        kind: Name of the kind in settings and paths, such as `drafter`.
+        noun: Name of the kind in messages, such as `early drafter`.
+        made: How it is made, in messages, such as `trained`.
+        command: Command-line arguments after `kerv` that make such an artifact. Empty if no command makes it.
+        schema: Dataclass of the description.
     """
 
     kind: str
@@ -128,67 +133,74 @@ class Artifact(Generic[T]):
 
     @property
     def again(self) -> str:
-        """How to get one that is missing or does not fit."""
+        """Text for error messages: how to make such an artifact."""
         return f"run 'kerv {' '.join(self.command)}'"
 
     def anew(self, path: Path) -> str:
-        """Return how to replace one that was made for another target."""
+        """Return text for error messages: how to replace the artifact in `path`, which belongs to another target."""
         return self.again
 
     def path(self, results: str, name: str | None, target: Path) -> Path:
-        """Return its path: that of a name, else the one beside the target in the folder `target`."""
+        """Return the path of an artifact.
+
+        Args:
+            results: The results folder.
+            name: Name of the artifact, or a path. None: the artifact beside the target.
+            target: Folder of the target.
+        """
         return artifact(results, self.kind, name) if name else beside(target, self.kind)
 
     def json(self, path: Path) -> Path:
-        """Return the file of its description."""
+        """Return the path of the description of the artifact in `path`."""
         return path / f"{self.kind}.json"
 
     def load(self, path: Path, artifacts: Artifacts) -> Any:
-        """Return the artifact, loaded for the target of `artifacts`. One without other files is its description.
+        """Load the artifact in `path`, for the target of `artifacts`. Without other files it is its description.
 
         Raises:
-            CheckpointError: As `checked`, or files that do not fit.
+            CheckpointError: The artifact is missing, damaged or made for another target.
         """
         return self.checked(path, artifacts.description)
 
     def made_for(self, description: T) -> MadeFor:
-        """Return the target that it was made for."""
+        """Return the target that the artifact was made for."""
         fields: Any = description
         return MadeFor(fields.target, fields.actions, fields.chunk)
 
     def sources(self, description: T) -> Mapping[str, str]:
-        """Return kind -> hash of the other artifacts that it was made from."""
+        """Return kind -> hash of the other artifacts that this artifact was made from."""
         return {}
 
     def needs(self, description: T) -> tuple[str, ...]:
-        """Return further kinds that a method with this artifact reads. Only the artifact knows them."""
+        """Return further kinds of artifacts that a method needs because this artifact's description names them."""
         return ()
 
     def check_use(self, description: T, use: Use) -> None:
-        """Refuse a use that the artifact does not fit.
+        """Refuse a use that the artifact was not made for. By default every use is allowed.
 
         Raises:
-            UsageError: Another method or world than it was made for.
-            CheckpointError: It lacks something that the method reads.
+            UsageError: The artifact was made for another method, environment, camera or horizon.
+            CheckpointError: Something that the method reads is missing in the artifact.
         """
 
     def command_beside(self, kinds: Collection[str]) -> tuple[str, ...]:
-        """Return `command` for a target that has artifacts of these `kinds`."""
+        """Return the command that makes the artifact, for a target with artifacts of these `kinds`."""
         return self.command
 
     def is_complete(self, description: T, kinds: Collection[str]) -> bool:
-        """Return whether it has all that `command` would make of the artifacts `kinds`."""
+        """Return whether the artifact holds everything that its command would make from artifacts of these `kinds`."""
         return True
 
     def digest(self, path: Path, description: T) -> str:
-        """Return the hash by which it counts in the identity of results."""
+        """Return the hash that stands for the artifact in the identity of results."""
         return sha256_of(self.json(path))
 
     def read(self, path: Path) -> T:
-        """Return its description, whatever its target.
+        """Read the description of the artifact in `path`, without checking its target.
 
         Raises:
-            CheckpointError: It is missing, damaged or of another format, or its files are not those that it names.
+            CheckpointError: The description is missing, damaged or of another format. Or the files beside it have other
+                hashes than it names.
         """
         file = self.json(path)
         if not file.is_file():
@@ -196,7 +208,7 @@ class Artifact(Generic[T]):
         return self.described(file)
 
     def described(self, file: Path) -> T:
-        """Return the description in an existing file. The errors are those of `read`."""
+        """Read the description in an existing file. The errors are those of `read`."""
         try:
             description = read_file(self.schema, file)
         except CheckpointError as error:
@@ -205,10 +217,11 @@ class Artifact(Generic[T]):
         return description
 
     def checked(self, path: Path, target: TargetDescription) -> T:
-        """Return its description, if it was made for this target.
+        """Read the description of the artifact in `path`, and check that it was made for this target.
 
         Raises:
-            CheckpointError: As `read`, or another target, action space or chunk length.
+            CheckpointError: The artifact is missing or damaged. Or it was made for another target, action space or
+                chunk length.
         """
         description = self.read(path)
         made_for, what = self.made_for(description), f"the {self.noun} in {path}"
@@ -217,7 +230,7 @@ class Artifact(Generic[T]):
 
 
 class Artifacts:
-    """The artifacts of one policy, checked and loaded on demand."""
+    """The target and the artifacts of one policy, checked and loaded on demand."""
 
     def __init__(
         self, results: str, policy: PolicySettings, search: Any = None, device: str = "cpu", dtype: str = "float32"
@@ -229,30 +242,33 @@ class Artifacts:
 
     @functools.cached_property
     def description(self) -> TargetDescription:
-        """The target's description. Its weights are not loaded."""
+        """The target's description. The weights are not loaded."""
         return checkpoint.read_target(self.folder)
 
     @property
     def target(self) -> Any:
-        """The target, loaded: a Target, of most families a ReadableTarget."""
+        """The loaded target: a `Target`, or for most families a `ReadableTarget` (`engine/protocol.py`)."""
         return _target(self.folder, self.description.sha256, self.device, self.dtype)
 
     def path(self, kind: str) -> Path:
-        """Return the path of the artifact of this kind."""
+        """Return the path of the policy's artifact of this kind."""
         beside = Path(self.description.origin.get("base", self.folder))
         return kind_of(kind).path(self.results, self.policy.artifacts.get(kind), beside)
 
     def check(self, kinds: Iterable[str], use: Use | None = None) -> dict[str, str]:
-        """Return kind -> hash, of the target and of `kinds`.
+        """Check artifacts without loading their weights.
 
         Args:
-            kinds: Kinds of artifacts.
-            use: What they are for. None: not checked.
+            kinds: Kinds of the artifacts.
+            use: The method and the world that they will be used in. None: do not check the use.
+
+        Returns:
+            Kind -> hash of the target, of the artifacts and of further artifacts that these name.
 
         Raises:
-            CheckpointError: One is missing, damaged, or was made for another target, or from another artifact than the
-                one among `kinds`.
-            UsageError: One does not fit its use.
+            CheckpointError: An artifact is missing, damaged, made for another target, or made from another artifact
+                than the policy uses.
+            UsageError: An artifact was not made for this use.
         """
         hashes, sources, todo = {TARGET: self.description.sha256}, [], list(kinds)
         for kind in todo:
@@ -274,17 +290,17 @@ class Artifacts:
         return hashes
 
     def _making(self, files: Artifact[Any]) -> tuple[str, ...]:
-        """Return the words of the command that makes a missing artifact."""
+        """Return the command-line arguments after `kerv` that make a missing artifact."""
         target, name = f"policy.target={self.policy.target}", self.policy.artifacts.get(files.kind)
         if name is None or "/" in name:
             return "prepare", target
         return *files.command, target, f"policy.artifacts.{files.kind}={name}"
 
     def load(self, kind: str) -> Any:
-        """Return the artifact, loaded for the target. It is one object per process.
+        """Load the policy's artifact of this kind. Further calls in this process return the same object.
 
         Raises:
-            CheckpointError: As `check`.
+            CheckpointError: The artifact is missing, damaged or made for another target.
         """
         path, digest = self.path(kind), self.check([kind])[kind]
         key = kind, path, digest, self.folder, self.device, self.dtype, repr(self.search)
@@ -294,10 +310,10 @@ class Artifacts:
 
 
 def kind_of(name: str) -> Artifact[Any]:
-    """Return the kind of artifact of this name.
+    """Return the kind of artifact with this name, such as `drafter`.
 
     Raises:
-        UnknownName: There is none.
+        UnknownName: No kind of artifact has this name.
     """
     return find("artifact", name).built()
 

@@ -1,6 +1,6 @@
-"""The calibration: figures fitted on training demonstrations (docs/methods.md §3, §4).
+"""The calibration: numbers measured on training demonstrations (docs/methods.md §3, §4).
 
-`kerv calibrate` writes it. Thresholds, predictors, boundaries and verify-skip read it.
+`kerv calibrate` writes it. Thresholds, predictors, boundaries and the rule that skips verification read it.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ FILE = "calibration.json"
 NEVER = 1.01  # s_min of a task that never skips: cosines do not exceed 1
 AGAIN = "run 'kerv calibrate' again"
 Errors = dict[str, dict[str, dict[str, list[float]]]]
-"""predictor -> task -> DoF -> mean absolute error 1 … H steps ahead, normalised action units."""
+"""Predictor -> task -> DoF -> mean absolute errors 1 to H control steps ahead, in normalised action units."""
 
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """The demonstrations of a calibration.
+    """The demonstrations that a calibration was measured on.
 
     Attributes:
-        sha256: Their hash.
-        tasks: Task -> {"training": episodes, "held_out": episodes}.
+        sha256: Hash of the demonstrations.
+        tasks: Task -> {"training": number of episodes, "held_out": number of episodes}.
     """
 
     sha256: str
@@ -37,9 +37,19 @@ class Demonstrations:
 
 @dataclass(frozen=True)
 class Variability:
-    """Distribution of the variability K over a task's pre-sampled decodes, in normalised action units."""
+    """The kinematic variability K of a task: the mean distance between draft and target tokens of a decode (§3.2).
 
-    k_s: float  # the reference level K_S
+    All numbers are in normalised action units.
+
+    Attributes:
+        k_s: Reference level K_S: the median K over the decodes that were measured.
+        decodes: Number of decodes that were measured.
+        p25: 25th percentile of K.
+        p75: 75th percentile of K.
+        p90: 90th percentile of K.
+    """
+
+    k_s: float
     decodes: int
     p25: float
     p75: float
@@ -48,7 +58,12 @@ class Variability:
 
 @dataclass(frozen=True)
 class BoundarySection:
-    """Ranges of the hybrid boundary by the number of positions that it looks at (§4.4)."""
+    """Ranges that scale the curvature and the path length of the hybrid boundary (docs/methods.md §4.4).
+
+    Attributes:
+        episodes: Number of episodes that were measured.
+        windows: Number of positions in the boundary's window, as text -> its ranges.
+    """
 
     episodes: int
     windows: dict[str, BoundaryRanges]
@@ -56,16 +71,18 @@ class BoundarySection:
 
 @dataclass(frozen=True)
 class SkipLevel:
-    """Verify-skip levels of a task, cosines (§4.3).
+    """The similarities from which a task's retrieved chunks are executed without verification (docs/methods.md §4.3).
+
+    Similarities are cosines. To measure them, entries of the datastore were looked up in other episodes.
 
     Attributes:
-        s_min: Similarity from which a chunk is executed without verification.
-        low: Lowest value that feedback may move `s_min` to.
-        high: Highest value.
-        share: Part of the datastore's entries that `s_min` would skip, each with another episode's best neighbour.
-        entries: Entries of the task that were looked up.
-        within: Part of the skipped ones whose error is at most epsilon.
-        error: Mean error of the skipped ones, normalised action units.
+        s_min: A chunk is executed without verification if its similarity is at least this.
+        low: Lowest value that feedback after an episode may move `s_min` to.
+        high: Highest value that feedback after an episode may move `s_min` to.
+        share: Share of the entries whose best neighbour reaches `s_min`.
+        entries: Number of entries that were looked up.
+        within: Of the entries that reach `s_min`, the share whose chunk was good. None: no entry reaches it.
+        error: Mean absolute error of their chunks, in normalised action units. None: no entry reaches `s_min`.
     """
 
     s_min: float
@@ -79,7 +96,14 @@ class SkipLevel:
 
 @dataclass(frozen=True)
 class SkipSection:
-    """Skip levels by task, for the datastore with this hash."""
+    """The similarities from which verification is skipped, for one datastore.
+
+    Attributes:
+        datastore: Hash of the datastore.
+        epsilon: Largest mean absolute error of a good chunk, in normalised action units.
+        confidence: Minimum share of good chunks among the skipped ones.
+        tasks: Task -> its similarities.
+    """
 
     datastore: str
     epsilon: float
@@ -89,12 +113,24 @@ class SkipSection:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Contents of `calibration.json`. Sections that were not measured are None or empty."""
+    """Contents of `calibration.json`. A section that was not measured is None or empty.
+
+    Attributes:
+        target: The target that was measured.
+        demos: The demonstrations.
+        window: Number of control steps of history that a predictor sees.
+        noise: Kalman filter (`kalman`, `damped`) -> its noise per DoF.
+        errors: Errors of all predictors on held-out episodes.
+        variability: Task -> reference level K_S and distribution of the kinematic variability K.
+        boundary: Ranges of the hybrid boundary.
+        skip: Similarities from which verification is skipped.
+        provenance: How it was made.
+    """
 
     target: MadeFor
     demos: Demonstrations
-    window: int  # control steps of history
-    noise: dict[str, Noise]  # per kind of filter
+    window: int
+    noise: dict[str, Noise]
     errors: Errors
     variability: dict[str, Variability]
     boundary: BoundarySection | None = None
@@ -105,14 +141,14 @@ class Calibration:
 
     @property
     def tasks(self) -> Collection[str]:
-        """Tasks that have levels."""
+        """Tasks for which K_S was measured."""
         return self.variability
 
     def k_s(self, task: str) -> float:
-        """Return the task's reference level K_S, in normalised action units.
+        """Return the task's reference level K_S of the variability, in normalised action units.
 
         Raises:
-            CheckpointError: The task was not pre-sampled.
+            CheckpointError: K_S was not measured for this task.
         """
         if task not in self.variability:
             raise CheckpointError(
@@ -122,10 +158,10 @@ class Calibration:
         return self.variability[task].k_s
 
     def ranges(self, window: int) -> BoundaryRanges:
-        """Return the ranges of R and D for a boundary that looks at `window` positions.
+        """Return the ranges of the path's radius of curvature and length, for a boundary that sees `window` positions.
 
         Raises:
-            CheckpointError: None were measured, or none for this window.
+            CheckpointError: No ranges were measured for this window.
         """
         if self.boundary is None:
             raise CheckpointError(f"the calibration has no ranges for the boundary: {AGAIN}")
@@ -138,14 +174,14 @@ class Calibration:
         return windows[str(window)]
 
     def skip_levels(self, task: str, datastore: str) -> tuple[float, float, float]:
-        """Return (low, s_min, high) of the task, cosines in ascending order; NEVER if nothing is skipped.
+        """Return the task's `low`, `s_min` and `high`, as in `SkipLevel`. All three are NEVER if the task never skips.
 
         Args:
-            task: Full name.
-            datastore: Hash of the datastore that retrieves.
+            task: Full name of the task.
+            datastore: Hash of the datastore that is in use.
 
         Raises:
-            CheckpointError: No levels, none for this task, or those of another datastore.
+            CheckpointError: The similarities were not measured, or not for this task or this datastore.
         """
         if self.skip is None:
             raise CheckpointError(f"the calibration has no skip levels: build a datastore, then {AGAIN}")
@@ -160,17 +196,17 @@ class Calibration:
 
 
 class CalibrationArtifact(Artifact[Calibration]):
-    """The calibration: a single file, which its path names."""
+    """The kind of artifact `calibration`: a single file. An artifact's path is that file, not a folder."""
 
     kind = noun = "calibration"
     made, command = "made", ("calibrate",)
     schema = Calibration
 
     def path(self, results: str, name: str | None, target: Path) -> Path:
-        """Return the named calibration, else the target's.
+        """Return the path of the calibration with this name; without a name, of the target's calibration.
 
-        A shipped one is pretrained/<name>/calibration.json, one made here
-        artifacts/calibration/<name>/calibration.json.
+        A shipped calibration is `pretrained/<name>/calibration.json`. One made by `kerv calibrate` is
+        `artifacts/calibration/<name>/calibration.json`.
         """
         if name is None and target.name == "target":
             return target.parent / FILE
@@ -179,24 +215,28 @@ class CalibrationArtifact(Artifact[Calibration]):
         return super().path(results, name, target) / FILE
 
     def json(self, path: Path) -> Path:
-        """Return the path itself."""
+        """Return `path`, which is the file of the description."""
         return path
 
     def check_use(self, description: Calibration, use: Use) -> None:
-        """Refuse a task without the reference level that the threshold reads."""
+        """Refuse a task without K_S, if the method's threshold needs it.
+
+        Raises:
+            CheckpointError: K_S was not measured for a task.
+        """
         if getattr(use.method["threshold"], "k_s", 0.0) is None:
             for task in use.tasks:
                 description.k_s(task)
 
     def command_beside(self, kinds: Collection[str]) -> tuple[str, ...]:
-        """Return the command; without a drafter it pre-samples no decodes."""
+        """Return the command that makes a calibration. Without a drafter among `kinds` it does not measure K_S."""
         return self.command if "drafter" in kinds else (*self.command, "decodes=0")
 
     def is_complete(self, description: Calibration, kinds: Collection[str]) -> bool:
-        """Return whether it has a section of each source in `kinds`."""
+        """Return whether K_S was measured if `kinds` has a drafter, and skip levels if `kinds` has a datastore."""
         sections = {"drafter": description.variability, "datastore": description.skip}
         return all(section for kind, section in sections.items() if kind in kinds)
 
     def made_for(self, description: Calibration) -> MadeFor:
-        """Return the target that it was made for."""
+        """Return the target that the calibration was made for."""
         return description.target

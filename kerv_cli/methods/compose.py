@@ -1,4 +1,4 @@
-"""A method: which parts fit together, what they need, and the decoder that is made of them (docs/methods.md)."""
+"""A method: check that its parts fit together, and build the decoder from them (docs/methods.md)."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from kerv_cli.targets.checkpoint import TargetDescription
 
 @dataclass(frozen=True)
 class Method:
-    """A method: its parts and its chunk.
+    """A decoding method: one part of each kind, such as proposer, acceptance and skip.
 
     Attributes:
-        settings: Kind -> settings, for every kind of METHOD_KINDS.
-        chunk: H; 0 for the target's.
-        name: Its name in messages.
+        settings: Kind of each part in METHOD_KINDS -> the part's settings.
+        chunk: Number of control steps per chunk. 0: as many as the target was trained for.
+        name: Name of the method, for messages.
     """
 
     settings: Mapping[str, Any]
@@ -35,37 +35,35 @@ class Method:
 
     @classmethod
     def of(cls, settings: MethodSettings) -> Method:
-        """Return the method of a command's settings."""
+        """Return the method that a command's settings describe."""
         return cls(settings.parts(), settings.chunk, settings.method)
 
     @functools.cached_property
     def parts(self) -> dict[str, Part]:
-        """Kind -> part.
+        """Kind -> the registered part, for every kind in METHOD_KINDS.
 
         Raises:
-            UnknownName: There is no such part.
+            UnknownName: The settings name a part that does not exist.
         """
         return {kind: part_of(kind, self.settings[kind].kind) for kind in METHOD_KINDS}
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """The kinds of artifacts that its parts read, each once."""
+        """The kinds of artifacts that the parts need, such as `drafter`, without repetitions."""
         kinds = (need for kind, part in self.parts.items() for need in part.needs(self.settings[kind]))
         return tuple(dict.fromkeys(kinds))
 
     def check(self, target: Target | TargetDescription, batch: int = 1, key: str = "rollout.batch") -> None:
-        """Refuse parts that do not fit together or to the target, and numbers out of range.
-
-        Nothing heavy is loaded yet.
+        """Refuse parts that do not work together or with the target, and numbers out of range. Loads no weights.
 
         Args:
-            target: A loaded target, or the description of one.
-            batch: Episodes that are decoded together.
-            key: The setting that says how many.
+            target: A loaded target, or a target's description.
+            batch: Number of episodes that are decoded together.
+            key: The setting with that number, for the error message.
 
         Raises:
-            UnknownName: There is no such part.
-            UsageError: A composition that cannot work, or a number out of range.
+            UnknownName: The settings name a part that does not exist.
+            UsageError: The parts cannot work together or with the target, or a number is out of range.
         """
         for kind, part in self.parts.items():
             if not isinstance(self.settings[kind], part.settings):
@@ -78,7 +76,11 @@ class Method:
         self._check_batch(batch, key)
 
     def _check_drafts(self) -> None:
-        """Check that a boundary has two drafters to choose from, and that an in-prefill draft needs no states."""
+        """Check the proposer, the boundary and the prefill draft.
+
+        A boundary that chooses needs a proposer with two drafters, and the reverse. A prefill draft must not need the
+        target's hidden states, which exist only after the prefill.
+        """
         proposer, boundary, draft = (self.parts[kind] for kind in ("proposer", "boundary", "prefill_draft"))
         if bool(proposer.traits.get("has_boundary")) != bool(boundary.traits.get("chooses")):
             raise UsageError(
@@ -92,7 +94,7 @@ class Method:
             )
 
     def _check_skip(self) -> None:
-        """Check that a rule that executes drafts unverified has one source of whole chunks before the prefill."""
+        """Check that a skip rule that executes the prefill draft without verification has a draft of whole chunks."""
         skip, draft = self.parts["skip"], self.parts["prefill_draft"]
         joined = skip.traits.get("merges") and draft.traits.get("merged")
         if skip.traits.get("takes_draft") and not draft.traits.get("chains") and not joined:
@@ -101,7 +103,7 @@ class Method:
             )
 
     def _check_batch(self, batch: int, key: str) -> None:
-        """Check that several episodes at a time run through the same forwards."""
+        """Check that the method can decode several episodes together, if `batch` is not 1."""
         if batch == 1:
             return
         draft, proposer, skip, threshold = (self.parts[k] for k in ("prefill_draft", "proposer", "skip", "threshold"))
@@ -116,15 +118,15 @@ class Method:
             raise UsageError(f"{key}={batch}: threshold={threshold.name} follows one episode. Use another")
 
     def decoder(self, target: Target, artifact: Callable[[str], Any], task: str = "") -> Decoder:
-        """Return the decoder of the method around a target.
+        """Build the decoder of this method for a target.
 
         Args:
-            target: The policy that verifies.
+            target: The policy that verifies drafts.
             artifact: Returns the loaded artifact of a kind. Called only for the kinds in `needs`.
-            task: Full name, for parts whose calibrated levels differ between tasks.
+            task: Full name of the task, for parts that have calibrated numbers per task.
 
         Raises:
-            UsageError: As `check`.
+            UsageError: The parts cannot work together or with the target, or a number is out of range.
             CheckpointError: An artifact is missing or belongs to another target.
         """
         self.check(target)

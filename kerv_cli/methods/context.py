@@ -1,4 +1,7 @@
-"""What parts are made from: `build` of a method's part takes (settings, context) and returns the part, or None."""
+"""The context in which a method's part is built.
+
+Each part registers a function that takes (settings, context) and returns the part. None stands for no part.
+"""
 
 from __future__ import annotations
 
@@ -11,18 +14,18 @@ from kerv_cli.base.errors import UsageError
 
 @dataclass(frozen=True)
 class Context:
-    """The surroundings of a part.
+    """Everything besides its own settings that a part is built from.
 
     Attributes:
-        target: A Target. Some parts want a ReadableTarget.
-        artifact: Returns the loaded artifact of a kind.
-        task: Full name, or empty.
-        built: The parts that are built already, by kind.
-        method: Settings of all parts, by kind.
-        chunk: H; 0 for the target's.
+        target: A `Target`. Some parts need a `ReadableTarget` (`engine/protocol.py`).
+        artifact: Returns the loaded artifact of a kind, such as `drafter`.
+        task: Full name of the task. Empty: unknown.
+        built: Kind -> part, for the parts of the method that are built already.
+        method: Kind -> settings, for all parts of the method.
+        chunk: Number of control steps per chunk. 0: as many as the target was trained for.
     """
 
-    target: Any  # a Target; some parts want a ReadableTarget
+    target: Any
     artifact: Callable[[str], Any]
     task: str = ""
     built: dict[str, Any] = field(default_factory=dict)
@@ -31,18 +34,18 @@ class Context:
 
     @property
     def calibration(self) -> Any:
-        """The target's `Calibration`. Its type would be a circular import."""
+        """The target's `Calibration`. It is typed as Any to avoid a circular import."""
         return self.artifact("calibration")
 
     def check_radius(self, name: str, r: int) -> None:
-        """Refuse a radius above the largest distance of two tokens.
+        """Refuse an acceptance radius that is larger than the distance of any two tokens.
 
         Args:
-            name: Of the threshold's setting.
-            r: The radius in bins.
+            name: Name of the threshold's setting, for the error message.
+            r: The radius, in bins.
 
         Raises:
-            UsageError: It is too large.
+            UsageError: The radius is too large.
         """
         most = self.target.actions.tokens - 1
         if r > most:

@@ -1,4 +1,7 @@
-"""Success, certified (docs/methods.md §4.6, ours): trust drafts on the tasks that a certificate covers."""
+"""Certified success (docs/methods.md §4.6, ours): execute drafts without verification on certified tasks.
+
+A certificate states that on its tasks a skip rule loses little of the success of autoregressive decoding (AR).
+"""
 
 from __future__ import annotations
 
@@ -11,21 +14,25 @@ from kerv_cli.base.registry import PREFILL, add, find, part_of
 
 @dataclass
 class CertifiedSkipSettings:
-    """The rule that the certificate names on its tasks; elsewhere a streak of at most `most` (§4.5)."""
+    """On the certificate's tasks, use its skip rule. On other tasks, use a streak (docs/methods.md §4.5)."""
 
     kind: str = "certified"
-    most: int = number(8, 1)
+    most: int = number(8, 1)  # longest streak of decodes without verification, on other tasks
 
 
 @dataclass
 class ScopedSettings:
-    """The draft that the certificate names on its tasks; elsewhere another one."""
+    """On the certificate's tasks, use its draft. On other tasks, use the draft `outside`."""
 
     kind: str = "scoped"
-    outside: str = "merged"
+    outside: str = "merged"  # prefill draft on other tasks
 
     def check_together(self, prefix: str) -> None:
-        """Refuse a draft for other tasks that cannot draft whole chunks before the prefill."""
+        """Refuse a draft `outside` that cannot draft whole chunks before the prefill.
+
+        Raises:
+            UsageError: It cannot.
+        """
         outside = find("proposer", self.outside, "prefill_draft.outside")
         if not (outside.traits.get("merged") or outside.traits.get("chains")):
             raise UsageError(
@@ -35,7 +42,10 @@ class ScopedSettings:
 
 
 def _needs(settings: ScopedSettings) -> tuple[str, ...]:
-    """Return the certificate, which names what its own draft reads, and what the other draft reads."""
+    """Return the kinds of artifacts needed: the certificate, and what the draft `outside` needs.
+
+    The certificate itself names what its own draft needs.
+    """
     outside = part_of("prefill_draft", settings.outside)
     return "certificate", *outside.needs(outside.default)
 

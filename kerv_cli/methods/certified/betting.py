@@ -1,12 +1,14 @@
-"""Tests of a mean by betting: the predictable plug-in of Waudby-Smith and Ramdas (2024).
+"""Test a mean by betting against it: the predictable plug-in bets of Waudby-Smith and Ramdas (2024).
 
-The hypothesis is that each value in [0, 1] has an expectation of `bound` or more, given those before it. Then bets
-against it do not win on average. No bet knows the value that it is laid on. So the wealth reaches 1/δ with probability
-δ at most, however often one looks (Ville). Values of different groups, e.g. tasks, must come in random order: sorted
-ones refute their order.
+The hypothesis: each value in [0, 1] has an expectation of at least `bound`, given the values before it. If it is true,
+bets against it do not win on average, because each bet is made before its value is known. A bettor starts with a wealth
+of 1. Under the hypothesis, the wealth ever reaches 1/δ with a probability of at most δ (Ville's inequality). So the test
+may be checked after each value. Values of different groups, such as tasks, must come in random order. Sorted values
+would reject the hypothesis only because of their order.
 
-For a certificate of success a pair's value is (1 + baseline − method) / 2 ∈ {0, ½, 1} and the bound (1 + m) / 2. The
-hypothesis is that a share m or more of the success is lost.
+For a certificate of success, each value comes from a pair of episodes with the same seed, by AR and by the method:
+(1 + AR − method) / 2, so 0, ½ or 1. The bound is (1 + m) / 2. The hypothesis is that the method loses a share m or more
+of the success.
 """
 
 from __future__ import annotations
@@ -15,13 +17,21 @@ import math
 
 import numpy as np
 
-MOST = 0.75  # share of the wealth that a bet can lose
+MOST = 0.75  # largest share of the wealth that a bet may lose
 
 
 def bets(values: np.ndarray, bound: float, delta: float) -> np.ndarray:
-    """Return bets (n,) per unit of bound − value, each from the values before it.
+    """Return the bet on each value. A bet wins its size times (bound − value), as a share of the wealth.
 
-    The number of values has to be settled before the first one is seen.
+    Each bet depends only on the values before it, and on the number of values n. So n must be fixed beforehand.
+
+    Args:
+        values: (n,) in [0, 1], in the order in which they came.
+        bound: The hypothesis is a mean of at least `bound`, in (0, 1).
+        delta: Error probability δ at which the bets aim to reject.
+
+    Returns:
+        (n,) sizes of the bets.
     """
     count = np.arange(1, len(values) + 1)
     mean = (0.5 + np.cumsum(values)) / (count + 1)
@@ -32,25 +42,32 @@ def bets(values: np.ndarray, bound: float, delta: float) -> np.ndarray:
 
 
 def wealth(values: np.ndarray, bound: float, delta: float) -> np.ndarray:
-    """Return the e-value (n,) of "the mean is below the bound" after each value.
+    """Return the wealth after each value, (n,). Large wealth is evidence that the mean is below `bound`.
 
     Args:
         values: (n,) in [0, 1], in the order in which they came.
-        bound: In (0, 1).
-        delta: The level that the bets aim at. The path is valid at every other level too.
+        bound: The hypothesis is a mean of at least `bound`, in (0, 1).
+        delta: Error probability δ at which the bets aim to reject. The wealth is valid for any other δ too.
     """
     return np.exp(np.cumsum(np.log1p(bets(values, bound, delta) * (bound - values))))
 
 
 def p_value(values: np.ndarray, bound: float, delta: float) -> float:
-    """Return p of the hypothesis that the mean is `bound` or more, however often one looked; 1 without values."""
+    """Return the p-value of the hypothesis that the mean is at least `bound`; 1 without values.
+
+    It is 1 / (largest wealth so far), so it stays valid if it is checked after each value. The arguments are those of
+    `wealth`.
+    """
     return float(1 / max(1.0, wealth(values, bound, delta).max(initial=1.0)))
 
 
 def more_to_decide(values: np.ndarray, bound: float, delta: float) -> float:
-    """Return about how many more values like these would bring the wealth to 1/δ with the best constant bet.
+    """Estimate how many more values like these the test needs until it rejects the hypothesis.
 
-    It is 0 if the wealth is there, infinite if the values do not speak against the hypothesis.
+    The estimate assumes the best constant bet. The arguments are those of `wealth`.
+
+    Returns:
+        0 if the test rejects already. Infinity if the values are no evidence against the hypothesis.
     """
     path = wealth(values, bound, delta)
     if path.max(initial=1.0) >= 1 / delta:

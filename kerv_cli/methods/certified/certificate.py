@@ -1,6 +1,6 @@
-"""The certificate of success, and the parts that apply it (docs/methods.md §4.6, ours).
+"""The certificate of success, and the skip rule and the draft that apply it (docs/methods.md §4.6, ours).
 
-A decoder is built for one task. So whether the certificate covers the task is decided once, when it is built.
+A certificate covers some tasks. Each decoder is built for one task, so this is checked once, when it is built.
 """
 
 from __future__ import annotations
@@ -23,18 +23,22 @@ from kerv_cli.methods.streak import StreakSkipSettings
 
 @dataclass(frozen=True)
 class Candidate:
-    """One rule of the fixed order.
+    """One candidate for a certificate: a rule that skips verification, tested against autoregressive decoding (AR).
+
+    Candidates are tested in a fixed order, until one fails. Both sides of a pair of episodes have the same seed.
 
     Attributes:
-        skip: Settings of its skip rule.
-        draft: Settings of its in-prefill draft.
-        pairs: Episodes paired with AR's on the same seeds.
-        ar: Those that AR solved.
-        successes: Those that the rule solved.
-        lost: Those that only AR solved.
-        won: Those that only the rule solved.
-        p: Of the hypothesis that the rule loses more than the margin. None if an earlier rule was not certified.
-        needed: About how many more pairs would certify it; 0: none, −1: never.
+        label: Name of the candidate.
+        skip: Settings of the skip rule.
+        pairs: Number of pairs of episodes.
+        ar: Number of episodes that AR solved.
+        successes: Number of episodes that the candidate solved.
+        lost: Number of pairs that only AR solved.
+        won: Number of pairs that only the candidate solved.
+        p: p-value of the hypothesis that the candidate loses the margin or more. None: not tested, because an earlier
+            candidate failed.
+        needed: About how many more pairs, at these rates, would certify it. 0: it is certified. −1: no number would.
+        draft: Settings of the prefill draft, which the rule executes. The first certificates all used the scout.
     """
 
     label: str
@@ -45,8 +49,8 @@ class Candidate:
     lost: int
     won: int
     p: float | None
-    needed: int = 0  # pairs more that would certify it at these rates; 0: none, −1: never
-    draft: dict[str, Any] = field(default_factory=lambda: {"kind": "scout"})  # the only one of the first certificates
+    needed: int = 0
+    draft: dict[str, Any] = field(default_factory=lambda: {"kind": "scout"})
 
     @property
     def rule(self) -> Any:
@@ -55,7 +59,7 @@ class Candidate:
 
     @property
     def source(self) -> Any:
-        """Settings of the draft."""
+        """Settings of the prefill draft."""
         return _part_settings("prefill_draft", self.draft)
 
 
@@ -65,18 +69,24 @@ def _part_settings(kind: str, plain: dict[str, Any]) -> Any:
 
 @dataclass(frozen=True)
 class Certificate:
-    """What was certified: on `tasks`, the rule `chosen` loses at most `margin` points of AR's success.
+    """A certificate: on `tasks`, the chosen candidate loses at most `margin` points of AR's success.
 
     Attributes:
-        chunk: H.
+        target: Hash of the target's weights.
+        actions: Action space of the target.
+        chunk: Number of control steps per chunk.
+        environment: Name of the environment.
+        tasks: Full names of the tasks.
         drafts: Kind -> hash of the artifacts that drafted.
-        method: Kind -> settings of the other parts.
-        world: Camera and horizon.
-        dtype: Number format.
-        delta: 1 − the confidence.
-        seeds: The selection seeds, as text.
-        candidates: The rules in their order.
-        chosen: Index of the certified rule; None if there is none.
+        method: Kind of each part except draft and skip rule -> its settings.
+        world: Camera and horizon (maximum episode length).
+        dtype: Number format of the models.
+        margin: Percentage points of success that may be lost.
+        delta: Probability that the certificate is wrong, at most.
+        seeds: Seeds of the test episodes, as text.
+        candidates: All candidates, from cautious to bold.
+        chosen: Index of the boldest certified candidate. None: no candidate was certified.
+        provenance: How it was made.
     """
 
     target: str
@@ -97,18 +107,18 @@ class Certificate:
 
     @property
     def certified(self) -> Candidate | None:
-        """The boldest certified rule; None if none was certified."""
+        """The boldest certified candidate; None if no candidate was certified."""
         return None if self.chosen is None else self.candidates[self.chosen]
 
     def check_method(self, method: Mapping[str, Any], dtype: str) -> None:
-        """Refuse a method that decodes differently from the certified one.
+        """Refuse a method that decodes differently from the certified method.
 
         Args:
-            method: Kind -> settings of its parts.
-            dtype: Number format.
+            method: Kind -> settings of the method's parts.
+            dtype: Number format of the models.
 
         Raises:
-            UsageError: The draft, another part or the number format differs; the message names both values.
+            UsageError: The draft, another part or the number format differs. The message names both values.
         """
         draft = method["prefill_draft"]
         if self.certified is not None and draft.kind != "scoped" and draft != self.certified.source:
@@ -128,7 +138,7 @@ class Certificate:
             raise UsageError(f"skip=certified with runtime.dtype={dtype}: the certificate is of {self.dtype}")
 
     def sentence(self) -> str:
-        """Return the certificate in one sentence."""
+        """Return what the certificate states, in one sentence."""
         chosen = self.certified
         if chosen is None:
             return "nothing is certified: every draft is verified"
@@ -139,24 +149,27 @@ class Certificate:
 
 
 class CertificateArtifact(Artifact[Certificate]):
-    """The certificate's single file."""
+    """The kind of artifact `certificate`: a folder with a single JSON."""
 
     kind, noun, made = "certificate", "certificate", "issued"
     command = ("calibrate", "success")
     schema = Certificate
 
     def made_for(self, description: Certificate) -> MadeFor:
-        """Return its target. Its chunk is checked with the method."""
+        """Return the target that was certified. The chunk length is not compared here but when the decoder is built."""
         return MadeFor(description.target, description.actions)
 
     def sources(self, description: Certificate) -> Mapping[str, str]:
-        """Return the drafters whose drafts were certified."""
+        """Return kind -> hash of the drafters whose drafts were certified."""
         return description.drafts
 
     def check_use(self, description: Certificate, use: Use) -> None:
-        """Refuse another environment, camera or horizon and, on its tasks, another method.
+        """Refuse another environment, camera or horizon than certified, and on the certified tasks another method.
 
-        A stressed world is allowed: the certificate says nothing about stress.
+        A stressed world is allowed, although the certificate says nothing about stress.
+
+        Raises:
+            UsageError: The use differs. The message names both values.
         """
         if use.environment != description.environment:
             raise UsageError(
@@ -170,7 +183,7 @@ class CertificateArtifact(Artifact[Certificate]):
             description.check_method(use.method, use.dtype)
 
     def needs(self, description: Certificate) -> tuple[str, ...]:
-        """Return what the certified draft reads."""
+        """Return the kinds of artifacts that the certified draft needs."""
         if description.certified is None:
             return ()
         source = description.certified.source
@@ -178,13 +191,13 @@ class CertificateArtifact(Artifact[Certificate]):
 
 
 def covering(context: Context) -> Certificate | None:
-    """Return the certificate if it covers the decoder's task."""
+    """Return the certificate if it covers the decoder's task, else None."""
     certificate: Certificate = context.artifact("certificate")
     return certificate if context.task in certificate.tasks else None
 
 
 def scoped(settings: ScopedSettings, context: Context) -> Proposer:
-    """Build prefill_draft=scoped: the draft for the task at hand."""
+    """Build prefill_draft=scoped: the certified draft on the certificate's tasks, else the draft `outside`."""
     certificate = covering(context)
     if certificate is not None and certificate.certified is not None:
         source = certificate.certified.source
@@ -194,7 +207,13 @@ def scoped(settings: ScopedSettings, context: Context) -> Proposer:
 
 
 def certified(settings: CertifiedSkipSettings, context: Context) -> Skip | None:
-    """Build skip=certified: the certified rule, or a streak on other tasks."""
+    """Build skip=certified: the certified rule on the certificate's tasks, else a streak.
+
+    None on the certificate's tasks if no rule was certified: then every draft is verified.
+
+    Raises:
+        UsageError: The method, the number format or the chunk length is not the certified one.
+    """
     certificate = covering(context)
     if certificate is None:
         return _built(StreakSkipSettings(most=settings.most), context)
