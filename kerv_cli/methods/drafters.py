@@ -1,4 +1,4 @@
-"""A drafter with weights is one class: it trains, saves, loads and proposes (docs/extending.md)."""
+"""Base of drafters with weights. One class trains, saves, loads and proposes (docs/extending.md)."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ Metrics = dict[str, float]
 
 @dataclass(frozen=True, kw_only=True)
 class DrafterDescription(checkpoint.Description):
-    """The JSON of a drafter; a kind may add fields.
+    """The JSON beside a drafter's weights. A kind of drafter may add fields.
 
     Attributes:
         target: Hash of the target's weights.
         actions: The target's action space.
-        chunk: The target's H; 0 if it does not matter.
-        settings: Its shapes and those of its training.
+        chunk: The target's number of control steps per chunk. 0: the drafter works with any number.
+        settings: Settings of the drafter's shapes and training.
         provenance: How it was made.
     """
 
@@ -44,15 +44,15 @@ class DrafterDescription(checkpoint.Description):
 
 @dataclass(frozen=True)
 class Training:
-    """One training of a drafter, as the optimisation loop sees it.
+    """One training of a drafter, in the form that the optimisation loop takes.
 
     Attributes:
-        drafter: Has the loss and the validation.
-        module: The network that is trained.
-        target: The frozen target that it imitates.
-        examples: What it is trained on.
-        held_out: Examples of other episodes, for validation.
-        settings: Those of the command: `drafter` of this drafter, `train` of the optimisation.
+        drafter: The kind of drafter, which defines the loss and the validation.
+        module: The network to train.
+        target: The frozen target that the network imitates.
+        examples: The training examples.
+        held_out: Examples from other episodes, for validation.
+        settings: Settings of `kerv train drafter`: `drafter` for the drafter, `train` for the optimisation.
     """
 
     drafter: TrainableDrafter
@@ -67,21 +67,23 @@ class Training:
         return len(self.examples)
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Return the drafter's loss of the examples `indices` (B,), and numbers to log."""
+        """Return the loss of the examples `indices` (B,) at optimisation step `step`, and metrics to log."""
         return self.drafter.loss(self, indices, step)
 
     @torch.no_grad()
     def validate(self, module: nn.Module) -> Metrics:
-        """Return the drafter's metrics of a module."""
+        """Return metrics of a network on the held-out examples."""
         return self.drafter.validate(self, module)
 
 
 class TrainableDrafter(Artifact[DrafterDescription]):
-    """Base of drafters with weights, in safetensors and `<kind>.json`. `registry.add_drafter` registers one.
+    """Base of the kinds of drafters with weights. `registry.add_drafter` registers a subclass.
+
+    A drafter is a folder with its weights in safetensors and a description `<kind>.json`.
 
     Attributes:
-        settings: Dataclass of its shapes and training.
-        any_chunk: Whether it drafts for any H.
+        settings: Dataclass of the settings of its shapes and training.
+        any_chunk: Whether one drafter works for any number of control steps per chunk.
     """
 
     schema = DrafterDescription
@@ -90,12 +92,12 @@ class TrainableDrafter(Artifact[DrafterDescription]):
 
     @property
     def command(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Words after `kerv` that train one."""
+        """Command-line arguments after `kerv` that train such a drafter."""
         return "train", "drafter", f"drafter={self.settings().kind}"
 
     @abstractmethod
     def network(self, settings: Any, target: Any) -> nn.Module:
-        """Return a fresh network for a target."""
+        """Return a network with initial weights, for drafting for `target`."""
 
     @abstractmethod
     def examples(
@@ -106,34 +108,49 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         held_out: float,
         progress: OnProgress,
     ) -> tuple[Sized, Sized]:
-        """Read the demonstrations through the target -> (training, held out), of different episodes.
+        """Decode the demonstrations' observations with the target, to make examples.
 
         Args:
             target: The loaded target, on the device to train on.
             dataset: The demonstrations.
-            settings: The drafter's.
-            held_out: Share of the episodes that is held out.
-            progress: Called with (done, total).
+            settings: Settings of the drafter.
+            held_out: Share of the episodes to hold out.
+            progress: Called with the amounts of work done and of all.
+
+        Returns:
+            The training examples, and the held-out examples, which come from other episodes.
         """
 
     def prepare(self, network: Any, examples: Any) -> None:
-        """Set what a fresh network takes from its examples."""
+        """Set what a network must know of the training examples before training, such as their mean and spread."""
 
     @abstractmethod
     def loss(self, training: Training, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Return the loss of the examples `indices` (B,), and numbers to log."""
+        """Return the loss of the training examples `indices` (B,) at optimisation step `step`, and metrics to log."""
 
     @abstractmethod
     def validate(self, training: Training, module: Any) -> Metrics:
-        """Return metrics of a module on the held-out examples, among them a `score`: higher is better."""
+        """Return metrics of a network on the held-out examples. The best weights are those with the highest `score`."""
 
     @classmethod
     @abstractmethod
     def proposer(cls, settings: Any, context: Context) -> Proposer:
-        """Return what drafts with the weights in `context.artifact(kind)`."""
+        """Return the proposer that drafts with the network `context.artifact(kind)`.
+
+        Args:
+            settings: Settings of the proposer.
+            context: The context in which the method is built.
+        """
 
     def objective(self, target: Any, dataset: DemoDataset, settings: Any, progress: OnProgress) -> Training:
-        """Read the demonstrations through the target; return what the optimisation loop trains."""
+        """Make the examples and a network with initial weights, for the optimisation loop.
+
+        Args:
+            target: The loaded target, on the device to train on.
+            dataset: The demonstrations.
+            settings: Settings of `kerv train drafter`.
+            progress: Called with the amounts of work done and of all.
+        """
         share = settings.train.held_out
         examples, held_out = self.examples(target, dataset, settings.drafter, share, progress)
         torch.manual_seed(settings.train.seed)
@@ -142,11 +159,14 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         return Training(self, network.to(target.device), target, examples, held_out, settings)
 
     def anew(self, path: Path) -> str:
-        """Return how to replace one of another target: a training goes on only with its own."""
+        """Return text for error messages: how to replace a drafter of another target.
+
+        It must be removed first, because a training resumes only for its own target.
+        """
         return f"{removal(self.kind, path)}, then {self.again}"
 
     def load(self, path: Path, artifacts: Artifacts) -> Any:
-        """Return the network with its weights, frozen, on the target's device in its number format."""
+        """Load the network with frozen weights, on the target's device and in the target's number format."""
         target, description = artifacts.target, self.checked(path, artifacts.description)
         settings = read(self.settings, description.settings, f"the {self.noun}'s settings", tolerant=True)
         return load_packed(self.network(settings, target), path, self.kind, target.device, target.dtype)
@@ -156,7 +176,7 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         return description.sha256
 
     def described(self, file: Path) -> DrafterDescription:
-        """Return the description in a file, after checking the weights beside it."""
+        """Read the description in a file, and check the hash of the weights beside it."""
         return checkpoint.read_description(file.parent, self.kind, self.schema)
 
     def save(
@@ -168,14 +188,14 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         stored: str = checkpoint.FLOAT32,
         **fields: Any,
     ) -> str:
-        """Write weights and description.
+        """Write the weights and the description.
 
         Args:
             path: The folder.
             module: The network.
-            made_for: Its target.
+            made_for: The target that it drafts for.
             provenance: How it was made.
-            stored: Number format on disk, as `train.stored`.
+            stored: Number format of the weights on disk: `float32`, `float16` or `int8`.
             fields: Further fields of this kind's description.
 
         Returns:

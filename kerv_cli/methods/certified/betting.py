@@ -2,9 +2,9 @@
 
 The hypothesis: each value in [0, 1] has an expectation of at least `bound`, given the values before it. If it is true,
 bets against it do not win on average, because each bet is made before its value is known. A bettor starts with a wealth
-of 1. Under the hypothesis, the wealth ever reaches 1/δ with a probability of at most δ (Ville's inequality). So the test
-may be checked after each value. Values of different groups, such as tasks, must come in random order. Sorted values
-would reject the hypothesis only because of their order.
+of 1. If the hypothesis is true, the wealth ever reaches 1/δ with a probability of at most δ (Ville's inequality). So
+the test may be checked after each value. Values of different groups, such as tasks, must come in random order. Sorted
+values would reject the hypothesis only because of their order.
 
 For a certificate of success, each value comes from a pair of episodes with the same seed, by AR and by the method:
 (1 + AR − method) / 2, so 0, ½ or 1. The bound is (1 + m) / 2. The hypothesis is that the method loses a share m or more

@@ -10,28 +10,28 @@ from kerv_cli.base.registry import DRAFTING, STATES, add_drafter
 
 @dataclass
 class DrafterSettings:
-    """Decoder layers of the target's width after its states, and their training (§2.2)."""
+    """Shapes and loss of the EAGLE-style drafter, which reads the target's hidden states (docs/methods.md §2.2)."""
 
     kind: str = "eagle"
-    layers: int = number(1, 0, 1024)
-    unroll: int = number(3, 1, 64)  # passes fed with its own predicted states, as drafting does; 1: the paper's
-    samples: int = number(12_000, 1, 10**8)  # observations whose greedy decodes it is trained on
-    state_weight: float = number(1.0, 0, 1e6)  # smooth-L1 on the hidden state
-    token_weight: float = number(0.1, 0, 1e6)  # soft cross-entropy with the target's distribution
+    layers: int = number(1, 0, 1024)  # decoder layers of the target's width
+    unroll: int = number(3, 1, 64)  # passes per training step; each later one reads the drafter's own states; paper: 1
+    samples: int = number(12_000, 1, 10**8)  # maximum number of observations whose greedy decodes it is trained on
+    state_weight: float = number(1.0, 0, 1e6)  # weight of the smooth L1 loss on the hidden state
+    token_weight: float = number(0.1, 0, 1e6)  # weight of the cross-entropy with the target's token distribution
 
 
 @dataclass
 class DrafterProposerSettings:
-    """EAGLE-style drafter (§2.2). The default is a greedy chain as deep as the chunk.
+    """Shape of an EAGLE-style draft (docs/methods.md §2.2). The default is a greedy chain that covers a chunk.
 
-    On a CPU the chain beats a tree: relaxed acceptance accepts most of what siblings would catch, and every verified
-    node costs time.
+    On a CPU the chain is faster than a tree. Every verified node costs time, and with relaxed acceptance a tree accepts
+    little more than its best path.
     """
 
     kind: str = "drafter"
-    depth: int = number(15, 1, MOST_TOKENS)  # tokens
-    top_k: int = number(1, 1, MOST_TOKENS)  # children expanded per level
-    nodes: int = number(15, 1, MOST_TOKENS)  # tree nodes kept after reranking
+    depth: int = number(15, 1, MOST_TOKENS)  # maximum number of tokens on a path
+    top_k: int = number(1, 1, MOST_TOKENS)  # nodes expanded per depth, and children of each; 1: a chain
+    nodes: int = number(15, 1, MOST_TOKENS)  # maximum number of nodes; the most probable ones are kept
 
 
 add_drafter(

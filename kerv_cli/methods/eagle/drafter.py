@@ -1,8 +1,9 @@
 """The EAGLE-style drafter: network, dynamic tree, training and files (docs/methods.md §2.2; EAGLE-2; Spec-VLA §3).
 
-The input at position i is the embedding of the token at i + 1 beside the target's last hidden state at i, mapped to the
-model's width. The layers predict the hidden state at i + 1, from which the target's frozen head gives the logits of
-position i + 2. The drafter's cache holds the whole prompt. Rotary positions count from the prompt's beginning.
+The input at position i is the embedding of token i + 1, concatenated with the target's last hidden state at i. A linear
+layer maps it to the target's width. The drafter predicts the hidden state at i + 1. From this state the target's frozen
+head computes the logits of token i + 2. The drafter's cache holds the whole prompt, and rotary positions count from the
+prompt's beginning.
 """
 
 from __future__ import annotations
@@ -48,11 +49,11 @@ from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
 VALIDATED = 60
-"""Held-out observations that a validation decodes."""
+"""Maximum number of held-out observations that a validation decodes."""
 
 
 class EagleNetwork(LayerStack):
-    """Decoder layers of the target's shape. Head and token embeddings are the target's own."""
+    """The drafter's network: decoder layers of the target's shape. It uses the target's embeddings and head."""
 
     inputs = 2
 
@@ -62,11 +63,11 @@ class EagleNetwork(LayerStack):
         self.fuse = nn.Linear(2 * width, width)
 
     def enter(self, *inputs: Tensor) -> Tensor:
-        """following, hidden (B, T, E) -> what the first layer reads."""
+        """Map the embeddings of the next tokens and the hidden states, each (B, T, E), to the first layer's input."""
         return self.fuse(torch.cat(inputs, -1))
 
     def draft_position(self, index: int) -> int:
-        """Return the rotary position of the drafted token at `index` of the sequence."""
+        """Return the rotary position of a drafted token. `index` is its place in the sequence, prompt included."""
         return index
 
     def forward(
@@ -77,22 +78,21 @@ class EagleNetwork(LayerStack):
         cache: Cache | None = None,
         seen: np.ndarray | Tensor | None = None,
     ) -> Tensor:
-        """Return the predicted hidden states (B, T, E).
+        """Return the predicted hidden states at the next positions, (B, T, E).
 
         Args:
-            following: Embeddings of the next tokens (B, T, E).
-            hidden: Hidden states (B, T, E).
-            positions: Rotary positions (T,).
-            cache: Keys and values before these positions.
-            seen: Which keys each query sees, (T, M) bool, as in `attention_mask`.
+            following: (B, T, E) embedding of the token after each position.
+            hidden: (B, T, E) hidden state at each position.
+            positions: (T,) rotary positions.
+            cache: Keys and values of earlier positions. None: there are none.
+            seen: (T, M) bool, which of the last M keys each query sees. None: causal.
         """
         return self.run((following, hidden), positions, cache, seen)
 
     def compiled_chain(self, target: Any) -> Program | None:
-        """Return what drafts a token and the state after it, by the target's embeddings and head.
+        """Return a compiled program that drafts one token after another, with the target's embeddings and head.
 
-        Returns:
-            The program; None if this drafter or the target is not compiled.
+        None if this drafter or the target is not compiled.
         """
 
         def step(hidden: Tensor) -> Tensor:
@@ -104,14 +104,14 @@ class EagleNetwork(LayerStack):
 
 
 class DrafterProposer(Proposer):
-    """Drafts a chain or a dynamic tree (docs/methods.md §2.2). Drafts stay on the device; nothing waits for it.
+    """Drafts a chain or a dynamic tree (docs/methods.md §2.2). The drafts stay on the GPU, so the CPU need not wait.
 
     Attributes:
-        depth: Tokens of a path.
-        top_k: Children expanded per level.
-        nodes: Nodes kept after reranking.
-        cache: The drafter's, of every committed position but the last.
-        hidden: Predicted state (E,) from which the first draft token follows.
+        depth: Maximum number of tokens on a path.
+        top_k: Number of nodes expanded per depth, and of children of each. 1 drafts a chain.
+        nodes: Maximum number of nodes. The most probable nodes are kept.
+        cache: Keys and values of the drafter, for all committed positions except the last.
+        hidden: (E,) predicted hidden state. The target's head computes the first draft token from it.
     """
 
     name = "drafter"
@@ -127,36 +127,43 @@ class DrafterProposer(Proposer):
         self.compiled = drafter.compiled_chain(target) if isinstance(drafter, EagleNetwork) else None
 
     def begin(self, chunk: Chunk) -> None:
-        """Feed the drafter the prompt's states and embeddings."""
+        """Run the drafter over the prompt's hidden states and embeddings, after the prefill."""
         self.observe(torch.cat([chunk.prompt[:, 1:], self.embed(chunk.tokens)], 1), chunk.hidden, 0)
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """Return a chain or a dynamic tree."""
+        """Return a chain, or a dynamic tree if `top_k` is above 1, of at most `depth` tokens per path."""
         depth = min(self.depth, depth)
         return Draft(self.chain(min(depth, self.nodes))) if self.top_k == 1 else self.tree(depth)
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
-        """Feed the drafter the states of the newly committed positions."""
+        """Run the drafter over the hidden states of the newly committed positions.
+
+        Args:
+            chunk: The chunk that is decoded.
+            first: Index in the chunk of the first newly committed position.
+            hidden: (1, T, E) the target's hidden states at these positions.
+            target_tokens: Not used.
+        """
         self.observe(self.embed(chunk.tokens[first + 1 :]), hidden, chunk.prompt_length + first)
 
     def embed(self, tokens: list[int]) -> Tensor:
-        """Return the target's embeddings (1, T, E) of T tokens."""
+        """Return the target's embeddings of T tokens, (1, T, E)."""
         return self.target.embed(upload([tokens], self.target.device))
 
     def observe(self, following: Tensor, hidden: Tensor, first: int) -> None:
-        """Feed the target's own states. They replace the last draft's in the cache.
+        """Run the drafter over the target's own hidden states. In the cache, they replace those of the last draft.
 
         Args:
-            following: Embedding of the token after each position, (1, T, E).
-            hidden: The target's states (1, T, E) at positions first, first + 1, …
-            first: The first position.
+            following: (1, T, E) embedding of the token after each position.
+            hidden: (1, T, E) the target's hidden states at the positions first, first + 1, …
+            first: The first position, counted from the prompt's beginning.
         """
         self.cache.length = first
         positions = torch.arange(first, first + hidden.shape[1], device=hidden.device)
         self.hidden = self.drafter(following, hidden, positions, self.cache)[0, -1]
 
     def chain(self, depth: int) -> Tensor:
-        """Return the greedy draft tokens (depth,)."""
+        """Draft greedily. Return the tokens (depth,)."""
         base = self.cache.length
         if self.compiled is not None:
             return torch.from_numpy(self.compiled.repeat(depth, self.hidden, cache=self.cache)[:, 0]).long()
@@ -172,10 +179,10 @@ class DrafterProposer(Proposer):
         return torch.cat(drafted)
 
     def tree(self, depth: int) -> Draft:
-        """Return EAGLE-2's dynamic tree.
+        """Draft EAGLE-2's dynamic tree of at most `depth` tokens per path.
 
-        It expands the top-k nodes of a level by cumulative log-probability, then keeps the best of all. A child is
-        never more probable than its parent, so the best nodes form a tree.
+        At each depth, the `top_k` nodes with the highest cumulative log-probability get `top_k` children each. In the
+        end the best `nodes` of all are kept. They form a tree, because a child is never more probable than its parent.
         """
         target, top_k, device = self.target, self.top_k, self.hidden.device
         scores = torch.log_softmax(target.head(self.hidden).float(), -1)
@@ -187,7 +194,7 @@ class DrafterProposer(Proposer):
         hidden = self.hidden.expand(1, width, -1)
         level = torch.arange(width, device=device)
         itself = torch.eye(max(width, top_k), dtype=torch.bool, device=device)
-        seen = itself[:width, :width]  # of the nodes that were forwarded, level by level
+        seen = itself[:width, :width]  # which earlier draft nodes each node of this depth sees
         for reached in range(1, depth):
             following = target.embed(tokens[None])
             position = torch.full((width,), first + reached - 1, device=device)
@@ -195,7 +202,7 @@ class DrafterProposer(Proposer):
             logp = torch.log_softmax(target.head(hidden[0]).float(), -1) + values[:, None]
             child_values, child_tokens = (best.flatten() for best in logp.topk(top_k, -1))
             values, flat = child_values.topk(top_k)
-            # every child competes for a path in the tree, only the best top_k are expanded further
+            # all children may become nodes of the tree, but only the best top_k get children
             parents.append(level[:, None].expand(-1, top_k).flatten())
             every.append(child_tokens)
             cumulative.append(child_values)
@@ -208,25 +215,25 @@ class DrafterProposer(Proposer):
 
 
 def _best(tokens: Tensor, parents: Tensor, scores: Tensor, nodes: int, depth: int) -> Draft:
-    # the sort is stable and children come after their parents: of equal scores the parent is kept
+    # the sort is stable and children come after their parents, so at equal scores the parent is kept
     best = scores.sort(descending=True, stable=True).indices[:nodes].sort().values
-    index = torch.full((tokens.shape[0] + 1,), ROOT, device=tokens.device)  # its last entry is the root's
+    index = torch.full((tokens.shape[0] + 1,), ROOT, device=tokens.device)  # the last entry is the root
     index[best] = torch.arange(best.shape[0], device=tokens.device)
     return Draft(tokens[best], index[parents[best]], depth)
 
 
 @dataclass(frozen=True)
 class TeacherStates(Rows):
-    """The target's greedy decodes of n observations whose prompts are equally long."""
+    """The target's greedy decodes of n observations with prompts of equal length P. A chunk has N tokens."""
 
-    prompt: Tensor  # (n, P, E) float16
-    hidden: Tensor  # (n, P + N − 1, E) float16
-    tokens: Tensor  # (n, N) int64
+    prompt: Tensor  # (n, P, E) float16, encoded prompts
+    hidden: Tensor  # (n, P + N − 1, E) float16, the target's last hidden states
+    tokens: Tensor  # (n, N) int64, greedy tokens
 
 
 @dataclass(frozen=True)
 class StatesByLength:
-    """Teacher states in a group per length of the prompt. Rows are counted through all groups."""
+    """The target's greedy decodes, in one group per prompt length. Row indices count through all groups."""
 
     groups: tuple[TeacherStates, ...]
 
@@ -234,7 +241,7 @@ class StatesByLength:
         return sum(map(len, self.groups))
 
     def parts(self, indices: Tensor) -> list[TeacherStates]:
-        """Return the rows at `indices` (B,), in batches of one prompt length."""
+        """Return the rows `indices` (B,), as one batch per prompt length."""
         batches, first = [], 0
         for group in self.groups:
             rows = indices[(indices >= first) & (indices < first + len(group))] - first
@@ -244,7 +251,7 @@ class StatesByLength:
         return batches
 
     def prompts(self) -> list[Tensor]:
-        """Return all prompts (1, P, E)."""
+        """Return all encoded prompts, each (1, P, E)."""
         return [prompt for group in self.groups for prompt in group.prompt.split(1)]
 
 
@@ -255,7 +262,15 @@ def _decodes(
     limit: int,
     on_progress: OnProgress,
 ) -> StatesByLength:
-    """Return the decodes of at most `limit` of the rows (episode, control step), evenly spread."""
+    """Decode observations greedily with the target.
+
+    Args:
+        target: The target.
+        dataset: The demonstrations.
+        rows: (index of the episode, control step) of each observation.
+        limit: Maximum number of observations, evenly spread over `rows`.
+        on_progress: Called with the numbers of observations done and of all.
+    """
     chosen = [rows[i] for i in torch.linspace(0, len(rows) - 1, min(limit, len(rows))).long().tolist()]
     groups, done = defaultdict[int, list[TeacherStates]](list), 0
 
@@ -274,13 +289,17 @@ def _decodes(
 
 @dataclass(frozen=True, kw_only=True)
 class EagleDescription(DrafterDescription):
-    """The JSON of an EAGLE-style drafter; `public` is the shape of one in the public layout."""
+    """The JSON beside an EAGLE-style drafter's weights.
+
+    Attributes:
+        public: Shape of a drafter in the published layout. None: the drafter has our own layout.
+    """
 
     public: PublicShape | None = None
 
 
 class EagleDrafter(TrainableDrafter):
-    """The EAGLE-style drafter. It drafts for a target with chunks of any length."""
+    """The kind of artifact `drafter`: an EAGLE-style drafter. It works for chunks of any length."""
 
     kind = noun = "drafter"
     command = ("train", "drafter")
@@ -289,11 +308,11 @@ class EagleDrafter(TrainableDrafter):
     any_chunk = True
 
     def network(self, settings: DrafterSettings, target: ReadableTarget) -> EagleNetwork:
-        """Return a fresh network of the target's width, heads and feed-forward width."""
+        """Return a network with initial weights, of the target's width, heads and feed-forward width."""
         return EagleNetwork(settings, target.width, target.heads, target.feed_forward)
 
     def load(self, path: Path, artifacts: Artifacts) -> EagleNetwork | PublicDrafter:
-        """Return the network, ready for inference, of whichever layout."""
+        """Load the network for inference, in our own layout or the published one."""
         description: Any = self.checked(path, artifacts.description)
         if description.public is not None:
             return load_public(path, description.public, artifacts.target)
@@ -305,10 +324,7 @@ class EagleDrafter(TrainableDrafter):
 
     @classmethod
     def proposer(cls, settings: Any, context: Context) -> DrafterProposer:
-        """Build proposer=drafter, and the drafter of proposer=hybrid.
-
-        The settings of both have depth, top_k and nodes.
-        """
+        """Build proposer=drafter, or the drafter of proposer=hybrid. Both settings have depth, top_k and nodes."""
         return DrafterProposer(
             context.artifact(cls.kind), context.target, settings.depth, settings.top_k, settings.nodes
         )
@@ -322,10 +338,12 @@ class EagleDrafter(TrainableDrafter):
         held_out: float,
         progress: OnProgress,
     ) -> tuple[StatesByLength, StatesByLength]:
-        """Return the target's greedy decodes of the *observations* of demonstrations, not the expert's answers.
+        """Decode the demonstrations' observations greedily with the target. The expert's actions are not used.
+
+        The arguments and the result are those of `TrainableDrafter.examples`.
 
         Raises:
-            CheckpointError: A single episode, or a damaged one.
+            CheckpointError: There is only one episode, or an episode is damaged.
         """
         every = held_out_every(len(dataset.episodes), held_out)
         rows: tuple[list[tuple[int, int]], ...] = ([], [])
@@ -336,7 +354,13 @@ class EagleDrafter(TrainableDrafter):
         return states, _decodes(target, dataset, rows[1], VALIDATED, lambda done, total: None)
 
     def loss(self, training: Training, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Return the mean loss over the unrolled passes, and the token loss of each pass."""
+        """Return the mean loss over the `unroll` passes, and the token loss of each pass to log.
+
+        Args:
+            training: The training.
+            indices: (B,) indices of the training examples.
+            step: Not used.
+        """
         losses: list[Tensor] = []
         metrics: Metrics = {}
         for states in training.examples.parts(indices):
@@ -346,7 +370,11 @@ class EagleDrafter(TrainableDrafter):
         return torch.stack(losses).sum(), metrics
 
     def unrolled(self, training: Training, states: TeacherStates) -> tuple[Tensor, Metrics]:
-        """Return the loss of states of one prompt length."""
+        """Return the loss and the metrics to log, for decodes with prompts of one length.
+
+        The first pass reads the target's hidden states. Each later pass reads the drafter's own predictions of the pass
+        before, as in drafting.
+        """
         settings, device = training.settings.drafter, training.target.device
         prompt, hidden = states.prompt.to(device).float(), states.hidden.to(device).float()
         tokens, start = states.tokens.to(device), prompt.shape[1]
@@ -359,18 +387,28 @@ class EagleDrafter(TrainableDrafter):
             state_loss, token_loss = self.compare(training, predicted[:, start - 1 :], hidden[:, start:])
             total = total + settings.state_weight * state_loss + settings.token_weight * token_loss
             metrics[f"token_loss_{number}"] = float(token_loss.detach())
-            # after the first drafted position the next pass sees its own predictions, as in drafting
+            # after the first drafted position the next pass reads its own predictions, as in drafting
             inputs = torch.cat([inputs[:, :start], predicted[:, start - 1 : -1]], 1)
         return total / settings.unroll, metrics
 
     def compare(self, training: Training, predicted: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the smooth L1 loss of states (B, N − 1, E) and the soft cross-entropy of their tokens 1 … N − 1."""
+        """Compare predicted hidden states with the target's, at tokens 1 to N − 1.
+
+        Args:
+            training: The training.
+            predicted: (B, N − 1, E) states that the drafter predicts.
+            hidden: (B, N − 1, E) the target's states.
+
+        Returns:
+            The smooth L1 loss of the states, and the cross-entropy of the drafter's token distribution with the
+            target's.
+        """
         teacher = training.target.head(hidden).softmax(-1)
         cross_entropy = -(teacher * F.log_softmax(training.target.head(predicted), -1)).sum(-1).mean()
         return F.smooth_l1_loss(predicted, hidden), cross_entropy
 
     def validate(self, training: Training, module: EagleNetwork) -> Metrics:
-        """Decode held-out observations: tokens committed per verification, strict and at r = 9."""
+        """Decode held-out observations. Return the tokens committed per verification, strict and within 9 bins."""
         target = training.target
         prompts = [prompt.to(target.device).float() for prompt in training.held_out.prompts()]
         strict, relaxed = (acceptance_length(target, module, prompts, r) for r in (0, 9))
@@ -378,7 +416,14 @@ class EagleDrafter(TrainableDrafter):
 
 
 def acceptance_length(target: Target, network: EagleNetwork, prompts: list[Tensor], r: int) -> float:
-    """Return AL (docs/methods.md §7) of decoding `prompts` with chains of up to 5 drafts at radius r."""
+    """Return the acceptance length: tokens committed per verification (docs/methods.md §7).
+
+    Args:
+        target: The target.
+        network: The drafter. It drafts chains of up to 5 tokens.
+        prompts: Encoded prompts to decode, each (1, P, E).
+        r: A draft token within r bins of the target's token is accepted.
+    """
     proposer = DrafterProposer(network, target, depth=5, top_k=1, nodes=5)
     decoder = Decoder(target, Parts(RelaxedRule(target.actions), Fixed(r), proposer=proposer))
     chunks = [decoder.decode_prompt(prompt) for prompt in prompts]
@@ -387,17 +432,17 @@ def acceptance_length(target: Target, network: EagleNetwork, prompts: list[Tenso
 
 
 def import_drafter(settings: Any) -> tuple[Path, dict[str, Any]]:
-    """Run `kerv build drafter`: check a drafter of the public layout against a target and copy it beside the target.
+    """Run `kerv build drafter`: check that a published drafter fits a target, and copy it into the results folder.
 
     Args:
         settings: `BuildDrafterSettings`.
 
     Returns:
-        The drafter's folder, and figures for the user.
+        The drafter's folder, and numbers to print: parameters, layers, positions and mask.
 
     Raises:
-        UsageError: No checkpoint is named.
-        CheckpointError: No such target, or an incomplete, damaged or pickled drafter, or one of another width.
+        UsageError: `checkpoint` is empty.
+        CheckpointError: The target does not exist. Or the drafter is incomplete, damaged, pickled or of another width.
     """
     if not settings.checkpoint:
         raise UsageError("checkpoint=DIR: name the folder of a drafter (config.json, model.safetensors)")
@@ -408,7 +453,7 @@ def import_drafter(settings: Any) -> tuple[Path, dict[str, Any]]:
     shape, tensors = read_public(Path(settings.checkpoint).expanduser(), target, convention)
     folder, layers = artifacts.path(EagleDrafter.kind), shape.language.num_hidden_layers
     network = PublicDrafter(shape)
-    network.load_state_dict(tensors, assign=True)  # stored in their own number format
+    network.load_state_dict(tensors, assign=True)  # the weights keep their number format
     figures = {"parameters": sum(tensor.numel() for tensor in tensors.values())}
     provenance = provenance_of("kerv build drafter", settings, device, **figures)
     shapes = asdict(DrafterSettings(kind="public", layers=layers))

@@ -1,7 +1,7 @@
-"""Drafters in the layout of the public EAGLE and Spec-VLA codes (docs/methods.md §2.2).
+"""Drafters in the file layout of the published EAGLE and Spec-VLA code (docs/methods.md §2.2).
 
-They are `fc` and one Llama layer without a norm before or after it. Embeddings and head are the target's. Their inputs
-are those of our own drafter. Two differences are switches of `Convention`.
+Such a drafter is a linear layer `fc` and one Llama layer, without a norm before or after it. It uses the target's
+embeddings and head, and has the same inputs as our own drafter. Two further differences are switches of `Convention`.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ EMBEDDING = "embed_tokens.weight"
 
 @dataclass(frozen=True)
 class Convention:
-    """How a public drafter's code differs from kerv's.
+    """Two ways in which a published drafter may differ from our own.
 
     Attributes:
-        positions: `sequence`: drafted tokens go on counting after the whole prompt. `text`: vision tokens are not
-            counted. EAGLE's tree counts token ids, and Spec-VLA gives vision tokens none.
-        mask: `causal`: every token sees all before it. `prompt`: no token sees a key after the prompt's last but one.
-            Spec-VLA trains so: its attention mask is zero from there on.
+        positions: Rotary positions of drafted tokens. `sequence`: they count all tokens before. `text`: they do not
+            count the vision tokens, because the published code counts token ids and vision tokens have none.
+        mask: `causal`: every token sees all tokens before it. `prompt`: every token sees only the prompt without its
+            last token. Spec-VLA was trained like that.
     """
 
     positions: str = "sequence"
@@ -43,10 +43,13 @@ class Convention:
 
 @dataclass(frozen=True)
 class PublicShape:
-    """Shape of a public drafter.
+    """Shape of a published drafter.
 
     Attributes:
-        skipped: Vision tokens, which `positions=text` does not count.
+        language: Sizes of its Llama layer.
+        bias: Whether `fc` has a bias.
+        convention: How it differs from our own drafter.
+        skipped: Number of vision tokens in the target's prompt. They get no position number with `positions=text`.
     """
 
     language: Language
@@ -56,13 +59,13 @@ class PublicShape:
 
 
 class DraftCache(Cache):
-    """A cache that remembers the length of the prompt."""
+    """Keys and values of a drafter, and the length of the prompt in `prompt`."""
 
     prompt = 0
 
 
 class PublicDrafter(nn.Module):
-    """The network; called like `EagleNetwork`."""
+    """The network of a published drafter. It is called like `EagleNetwork`."""
 
     def __init__(self, shape: PublicShape) -> None:
         super().__init__()
@@ -71,12 +74,18 @@ class PublicDrafter(nn.Module):
         self.layers = nn.ModuleList(LlamaLayer(language, normed=i > 0) for i in range(language.num_hidden_layers))
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> DraftCache:
-        """Return an empty cache, on CUDA of fixed shapes unless `fixed` says otherwise."""
+        """Return an empty cache.
+
+        Args:
+            batch: Number of sequences.
+            capacity: Maximum number of tokens.
+            fixed: Whether its tensors always have full size, as CUDA graphs need. None: only on CUDA.
+        """
         weight, sizes = self.fc.weight, self.shape.language.cache_sizes(batch, capacity)
         return DraftCache(*sizes, weight, weight.is_cuda if fixed is None else fixed)
 
     def draft_position(self, index: int) -> int:
-        """Return the rotary position of the drafted token at `index` of the sequence."""
+        """Return the rotary position of a drafted token. `index` is its place in the sequence, prompt included."""
         return index - self.shape.skipped * (self.shape.convention.positions == "text")
 
     def forward(
@@ -87,9 +96,9 @@ class PublicDrafter(nn.Module):
         cache: DraftCache | None = None,
         seen: np.ndarray | Tensor | None = None,
     ) -> Tensor:
-        """Return the predicted hidden states (B, T, E). A call on an empty cache is the prompt's.
+        """Return the predicted hidden states (B, T, E). The arguments are those of `EagleNetwork.forward`.
 
-        The arguments are those of `EagleNetwork.forward`.
+        The first call, with an empty cache, must pass the whole prompt.
         """
         if cache is not None and not cache.length:
             cache.prompt = hidden.shape[1]
@@ -98,7 +107,16 @@ class PublicDrafter(nn.Module):
         return run_layers(self.layers, self.shape.language, x, positions, cache, seen, mask)
 
     def prompt_mask(self, x: Tensor, cache: DraftCache | None, seen: np.ndarray | Tensor | None) -> Tensor:
-        """Return an additive mask (T, S + T) in which no key after the prompt's last but one is seen."""
+        """Return the additive attention mask for `mask=prompt`: it hides all keys except the prompt's without its last.
+
+        Args:
+            x: (B, T, E) inputs of the layers.
+            cache: Keys and values of the S tokens before. None: there are none, and x is the prompt.
+            seen: (T, M) bool, which of the last M keys each query may see otherwise. None: causal.
+
+        Returns:
+            (T, S + T): 0 for visible keys, −∞ for hidden keys.
+        """
         prompt = cache.prompt if cache is not None else x.shape[1]
         mask = attention_mask(np.tri(x.shape[1], dtype=bool) if seen is None else seen, x.shape[1], cache, x)
         if mask is None:
@@ -109,16 +127,24 @@ class PublicDrafter(nn.Module):
 
 
 def layout_of(shape: PublicShape) -> dict[str, Sizes]:
-    """Return name -> shape of a drafter's own tensors."""
+    """Return name -> size of each tensor that a published drafter of this shape must contain."""
     with torch.device("meta"):
         return sizes_of(PublicDrafter(shape))
 
 
 def read_public(folder: Path, target: ReadableTarget, convention: Convention) -> tuple[PublicShape, dict[str, Tensor]]:
-    """Return shape and tensors of a public drafter's folder, without its copy of the embeddings.
+    """Read a published drafter. Its copy of the target's embeddings is left out.
+
+    Args:
+        folder: Folder with `config.json` and `model.safetensors`.
+        target: The target that it drafts for.
+        convention: How it differs from our own drafter.
+
+    Returns:
+        Its shape, and its tensors by name.
 
     Raises:
-        CheckpointError: An incomplete, damaged or pickled folder, or a drafter of another width than the target's.
+        CheckpointError: The folder is incomplete, damaged or pickled, or the drafter has another width than the target.
     """
     config, pickled = folder / CONFIG, folder / "pytorch_model.bin"
     language = read(Language, read_json(config), str(config), tolerant=True)
@@ -137,10 +163,10 @@ def read_public(folder: Path, target: ReadableTarget, convention: Convention) ->
 
 
 def load_public(folder: Path, shape: PublicShape, target: ReadableTarget) -> PublicDrafter:
-    """Return the drafter in `folder`, frozen, on the target's device.
+    """Load an imported drafter with frozen weights, on the target's device and in its number format.
 
     Raises:
-        CheckpointError: The weights are damaged or of another shape.
+        CheckpointError: The weights are damaged or have other shapes.
     """
     tensors = load_tensors(folder / WEIGHTS, "drafter")
     layout = {name: tuple(tensor.shape) for name, tensor in tensors.items()}

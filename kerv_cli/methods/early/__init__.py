@@ -1,4 +1,4 @@
-"""The early drafter: the whole chunk from the prompt, before the target's trunk runs (docs/methods.md §5, ours)."""
+"""The early drafter: drafts a chunk from the prompt, before the target's trunk runs (docs/methods.md §5, ours)."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from kerv_cli.base.registry import PREFILL, add_drafter
 
 @dataclass
 class EarlySettings:
-    """A residual network from the prompt to the whole chunk, and its training (§5)."""
+    """Shapes of the early drafter, a residual network from the prompt to a whole chunk (docs/methods.md §5)."""
 
     kind: str = "early"
     layers: int = number(2, 0, 1024)  # residual blocks
     width: int = number(384, 1, 65_536)  # hidden units
-    rank: int = number(32, 1, 65_536)  # features per token before the bins
-    samples: int = number(100_000, 1, 10**8)  # observations whose greedy decodes it is trained on, at most
+    rank: int = number(32, 1, 65_536)  # features per token, from which one head computes the logits of all bins
+    samples: int = number(100_000, 1, 10**8)  # maximum number of observations whose greedy decodes it is trained on
 
 
 add_drafter(
