@@ -1,7 +1,8 @@
-"""The early drafter: network, proposer, training and files (docs/methods.md §5, ours).
+"""The early drafter: network, proposer and training (docs/methods.md §5, ours).
 
-It drafts the whole chunk from the encoded prompt, before the target's trunk runs. A residual network turns the pooled
-prompt into a few features per token, and one head turns features into bins. A chunk costs one small pass.
+It drafts a whole chunk from the encoded prompt, before the target's trunk runs. A residual network turns the pooled
+prompt into a few features per token, and one head turns the features into logits over the bins. So a chunk costs one
+small forward pass.
 """
 
 from __future__ import annotations
@@ -34,11 +35,14 @@ from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 SURE = 0.05
-"""Estimate from which fallback sources do not draft: 89 % of such chunks were accepted whole (mt10-vision, r = 9)."""
+"""The early drafter is sure of a chunk if it estimates at least this probability that all tokens are accepted.
+
+The estimate is too low: 89 % of such chunks were accepted whole (mt10-vision, radius 9).
+"""
 
 
 class Block(nn.Module):
-    """Residual SwiGLU block, pre-norm; in a comparison better than a plain MLP block with as many weights."""
+    """Residual SwiGLU block with a norm before it. A plain MLP block with as many weights was worse."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -48,24 +52,24 @@ class Block(nn.Module):
         nn.init.zeros_(self.down.weight)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return (B, W) of (B, W)."""
+        """Map features (B, W) to features (B, W)."""
         gate, up = self.gate_up(self.norm(x)).chunk(2, -1)
         return x + self.down(F.silu(gate) * up)
 
 
 class EarlyNetwork(Packable):
-    """A residual network from the pooled prompt (F,) to the logits (N, V) of all tokens."""
+    """A residual network from the pooled prompt (F features) to the logits of a chunk (N tokens, V bins)."""
 
-    mean: Tensor
-    scale: Tensor
-    strict: Tensor
+    mean: Tensor  # (F,) mean of the training features
+    scale: Tensor  # (F,) 1 / standard deviation of the training features
+    strict: Tensor  # (N,) bool, tokens that must equal the target's, such as the gripper's
     packed: Program | None
 
     def __init__(self, settings: EarlySettings, actions: ActionSpace, chunk: int, features: int) -> None:
         super().__init__()
         self.settings, self.actions, self.chunk = settings, actions, chunk
         self.tokens = chunk * actions.dofs
-        # prompt embeddings differ in size by orders of magnitude
+        # the prompt's features differ in size by orders of magnitude
         self.register_buffer("mean", torch.zeros(features))
         self.register_buffer("scale", torch.ones(features))
         self.register_buffer("strict", torch.from_numpy(actions.strict_tokens(self.tokens)), persistent=False)
@@ -76,20 +80,20 @@ class EarlyNetwork(Packable):
         self.head = nn.Linear(settings.rank, actions.tokens)
 
     def pack_weights(self) -> Program | None:
-        """Return the compiled network; None in other formats than float32."""
+        """Return the compiled network; None if the weights are not float32."""
         return Program(self.logits, (1, len(self.mean))) if self.mean.dtype == torch.float32 else None
 
     def standardise(self, features: Tensor) -> None:
-        """Take mean and spread from the training features (n, F)."""
+        """Set `mean` and `scale` from the training features (n, F)."""
         self.mean.copy_(features.float().mean(0))
         self.scale.copy_(1.0 / features.float().std(0).clamp_min(1e-3))
 
     def forward(self, features: Tensor) -> Tensor:
-        """Return the logits (B, N, V) of pooled prompts (B, F)."""
+        """Return the logits (B, N, V) for pooled prompts (B, F), by the compiled network if there is one."""
         return self.packed(features)[0] if self.packed and self.is_packed(features) else self.logits(features)
 
     def logits(self, features: Tensor) -> Tensor:
-        """Compute `forward` by the modules."""
+        """Return the logits (B, N, V) for pooled prompts (B, F), by the PyTorch modules."""
         x = self.enter((features - self.mean) * self.scale)
         for block in self.blocks:
             x = block(x)
@@ -97,43 +101,53 @@ class EarlyNetwork(Packable):
 
     @torch.inference_mode()
     def draft(self, features: Tensor, radius: int) -> Tensor:
-        """Return N tokens and the odds that all are accepted, (B, N + 1) float64, without waiting for the device.
+        """Draft chunks. The result stays on the device, so the CPU need not wait for a GPU.
 
         Args:
-            features: Pooled prompts (B, F).
-            radius: r in bins, see `choose`.
+            features: (B, F) pooled prompts.
+            radius: Acceptance radius, in bins.
+
+        Returns:
+            (B, N + 1) float64: the N tokens, then the estimated probability that all of them are accepted.
         """
         return self.chosen(self(features.to(self.head.weight.dtype)), radius)
 
     def chosen(self, logits: Tensor, radius: int) -> Tensor:
-        """Return the result of `draft` from logits (B, N, V)."""
+        """Choose the tokens of chunks from logits (B, N, V). The result is that of `draft`."""
         tokens, odds = choose_with_odds(logits, radius, self.strict)
         return torch.cat([tokens.double(), odds.double()[:, None]], -1)
 
 
 def choose(logits: Tensor, radius: int, strict: Tensor) -> Tensor:
-    """Return the tokens (B, N) that are most likely to be accepted at a radius.
+    """Choose the tokens that are most likely to be accepted within a radius.
 
-    The most probable bin need not have the most probability within ±radius. Many bins tie within a wide radius. The
-    probabilities within a third of it and of the bin itself break the tie, so that accepted tokens stay near the
-    target's. A strict token must equal the target's: it is the most probable one.
+    The best bin has the most probability within ±radius around it. That need not be the most probable bin. With a wide
+    radius many bins are equally good. Then the probability within a third of the radius, and that of the bin itself,
+    decide, so that accepted tokens are near the target's. A strict token (such as the gripper's) must equal the
+    target's, so the most probable bin is chosen.
 
     Args:
         logits: (B, N, V).
-        radius: In bins.
-        strict: (N,) bool.
+        radius: Acceptance radius, in bins.
+        strict: (N,) bool, whether the token is strict.
+
+    Returns:
+        (B, N) tokens.
     """
     return logits.argmax(-1) if not radius else choose_with_odds(logits, radius, strict)[0]
 
 
 def choose_with_odds(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the tokens of `choose` and the odds (B,) that all of them are accepted.
+    """Choose tokens as `choose` does, and estimate the probability that all of them are accepted.
 
-    The odds assume independent tokens, and training on soft labels keeps them low. Compare chunks by them; they are no
-    probabilities.
+    The estimate treats tokens as independent, and training on soft labels makes it too low. Use it only to compare
+    chunks.
+
+    Returns:
+        The tokens (B, N), and the estimates (B,).
     """
     probability = logits.float().softmax(-1)
-    below = F.pad(probability, (radius + 1, radius)).cumsum(-1)  # one sum for both radii
+    below = F.pad(probability, (radius + 1, radius)).cumsum(-1)  # one cumulative sum for both radii
     near, best = _between(below, radius, radius, logits.shape[-1]), logits.argmax(-1)
     tokens = best
     if radius:
@@ -144,46 +158,56 @@ def choose_with_odds(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tenso
 
 
 def _between(below: Tensor, pad: int, radius: int, bins: int) -> Tensor:
-    """Return the probability within `radius` ≤ pad bins (…, V), from the cumulated one (…, V + 2 pad + 1)."""
+    """Return the probability within ±radius around each bin.
+
+    Args:
+        below: (…, V + 2 pad + 1) cumulative probability over the bins, padded on both sides.
+        pad: Padding of `below`, at least `radius`.
+        radius: In bins.
+        bins: Number V of bins.
+
+    Returns:
+        (…, V).
+    """
     return below[..., pad + radius + 1 :][..., :bins] - below[..., pad - radius :][..., :bins]
 
 
 def radius_of(chunks: Sequence[Chunk]) -> int:
-    """Return r of chunks whose limits are equal."""
+    """Return the acceptance radius in bins of chunks that all have the same limits."""
     return max(chunks[0].limits, default=0)
 
 
 class EarlyProposer(ChainProposer):
-    """The early drafter's chunk (docs/methods.md §5), drafted once per observation."""
+    """Drafts chunks with the early drafter (docs/methods.md §5), once per observation."""
 
     name = "early"
 
     def __init__(self, early: EarlyNetwork, target: ReadableTarget) -> None:
         self.early, self.target = early, target
-        self._drafted: tuple[Chunk, list[int], float] | None = None  # the chunk, its draft and the odds
+        self._drafted: tuple[Chunk, list[int], float] | None = None  # the last chunk, its draft, and the estimate
 
     def drafted(self, chunk: Chunk) -> tuple[list[int], float]:
-        """Return the draft of the chunk's N tokens and the odds that all are accepted."""
+        """Return the draft of the chunk's N tokens, and the estimated probability that all are accepted."""
         if self._drafted is None or self._drafted[0] is not chunk:
             numbers = read(self._rows([chunk])[0])[0]
             self._drafted = chunk, numbers[:-1].astype(np.int64).tolist(), float(numbers[-1])
         return self._drafted[1:]
 
     def _rows(self, chunks: Sequence[Chunk]) -> Tensor:
-        """Return the drafts (B, N + 1) of chunks whose limits are equal, as `EarlyNetwork.draft`."""
+        """Draft several chunks with equal acceptance limits. The result (B, N + 1) is that of `EarlyNetwork.draft`."""
         features = torch.cat([self.target.pooled(chunk.prompt) for chunk in chunks])
         return self.early.draft(features, radius_of(chunks))
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Return the drafted tokens after the committed ones."""
+        """Return one chain: up to `depth` drafted tokens after the chunk's committed tokens."""
         return [self.drafted(chunk)[0][len(chunk.tokens) : chunk.size][:depth]]
 
     def tokens_of(self, chunks: Sequence[Chunk]) -> list[list[int]]:
-        """Return the drafts of chunks whose limits are equal."""
+        """Return the N draft tokens of each chunk. The chunks must have equal acceptance limits."""
         return self._rows(chunks)[:, :-1].long().tolist()
 
     def is_sure(self, chunk: Chunk) -> bool:
-        """Return whether the odds of the whole chunk reach SURE."""
+        """Return whether the estimated probability that the whole chunk is accepted is at least SURE."""
         return self.drafted(chunk)[1] >= SURE
 
 
@@ -192,25 +216,25 @@ class Decodes(Rows):
     """The target's greedy decodes of n observations, in the order of episodes."""
 
     tokens: Tensor  # (n, N) int64
-    episodes: Tensor  # (n,) int64
-    perturbed: Tensor  # (n,) bool, the observation's episode was executed with noise
+    episodes: Tensor  # (n,) int64, index of the observation's episode
+    perturbed: Tensor  # (n,) bool, whether the observation's episode was executed with noise
 
 
 @dataclass(frozen=True)
 class EarlyExamples(Decodes):
-    """What an early drafter learns from."""
+    """The n training examples of an early drafter."""
 
     features: Tensor  # (n, F) float16, pooled prompts
 
 
 class EarlyDrafter(TrainableDrafter):
-    """The early drafter. It learns the target's greedy decodes; neighbouring bins share probability."""
+    """The kind of artifact `early`. It learns the target's greedy tokens, with labels spread over neighbouring bins."""
 
     kind, noun = "early", "early drafter"
     settings: type[Any] = EarlySettings
 
     def network(self, settings: Any, target: Any) -> nn.Module:
-        """Return a fresh network for the target's action space, H and F."""
+        """Return a network with initial weights, for the target's action space, chunk length and pooled prompt."""
         return EarlyNetwork(settings, target.actions, target.chunk, target.pooled_width)
 
     @classmethod
@@ -222,12 +246,13 @@ class EarlyDrafter(TrainableDrafter):
     def examples(
         self, target: Any, dataset: DemoDataset, settings: Any, held_out: float, progress: OnProgress
     ) -> tuple[Decodes, Decodes]:
-        """Return the target's decodes of about `settings.samples` observations, spread evenly over all episodes.
+        """Decode about `settings.samples` observations with the target, spread evenly over all episodes.
 
-        Prompts are pooled right after encoding, so that neither frames nor prompts stay in memory.
+        Prompts are pooled right after encoding, so that neither images nor prompts stay in memory. The arguments and
+        the result are those of `TrainableDrafter.examples`.
 
         Raises:
-            CheckpointError: The frames are not of the size that the target takes.
+            CheckpointError: The images have another size than the target takes.
         """
         sees = bool(target.cameras)
         share, columns = share_of(dataset, settings.samples, sees), list[dict[str, Tensor]]()
@@ -248,27 +273,36 @@ class EarlyDrafter(TrainableDrafter):
         return split(EarlyExamples(features=torch.cat(features), tokens=torch.cat(tokens), **joined), held_out)
 
     def prepare(self, network: Any, examples: Any) -> None:
-        """Take mean and spread of the features."""
+        """Set the mean and the spread by which the network standardises its input features."""
         network.standardise(examples.features)
 
     def outputs(self, training: Training, module: Any, examples: Any, indices: Tensor) -> tuple[Tensor, ...]:
-        """Return the module's outputs for the examples `indices` (B,): first of all its logits (B, N, V)."""
+        """Run the network on the examples `indices` (B,). The first output is the logits (B, N, V)."""
         return (module(examples.features[indices].to(training.target.device).float()),)
 
     def token_loss(self, training: Training, logits: Tensor, indices: Tensor) -> Tensor:
-        """Return the cross-entropy of logits (B, N, V) with the target's softened tokens."""
+        """Return the cross-entropy of logits (B, N, V) with the target's tokens, as labels spread over bins.
+
+        Args:
+            training: The training.
+            logits: (B, N, V).
+            indices: (B,) indices of the training examples.
+        """
         device = training.target.device
         labels = _labels(training.target.actions.tokens, training.settings.train.label_sigma, device)
         return token_loss(logits, training.examples.tokens[indices].to(device), labels)
 
     def loss(self, training: Training, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Return the token loss."""
+        """Return the token loss of the training examples `indices` (B,), and metrics to log."""
         logits = self.outputs(training, training.module, training.examples, indices)[0]
         loss = self.token_loss(training, logits, indices)
         return loss, {"token_loss": float(loss.detach())}
 
     def validate(self, training: Training, module: Any) -> Metrics:
-        """Compare drafts of held-out observations with the target; plain and perturbed episodes count alike."""
+        """Compare drafts of held-out observations with the target's tokens.
+
+        Plain episodes together weigh as much as perturbed episodes together.
+        """
         held_out, actions = training.held_out, training.target.actions
         batches = (self.outputs(training, module, held_out, i) for i in torch.arange(len(held_out)).split(256))
         logits, *rest = (torch.cat(parts).cpu() for parts in zip(*batches, strict=True))
@@ -277,7 +311,7 @@ class EarlyDrafter(TrainableDrafter):
         return {"score": score, **metrics, **self.further_metrics(training, *rest)}
 
     def further_metrics(self, training: Training, *outputs: Tensor) -> Metrics:
-        """Return metrics of the outputs after the logits."""
+        """Return metrics of the network's outputs after the logits. The early drafter has none."""
         return {}
 
 
@@ -287,32 +321,47 @@ def _labels(tokens: int, sigma: float, device: torch.device) -> Tensor:
 
 
 def share_of(dataset: DemoDataset, samples: int, sees: bool) -> float:
-    """Return the share of the observations that makes about `samples`. A target that sees needs those with a frame."""
+    """Return which share of the observations gives about `samples` observations.
+
+    Args:
+        dataset: The demonstrations.
+        samples: Number of observations wanted.
+        sees: Whether the target has cameras. Then only control steps with a stored image count.
+    """
     stride = int(dataset.manifest.config["frame_stride"]) if sees else 1
     return min(1.0, samples * stride / sum(e.steps for e in dataset.episodes))
 
 
 def evenly(steps: np.ndarray, share: float) -> np.ndarray:
-    """Return an evenly spread share of the steps (n,); the first is always one of them."""
+    """Return an evenly spread share of the steps (n,). The first step is always included."""
     order = np.arange(len(steps))
     return steps[np.ceil((order + 1) * share - 1e-9) > np.ceil(order * share - 1e-9)]
 
 
 def columns_of(episode: DemoEpisode, index: int, count: int) -> dict[str, Tensor]:
-    """Return the fields of `Decodes` that need no target, for `count` control steps of one episode."""
+    """Return the columns `episodes` and `perturbed` of `Decodes`, for `count` observations of one episode.
+
+    Args:
+        episode: The episode.
+        index: Its index in the dataset.
+        count: Number of observations.
+    """
     return {"episodes": torch.full((count,), index), "perturbed": torch.full((count,), episode.perturbed)}
 
 
 def measure(logits: Tensor, examples: Decodes, strict: Tensor) -> Metrics:
-    """Return accepted tokens and the share of whole chunks at every radius, and the token accuracy.
+    """Measure how much of the drafts would be accepted, at the radii 0, 3 and 9.
 
-    Accepted is the longest prefix within the radius of the target's tokens. That approximates relaxed acceptance, in
-    which later target tokens depend on the accepted draft.
+    The accepted tokens are the longest prefix within the radius of the target's greedy tokens. That only approximates
+    relaxed acceptance, in which later target tokens depend on the accepted draft.
 
     Args:
         logits: (n, N, V) of the drafter.
-        examples: n decodes of the target.
-        strict: (N,) bool, tokens that must be equal.
+        examples: The target's greedy decodes of the same n observations.
+        strict: (N,) bool, tokens that must equal the target's.
+
+    Returns:
+        The mean number of accepted tokens and the share of chunks accepted whole, per radius, and the token accuracy.
     """
     kinds = [mask for mask in (examples.perturbed, ~examples.perturbed) if mask.any()]
 

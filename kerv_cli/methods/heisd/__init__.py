@@ -1,7 +1,8 @@
-"""HeiSD (docs/methods.md §2.1, §4): drafts by retrieval, beside the drafter, and skipped verification.
+"""HeiSD (docs/methods.md §2.1, §4): drafts by retrieval or by the drafter, and skipped verification.
 
-A boundary chooses between retrieval and the drafter. Kinematic groups are accepted as a whole. If a stored observation
-is similar enough, its chunk is executed without verification.
+A boundary chooses for each chunk whether retrieval or the drafter drafts. Retrieved drafts are accepted or rejected by
+kinematic group (position, rotation, gripper). If a stored observation is similar enough, its chunk is executed without
+verification.
 """
 
 from __future__ import annotations
@@ -15,25 +16,25 @@ MANIFEST = "manifest.json"
 _DATASTORE, _RULES = "kerv_cli.methods.heisd.datastore:", "kerv_cli.methods.heisd.rules:"
 
 
-# --- the datastore and what drafts from it (§4.1, §4.2)
+# --- the datastore and its proposer (§4.1, §4.2)
 
 
 @dataclass
 class RetrievalProposerSettings:
-    """The nearest stored chunks of the task as one tree (§4.2)."""
+    """Draft the task's most similar stored chunks, merged into one tree (docs/methods.md §4.2)."""
 
     kind: str = "retrieval"
-    neighbours: int = number(5, 1, MOST_TOKENS)  # stored chunks
-    nodes: int = number(50, 1, MOST_TOKENS)  # tree nodes
+    neighbours: int = number(5, 1, MOST_TOKENS)  # number of stored chunks in the tree
+    nodes: int = number(50, 1, MOST_TOKENS)  # maximum number of tree nodes
 
 
 @dataclass
 class QdrantSearchSettings:
-    """Search by Qdrant (the extra: pip install 'kerv[qdrant]'). Without url and path: in memory."""
+    """Search the datastore with Qdrant (pip install 'kerv[qdrant]'). Without url and path it searches in memory."""
 
     kind: str = "qdrant"
-    url: str | None = None  # a server, e.g. http://localhost:6333
-    path: str | None = None  # a folder of qdrant-client's local mode, for one process at a time
+    url: str | None = None  # address of a server, such as http://localhost:6333
+    path: str | None = None  # folder for qdrant-client's local mode, which only one process at a time can use
 
 
 add("artifact", "datastore", _DATASTORE + "DatastoreArtifact", by_task=True, needs_task=True, described_by=MANIFEST)
@@ -57,16 +58,16 @@ add("datastore", "qdrant", _DATASTORE + "QdrantIndex", QdrantSearchSettings)
 
 @dataclass
 class HybridProposerSettings:
-    """HeiSD: retrieval or the drafter, as the boundary says (§4.4).
+    """HeiSD: draft by retrieval or with the drafter, as the boundary chooses (docs/methods.md §4.4).
 
-    The paper's five neighbours need about 50 nodes and cost more than they gain here.
+    The paper uses five neighbours. They need about 50 nodes, which cost more than they gain on our targets.
     """
 
     kind: str = "hybrid"
-    depth: int = number(15, 1, MOST_TOKENS)  # the drafter's, tokens
-    top_k: int = number(1, 1, MOST_TOKENS)
-    nodes: int = number(24, 1, MOST_TOKENS)  # of a tree
-    neighbours: int = number(3, 1, MOST_TOKENS)
+    depth: int = number(15, 1, MOST_TOKENS)  # drafter: maximum number of tokens on a path
+    top_k: int = number(1, 1, MOST_TOKENS)  # drafter: nodes expanded per depth; 1: a chain
+    nodes: int = number(24, 1, MOST_TOKENS)  # maximum number of nodes of either tree
+    neighbours: int = number(3, 1, MOST_TOKENS)  # retrieval: number of stored chunks in the tree
 
 
 _hybrid = (_RULES + "HybridProposer.build", HybridProposerSettings, ("drafter", "datastore"))
@@ -78,21 +79,24 @@ add("proposer", "hybrid", *_hybrid, when=STATES, has_boundary=True, cost=DRAFTIN
 
 @dataclass
 class SequenceAcceptanceSettings:
-    """HeiSD: a kinematic group of one control step is accepted or rejected as a whole; strict DoFs must match."""
+    """HeiSD: accept or reject each kinematic group (position, rotation, gripper) of a control step as a whole.
+
+    Strict DoFs, such as the gripper, must equal the target's tokens.
+    """
 
     kind: str = "sequence"
-    group_limit: int = number(30, 0, MOST_BINS)  # summed bias of a group, bins
-    token_limit: int = number(15, 0, MOST_BINS)  # bias of one token, bins
+    group_limit: int = number(30, 0, MOST_BINS)  # largest accepted sum of a group's distances, bins
+    token_limit: int = number(15, 0, MOST_BINS)  # largest accepted distance of one token, bins
 
 
 @dataclass
 class HybridAcceptanceSettings:
-    """HeiSD: retrieved drafts by `sequence`, all others by `relaxed`."""
+    """HeiSD: judge retrieved drafts by acceptance=sequence, and all other drafts by acceptance=relaxed."""
 
     kind: str = "hybrid"
-    strict_dofs: bool = True
-    group_limit: int = number(30, 0, MOST_BINS)
-    token_limit: int = number(15, 0, MOST_BINS)
+    strict_dofs: bool = True  # relaxed: whether strict DoFs, such as the gripper, must match; paper: false
+    group_limit: int = number(30, 0, MOST_BINS)  # sequence: largest accepted sum of a group's distances, bins
+    token_limit: int = number(15, 0, MOST_BINS)  # sequence: largest accepted distance of one token, bins
 
 
 add("acceptance", "sequence", _RULES + "GroupRule.build", SequenceAcceptanceSettings, reads_threshold=False)
@@ -104,17 +108,17 @@ add("acceptance", "hybrid", _RULES + "by_proposer", HybridAcceptanceSettings)
 
 @dataclass
 class FusedBoundarySettings:
-    """HeiSD: retrieval where the path is straight and fast, the drafter where it bends or slows down."""
+    """HeiSD: retrieval drafts if the hand's path is straight and fast, the drafter if it bends or slows down."""
 
     kind: str = "fused"
-    alpha: float = number(0.5, 0, 1)  # weight of the radius of curvature against the path length
-    window: int = number(15, 3, MOST_DECODES)  # newest measured positions
-    f_star: float = number(0.3, 0, 1)  # fused metric from which retrieval drafts (measured; HeiSD: 0.5)
+    alpha: float = number(0.5, 0, 1)  # weight of the radius of curvature; the path length has the weight 1 − alpha
+    window: int = number(15, 3, MOST_DECODES)  # number of newest hand positions to look at
+    f_star: float = number(0.3, 0, 1)  # retrieval drafts if the weighted sum is at least this (paper: 0.5)
 
 
 @dataclass
 class RandomBoundarySettings:
-    """The control of the fused boundary: the same shares without the metric."""
+    """Choose retrieval or the drafter at random: a baseline for boundary=fused."""
 
     kind: str = "random"
     p: float = number(0.5, 0, 1)  # probability of retrieval
@@ -127,24 +131,24 @@ add("boundary", "fused", _RULES + "Fused.build", FusedBoundarySettings, ("calibr
 add("boundary", "random", _RULES + "Random.build", RandomBoundarySettings, chooses=True)
 
 
-# --- what is executed without a verification (§4.3)
+# --- which retrieved chunks are executed without verification (§4.3)
 
 
 @dataclass
 class SimilaritySkipSettings:
-    """HeiSD: executes a retrieved chunk of at least similarity s_min without a forward of the target's trunk."""
+    """HeiSD: execute a retrieved chunk without verification if its similarity is at least s_min."""
 
     kind: str = "similarity"
-    s_min: float | None = number(None, -1e9, 1e9)  # None: the task's, from the calibration
-    max_skips: int = number(2, 1, MOST_DECODES)  # decodes in a row without a verification
-    # share of the calibrated range that s_min rises after a failed episode (HeiSD: 0.25), and falls after a successful
-    # one; above 0 results depend on the order of episodes
+    s_min: float | None = number(None, -1e9, 1e9)  # None: the task's calibrated value
+    max_skips: int = number(2, 1, MOST_DECODES)  # maximum number of decodes in a row without verification
+    # feedback, as a share of the calibrated range: s_min rises by `up` after a failed episode (HeiSD: 0.25) and falls
+    # by `down` after a successful episode (usual: 0.05); above 0, results depend on the order of the episodes
     up: float = number(0.0, 0, 1e9)
     down: float = number(0.0, 0, 1e9)
 
 
 def needs_of_similarity(settings: SimilaritySkipSettings) -> tuple[str, ...]:
-    """Return the datastore, and the calibration if no level is given."""
+    """Return the kinds of artifacts needed: the datastore, and the calibration if `s_min` is None."""
     return ("datastore", "calibration") if settings.s_min is None else ("datastore",)
 
 
