@@ -18,7 +18,7 @@ from kerv_cli.training.settings import BuildDatastoreSettings, BuildDrafterSetti
 @command(
     "build target",
     BuildTargetSettings,
-    keys="grow policy.target target checkpoint name statistics environment camera int8 results",
+    keys="grow policy.target target checkpoint name statistics environment camera results",
     examples=(
         "kerv build target checkpoint=models/openvla-7b name=openvla",
         "kerv build target grow=150m policy.target=mt10-vision name=mt10-150m",
