@@ -1,4 +1,4 @@
-"""Runs a stored study again, from the settings in the database."""
+"""Runs a stored study again, with its settings from the database."""
 
 from __future__ import annotations
 
@@ -19,15 +19,19 @@ from kerv_cli.lab.study import new_name
 
 
 def again_words(run: RunEntry, results: str) -> list[str]:
-    """Return the command-line arguments that repeat a run in a results folder, and go on with its repetition."""
+    """Return the command-line arguments (without `kerv`) that repeat a run, or resume its repetition."""
     return ["runs", "rerun", run.id, *([] if results == CommandSettings().results else [f"results={results}"])]
 
 
 def plan_of(run: RunEntry, results: str) -> Plan:
-    """Plan a repetition of a sweep or a rollout, or the rest of one that was interrupted.
+    """Plan to run a sweep or a rollout again. If an earlier repetition was interrupted, plan the rest of that one.
+
+    Args:
+        run: The sweep or rollout to repeat.
+        results: The results folder.
 
     Raises:
-        CheckpointError: The weights or the data of the run have changed.
+        CheckpointError: The weights or data of the run have changed since.
         UsageError: A setting cannot run.
     """
     database, study = Database(results), store_of(run).load()
@@ -48,7 +52,7 @@ def plan_of(run: RunEntry, results: str) -> Plan:
 
 
 def _checked(setting: Setting, tasks: list[str], results: str) -> Setting:
-    """Return a stored setting for this results folder. Check that its weights and data are the same."""
+    """Return a stored setting for this results folder. Refuse it if its weights or data have changed."""
     stored = {**setting.settings, "results": results}
     identity = check(settings_from({**stored, "task": tasks}))
     for kind in setting.identity.keys() | identity.keys():

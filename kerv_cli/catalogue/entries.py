@@ -1,4 +1,4 @@
-"""The runs of a results folder: studies, artifacts that were made, and commands that were begun."""
+"""Lists what a results folder contains: studies, artifacts (weights and data), and commands that were started."""
 
 from __future__ import annotations
 
@@ -29,38 +29,38 @@ from kerv_cli.lab.store import IMPORT, ROLLOUT, SWEEP, StudyStore
 from kerv_cli.targets.folders import shipped_dir
 
 LOG, WEIGHTS = "log.csv", "model.safetensors"
-"""Files of a training."""
+"""Names of a training's files: validation results, weights."""
 POLICY = "policy"
-"""Kind of what `kerv build policy` installs. It is listed while it is unfinished."""
+"""Kind of a policy that `kerv build policy` installs. It is listed only while it is unfinished."""
 LAST = "last"
-"""Name of the newest run."""
+"""Stands for the newest entry, as an argument of commands."""
 _STUDIES = (SWEEP, ROLLOUT, IMPORT)
 _STATES = ("complete", "begun", "damaged", "step ", "running", "interrupted", "failed")
 _FILTERS = ("kind", "method", "task", "state", "since")
 
 
 def artifact_kinds() -> tuple[str, ...]:
-    """Return the kinds of artifacts, with those of plugins."""
+    """Return the kinds of artifacts (weights and data), including those that plugins add."""
     return ("demos", "target", *parts("artifact"))
 
 
 @dataclass(frozen=True)
 class RunEntry:
-    """One run.
+    """One entry of the list that `kerv runs` shows: a study, an artifact, or an unfinished command.
 
     Attributes:
-        id: Its name in commands.
-        kind: sweep, rollout, import, policy or a kind of artifact.
-        folder: Its folder.
-        started: Time in UTC (ISO 8601). Of an artifact: when its newest file changed.
-        state: E.g. `complete`, `2 of 6 episodes`, `step 300 of 600`, `begun`, `damaged`.
-        methods: Methods of its settings.
-        tasks: Its tasks.
+        id: Name in commands.
+        kind: sweep, rollout, import, policy, or a kind of artifact.
+        folder: Folder of its files.
+        started: Start time in UTC (ISO 8601). For an artifact, the time when its newest file changed.
+        state: For example `complete`, `2 of 6 episodes`, `step 300 of 600`, `begun` or `damaged`.
+        methods: Decoding methods of its settings. For an artifact, its kind.
+        tasks: Names of its tasks.
         episodes: Number of its episodes.
-        figures: Its main numbers by name.
-        command: Words after `kerv` that made it. Empty if they are unknown.
+        figures: Its main numbers by name, such as the success rate.
+        command: Command-line arguments (without `kerv`) that made it. Empty if unknown.
         sha256: Hash by which other artifacts refer to it.
-        made_from: Hashes of the artifacts that it was made from, by kind.
+        made_from: Kind -> hash, for the artifacts that it was made from.
     """
 
     id: str
@@ -78,17 +78,17 @@ class RunEntry:
 
     @property
     def has_episodes(self) -> bool:
-        """Whether the run is a sweep, a rollout or an import."""
+        """Whether the entry is a study: a sweep, a rollout or an import."""
         return self.kind in _STUDIES
 
     @property
     def is_training(self) -> bool:
-        """Whether the run is a training, or has weights that were imported or copied."""
+        """Whether the entry is a training, or has weights that were imported or copied."""
         return not self.has_episodes and any((self.folder / name).is_file() for name in (LOG, WEIGHTS))
 
 
 def find_runs(results: str | Path) -> list[RunEntry]:
-    """Return every run of the results folder, the newest first."""
+    """Return all entries of the results folder, newest first."""
     database = Database(results)
     rows: dict[tuple[str, str], RunRow] = {}
     for row in run_rows(database):
@@ -111,16 +111,16 @@ def find_runs(results: str | Path) -> list[RunEntry]:
 
 
 def find_run(results: str | Path, name: str, exact: bool = False) -> RunEntry:
-    """Return the run with this id or a unique part of it, or the newest run for `last`.
+    """Return one entry of the results folder.
 
     Args:
         results: The results folder.
-        name: Id, part of an id, or `last`.
-        exact: Accept only a whole id.
+        name: Id of the entry, a part of it that no other id contains, or `last` for the newest entry.
+        exact: Whether to accept only a whole id.
 
     Raises:
-        UsageError: Several runs match, or there are no runs.
-        UnknownName: No run matches.
+        UsageError: Several entries match, or there are none at all.
+        UnknownName: No entry matches.
     """
     runs = find_runs(results)
     if not runs:
@@ -136,14 +136,15 @@ def find_run(results: str | Path, name: str, exact: bool = False) -> RunEntry:
 
 
 def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry]:
-    """Return the runs that match every filter.
+    """Return the entries that match every filter.
 
     Args:
-        runs: Runs to choose from.
-        filters: kind, method or task (also patterns such as `drawer*`), state (its beginning), since (ISO 8601).
+        runs: Entries to choose from.
+        filters: Name of a filter -> its value. kind: equal. method and task: equal, or a pattern such as `drawer*`.
+            state: how the state begins. since: earliest start (ISO 8601).
 
     Raises:
-        UnknownName: A filter, kind or state is unknown.
+        UnknownName: A filter, kind or state does not exist.
         UsageError: `since` is not a date.
     """
     for key in filters:
@@ -171,10 +172,10 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
 
 
 def store_of(run: RunEntry) -> StudyStore:
-    """Return the store of a sweep, a rollout or an import.
+    """Return the stored study (settings and episodes) of an entry.
 
     Raises:
-        UsageError: The run is of another kind.
+        UsageError: The entry is not a sweep, rollout or import.
     """
     if not run.has_episodes:
         raise UsageError(f"{run.id} is a {run.kind}: it has no episodes")
@@ -222,10 +223,12 @@ def _studies(database: Database, rows: Mapping[tuple[str, str], RunRow]) -> list
 
 
 def description_of(run: RunEntry) -> dict[str, Any]:
-    """Return the provenance of an artifact; empty if it has none, or before a training's first validation.
+    """Return the provenance of an artifact: the command, settings and data that made it.
+
+    Empty if it is unknown, or before a training's first validation.
 
     Raises:
-        CheckpointError: The file is damaged.
+        CheckpointError: The artifact's description is damaged.
     """
     return dict(_described(run.folder, run.kind).get("provenance") or {})
 
@@ -251,7 +254,7 @@ def _artifacts(folder: Path, kind: str) -> Iterator[RunEntry]:
 
 
 def state_of(folder: Path, kind: str) -> str:
-    """Return the state of the artifact in a folder; see `RunEntry`."""
+    """Return the state of the artifact in a folder, such as `complete` or `step 300 of 600` (see `RunEntry`)."""
     return _artifact(folder, kind).state
 
 
@@ -281,7 +284,12 @@ def _artifact(folder: Path, kind: str) -> RunEntry:
 
 
 def _hash_of(path: Path, value: Mapping[str, Any]) -> str:
-    """Return the hash of an artifact's weights or data, else of its description."""
+    """Return the hash of an artifact's weights or data. If it names none, return the hash of its description.
+
+    Args:
+        path: File of the description.
+        value: Contents of that file.
+    """
     if value.get("kind") == "datastore":
         return content_of(value["key"], value["chunk"], value["target"], value["files"])
     return str(value.get("sha256") or (sha256_of(path) if value else ""))
@@ -289,7 +297,7 @@ def _hash_of(path: Path, value: Mapping[str, Any]) -> str:
 
 def _trained_state(folder: Path, settings: Mapping[str, Any]) -> str:
     if not (folder / LOG).is_file():
-        return "complete"  # copied or imported: it has no log
+        return "complete"  # weights that were copied or imported have no log
     rows = list(csv.DictReader(io.StringIO(read_text(folder / LOG))))
     steps, step = int(settings.get("train", {}).get("steps", 0)), float(rows[-1]["step"]) if rows else 0.0
     return "complete" if step >= steps else f"step {step:.0f} of {steps}"
@@ -304,7 +312,10 @@ def _made_from(value: Mapping[str, Any], provenance: Mapping[str, Any]) -> dict[
 
 
 def parents(run: RunEntry, runs: Sequence[RunEntry]) -> dict[str, str]:
-    """Return what a run was made from, by kind: a run, a shipped policy, or else the beginning of a hash."""
+    """Return what an entry was made from: kind -> id of an entry, or the name of a shipped policy.
+
+    If neither is known, the value is the first digits of the hash.
+    """
     names = {other.sha256: other.id for other in runs if other.sha256}
     for folder in visible(shipped_dir()):
         for kind in artifact_kinds():
@@ -314,15 +325,15 @@ def parents(run: RunEntry, runs: Sequence[RunEntry]) -> dict[str, str]:
 
 
 def disk_bytes(folder: Path) -> int:
-    """Return the size of all files in a folder."""
+    """Return the total size of all files in a folder, in bytes."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def check_removable(run: RunEntry) -> None:
-    """Check that a run can be removed.
+    """Refuse to remove an entry that is in use.
 
     Raises:
-        UsageError: Its folder is a link, or a process makes it at the moment.
+        UsageError: Its folder is a symbolic link, or a process is making it.
     """
     if run.folder.is_symlink():
         raise UsageError(f"{run.folder} is a link to {os.readlink(run.folder)}: remove the link, or what it points to")
@@ -331,17 +342,17 @@ def check_removable(run: RunEntry) -> None:
 
 
 def remove(run: RunEntry, results: str | Path) -> None:
-    """Remove a run's folder and its rows.
+    """Remove an entry: its folder and its rows in the database.
 
-    First the folder is renamed to a temporary name, which every command ignores and a later one removes. If this
-    process is killed before the rows are gone, the run is still listed and can be removed again.
+    The folder is renamed first, to a temporary name that every command ignores and that a later command deletes. If
+    this process is killed before the rows are deleted, the entry is still listed and can be removed again.
 
     Args:
-        run: What to remove.
+        run: The entry to remove.
         results: Its results folder.
 
     Raises:
-        StorageError: The disk refused.
+        StorageError: The disk is full or not writable.
     """
     gone = temporary_beside(run.folder)
     if run.folder.exists():

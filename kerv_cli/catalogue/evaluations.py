@@ -1,7 +1,8 @@
-"""Imports evaluations that vla-eval and lerobot-eval ran, as a study with a setting per imported path.
+"""Imports evaluations that vla-eval or lerobot-eval ran. They become one study, with one setting per imported path.
 
-A recording of vla-eval is a SQLite file. For servers of kerv the decodes are known too (served.py). For other servers
-success and steps are known, but no times. lerobot-eval writes `eval_info.json`, which has successes alone.
+A vla-eval recording is a SQLite file. If a kerv server decoded the episodes, their decodes are imported too
+(served.py). Of other servers only success and number of steps are known. lerobot-eval writes `eval_info.json`, which
+only has successes.
 """
 
 from __future__ import annotations
@@ -31,28 +32,28 @@ from kerv_cli.lab.plan import Episode, Setting, Study
 from kerv_cli.lab.store import IMPORT, ImportedEpisode, StudyStore
 
 LEROBOT_FILE = "eval_info.json"
-"""Name of lerobot-eval's results."""
+"""Name of the file with lerobot-eval's results."""
 _DAMAGE = (sqlite3.Error, OSError, ValueError, KeyError, TypeError, AttributeError)
 
 _UNKNOWN_DECODE = {"index": 0, "step": 0, "mode": "elsewhere", "forwards": 0, "seconds": math.nan, "tokens": [],
                    "actions": [], "rounds": [], "compensated": 0, "skipped": False}  # fmt: skip
-"""Stands for all decodes of a server that is not kerv's."""
+"""Placeholder for the unknown decodes of a server that is not kerv's."""
 
 
 @dataclass(frozen=True)
 class RecordedEpisode:
-    """One episode of a recording.
+    """One episode of a recorded evaluation.
 
     Attributes:
         task: Name of the task.
         index: Number of the episode within the task.
-        seed: Seed of its initial state if the benchmark names it, else the index.
+        seed: Seed of the initial state. If the benchmark does not name it, the index.
         success: Whether the task was solved.
-        steps: Number of control steps. None: unknown.
+        steps: Number of control steps; None if unknown.
         seconds: Wall time.
-        id: The harness's name for it.
-        start: Initial state.
-        reason: Why it ended in an error. Empty: it did not.
+        id: The episode's id in the evaluation program.
+        start: Numbers that describe the initial state.
+        reason: The error that ended the episode. Empty if there was none.
     """
 
     task: str
@@ -68,17 +69,17 @@ class RecordedEpisode:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """One benchmark of a recording.
+    """One benchmark of a recorded evaluation.
 
     Attributes:
         source: The file.
-        id: The harness's name for it.
+        id: The evaluation's id in the evaluation program.
         benchmark: Name of the benchmark.
         config: Settings of the benchmark.
         server: What the model server said about itself.
-        episodes: Its episodes.
+        episodes: The recorded episodes.
         planned: Number of episodes that were planned, as far as the recording says.
-        harness: The program that ran it.
+        harness: Name of the evaluation program.
     """
 
     source: Path
@@ -92,12 +93,12 @@ class Evaluation:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """`Policy.facts` of a server of kerv. Empty for other servers."""
+        """Facts about the kerv server (`Policy.facts`). Empty for other servers."""
         return dict(self.server.get("kerv") or {})
 
     @property
     def name(self) -> str:
-        """Method of a server of kerv, else the name of the server."""
+        """The decoding method, if kerv served the policy; otherwise the name of the model server."""
         method = self.facts.get("settings", {}).get("method")
         return str(method or self.server.get("model_server") or "server")
 
@@ -105,23 +106,23 @@ class Evaluation:
 def import_evaluations(
     results: Path, paths: Sequence[Path], name: str, labels: Sequence[str], baseline: str, words: Sequence[str]
 ) -> tuple[str, list[str]]:
-    """Write evaluations as one study.
+    """Import evaluations into the database as one study.
 
     Args:
         results: The results folder.
-        paths: Recordings of vla-eval, results of lerobot-eval, or folders that hold some. Each is one setting.
-        name: Name of the study. Empty: that of the benchmarks.
-        labels: A label for each path. Empty: names of the servers.
-        baseline: Label of the baseline. Empty: ar, else the first.
-        words: Words after `kerv` of the command.
+        paths: One path per setting: a vla-eval recording, a result of lerobot-eval, or a folder that contains some.
+        name: Name of the study. Empty: made from the benchmarks' names.
+        labels: A label for each path. Empty: the servers' names.
+        baseline: Label of the baseline. Empty: ar if there is one, or else the first label.
+        words: Command-line arguments (without `kerv`) of the import.
 
     Returns:
-        The name of the study, and lines about missing episodes.
+        Name of the study, and one line of text for each group of missing episodes.
 
     Raises:
-        UsageError: A path holds no evaluation, or they cannot be compared. Another study has the name, or there is no
-            such label.
-        StorageError: The disk refused.
+        UsageError: A path holds no evaluation, the evaluations cannot be compared, another study has the same name, or
+            the baseline's label does not exist.
+        StorageError: The disk is full or not writable.
         CheckpointError: A file is damaged.
     """
     by_label = labelled([read_evaluations(path) for path in paths], labels)
@@ -153,11 +154,11 @@ def import_evaluations(
 
 
 def read_evaluations(path: Path) -> list[Evaluation]:
-    """Return the evaluations in a file or a folder of vla-eval or lerobot-eval, which are of one server.
+    """Read the evaluations in a file or folder of vla-eval or lerobot-eval. All must be of the same model server.
 
     Raises:
-        UsageError: There is no recording, none has an episode, or there are several servers.
-        CheckpointError: A file is damaged or cut short.
+        UsageError: There is no recording, no recording has an episode, or they are of several servers.
+        CheckpointError: A file is damaged or incomplete.
     """
     info = path / LEROBOT_FILE if path.is_dir() else path
     if info.name == LEROBOT_FILE and info.is_file():
@@ -183,11 +184,11 @@ def read_evaluations(path: Path) -> list[Evaluation]:
 
 
 def _read_lerobot(path: Path) -> list[Evaluation]:
-    """Return the evaluations of lerobot-eval's results, one per group of tasks.
+    """Read the results of lerobot-eval. Return one evaluation per group of tasks.
 
-    A file with several tasks has `per_task` (task_group, task_id and lists of metrics), one with a single task
-    `per_episode`. The file does not name the policy, so its name is that of the file's folder. Without a seed in the
-    file, an episode's number is its seed: lerobot-eval gives the episodes of every task the same seeds in order.
+    A file with several tasks has `per_task` (task_group, task_id and lists of metrics). A file with a single task has
+    `per_episode`. The file does not name the policy, so the name of its folder is used. Without a seed in the file, an
+    episode's number is its seed, because lerobot-eval gives the episodes of every task the same seeds in order.
     """
     value = read_mapping(path)
     groups: dict[str, list[RecordedEpisode]] = {}
@@ -215,7 +216,7 @@ def _read_lerobot(path: Path) -> list[Evaluation]:
 
 
 def _read_recording(path: Path) -> list[Evaluation]:
-    """Return the evaluations of a recording of vla-eval."""
+    """Read the evaluations in a vla-eval recording."""
     with contextlib.closing(connect_foreign(path)) as file:
         return [_evaluation(file, path, *row) for row in file.execute("SELECT eval_id, metadata FROM eval_metadata")]
 
@@ -253,11 +254,11 @@ def _episode(
 
 
 def labelled(recordings: Sequence[list[Evaluation]], labels: Sequence[str] = ()) -> dict[str, list[Evaluation]]:
-    """Return the evaluations of each path by label, which are one setting.
+    """Give each path's evaluations a label. The evaluations of one label become one setting.
 
     Args:
         recordings: The evaluations of each path.
-        labels: A label for each path. Empty: names of the servers.
+        labels: A label for each path. Empty: the servers' names.
 
     Raises:
         UsageError: The number of labels is wrong, or the evaluations have different episodes.
@@ -294,14 +295,22 @@ def _check_same_episodes(names: str, first: Sequence[Evaluation], other: Sequenc
 
 
 def _conditions(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a benchmark that determine its world."""
+    """Return those settings of a benchmark that determine its episodes, with dotted keys."""
     return flat({key: config.get(key) for key in ("benchmark", "mode", "max_steps", "params")})
 
 
 def _episodes(
     setting: Setting, one: Evaluation, names_benchmark: bool
 ) -> Iterator[tuple[Episode, RecordedEpisode | None]]:
-    """Yield the episodes of an evaluation. None: it is missing or ended in an error."""
+    """Yield the planned episodes of an evaluation, each with its recorded result.
+
+    The result is None if the episode is missing or ended in an error.
+
+    Args:
+        setting: The setting of the evaluation.
+        one: The evaluation.
+        names_benchmark: Whether to put the benchmark's name before the task's.
+    """
     each = int(one.config.get("episodes_per_task") or 0)
     for task in dict.fromkeys(episode.task for episode in one.episodes):
         episodes = [episode for episode in one.episodes if episode.task == task]
@@ -323,7 +332,10 @@ def _notes(label: str, one: Evaluation) -> Iterator[str]:
 
 
 def _settings(first: Evaluation) -> dict[str, Any]:
-    """Return RolloutSettings that say what ran: those of a server of kerv, else defaults with the server's name."""
+    """Return the rollout settings of the evaluation, as nested plain values.
+
+    For a kerv server they are its own. For another server they are the defaults, with the server's name as method.
+    """
     stored = first.facts.get("settings")
     plain = dataclasses.asdict(RolloutSettings()) | {"method": first.name}
     if isinstance(stored, dict):
@@ -340,7 +352,10 @@ def _settings(first: Evaluation) -> dict[str, Any]:
 
 
 def _identity(evaluations: Sequence[Evaluation]) -> dict[str, str]:
-    """Return hashes of the weights, and of what was recorded: a rollout never reuses an imported episode."""
+    """Return hashes of the weights and of the recorded results.
+
+    The latter make sure that a rollout never reuses an imported episode.
+    """
     recorded = [[one.id, [dataclasses.astuple(e) for e in one.episodes]] for one in evaluations]
     digest = hashlib.sha256(json.dumps(recorded, sort_keys=True).encode()).hexdigest()
     hashes = {str(k): str(v) for k, v in dict(evaluations[0].facts.get("identity") or {}).items()}
@@ -350,7 +365,13 @@ def _identity(evaluations: Sequence[Evaluation]) -> dict[str, str]:
 def _imported(results: Path, episode: Episode, one: Evaluation, recorded: RecordedEpisode) -> ImportedEpisode:
     """Return an episode for the database, with its decodes if kerv served it.
 
-    The evaluations did not take turns, so each is a block of its own.
+    Each evaluation is a block (episodes that one process ran) of its own, because it did not take turns with others.
+
+    Args:
+        results: The results folder, which holds the served episodes.
+        episode: Setting, task, seed and repeat in the study.
+        one: The evaluation.
+        recorded: The recorded result.
     """
     path = path_of(results, one.id, recorded.id) if one.facts else None
     served = read_served(path) if path is not None else None

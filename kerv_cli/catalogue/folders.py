@@ -1,4 +1,8 @@
-"""Imports results folders. Those of 0.1.0 have a folder per study, with plan.yaml, run.json and a folder per cell."""
+"""Imports results folders of this version, and of version 0.1.0.
+
+Version 0.1.0 had no database. It had one folder per study, with plan.yaml, run.json and one folder per cell. A cell is
+a setting on one task with a few seeds.
+"""
 
 from __future__ import annotations
 
@@ -32,14 +36,14 @@ _NOT_OF_BLOCK = {"state", "episodes", "successes", "seconds", "wall_seconds", "t
 _DAMAGE = (OSError, ValueError, KeyError, TypeError, AttributeError, pa.ArrowException, KervError)
 
 Cells = list[tuple[str, list[Episode]]]
-"""Id of a cell and its episodes."""
+"""For each cell (a setting on one task with a few seeds): its id and its episodes."""
 
 
 def is_results(path: Path) -> bool:
     """Return whether a path is a results folder or a kerv.db.
 
     Raises:
-        UsageError: It does not exist.
+        UsageError: The path does not exist.
     """
     if not path.exists():
         raise UsageError(
@@ -49,21 +53,21 @@ def is_results(path: Path) -> bool:
 
 
 def _database_of(path: Path) -> Path | None:
-    """Return the database that a path is or holds. Its name ends with .db."""
+    """Return the database file: the path itself, or kerv.db in the folder. None if there is none."""
     file = path / FILE if path.is_dir() else path
     return file if file.is_file() and file.suffix == Path(FILE).suffix else None
 
 
 def import_results(results: Database, paths: Sequence[Path], name: str = "") -> Imported:
-    """Copy the studies of results folders and databases.
+    """Copy the studies of results folders and databases into a database.
 
     Args:
-        results: Where they are copied to.
-        paths: Results folders of this version or 0.1.0, and databases.
-        name: Name of the study here, if there is only one. Empty: as there.
+        results: The database to copy to.
+        paths: Results folders of this version or 0.1.0, or database files.
+        name: New name of the study, if there is only one. Empty: keep the names.
 
     Raises:
-        UsageError: A path is the results folder itself, or `name` is set and there are several studies.
+        UsageError: A path is the results folder itself, or `name` is given and there are several studies.
         CheckpointError: A database is damaged.
     """
     imported = Imported()
@@ -79,23 +83,25 @@ def import_results(results: Database, paths: Sequence[Path], name: str = "") -> 
 
 
 def _older_studies(path: Path) -> list[tuple[str, Path]]:
-    """Return the studies and rollouts of version 0.1.0 in a folder: kind and folder of each."""
+    """Return kind and folder of each study and rollout of version 0.1.0 in a results folder."""
     found = [(kind, plan.parent) for name, kind in _FOLDERS.items() for plan in path.glob(f"{name}/[!.]*/plan.yaml")]
     return sorted(found, reverse=True)
 
 
 def _import_older(results: Database, path: Path, name: str, imported: Imported) -> None:
-    """Copy every study and rollout into the database. Recordings and artifacts are files and stay where they are.
+    """Copy all studies and rollouts of a results folder of version 0.1.0 into a database.
+
+    Recordings and artifacts are not copied.
 
     Args:
-        results: Where they are copied to.
+        results: The database to copy to.
         path: The older results folder.
-        name: Name of the study here. Empty: as there.
-        imported: Notes what was imported.
+        name: New name of the study. Empty: keep the names.
+        imported: Collects the names of imported studies and notes about damaged ones.
 
     Raises:
-        UsageError: `name` is set and there are several studies.
-        StorageError: The disk refused.
+        UsageError: `name` is given and there are several studies.
+        StorageError: The disk is full or not writable.
     """
     studies = _older_studies(path)
     check_one(path, name, len(studies))
@@ -113,7 +119,7 @@ def _import_older(results: Database, path: Path, name: str, imported: Imported) 
 
 
 def _study_of(folder: Path, name: str, kind: str) -> tuple[Study, Cells]:
-    """Return the study of a plan.yaml and its cells."""
+    """Return the study that a plan.yaml of version 0.1.0 describes, and the cells with its episodes."""
     plan = read_yaml(folder / "plan.yaml")
     settings = {
         str(label): Setting(
@@ -135,9 +141,10 @@ def _study_of(folder: Path, name: str, kind: str) -> tuple[Study, Cells]:
 
 
 def completed(stored: Mapping[str, Any]) -> dict[str, Any]:
-    """Return stored settings in today's form: defaults for what they lack, without what no longer exists.
+    """Convert stored settings to the current format, without the task.
 
-    Settings of a part that is not registered stay as they are.
+    Missing settings get their defaults. Settings that no longer exist are removed. Settings of a part that is not
+    installed stay as they are.
     """
     plain = dataclasses.asdict(read(RolloutSettings, with_artifacts(stored), "a stored setting", tolerant=True))
     for group in SETTINGS_GROUPS:
@@ -151,7 +158,7 @@ def completed(stored: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _episodes(folder: Path, cells: Cells, imported: Imported) -> Iterator[ImportedEpisode]:
-    """Yield the episodes of every whole cell. Each damaged one adds a line to the notes."""
+    """Yield the episodes of every complete cell. For each damaged cell, add a line to the notes of `imported`."""
     for name, episodes in cells:
         # a cell that ran again has newer folders NAME-2, NAME-3, …
         again = [path for path in visible(folder / "cells") if path.name.startswith(f"{name}-")]
@@ -181,7 +188,7 @@ def _of_cell(cell: Path, episodes: list[Episode]) -> Iterator[ImportedEpisode]:
         row = rows[one.seed]
         known = {name: row[name] for name in _ROW if name in row and row[name] == row[name]}  # without NaN
         mine = decodes.filter(pa.compute.equal(decodes["seed"], one.seed))
-        # columns that it lacks are null
+        # missing columns become null
         table = pa.concat_tables([DECODE_SCHEMA.empty_table(), mine], promote_options="permissive")
         table = table.select(DECODE_SCHEMA.names).cast(DECODE_SCHEMA)
         yield ImportedEpisode(one, known, table, str(row["block"]), about, run, code=code)

@@ -1,7 +1,8 @@
-"""Files of the episodes that a server of kerv served: results/served/<evaluation>/<episode>.arrow.
+"""Files of episodes that a kerv policy server decoded: <results>/served/<evaluation>/<episode>.arrow.
 
-A file holds the decodes. Its metadata holds the columns of the episode and the server's facts as JSON. Both names come
-from the harness. Arrow files are read several times as fast as Parquet, and an import reads thousands.
+Each file holds the decodes of one episode. Its metadata holds, as JSON, the episode's columns and facts about the
+server. The evaluation program chooses both names. Arrow is used because it is read several times as fast as Parquet,
+and an import reads thousands of files.
 """
 
 from __future__ import annotations
@@ -25,23 +26,23 @@ _NAME = re.compile(r"\w[\w.-]{0,199}")
 
 
 def path_of(results: Path, evaluation: str, episode: str) -> Path | None:
-    """Return the file of an episode, or None if the names are not file names."""
+    """Return the file of a served episode. None if a name cannot be used as a file name."""
     if not _NAME.fullmatch(evaluation) or not _NAME.fullmatch(episode):
         return None
     return results / SERVED / evaluation / f"{episode}.arrow"
 
 
 def write_served(path: Path, record: EpisodeRecord, started: str, by: Mapping[str, Any]) -> None:
-    """Write an episode.
+    """Write one episode.
 
     Args:
         path: The file.
-        record: The episode. Its path has shape (0, 3) if it is unknown.
-        started: Time at which it began (ISO 8601).
-        by: `Policy.facts` of the server.
+        record: The episode. If the end effector's path is unknown, `record.path` has the shape (0, 3).
+        started: Time at which the episode began (ISO 8601).
+        by: Facts about the server (`Policy.facts`).
 
     Raises:
-        StorageError: The disk refused.
+        StorageError: The disk is full or not writable.
     """
     row = episode_row(record) | {"task": record.task, "seed": record.seed, "started": started}
     if not len(record.path):
@@ -54,7 +55,10 @@ def write_served(path: Path, record: EpisodeRecord, started: str, by: Mapping[st
 
 
 def read_served(path: Path) -> tuple[dict[str, Any], pa.Table] | None:
-    """Return the columns of the episode in a file and its decodes, or None if there is no file.
+    """Read one episode.
+
+    Returns:
+        The episode's columns, and the table of its decodes. None if the file does not exist.
 
     Raises:
         CheckpointError: The file is damaged.

@@ -1,6 +1,6 @@
-"""Studies of another kerv.db: what `kerv runs export --to db` writes, or the database of another results folder.
+"""Copies studies between databases: imports the studies of another kerv.db, and exports one study to a new kerv.db.
 
-SQLite files of others are read with limits, because a small file can stand for a huge result.
+SQLite files from others are read with limits on time and size, because a small file can make a query endless.
 """
 
 from __future__ import annotations
@@ -40,29 +40,29 @@ _DAMAGE = (sa.exc.SQLAlchemyError, sqlite3.Error, pa.ArrowException, OSError, Va
 _ROW = (*(column.name for column in MEASURES), "order", "started", "worker_pid")
 
 MOST_STEPS = 20_000_000
-"""Steps of SQLite's virtual machine that a connection may take, besides STEPS_PER_BYTE. They take about a second."""
+"""Limit on steps of SQLite's virtual machine per connection, about a second. STEPS_PER_BYTE is added."""
 STEPS_PER_BYTE = 20
 MOST_VALUE = 2**28
-"""Bytes of one value of a SQLite file."""
+"""Limit on the bytes of one value in a SQLite file."""
 _EVERY = 10_000
 
 
 def connect_foreign(path: Path, **options: Any) -> sqlite3.Connection:
-    """Return a read-only connection to a SQLite file.
+    """Open a SQLite file from somebody else, read-only.
 
-    Queries end in an error after a number of steps that depends on the size of the file.
+    A query fails after a number of steps that depends on the file's size.
 
     Args:
         path: The file.
-        options: Options of `sqlite3.connect`.
+        options: Further arguments for `sqlite3.connect`.
 
     Raises:
         OSError: The file is missing or is not a regular file.
-        ValueError: The file is cut short, or has views.
+        ValueError: The file is incomplete, or contains views, which could make any query slow.
     """
     size = regular(path).stat().st_size
     log = path.with_name(f"{path.name}-wal")
-    # a file whose writer was killed has its last rows in the log, which an immutable connection does not read
+    # if its writer was killed, the last rows are in the log, which a connection with immutable=1 would ignore
     immutable = "" if log.is_file() and log.stat().st_size else "&immutable=1"
     connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro{immutable}", uri=True, **options)
     try:
@@ -90,13 +90,20 @@ def connect_foreign(path: Path, **options: Any) -> sqlite3.Connection:
 
 @dataclass
 class Imported:
-    """Names of the studies that were imported, and lines about what was left out."""
+    """Result of an import: names of the imported studies, and lines of text about what was left out."""
 
     names: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     def add(self, store: StudyStore, study: Study, episodes: Iterator[ImportedEpisode], command: Sequence[str]) -> None:
-        """Write a study. If one of its name has episodes, leave it out."""
+        """Write a study. If the database already has episodes of a study with this name, leave it out and note that.
+
+        Args:
+            store: Where the study is written.
+            study: The settings and all episodes.
+            episodes: The episodes that exist.
+            command: Command-line arguments (without `kerv`) that ran the study.
+        """
         if store.counts()[0]:
             self.notes.append(f"{store.name} exists and was left out: 'kerv runs rm {store.name}' removes it")
         else:
@@ -104,26 +111,31 @@ class Imported:
             self.names.append(store.name)
 
     def leave_out(self, path: Path, error: BaseException) -> None:
-        """Note that a damaged study or part of one is left out."""
+        """Note that a damaged study, or a damaged part of one, was left out."""
         self.notes.append(f"{path} was left out: {' '.join(f'{type(error).__name__} {error}'.split())[:160]}")
 
 
 def check_one(path: Path, name: str, studies: int) -> None:
-    """Refuse a name for several studies.
+    """Refuse a new name if there are several studies to name.
+
+    Args:
+        path: Where the studies are, for the error message.
+        name: The new name. Empty: studies keep their names.
+        studies: Number of studies.
 
     Raises:
-        UsageError: There are several.
+        UsageError: A name is given, and the number of studies is not 1.
     """
     if name and studies != 1:
         raise UsageError(f"name={name}: {path} holds {studies} studies, a name is for one")
 
 
 def episodes_in(connection: sa.Connection, settings: dict[int, Setting]) -> Iterator[ImportedEpisode]:
-    """Yield the episodes of a database's settings.
+    """Yield the stored episodes of some settings in another database.
 
     Args:
-        connection: The database.
-        settings: Settings of a study by their ids.
+        connection: The other database.
+        settings: The settings by their ids in that database.
 
     Raises:
         ValueError: The decodes of an episode are damaged or too large.
@@ -143,17 +155,17 @@ def episodes_in(connection: sa.Connection, settings: dict[int, Setting]) -> Iter
 
 
 def import_database(results: Database, path: Path, name: str, imported: Imported) -> None:
-    """Copy the studies of another database.
+    """Copy all studies of another database file.
 
     Args:
-        results: Where they are copied to.
-        path: File of the other database.
-        name: Name of the study here. Empty: as there.
-        imported: Notes what was imported.
+        results: The database to copy to.
+        path: The other database file.
+        name: New name of the study, if there is only one. Empty: keep the names.
+        imported: Collects the names of imported studies and notes about others.
 
     Raises:
-        UsageError: `name` is set and there are several studies.
-        CheckpointError: The file is damaged, or from a newer kerv.
+        UsageError: `name` is given and there are several studies.
+        CheckpointError: The file is damaged, or was written by a newer version of kerv.
     """
     engine = sa.create_engine(
         "sqlite://", creator=lambda: connect_foreign(path, check_same_thread=False), poolclass=sa.pool.NullPool
@@ -172,7 +184,7 @@ def import_database(results: Database, path: Path, name: str, imported: Imported
 
 
 def _command(connection: sa.Connection, study: Study) -> tuple[str, ...]:
-    """Return the words after `kerv` that ran a study last."""
+    """Return the command-line arguments (without `kerv`) that ran a study last. Empty if none are stored."""
     newest = sa.select(RUNS.c.command).where(RUNS.c.kind == study.kind, RUNS.c.name == study.name)
     return tuple(connection.scalar(newest.order_by(RUNS.c.started.desc(), RUNS.c.id.desc())) or ())
 
@@ -193,11 +205,11 @@ def _damage(path: Path) -> Iterator[None]:
 
 
 def export_database(store: StudyStore, folder: Path) -> Path:
-    """Write a kerv.db with one study into a folder and return its file. An older one is replaced.
+    """Write a kerv.db with a single study into a folder, and return the file. An existing kerv.db is replaced.
 
     Raises:
-        UsageError: The folder holds other files.
-        StorageError: The disk refused.
+        UsageError: The folder contains other files.
+        StorageError: The disk is full or not writable.
     """
 
     def fill(new: Path) -> None:

@@ -1,4 +1,4 @@
-"""The command that this process runs: its words and its database. Imports nothing heavy."""
+"""The command that this process runs: its command-line arguments and its database. This file imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 
 STORE = "KERV_STORE"
-"""Environment variable with the URL of the database. Empty: SQLite in the results folder."""
+"""Environment variable with the URL of the database. If empty, it is a SQLite file in the results folder."""
 _words: list[str] = []
 
 
 def current_command() -> list[str]:
-    """Return the words after `kerv` of this process's command."""
+    """Return this process's command-line arguments, without `kerv` itself."""
     return list(_words)
 
 
 def set_command(words: Sequence[str]) -> list[str]:
-    """Set the words after `kerv` of this process's command, and return those set before."""
+    """Replace this process's command-line arguments (without `kerv`), and return the previous ones."""
     before = list(_words)
     _words[:] = words
     return before
@@ -26,13 +26,14 @@ def set_command(words: Sequence[str]) -> list[str]:
 
 @contextlib.contextmanager
 def chosen_store(overrides: Iterable[str]) -> Iterator[list[str]]:
-    """Use the database that `store=URL` names, in this process and its workers, until the block ends.
+    """Use the database named by the override `store=URL`, in this process and its workers, for the `with` block.
 
     Args:
-        overrides: Overrides of a command. Without a `store=` the variable KERV_STORE stays as it is.
+        overrides: Overrides of a command. Without a `store=` among them, the variable KERV_STORE stays as it is.
 
     Yields:
-        The same overrides. A URL has lost its password, so that none is stored, and is quoted if Hydra needs that.
+        The same overrides, but without the URL's password, so that it is never stored. The URL is quoted if Hydra needs
+        that.
     """
     overrides, before = list(overrides), os.environ.get(STORE)
     for number, override in enumerate(overrides):

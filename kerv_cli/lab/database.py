@@ -1,7 +1,7 @@
-"""The database of a results folder: tables of runs, studies, episodes and curves (docs/formats.md).
+"""The database of a results folder: tables of runs, studies, episodes and training curves (docs/formats.md).
 
-The default is SQLite in `<results>/kerv.db`. `store=postgresql://USER@HOST/DB` or the variable KERV_STORE puts the same
-tables on a server. Only the process of a command writes. Its workers send their episodes to it.
+By default it is SQLite in `<results>/kerv.db`. With `store=postgresql://USER@HOST/DB`, or the variable KERV_STORE, the
+same tables are on a server. Only the process that runs a command writes. Its workers send their episodes to it.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from kerv_cli.lab.command import STORE
 
 FILE = "kerv.db"
 SCHEMA = 1
-"""Version of the tables. Raise it with every change of them, and add the statements to MIGRATIONS."""
+"""Version of the tables. Increase it whenever they change, and add the SQL statements to MIGRATIONS."""
 MIGRATIONS: dict[int, Sequence[str]] = {}
-"""Version -> statements that turn its tables into those of the next version."""
+"""Version -> SQL statements that turn its tables into those of the next version."""
 LOCK_SECONDS = 60
-"""Longest time to wait for another process's transaction."""
+"""Longest time to wait for another process's transaction, seconds."""
 
 _META = sa.MetaData()
 _JSON = sa.JSON(none_as_null=True)
@@ -38,20 +38,20 @@ def _table(name: str, *columns: sa.schema.SchemaItem) -> sa.Table:
 
 
 def _required(kind: Any, *names: str) -> list[sa.Column[Any]]:
-    """Return columns of one type that are never null."""
+    """Return columns of one type that cannot be null, one for each name."""
     return [sa.Column(name, kind, nullable=False) for name in names]
 
 
 def _to(name: str, column: str, **options: Any) -> sa.Column[Any]:
-    """Return a column that refers to another row, and is deleted with it."""
+    """Return a column that refers to a row of another table. A row is deleted together with the one it refers to."""
     return sa.Column(name, sa.ForeignKey(column, ondelete="CASCADE"), **options)
 
 
 ABOUT = _table("kerv", sa.Column("key", sa.Text, primary_key=True), sa.Column("value", sa.Text, nullable=False))
 RUNS = _table(
-    "runs",  # a row per command that was begun
+    "runs",  # one row per command that was started
     # kind: sweep, rollout, import, or a kind of artifact; name: of the study or the artifact; started: ISO 8601, UTC;
-    # command: words after `kerv`; heartbeat: seconds since 1970
+    # command: command-line arguments without `kerv`; heartbeat: seconds since 1970
     sa.Column("id", sa.Text, primary_key=True),
     *_required(sa.Text, "kind", "name", "status", "message", "host", "started", "git_commit"),
     *_required(sa.Integer, "done", "total", "pid"),
@@ -79,9 +79,9 @@ SETTINGS = _table(
     sa.UniqueConstraint("study_id", "label"),
 )
 BLOCKS = _table(
-    "blocks",  # one attempt to run some episodes in one process, in which settings take turns
+    "blocks",  # one attempt to run a group of episodes in one process, with settings taking turns
     sa.Column("id", sa.Text, primary_key=True),
-    sa.Column("claim", sa.Text),  # JSON: the episodes of the study that it runs; null when it has ended
+    sa.Column("claim", sa.Text),  # JSON: the episodes that are running; null after the block has ended
     *_required(sa.Text, "run", "seeds", "started", "code"),  # code: hash of the source code
     *_required(_JSON, "about"),  # machine, versions, commit, executor, workers
 )
@@ -101,7 +101,7 @@ MEASURES: tuple[sa.Column[Any], ...] = (
     *(sa.Column(name, sa.Double) for name in _NUMBERS),
     sa.Column("initial_state", _JSON),
 )
-"""Columns of an episode's record, those of rows.EPISODE_SCHEMA. Listed here because rows.py imports pyarrow."""
+"""Columns from an episode's record, equal to rows.EPISODE_SCHEMA. Listed here because rows.py imports pyarrow."""
 EPISODES = _table(
     "episodes",
     sa.Column("id", sa.Integer, primary_key=True),
@@ -112,24 +112,24 @@ EPISODES = _table(
     sa.Column("worker_pid", sa.Integer),
     *MEASURES,
     *_required(sa.LargeBinary, "decode_seconds"),  # (decodes,) little-endian float64
-    # an episode can run again in another block, in turn with other settings or with other code
+    # the same episode may run again in another block, with other settings or other code
     sa.UniqueConstraint("work", "task", "seed", "repeat", "block"),
 )
 DECODES = _table(
     "decodes", _to("episode_id", "episodes.id", primary_key=True), sa.Column("parquet", sa.LargeBinary, nullable=False)
 )
 WANTED = _table(
-    "wanted",  # the episodes of a study; those without episode_id are missing
+    "wanted",  # all episodes of a study; an episode without episode_id has not run
     _to("setting_id", "settings.id", primary_key=True),
     sa.Column("task", sa.Text, primary_key=True),
     sa.Column("seed", sa.BigInteger, primary_key=True),
     sa.Column("repeat", sa.Integer, primary_key=True),
     *_required(sa.Integer, "position"),
     sa.Column("episode_id", sa.ForeignKey("episodes.id", ondelete="SET NULL"), index=True),
-    sa.Column("error", sa.Text),  # traceback of the last attempt if it failed
+    sa.Column("error", sa.Text),  # traceback, if the last attempt failed
 )
 METRICS = _table(
-    "metrics",  # curves of trainings
+    "metrics",  # validation curves of trainings
     *(sa.Column(name, sa.Text, primary_key=True) for name in ("kind", "name", "metric")),
     sa.Column("step", sa.Integer, primary_key=True),
     *_required(sa.Double, "value"),
@@ -137,23 +137,23 @@ METRICS = _table(
 
 
 def now() -> str:
-    """Return the time in UTC, ISO 8601 with seconds."""
+    """Return the current time in UTC, ISO 8601 with seconds."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 class Database:
     """The tables of one results folder.
 
-    The first write creates the database. Before, reading finds no rows.
+    The first write creates the database. Until then, all tables read as empty.
 
     Args:
         results: The results folder.
-        url: URL of the tables. Default: that of the variable KERV_STORE, else the file in the results folder.
+        url: URL of the database. Empty: the variable KERV_STORE, or else the SQLite file in the results folder.
 
     Raises:
         UsageError: The URL cannot be used.
-        StorageError: The server does not answer, or the disk refuses.
-        CheckpointError: The file is damaged, or from a newer kerv.
+        StorageError: The server does not answer, or the disk is full or not writable.
+        CheckpointError: The file is damaged, or was written by a newer version of kerv.
     """
 
     def __init__(self, results: str | Path, url: str = "") -> None:
@@ -172,7 +172,7 @@ class Database:
 
     @property
     def exists(self) -> bool:
-        """Whether the file exists. True for a server."""
+        """Whether the SQLite file exists. Always True for a server."""
         return self.file is None or self.file.exists()
 
     def close(self) -> None:
@@ -183,7 +183,7 @@ class Database:
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[sa.Connection]:
-        """Yield a connection that reads. Without a database it reads empty tables in memory."""
+        """Yield a connection for reading. If there is no database yet, yield one with empty tables."""
         with self._errors():
             if self._engine is None and not self.exists:
                 engine = sa.create_engine("sqlite://", poolclass=sa.pool.NullPool)
@@ -196,7 +196,7 @@ class Database:
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[sa.Connection]:
-        """Yield a connection in a transaction, which is committed when the block ends."""
+        """Yield a connection in a transaction, which is committed when the `with` block ends."""
         with self._errors():
             engine = self._opened(create=True).execution_options(kerv_writes=True)
             with engine.begin() as connection:
@@ -246,7 +246,7 @@ class Database:
 
 @functools.cache
 def _server(url: sa.URL) -> sa.Engine:
-    """Return this process's connections to a server."""
+    """Return the SQLAlchemy engine for a server. It is shared within this process."""
     seconds = {"connect_timeout": 5, "options": f"-c lock_timeout={LOCK_SECONDS}s"}
     try:
         engine = sa.create_engine(url, connect_args=seconds, pool_pre_ping=True)
@@ -275,7 +275,10 @@ def _configure(connection: Any, record: object) -> None:
 
 
 def _begin(connection: sa.Connection) -> None:
-    """Let one process write at a time. What it reads stays true until it commits."""
+    """Start a transaction.
+
+    Only one process writes at a time; others wait. So what a writer has read stays true until it commits.
+    """
     if connection.get_execution_options().get("kerv_writes"):
         postgresql = connection.dialect.name == "postgresql"
         connection.exec_driver_sql("SELECT pg_advisory_xact_lock(5271009)" if postgresql else "BEGIN IMMEDIATE")
@@ -289,7 +292,7 @@ def _version(connection: sa.Connection) -> int | None:
 
 
 def _migrated(connection: sa.Connection) -> int:
-    """Create the tables, or update those of an older kerv. Return their version."""
+    """Create the tables, or update tables of an older version of kerv. Return their new version."""
     version = _version(connection)  # another process may have done so in the meantime
     if version is None:
         _META.create_all(connection)
@@ -303,5 +306,5 @@ def _migrated(connection: sa.Connection) -> int:
 
 
 def newer(name: str | Path, version: int) -> CheckpointError:
-    """Return the error for tables of a newer kerv."""
+    """Return the error to raise for a database that a newer version of kerv has written."""
     return CheckpointError(f"{name} is from a newer kerv (schema {version}, this one reads {SCHEMA}): update kerv")

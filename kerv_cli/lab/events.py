@@ -1,4 +1,4 @@
-"""Events of a running study: `execute` emits them, a display shows them."""
+"""Events of a running study. `execute` sends them, and a progress display shows them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Started:
 
     Attributes:
         to_run: Number of episodes to run.
-        reused: Number of episodes that exist.
+        reused: Number of episodes that are in the database already.
     """
 
     to_run: int
@@ -24,34 +24,34 @@ class Started:
 
 @dataclass(frozen=True)
 class BlockStarted:
-    """A block was given to the executor."""
+    """A worker was given a block (episodes that one process runs)."""
 
     block: Block
 
 
 @dataclass(frozen=True)
 class BlockEnded:
-    """A block is over."""
+    """A block (episodes that one process runs) has ended."""
 
     block: Block
 
 
 @dataclass(frozen=True)
 class BlockWaits:
-    """Another sweep runs the block. `execute` looks at it again later."""
+    """Another sweep is running the same block of episodes. `execute` checks again later."""
 
     block: Block
 
 
 @dataclass(frozen=True)
 class EpisodeEnd:
-    """The end of an episode.
+    """An episode has ended.
 
     Attributes:
         episode: The episode.
         success: Whether the task was solved.
         seconds: Wall time.
-        elsewhere: Whether another sweep ran it in the meantime.
+        elsewhere: Whether another sweep has run it.
     """
 
     episode: Episode
@@ -62,13 +62,13 @@ class EpisodeEnd:
 
 @dataclass(frozen=True)
 class SettingFailed:
-    """A setting failed in a block; the other settings of the block go on.
+    """A setting failed in a block of episodes. The other settings of the block go on.
 
     Attributes:
         reason: The error in one line.
         trace: Its traceback.
-        error: The error, if kerv raised it deliberately. Other errors may not be picklable.
-        episodes: The episodes that do not run. The one that failed is the first.
+        error: The error itself if it is a KervError, else None, because other errors may not be picklable.
+        episodes: The episodes that failed or that will not run. The first is the one that failed.
     """
 
     reason: str
@@ -79,11 +79,11 @@ class SettingFailed:
 
 @dataclass
 class Outcome:
-    """The result of `execute`. Each episode of the study is in exactly one of the three lists.
+    """Result of `execute`. Each episode of the study is in exactly one of the three lists.
 
     Attributes:
-        done: Episodes that ran.
-        reused: Episodes that existed, or that another sweep ran.
+        done: Episodes that this call ran.
+        reused: Episodes that were in the database already, or that another sweep ran.
         failed: Settings that failed, with their episodes.
         seconds: Wall time.
     """
@@ -94,7 +94,7 @@ class Outcome:
     seconds: float = 0.0
 
     def add(self, other: Outcome) -> None:
-        """Add the result of another part of the study."""
+        """Add the result of another part of the study to this one."""
         self.done += other.done
         self.reused += other.reused
         self.failed += other.failed

@@ -1,7 +1,8 @@
-"""Runs the blocks of a plan through an executor and commits each episode when it ends.
+"""Runs the missing episodes of a plan through an executor, and saves each episode when it ends.
 
-The settings of a block take turns in one process, episode by episode. Workers send their episodes to the process that
-began the run, which alone writes to the database. A kill loses at most the episodes that are running.
+Episodes run in blocks. Within a block the settings take turns in one process, episode by episode. Workers send their
+episodes to the process that began the run. Only this process writes to the database. If it is killed, at most the
+episodes that are running are lost.
 """
 
 from __future__ import annotations
@@ -44,22 +45,22 @@ from kerv_cli.targets.provenance import stamp
 _POLL_SECONDS = 0.2
 
 RunEpisode = Callable[[int], EpisodeRecord]
-"""Runs the episode of a seed."""
+"""Function that runs the episode with a given seed."""
 
 Prepare = Callable[[Setting, str], RunEpisode]
-"""Builds and warms up a setting on a task. Picklable. For a batch it also has the method `EpisodeRunner.together`."""
+"""Function that builds and warms up a setting's decoder for a task. Picklable. `together` runs batches."""
 
 
 @dataclass(frozen=True)
 class Message:
-    """What a worker sends: an episode began, ended or failed.
+    """Message from a worker: an episode began, ended or failed. It began if `row` and `failure` are empty.
 
     Attributes:
         index: Index of the episode in its block.
-        row: Columns of the table `episodes`, if it ended.
-        decodes: Its decodes as Parquet, if it ended.
-        about: Provenance of the worker, if it ended.
-        failure: The error, if it failed.
+        row: Columns of the table `episodes`, if the episode ended.
+        decodes: The episode's decodes as a Parquet file, if it ended.
+        about: The worker's machine and versions, if the episode ended.
+        failure: The error, if the episode failed.
     """
 
     index: int
@@ -74,7 +75,7 @@ Send = Callable[[Message], None]
 
 @dataclass(frozen=True)
 class Spool:
-    """A folder of messages to another process. Picklable."""
+    """Sends messages to another process as files in a folder. Picklable."""
 
     folder: Path
 
@@ -82,7 +83,7 @@ class Spool:
         """Write a message.
 
         Raises:
-            StorageError: The disk refused.
+            StorageError: The disk is full or not writable.
         """
         path = self.folder / f"{time.time_ns():020d}"
         with storage_errors(path):
@@ -91,7 +92,7 @@ class Spool:
             os.replace(temporary, path)
 
     def take(self) -> Iterator[Message]:
-        """Yield the messages, the oldest first, and remove each."""
+        """Yield all messages, oldest first, and delete each."""
         for path in visible(self.folder):
             message = pickle.loads(path.read_bytes())
             path.unlink()
@@ -100,14 +101,14 @@ class Spool:
 
 @dataclass(frozen=True)
 class BlockRun:
-    """The function that an executor calls to run a block. Picklable with a `Spool`."""
+    """The function that an executor calls to run one block of episodes. Picklable if `send` is a `Spool`."""
 
     block: Block
     prepare: Prepare
     send: Send
 
     def __call__(self) -> None:
-        """Run the block, and send each episode when it ends."""
+        """Run the block, and send a message for each episode that ends."""
         if self.block.batch > 1:
             self._run_batch()
         else:
@@ -130,7 +131,7 @@ class BlockRun:
                     self.send(message)
 
     def _try(self, one: Episode, function: Callable[[], Any]) -> Any:
-        """Call a function; if it fails, send its error and return None."""
+        """Call a function for episode `one`. If it fails, send the error and return None."""
         self.send(Message(self.block.episodes.index(one)))
         try:
             return function()
@@ -158,7 +159,10 @@ class BlockRun:
                 self.send(Message(self.block.episodes.index(one), failure=failure_of(result)))
 
     def _batch_results(self) -> Iterator[tuple[Episode, EpisodeRecord | Exception]]:
-        """Yield each episode when it ends. An error of all decodes fails an episode of each task."""
+        """Run the block's episodes as a batch, and yield each when it ends, with its record or error.
+
+        An error that stops the whole batch is yielded once per task.
+        """
         runner: Any = self.prepare
         try:
             yield from runner.together(self.block.episodes)
@@ -178,7 +182,7 @@ class BlockRun:
 
 
 def failure_of(error: BaseException) -> events.SettingFailed:
-    """Return what to tell of an error: its message in one line, with type and place if it is not one of kerv's own."""
+    """Describe an error in one line. For errors other than KervError, add the type and the file and line."""
     trace = "".join(traceback.format_exception(error))
     text = " ".join(str(error).split())
     if isinstance(error, KervError):
@@ -191,17 +195,17 @@ def failure_of(error: BaseException) -> events.SettingFailed:
 def execute(plan: Plan, prepare: Prepare, record: Run, on_event: events.OnEvent = lambda event: None) -> events.Outcome:
     """Run the missing episodes of a plan, block by block.
 
-    If a setting raises or its worker is killed, it is reported as failed and the rest of its block goes on. Blocks that
-    another sweep runs are waited for. With one local worker everything happens in this process.
+    If a setting fails, or its worker is killed, it is reported as failed and the other settings go on. If another sweep
+    is running the same episodes, wait for it. With one local worker everything runs in this process.
 
     Args:
-        plan: The plan. Its study is in the database.
-        prepare: Builds the settings.
-        record: The run of this command.
-        on_event: Shows progress.
+        plan: Which episodes to run. Its study is in the database.
+        prepare: Builds a setting's decoder for a task.
+        record: The database row of this command.
+        on_event: Called with each event, to show progress.
 
     Raises:
-        StorageError: The disk refused a result.
+        StorageError: The disk is full or not writable.
         UsageError: The executor cannot be used.
     """
     return _Sweep(plan, prepare, record, on_event).run()
@@ -209,16 +213,16 @@ def execute(plan: Plan, prepare: Prepare, record: Run, on_event: events.OnEvent 
 
 @dataclass(eq=False)
 class _Attempt:
-    """A block that runs.
+    """A block of episodes that is running.
 
     Attributes:
         block: The block.
-        id: Id of its row.
-        spool: Where its worker sends messages.
+        id: Id of its row in the database.
+        spool: Where its worker writes messages.
         last: The episode that began last.
-        future: Its end.
+        future: Completed when the block has ended.
         ended: Episodes that ended.
-        failed: Episodes that failed, or that do not run because their setting failed.
+        failed: Episodes that failed, or that will not run because their setting failed.
     """
 
     block: Block
@@ -242,7 +246,7 @@ class _Sweep:
         self.database, self.runtime = plan.store.database, plan.runtime
         self.outcome = events.Outcome(reused=list(plan.existing))
         self.waiting: deque[Block] = deque(plan.blocks())
-        self.elsewhere: list[Block] = []  # another sweep runs them
+        self.elsewhere: list[Block] = []  # another sweep is running them
         self.attempts: list[_Attempt] = []
         self.is_here = self.runtime.executor == "local" and self.runtime.workers == 1
         self.spool = temporary_beside(self.database.results / "spool")
@@ -250,7 +254,7 @@ class _Sweep:
     def run(self) -> events.Outcome:
         clock, to_run = time.perf_counter(), self.plan.to_run
         options = check_executor(self.runtime)
-        clean(self.database.results)  # messages to processes that were killed
+        clean(self.database.results)  # remove messages to processes that were killed
         self.record.beat(0, len(to_run))
         self.on_event(events.Started(len(to_run), len(self.plan.existing)))
         if to_run:
@@ -261,7 +265,7 @@ class _Sweep:
         return self.outcome
 
     def _run_blocks(self, executor: Executor) -> None:
-        """Keep every slot of the executor busy until all blocks have ended."""
+        """Give blocks to the executor, and keep all of its workers busy, until every block has ended."""
         finished = False
         try:
             while self.waiting or self.attempts or self.elsewhere:
@@ -281,13 +285,13 @@ class _Sweep:
         finally:
             executor.close(abandon=not finished)
             for attempt in self.attempts:
-                with contextlib.suppress(KervError):  # the first error is the one to show
+                with contextlib.suppress(KervError):  # show the first error only
                     self._take(attempt)
                 self._release(attempt)
             shutil.rmtree(self.spool, ignore_errors=True)
 
     def _begin(self, executor: Executor, block: Block) -> None:
-        """Claim a block and give it to the executor, without the episodes that another sweep has run since."""
+        """Claim a block, remove episodes that another sweep has run in the meantime, and give it to the executor."""
         name = f"{self.record.id}-{secrets.token_hex(4)}"
         if not self._claim(block, name):
             self.elsewhere.append(block)
@@ -306,7 +310,11 @@ class _Sweep:
         attempt.future = executor.submit(BlockRun(attempt.block, self.prepare, send))
 
     def _claim(self, block: Block, name: str) -> bool:
-        """Insert the row of a block. Return False if a live run holds one of its episodes for the same study."""
+        """Write a row that reserves the block's episodes for this run.
+
+        Returns:
+            False if another run that is alive has reserved one of these episodes for the same study.
+        """
         episodes = {"/".join(map(str, (self.plan.study.name, *one.key))) for one in block.episodes}
         with self.database.writing() as connection:
             for row in connection.execute(sa.select(BLOCKS).where(BLOCKS.c.claim.is_not(None))).all():
@@ -324,7 +332,11 @@ class _Sweep:
         return True
 
     def _leave_out_existing(self, attempt: _Attempt) -> bool:
-        """Leave out the episodes that other sweeps have run since the plan. Return whether any are left."""
+        """Remove the episodes from a block that other sweeps have run since the plan was made.
+
+        Returns:
+            Whether any episodes are left.
+        """
         study = replace(self.plan.study, settings=attempt.block.settings, episodes=attempt.block.episodes)
         existing, missing = split(study, stored_episodes(self.database, study, newer_than=self.plan.newest))
         if existing:
@@ -368,7 +380,7 @@ class _Sweep:
             raise KervError(f"study {name} was deleted while it ran: the same command begins it anew")
 
     def _fail(self, attempt: _Attempt, one: Episode, failure: events.SettingFailed) -> None:
-        """Note that a setting failed on a task. Its other episodes of the block do not run."""
+        """Note that a setting failed on a task. Its remaining episodes in the block will not run."""
         if isinstance(failure.error, StorageError):
             raise failure.error
         same = [other for other in attempt.rest if (other.setting.work, other.task) == (one.setting.work, one.task)]
@@ -385,13 +397,13 @@ class _Sweep:
         self.on_event(failure)
 
     def _end(self, attempt: _Attempt) -> None:
-        """End a block: take its last messages, and queue the episodes that a lost worker left."""
+        """End a block: read its last messages, and queue the remaining episodes again if its worker was lost."""
         self._take(attempt)
         error = attempt.future.exception()
         lost: list[Episode] = []
         if isinstance(error, StorageError) or (error is not None and self.is_here):
             raise error
-        if isinstance(error, WorkerLost):  # the episode that ran has failed; the others run again
+        if isinstance(error, WorkerLost):  # the running episode has failed; the others run again
             self._fail(attempt, attempt.last, events.SettingFailed(str(error)))
             lost = self._lost(attempt)
         elif error is not None:
@@ -403,7 +415,11 @@ class _Sweep:
             self.waiting.append(Block(tuple(lost)))
 
     def _lost(self, attempt: _Attempt) -> list[Episode]:
-        """Return the episodes to run again: all of a setting that depends on their order, else those that are left."""
+        """Return the episodes of a lost worker's block that must run again.
+
+        These are the remaining ones. If a setting's results depend on the order of episodes, all of its episodes run
+        again.
+        """
         rest = attempt.rest
         whole = {one.setting.work for one in rest if one.setting.depends_on_order}
         again = {one for one in attempt.ended if one.setting.work in whole}
@@ -411,7 +427,10 @@ class _Sweep:
         return [one for one in attempt.block.episodes if one in again or one in rest]
 
     def _release(self, attempt: _Attempt) -> None:
-        """Give up the claim on a block. If the disk refuses, the claim is void as soon as this run has ended."""
+        """Give up the reservation of a block's episodes.
+
+        If writing fails, the reservation still ends with this run.
+        """
         shutil.rmtree(attempt.spool.folder, ignore_errors=True)
         mine = BLOCKS.c.id == attempt.id
         release = sa.update(BLOCKS).values(claim=None) if attempt.ended else sa.delete(BLOCKS)

@@ -1,4 +1,7 @@
-"""Episodes of a study: which the database has, which are missing and why, and the blocks in which they run."""
+"""The episodes of a study: which exist in the database, which are missing and why, and in which blocks they run.
+
+A block is a group of episodes that one process runs, with the settings taking turns.
+"""
 
 from __future__ import annotations
 
@@ -30,24 +33,24 @@ FULL_BATCHES = 16
 """Largest number of batches in a block."""
 
 NEVER, TIMED, CHANGED, ALL = "never", "timed", "changed", "all"
-"""Values of `rerun=`. Run again: nothing, what was not timed in turn, what other code computed, everything."""
+"""Values of `rerun=`: run again no episodes, those not timed in turn with others, those that other code ran, or all."""
 
 Key = tuple[str, str, int, int]
-"""Work, task, seed and repeat. Equal keys are the same episode in any study."""
+"""A setting's hash `work`, task, seed and repeat. Equal keys mean the same episode in any study."""
 K = TypeVar("K")
 
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """One row of a study's table.
+    """One setting of a study: a row of its table.
 
     Attributes:
-        label: Its name in the study.
+        label: The setting's name in the study.
         overrides: The overrides that make it, as the user wrote them.
-        settings: RolloutSettings as plain values, without the task.
+        settings: The rollout's settings as nested plain values, without the task.
         identity: Hashes of the weights and data that it reads.
-        varies: Overrides of a grid in which its settings differ, key -> value.
-        name: Name that the settings of a grid share. Default: the label.
+        varies: Key -> value, for the keys that differ within a grid of settings.
+        name: Name of that grid, which its settings share. By default the label.
     """
 
     label: str
@@ -67,17 +70,17 @@ class Setting:
 
     @functools.cached_property
     def depends_on_order(self) -> bool:
-        """Whether the result of an episode depends on the episodes before it."""
+        """Whether an episode's result depends on the episodes before it, because a skip rule adapts."""
         return depends_on_order(self.settings)
 
     def on(self, task: str) -> dict[str, Any]:
-        """Return its RolloutSettings for one task, as plain values."""
+        """Return the rollout's settings with one task added, as nested plain values."""
         return {**self.settings, "task": [task]}
 
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode of a study."""
+    """One episode of a study. `repeat` counts measurements of the same setting, task and seed, from 0."""
 
     setting: Setting
     task: str
@@ -86,7 +89,7 @@ class Episode:
 
     @property
     def key(self) -> Key:
-        """Work, task, seed and repeat."""
+        """The setting's hash `work`, the task, the seed and the repeat. Equal keys mean the same episode."""
         return self.setting.work, self.task, self.seed, self.repeat
 
 
@@ -95,14 +98,14 @@ class Study:
     """Settings to compare, and the episodes that compare them.
 
     Attributes:
-        name: Its name in the database.
-        settings: What it compares.
-        episodes: All its episodes, in the order in which they run.
+        name: Name in the database.
+        settings: The settings.
+        episodes: All episodes, in the order in which they run.
         kind: sweep, rollout or import.
-        title: Title of its report.
+        title: Title of the report.
         baseline: Label of the setting that the others are compared with.
-        axis: Config key of the x axis of its plots. Empty: no plot.
-        note: A sentence for its report.
+        axis: Configuration key on the x axis of plots. Empty: no plot.
+        note: A sentence printed in the report.
         block: Number of seeds for which the settings take turns in one process.
     """
 
@@ -132,6 +135,12 @@ def all_episodes(
 ) -> tuple[Episode, ...]:
     """Return every episode of these settings, ordered by repeat, task and block of seeds.
 
+    Args:
+        settings: The settings to compare.
+        tasks: Names of the tasks.
+        block: Number of seeds for which the settings take turns.
+        repeats: How often every episode is measured.
+
     Raises:
         UsageError: There are more than MOST_EPISODES.
     """
@@ -153,12 +162,12 @@ def all_episodes(
 
 @dataclass(frozen=True)
 class StoredEpisode:
-    """A row of the database that a study may use.
+    """An episode in the database that a study may reuse.
 
     Attributes:
-        id: Number of the row.
-        block: Id of the block in which it ran.
-        started: Time at which that block began.
+        id: Its row number.
+        block: Id of the block (episodes run by one process) in which it ran.
+        started: Time at which that block began (ISO 8601).
         code: Hash of the code that ran it.
         seeds: Seeds of the block, as `seeds_text` writes them.
     """
@@ -172,26 +181,26 @@ class StoredEpisode:
 
 @dataclass(frozen=True)
 class Block:
-    """Episodes that one process runs: one task and one repeat, with settings that take turns seed by seed.
+    """Episodes that one process runs: one task and one repeat. The settings take turns, seed by seed.
 
-    A block that runs as a batch has one setting instead, and any tasks and seeds.
+    A block that runs as a batch (several episodes at once) has a single setting instead, and any tasks and seeds.
     """
 
     episodes: tuple[Episode, ...]
 
     @property
     def task(self) -> str:
-        """Task of its first episode."""
+        """Task of the block's first episode."""
         return self.episodes[0].task
 
     @functools.cached_property
     def settings(self) -> tuple[Setting, ...]:
-        """Its settings, each once."""
+        """The block's settings, each once."""
         return tuple({one.setting.work: one.setting for one in self.episodes}.values())
 
     @property
     def seeds(self) -> list[int]:
-        """Its seeds, each once, ascending."""
+        """The block's seeds, each once, ascending."""
         return sorted({one.seed for one in self.episodes})
 
     @property
@@ -207,14 +216,14 @@ class Block:
 
     @property
     def title(self) -> str:
-        """Name and size, for a display."""
+        """Name and size of the block, for a progress display."""
         if self.batch == 1:
             return f"{self.name}: {count(len(self.settings), 'setting')} in turn"
         label = self.episodes[0].setting.label
         return f"{label} from {self.name} on: {count(len(self.episodes), 'episode')}, {self.batch} at a time"
 
     def turns(self) -> Iterator[Episode]:
-        """Yield its episodes seed by seed, with the settings in an order drawn from task, seed and repeat."""
+        """Yield the episodes seed by seed. For each seed the settings' order is random but reproducible."""
         import numpy as np
 
         for seed in self.seeds:
@@ -231,15 +240,18 @@ def split(
     since: str = "",
     earlier: Mapping[str, tuple[Setting, str]] | None = None,
 ) -> tuple[dict[Episode, StoredEpisode], dict[Episode, str]]:
-    """Return the episodes of a study that exist, and those that are missing with the reason.
+    """Divide a study's episodes into existing and missing ones.
 
     Args:
         study: The study.
-        stored: Rows of the database by key.
-        rerun: NEVER, TIMED, CHANGED or ALL.
-        since: With ALL, rows of blocks that began at this time or later exist (ISO 8601). They belong to the same
-            command, which was interrupted.
-        earlier: Newest stored setting of a label, and its work. Explains what changed.
+        stored: Episodes in the database, by `Episode.key`.
+        rerun: Which existing episodes to run again: NEVER, TIMED, CHANGED or ALL.
+        since: Only with ALL: episodes of blocks that began at this time (ISO 8601) or later count as existing. The same
+            command ran them before it was interrupted. Empty: none do.
+        earlier: Label -> the newest stored setting with this label and its hash. Used to explain what has changed.
+
+    Returns:
+        Existing episodes with their rows, and missing episodes with the reason for running them.
     """
     from kerv_cli.episodes.identity import code_hash
 
@@ -288,12 +300,15 @@ def _grouped(episodes: Iterable[Episode], key: Callable[[Episode], K]) -> dict[K
 
 
 def _turns(episodes: Iterable[Episode]) -> dict[tuple[str, int, int], list[Episode]]:
-    """Group the episodes that take turns, by task, seed and repeat."""
+    """Group the episodes in which the settings take turns, by task, seed and repeat."""
     return _grouped(episodes, lambda one: (one.task, one.seed, one.repeat))
 
 
 def _ordered_parts(episodes: Iterable[Episode], block: int) -> list[list[Episode]]:
-    """Group episodes whose results depend on their order, by setting, task, repeat and block of seeds."""
+    """Group the episodes whose results depend on their order, by setting, task, repeat and block of seeds.
+
+    Episodes of other settings are left out.
+    """
 
     def key(one: Episode) -> tuple[str, str, int, int]:
         return one.setting.work, one.task, one.repeat, (one.seed - one.setting.settings["seed"]) // block
@@ -302,7 +317,12 @@ def _ordered_parts(episodes: Iterable[Episode], block: int) -> list[list[Episode
 
 
 def _keep_whole_orders(usable: dict[Episode, list[StoredEpisode]], block: int) -> None:
-    """Keep rows of episodes that depend on their order only if one block ran exactly these seeds."""
+    """Remove stored episodes that depend on their order, unless one block ran exactly the wanted seeds.
+
+    Args:
+        usable: Episode -> its stored rows. It is changed.
+        block: Number of seeds in a block.
+    """
     sizes = Counter(row.block for rows in usable.values() for row in rows)
     for part in _ordered_parts(usable, block):
         seeds = seeds_text(one.seed for one in part)
@@ -314,14 +334,14 @@ def _keep_whole_orders(usable: dict[Episode, list[StoredEpisode]], block: int) -
 
 
 def blocks_of(episodes: Iterable[Episode], block: int, workers: int = 1) -> list[Block]:
-    """Group episodes into blocks.
+    """Group episodes into blocks, each to be run by one process.
 
-    Seeds stay in one block if the study keeps them together and the same settings lack them. If a setting depends on
-    the order of episodes, all its seeds stay together. All episodes of a block use the same number of threads.
-    Episodes that run as a batch are grouped by setting, into at least as many blocks as there are workers.
+    Seeds that the study keeps together share a block if the same settings are missing for them. If a setting depends on
+    the order of episodes, all its seeds stay together. All episodes of a block use the same number of threads. Episodes
+    that run as a batch are grouped by setting, into at least as many blocks as there are workers.
 
     Args:
-        episodes: What to run.
+        episodes: The episodes to run.
         block: Number of seeds in a block.
         workers: Number of processes.
     """
@@ -347,12 +367,12 @@ def seed_blocks(study: Study) -> list[list[Episode]]:
 
 
 def differences(new: Setting, old: Setting | None = None, work: str = "") -> str:
-    """Return in a few words how a setting differs from a stored one of the same label.
+    """Describe in a few words how a setting differs from a stored one with the same label.
 
     Args:
         new: The setting.
-        old: The stored setting.
-        work: The hash with which `old` was stored.
+        old: The stored setting; None if there is none.
+        work: The hash under which `old` was stored.
     """
     target = new.settings["policy"]["target"]
     if old is None or old.settings["policy"]["target"] != target:
@@ -371,12 +391,12 @@ def differences(new: Setting, old: Setting | None = None, work: str = "") -> str
 
 
 def plain_settings(settings: Plain) -> dict[str, Any]:
-    """Return RolloutSettings without the task, as a Setting holds them."""
+    """Return a rollout's settings without the task, as a Setting holds them."""
     return without(settings, {"task"})
 
 
 def seeds_text(seeds: Iterable[int]) -> str:
-    """Return seeds as ranges: (5, 6, 7, 9) -> "5-7;9"."""
+    """Write seeds as ranges: (5, 6, 7, 9) -> "5-7;9"."""
     runs: list[list[int]] = []
     for seed in sorted(set(seeds)):
         if runs and seed == runs[-1][1] + 1:

@@ -1,4 +1,7 @@
-"""Rows of the commands that were begun: who runs each, how far it is, how it ended."""
+"""The table `runs` of the database: one row per command that was started (a run).
+
+A row says which process runs the command, how far it is, and how it ended.
+"""
 
 from __future__ import annotations
 
@@ -27,17 +30,21 @@ from kerv_cli.targets.provenance import git_commit
 RUNNING, COMPLETE, FAILED, INTERRUPTED = "running", "complete", "failed", "interrupted"
 
 BEAT_SECONDS = 5.0
-"""Time between two heartbeats of a run."""
+"""Seconds between two heartbeats of a run."""
 STALE_SECONDS = 900.0
-"""A run on another machine counts as dead after this time without a heartbeat."""
+"""A run on another machine counts as dead after so many seconds without a heartbeat."""
 
 _open: set[str] = set()
-"""Ids of this process's runs that have not ended. A full disk can refuse to write the end of one."""
+"""Ids of this process's runs that have not ended. The database may miss an end, because the disk was full."""
 
 
 @dataclass(frozen=True)
 class RunRow:
-    """A row of the table `runs`; `status` is `interrupted` if its process is dead."""
+    """A row of the table `runs`: one command that was started.
+
+    Its `status` is `running`, `complete`, `failed` or `interrupted`. If the process is dead, `running` is read as
+    `interrupted`.
+    """
 
     id: str
     kind: str
@@ -65,18 +72,18 @@ def _row_of(row: Any) -> RunRow:
 
 
 def is_running(connection: sa.Connection, run: str) -> bool:
-    """Return whether the run with this id may still be at work."""
+    """Return whether the run with this id may still be working."""
     row = connection.execute(sa.select(RUNS).where(RUNS.c.id == run)).first()
     return row is not None and _row_of(row).status == RUNNING
 
 
 def run_rows(database: Database, kind: str | None = None, name: str | None = None) -> list[RunRow]:
-    """Return the begun commands, the newest first.
+    """Return the commands that were started, newest first.
 
     Args:
-        database: Where they are.
-        kind: Only those of this kind.
-        name: Only those of this study or artifact.
+        database: The database.
+        kind: Only runs of this kind; None for all.
+        name: Only runs that made this study or artifact; None for all.
     """
     query = sa.select(RUNS).order_by(RUNS.c.started.desc(), RUNS.c.heartbeat.desc(), RUNS.c.id.desc())
     query = query if kind is None else query.where(RUNS.c.kind == kind)
@@ -86,21 +93,22 @@ def run_rows(database: Database, kind: str | None = None, name: str | None = Non
 
 
 class Run:
-    """The row of a command from its first second to its end, with a heartbeat of its own thread.
+    """Writes the database row of a command, from its start to its end. Use it in a `with` statement.
 
-    A context manager. A command that ends with a UsageError leaves no row.
+    A thread updates the row every few seconds (a heartbeat), so that others see that the command is alive. A command
+    that ends with a UsageError leaves no row.
 
     Args:
         database: Where the row is written.
-        kind: sweep, rollout, import, or the kind of artifact that is made.
-        name: Name of the study or the artifact.
-        command: Words after `kerv` that go on with it. Default: those of `current_command`.
+        kind: sweep, rollout, import, or the kind of artifact that the command makes.
+        name: Name of the study or artifact.
+        command: Command-line arguments (without `kerv`) that resume the command. Empty: `current_command()`.
         total: Number of steps or episodes.
-        alone: Refuse to begin while another process makes the same.
+        alone: Whether to refuse to start while another process makes the same study or artifact.
 
     Raises:
-        UsageError: Another process makes the same.
-        StorageError: The disk refused.
+        UsageError: Another process is making the same study or artifact.
+        StorageError: The database is not writable.
     """
 
     def __init__(
@@ -143,7 +151,12 @@ class Run:
         return self
 
     def beat(self, done: int, total: int | None = None) -> None:
-        """Note progress. The next heartbeat writes it; a new total is written at once."""
+        """Note progress. It is written with the next heartbeat, or immediately if `total` changes.
+
+        Args:
+            done: Number of steps or episodes that are finished.
+            total: Number of steps or episodes in all; None to keep it.
+        """
         is_new = total not in (None, self.total)
         self.done, self.total = done, self.total if total is None else total
         if is_new:
@@ -151,7 +164,7 @@ class Run:
 
     def _keep_beating(self) -> None:
         while not self._ended.wait(BEAT_SECONDS):
-            with contextlib.suppress(KervError):  # the command itself meets the same error and shows it
+            with contextlib.suppress(KervError):  # the command itself will meet the same error and report it
                 self._update()
 
     def _update(self, **values: Any) -> None:
@@ -166,7 +179,7 @@ class Run:
         self._heart.join()
         _open.discard(self.id)
         try:
-            if isinstance(error, UsageError):  # nothing was begun: an earlier command is still the one that goes on
+            if isinstance(error, UsageError):  # nothing was done: an earlier row is still the one to resume
                 with self.database.writing() as connection:
                     connection.execute(sa.delete(RUNS).where(RUNS.c.id == self.id))
             elif error is None:
@@ -181,24 +194,37 @@ class Run:
 
 
 def name_in(results: str | Path, kind: str, folder: Path) -> str:
-    """Return an artifact's name: that of its folder, or the whole path outside `<results>/artifacts`."""
+    """Return the name of an artifact in the database.
+
+    It is the folder's name, or the whole path for a folder outside `<results>/artifacts/<kind>`.
+    """
     return folder.name if folder.parent == results_dir(str(results)) / "artifacts" / kind else str(folder.absolute())
 
 
 def making(results: str | Path, kind: str, folder: Path, command: Sequence[str] = ()) -> Run:
-    """Return the run of a command that makes an artifact in a folder; see `Run`."""
+    """Return the run (see `Run`) of a command that makes an artifact.
+
+    Args:
+        results: The results folder.
+        kind: Kind of the artifact.
+        folder: Folder of the artifact.
+        command: Command-line arguments (without `kerv`) that resume the command. Empty: `current_command()`.
+    """
     return Run(Database(results), kind, name_in(results, kind, folder), command)
 
 
 def command_to_go_on(results: str | Path, kind: str, folder: Path) -> tuple[str, ...]:
-    """Return the words after `kerv` that go on with an unfinished artifact; empty if no row has them."""
+    """Return the command-line arguments (without `kerv`) that resume an unfinished artifact.
+
+    Empty if the artifact is complete, or if the database has no row for it.
+    """
     rows = run_rows(Database(results), kind, name_in(results, kind, folder))
     return rows[0].command if rows and rows[0].status != COMPLETE else ()
 
 
 @dataclass(frozen=True)
 class Curve:
-    """The validations of a training as rows of the database."""
+    """The validation results of a training, stored as rows of the database."""
 
     database: Database
     kind: str
@@ -206,17 +232,17 @@ class Curve:
 
     @staticmethod
     def of(folder: Path, results: str | Path | None = None) -> Curve:
-        """Return the curve of the training in a folder.
+        """Return the curve of a training.
 
         Args:
             folder: Folder of the artifact.
-            results: The results folder. Default: the folder that holds its `artifacts`.
+            results: The results folder. None: the folder that contains the artifact's `artifacts` folder.
         """
         results, kind = results or folder.parents[2], folder.parent.name
         return Curve(Database(results), kind, name_in(results, kind, folder))
 
     def write(self, history: Sequence[Mapping[str, float]]) -> None:
-        """Replace all rows by these validations. Each maps metrics to values, with its `step`."""
+        """Store these validations instead of earlier ones. Each maps names of metrics to values, and has a `step`."""
         rows = [
             {"kind": self.kind, "name": self.name, "step": int(one["step"]), "metric": metric, "value": float(value)}
             for one in history
@@ -229,7 +255,7 @@ class Curve:
                 connection.execute(sa.insert(METRICS), rows)
 
     def read(self) -> list[dict[str, float]]:
-        """Return the validations in order."""
+        """Return the validations, ordered by step."""
         query = sa.select(METRICS).where(METRICS.c.kind == self.kind, METRICS.c.name == self.name)
         history: dict[int, dict[str, float]] = {}
         with self.database.reading() as connection:
@@ -239,22 +265,28 @@ class Curve:
 
 
 def unfinished(database: Database, kind: str, command: Sequence[str]) -> RunRow | None:
-    """Return the newest row of a command, or None if it is complete or there is none."""
+    """Return the newest row of a command. None if that row is complete, or if there is no row."""
     row = next((row for row in run_rows(database, kind) if row.command == tuple(command)), None)
     return None if row is None or row.status == COMPLETE else row
 
 
 def forget(database: Database, kind: str, name: str) -> None:
-    """Delete the rows of all commands that made this study or artifact, and its curve."""
+    """Delete the rows of all commands that made this study or artifact, and its validation curve."""
     with database.writing() as connection:
         for table in (RUNS, METRICS):
             connection.execute(sa.delete(table).where(table.c.kind == kind, table.c.name == name))
 
 
 def interrupted_since(database: Database, kind: str, name: str, command: Sequence[str]) -> str:
-    """Return when the interrupted command began that this one goes on with (ISO 8601); empty if there is none.
+    """Return when a command was first started that has been interrupted and is now resumed (ISO 8601).
 
-    It has the same words and was never complete.
+    Empty if there is nothing to resume: the newest run has other arguments or is complete.
+
+    Args:
+        database: The database.
+        kind: Kind of the study or artifact.
+        name: Name of the study or artifact.
+        command: Command-line arguments (without `kerv`) of the command.
     """
     since = ""
     for row in run_rows(database, kind, name):

@@ -1,4 +1,4 @@
-"""Studies in the database: their settings, their episodes, and what is missing of a study."""
+"""Stored studies: their settings and episodes in the database, and which episodes are missing."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ if TYPE_CHECKING:
 SWEEP, ROLLOUT, IMPORT = "sweep", "rollout", "import"
 """Kinds of studies, made by `kerv sweep`, `kerv rollout` and `kerv runs import`."""
 _FOLDERS = {SWEEP: "studies", ROLLOUT: "rollouts", IMPORT: "studies"}
-_AT_ONCE = 500  # values of an IN (...)
+_AT_ONCE = 500  # most values in one SQL IN (…)
 _ABOUT = ("title", "baseline", "axis", "note", "block")
 PROVENANCE = ("host", "device_name", "git_commit", "engine", "executor", "workers")
-"""Columns of an episode's block that tables show, besides versions."""
+"""Facts about the machine and code that ran an episode, which tables show beside the versions."""
 
 
 @dataclass(frozen=True)
 class ImportedEpisode:
-    """An episode that another program or another database has.
+    """An episode from another program or another database, to be imported.
 
     Attributes:
-        episode: The episode of the study.
+        episode: Setting, task, seed and repeat in the study.
         row: Columns of the table `episodes`, as far as they are known.
-        decodes: Table with the columns of rows.DECODE_SCHEMA.
-        block: Id of the block in which settings took turns.
-        about: Provenance of that block.
-        run: Id of the run. Empty: that of the import.
+        decodes: Its decodes, a table with the columns of rows.DECODE_SCHEMA.
+        block: Id of the block (episodes that one process ran) in which it ran.
+        about: Machine and versions that ran the block.
+        run: Id of the run (the command that ran it). Empty: the run that imports it.
         seeds: Seeds of the block, as `seeds_text` writes them.
         code: Hash of the code that ran it.
     """
@@ -56,14 +56,12 @@ class ImportedEpisode:
 
 
 class StudyStore:
-    """A study in the database of a results folder, and its folder of files.
-
-    The folder holds recordings and the report.
+    """One study in the database, and its folder with recordings and the report.
 
     Args:
         results: The results folder, or its database.
         name: Name of the study.
-        kind: sweep, rollout or import. Default: as the database says, else sweep.
+        kind: sweep, rollout or import. Empty: as stored in the database, or sweep if the study is not stored.
 
     Raises:
         UsageError: The name is not a plain folder name.
@@ -76,7 +74,7 @@ class StudyStore:
 
     @property
     def kind(self) -> str:
-        """sweep, rollout or import."""
+        """How the study was made: sweep, rollout or import."""
         if not self._kind:
             row = self._row()
             self._kind = SWEEP if row is None else row.kind
@@ -84,22 +82,22 @@ class StudyStore:
 
     @property
     def root(self) -> Path:
-        """Folder of its files."""
+        """The study's folder."""
         return self.database.results / _FOLDERS[self.kind] / self.name
 
     @property
     def rollouts(self) -> Path:
-        """Folder of its recordings."""
+        """The folder of the study's recordings."""
         return self.root / "rollouts"
 
     @property
     def recordings(self) -> list[Path]:
-        """Its .rrd files, by name."""
+        """Paths of the study's .rrd files, sorted by name."""
         return sorted(self.rollouts.glob("[!.]*.rrd"))
 
     @property
     def exists(self) -> bool:
-        """Whether the database has the study."""
+        """Whether the study is in the database."""
         return self._row() is not None
 
     def _row(self) -> Any:
@@ -107,11 +105,15 @@ class StudyStore:
             return connection.execute(sa.select(STUDIES).where(STUDIES.c.name == self.name)).first()
 
     def how_to_run(self) -> str:
-        """Return the command that runs it, for messages."""
+        """Return text for messages that says how to run the study: run `COMMAND`."""
         return f"run `{self.sweep_command()}`" if self.kind == SWEEP else f"run `kerv runs rerun {self.name}`"
 
     def sweep_command(self, *overrides: str) -> str:
-        """Return the newest command that swept the study, or `kerv sweep study=NAME`, with further overrides."""
+        """Return the newest command that ran the study as a sweep, or `kerv sweep study=NAME` if none is stored.
+
+        Args:
+            overrides: Further overrides to append.
+        """
         typed = (row.command for row in run_rows(self.database, SWEEP, self.name) if row.command[:1] == ("sweep",))
         words: Iterable[str] = next(typed, ("sweep", f"study={self.name}"))
         words = (word for word in words if not word.startswith(("results=", "rerun=", "-")))
@@ -121,7 +123,7 @@ class StudyStore:
         """Return the study as it was planned last.
 
         Raises:
-            UsageError: There is no such study. The message says what to run.
+            UsageError: The database has no such study. The message says which command runs it.
         """
         row = self._row()
         if row is None:
@@ -132,13 +134,13 @@ class StudyStore:
     def save(self, study: Study, existing: Mapping[Episode, StoredEpisode] | None = None, whole: bool = True) -> None:
         """Write a study's settings and episodes.
 
-        Settings that did not change keep their episodes of other tasks, if these have the new seeds and repeats. So
-        sweeps of one study over different tasks end in one report.
+        Settings that did not change keep their stored episodes of other tasks, as far as their seeds and repeats are in
+        the new study's ranges. So sweeps of one study over different tasks end in one report.
 
         Args:
             study: The study.
-            existing: Rows of its episodes that the database has.
-            whole: Replace the study that is stored. False: add to it.
+            existing: Episodes that the database already has, with their rows.
+            whole: Whether to replace the stored study. False adds to it.
         """
         with self.database.writing() as connection:
             self._save(connection, study, existing or {}, whole)
@@ -186,7 +188,7 @@ class StudyStore:
             connection.execute(sa.insert(WANTED), rows)
 
     def counts(self) -> tuple[int, int]:
-        """Return the number of episodes that exist, and of all."""
+        """Return how many of the study's episodes exist, and how many it has in all."""
         with self.database.reading() as connection:
             row = connection.execute(
                 sa.select(sa.func.count(WANTED.c.episode_id), sa.func.count())
@@ -196,13 +198,13 @@ class StudyStore:
         return int(row[0]), int(row[1])
 
     def frame(self, episodes: Iterable[Episode] | None = None) -> pd.DataFrame:
-        """Return the episodes that exist, in the study's order: a row per label, task, seed and repeat.
+        """Return the existing episodes as a table, in the study's order: one row per label, task, seed and repeat.
 
-        The columns are those of the table `episodes`, with `decode_seconds` as an array, then `run`, `code` and the
-        provenance of the block.
+        It has the columns of the table `episodes`, with `decode_seconds` as an array. Further columns are `run`,
+        `code`, and the machine and versions that ran the episode.
 
         Args:
-            episodes: Only these.
+            episodes: Only these episodes; None for all.
         """
         import numpy as np
         import pandas as pd
@@ -238,11 +240,11 @@ class StudyStore:
         return pd.concat([frame, about], axis=1).reset_index(drop=True)
 
     def decodes(self, episodes: Sequence[int], columns: Sequence[str] | None = None) -> pa.Table:
-        """Return the decodes of some episodes, with their index in the list as the column `episode`.
+        """Return the decodes of several episodes in one table. Its column `episode` is an index into `episodes`.
 
         Args:
             episodes: Row numbers of the episodes.
-            columns: Columns to read. Default: all.
+            columns: Columns to read; None for all.
         """
         import pyarrow as pa
 
@@ -261,12 +263,12 @@ class StudyStore:
         return pa.concat_tables(tables, promote_options="default")
 
     def add(self, study: Study, episodes: Iterable[ImportedEpisode], command: Sequence[str]) -> None:
-        """Write a study whose episodes ran elsewhere, in one transaction.
+        """Write a study whose episodes were run elsewhere, in one transaction.
 
         Args:
-            study: Its settings and all its episodes.
-            episodes: Those that exist.
-            command: Words after `kerv`, for the row of the run.
+            study: The settings and all episodes.
+            episodes: The episodes that exist.
+            command: Command-line arguments (without `kerv`) of the import.
         """
         from kerv_cli.episodes.rows import seconds_blob, table_blob
 
@@ -291,14 +293,17 @@ class StudyStore:
                 connection.execute(self.update_of(one.episode).values(episode_id=number))
 
     def update_of(self, one: Episode) -> sa.Update:
-        """Return the UPDATE of an episode's rows in the study; labels of equal settings share the episode."""
+        """Return the SQL UPDATE of an episode's rows in this study.
+
+        It affects several rows if several labels have equal settings: they share the episode.
+        """
         settings = sa.select(SETTINGS.c.id).join(STUDIES).where(STUDIES.c.name == self.name)
         settings = settings.where(SETTINGS.c.work == one.setting.work)
         same = (WANTED.c.task == one.task, WANTED.c.seed == one.seed, WANTED.c.repeat == one.repeat)
         return sa.update(WANTED).where(WANTED.c.setting_id.in_(settings), *same)
 
     def remove(self) -> None:
-        """Delete the study, and its episodes that no other study has."""
+        """Delete the study, and those of its episodes that no other study uses."""
         used = sa.select(WANTED.c.episode_id).where(WANTED.c.episode_id.is_not(None))
         with self.database.writing() as connection:
             mine = used.select_from(WANTED.join(SETTINGS).join(STUDIES)).where(STUDIES.c.name == self.name)
@@ -312,7 +317,16 @@ class StudyStore:
 
 
 def _save_setting(connection: sa.Connection, study: int, position: int, setting: Setting) -> int:
-    """Write a setting and return its id. One of the same label and other work is replaced, with its episodes."""
+    """Write a setting, and return its id.
+
+    A stored setting with the same label but another hash `work` is deleted first, together with its list of episodes.
+
+    Args:
+        connection: The database, in a transaction.
+        study: Id of the study.
+        position: Place of the setting in the study.
+        setting: The setting.
+    """
     values = {
         "position": position,
         "name": setting.name,
@@ -332,7 +346,7 @@ def _save_setting(connection: sa.Connection, study: int, position: int, setting:
 
 
 def insert_episode(connection: sa.Connection, row: Mapping[str, Any], decodes: bytes) -> int:
-    """Write an episode and its decodes, and return its row number."""
+    """Write an episode's row and its decodes (a Parquet file), and return its row number."""
     number = connection.execute(sa.insert(EPISODES).values(row).returning(EPISODES.c.id)).scalar_one()
     connection.execute(sa.insert(DECODES).values(episode_id=number, parquet=decodes))
     return int(number)
@@ -343,7 +357,7 @@ def _setting_of(row: Any) -> Setting:
 
 
 def stored_study(connection: sa.Connection, row: Any) -> tuple[Study, dict[int, Setting]]:
-    """Return the study of a row of the table `studies`, and its settings by their ids."""
+    """Return the study that a row of the table `studies` describes, and its settings by their ids."""
     query = sa.select(SETTINGS).where(SETTINGS.c.study_id == row.id).order_by(SETTINGS.c.position)
     settings = {one.id: _setting_of(one) for one in connection.execute(query)}
     wanted = sa.select(WANTED).where(WANTED.c.setting_id.in_(settings)).order_by(WANTED.c.position)
@@ -355,16 +369,16 @@ def stored_study(connection: sa.Connection, row: Any) -> tuple[Study, dict[int, 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a study's database has, what is to run, and how.
+    """What a study needs: its existing episodes, its missing episodes, and how to run them.
 
     Attributes:
         study: The study.
         store: Where it is stored.
         existing: Episodes that the database has, with their rows.
         missing: Episodes to run, each with the reason.
-        newest: Id of the newest row that was read. Later ones are from sweeps that run at the same time.
+        newest: Largest row number among the stored episodes. Larger ones were written after the plan, by other sweeps.
         runtime: Executor, workers and device.
-        command: Words after `kerv` that go on with it.
+        command: Command-line arguments (without `kerv`) that resume the study.
     """
 
     study: Study
@@ -377,11 +391,11 @@ class Plan:
 
     @property
     def to_run(self) -> list[Episode]:
-        """The episodes to run. One that two labels share runs once."""
+        """The episodes to run. An episode that several labels share runs once."""
         return list({one.key: one for one in self.missing}.values())
 
     def blocks(self) -> list[Block]:
-        """Return the episodes to run as blocks, in the order of their first episodes."""
+        """Return the episodes to run, grouped into blocks, in the order of their first episodes."""
         return blocks_of(self.to_run, self.study.block, self.runtime.workers)
 
 
@@ -393,15 +407,15 @@ def plan_study(
     runtime: RuntimeSettings | None = None,
     command: Sequence[str] = (),
 ) -> Plan:
-    """Plan a study: compare its episodes with those of the database.
+    """Compare a study's episodes with the database, and return the plan to run the missing ones.
 
     Args:
         database: The database.
         study: The study.
-        rerun: See `plan.split`.
-        since: See `plan.split`.
+        rerun: Which existing episodes to run again, as in `plan.split`.
+        since: Start of the interrupted command that is resumed, as in `plan.split`. Empty: none.
         runtime: Executor, workers and device.
-        command: Words after `kerv` that go on with it.
+        command: Command-line arguments (without `kerv`) that resume the study.
     """
     stored = stored_episodes(database, study)
     existing, missing = split(study, stored, rerun, since, _earlier(database, study))
@@ -411,14 +425,14 @@ def plan_study(
 
 
 def stored_episodes(database: Database, study: Study, newer_than: int = 0) -> dict[Key, list[StoredEpisode]]:
-    """Return the rows that a study may use, by key.
+    """Return the stored episodes that a study may reuse, by `Episode.key`.
 
-    Only a rollout uses the episodes of rollouts. In them no other setting took turns.
+    Episodes of rollouts are reused only by rollouts, because no other setting was timed in turn with them.
 
     Args:
         database: The database.
         study: The study.
-        newer_than: Only rows with a larger id.
+        newer_than: Return only rows with a larger row number.
     """
     stored: dict[Key, list[StoredEpisode]] = {}
     works = sorted({setting.work for setting in study.settings})
@@ -438,7 +452,7 @@ def stored_episodes(database: Database, study: Study, newer_than: int = 0) -> di
 
 
 def _earlier(database: Database, study: Study) -> dict[str, tuple[Setting, str]]:
-    """Return the newest stored setting of each label that has episodes, and its work."""
+    """Return, for each label of the study, the newest stored setting that has episodes, and its hash `work`."""
     ran = sa.select(WANTED.c.setting_id).where(WANTED.c.episode_id.is_not(None))
     query = sa.select(SETTINGS).where(SETTINGS.c.label.in_(study.labels), SETTINGS.c.id.in_(ran))
     with database.reading() as connection:
@@ -447,7 +461,7 @@ def _earlier(database: Database, study: Study) -> dict[str, tuple[Setting, str]]
 
 
 def studies(database: Database) -> list[StudyStore]:
-    """Return the studies of the database, the newest first."""
+    """Return all studies in the database, newest first."""
     query = sa.select(STUDIES.c.name, STUDIES.c.kind).order_by(STUDIES.c.id.desc())
     with database.reading() as connection:
         return [StudyStore(database, row.name, row.kind) for row in connection.execute(query)]

@@ -1,4 +1,4 @@
-"""The two calls of every command that runs episodes: `plan` finds what is missing, `run` runs it."""
+"""Plans a study and runs it: `plan` finds the missing episodes, `run` runs them."""
 
 from __future__ import annotations
 
@@ -29,27 +29,27 @@ from kerv_cli.lab.runs import Run, interrupted_since, unfinished
 from kerv_cli.lab.store import ROLLOUT, SWEEP, Plan, StudyStore, plan_study
 
 InterimAnalysis = Callable[[StudyStore, Sequence[Episode], Sequence[str], int, int], list[str]]
-"""Called after a block of seeds. It returns the labels of the settings that go on.
+"""Function that is called after each block of seeds. It returns the labels of the settings that continue.
 
-Its arguments are the store, the episodes so far, the labels that are undecided, the number of this analysis from 1, and
-how many there are at most.
+Its arguments are the stored study, the episodes so far, the labels of the settings that have continued so far, the
+number of this analysis (from 1), and the largest possible number of analyses.
 """
 
 OnEpisodeStep = Callable[[Setting, str, int, int], None]
-"""Called after each control step with setting, task, seed and number of steps."""
+"""Function that is called after each control step with the setting, task, seed and number of steps executed."""
 
 Save = Callable[[EpisodeRecord, Path, str], object]
-"""Writes an episode to a .rrd file; the last argument is the label of the setting."""
+"""Function that writes an episode to a .rrd file. The last argument is the setting's label."""
 
 
 @dataclass(frozen=True)
 class EpisodeRunner:
-    """Prepares settings for their episodes. Picklable without `on_step`.
+    """Builds the decoder of a setting and runs its episodes. Picklable if `on_step` is None.
 
     Attributes:
-        rollouts: Folder of the .rrd files, one per recorded episode.
-        save: Writes one of them.
-        on_step: Shows progress within an episode.
+        rollouts: Folder for recordings, one .rrd file per recorded episode.
+        save: Writes a recording.
+        on_step: Called after each control step, to show progress.
     """
 
     rollouts: Path
@@ -57,7 +57,7 @@ class EpisodeRunner:
     on_step: OnEpisodeStep | None = None
 
     def __call__(self, setting: Setting, task: str) -> Callable[[int], EpisodeRecord]:
-        """Build the setting's decoder. Return the function that runs the episode of a seed."""
+        """Build the setting's decoder for a task. Return a function that runs the episode with a given seed."""
         runner = Runner(settings_from(setting.on(task)), task)
 
         def run_episode(seed: int) -> EpisodeRecord:
@@ -72,7 +72,10 @@ class EpisodeRunner:
         return run_episode
 
     def together(self, episodes: Sequence[Episode]) -> Iterator[tuple[Episode, EpisodeRecord | Exception]]:
-        """Run episodes of one setting, `rollout.batch` at a time. Yield each with its record or its world's error."""
+        """Run episodes of one setting, `rollout.batch` at a time.
+
+        Yield each episode with its record, or with the error that its world raised.
+        """
         setting = episodes[0].setting
         settings = settings_from(setting.on(episodes[0].task))
         requests = [Request(one, one.task, one.seed) for one in episodes]
@@ -83,7 +86,11 @@ class EpisodeRunner:
 
 
 def study_of(resolved: ResolvedStudy, kind: str = SWEEP) -> Study:
-    """Return a resolved study with its episodes, on the devices of this machine.
+    """Check a study's settings, and return the study with all its episodes. Devices are those of this machine.
+
+    Args:
+        resolved: The composed study.
+        kind: SWEEP or ROLLOUT.
 
     Raises:
         UsageError: A setting cannot run, or there are too many episodes.
@@ -112,16 +119,16 @@ def study_of(resolved: ResolvedStudy, kind: str = SWEEP) -> Study:
 
 
 def plan(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
-    """Plan a sweep: find the episodes of a study that the database lacks.
+    """Plan a sweep: find the episodes of a study that are missing from the database.
 
     Args:
-        resolved: The study.
-        command: Words after `kerv` that go on with it.
+        resolved: The composed study.
+        command: Command-line arguments (without `kerv`) that resume this sweep.
 
     Raises:
         UsageError: A setting cannot run.
         CheckpointError: A setting's weights or data cannot be read.
-        StorageError: The results folder cannot be written.
+        StorageError: The results folder is not writable.
     """
     runtime, results, rerun = resolved.first.runtime, resolved.first.results, resolved.sweep.rerun
     check_executor(runtime)
@@ -132,7 +139,12 @@ def plan(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
 
 
 def plan_rollout(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
-    """Plan a new rollout, or the rest of the newest one that the same command left unfinished. See `plan`."""
+    """Plan a rollout. If the same command was interrupted before, plan the rest of its newest rollout instead.
+
+    Args:
+        resolved: The composed settings.
+        command: Command-line arguments (without `kerv`) of the rollout.
+    """
     check_writable(resolved.first.results)
     study, database = study_of(resolved, ROLLOUT), Database(resolved.first.results)
     runtime = replace(resolved.first.runtime, workers=1, executor="local")
@@ -144,7 +156,7 @@ def plan_rollout(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
 
 
 def new_name(database: Database, study: Study) -> str:
-    """Return a name with date, time and methods for a rollout: `20260301-142530-ar-spec_vla`."""
+    """Return a name for a new rollout, with date, time and methods: `20260301-142530-ar-spec_vla`."""
     methods = "-".join(dict.fromkeys(str(setting.settings["method"]) for setting in study.settings))
     name = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{re.sub(r'[^A-Za-z0-9_.-]', '_', methods)[:32]}"
     return f"{name}-{secrets.token_hex(2)}" if StudyStore(database, name).exists else name
@@ -158,19 +170,19 @@ def run(
     on_step: OnEpisodeStep | None = None,
     analysis: InterimAnalysis | None = None,
 ) -> Outcome:
-    """Run the missing episodes of a plan. Each is in the database as soon as it ends.
+    """Run the missing episodes of a plan. Each is saved in the database as soon as it ends.
 
     Args:
-        planned: What to run.
-        on_event: Shows progress.
-        save: Writes recordings. Default: nothing is recorded.
-        on_step: Shows progress within an episode, if there is one local worker.
-        analysis: Decides after each block of seeds which settings go on. Default: all do.
+        planned: The plan.
+        on_event: Called with each event, to show progress.
+        save: Writes recordings. By default nothing is recorded.
+        on_step: Called after each control step. Used only with a single local worker.
+        analysis: Called after each block of seeds; decides which settings continue. By default all do.
 
     Raises:
-        Interrupted: Ctrl-C.
+        Interrupted: Ctrl-C was pressed.
         KervError: An episode of a rollout failed.
-        StorageError: The disk refused.
+        StorageError: The disk is full or not writable.
     """
     store, single = planned.store, planned.runtime.executor == "local" and planned.runtime.workers == 1
     is_rollout = planned.study.kind == ROLLOUT
@@ -199,7 +211,10 @@ def run(
 def _run_until_decided(
     planned: Plan, runner: EpisodeRunner, record: Run, on_event: OnEvent, analysis: InterimAnalysis
 ) -> Outcome:
-    """Run block after block of seeds, and leave out the settings that are decided. The study keeps what ran."""
+    """Run one block of seeds after the other. After each, stop the settings whose question is answered.
+
+    The stored study contains only the episodes that ran.
+    """
     study, total = planned.study, Outcome()
     undecided = [label for label in study.labels if label != study.baseline]
     blocks = seed_blocks(study)
@@ -225,7 +240,7 @@ def _run_until_decided(
 
 
 def plan_rows(planned: Plan) -> list[dict[str, object]]:
-    """Return a row per setting: how many episodes are missing, how many exist, and why any are run."""
+    """Return one table row per setting: numbers of missing and existing episodes, and why episodes will run."""
     rows: list[dict[str, object]] = []
     for label in planned.study.labels:
         episodes = [one for one in planned.study.episodes if one.setting.label == label]
@@ -245,14 +260,17 @@ def plan_rows(planned: Plan) -> list[dict[str, object]]:
 
 
 def estimate(planned: Plan, guess: float) -> tuple[float, str]:
-    """Estimate the seconds that the missing episodes take, and say where the number comes from.
+    """Estimate how long the missing episodes will take.
 
-    A setting's mean wall time per episode counts; without stored episodes, the mean of the others. Workers are taken to
-    scale perfectly, up to one per block.
+    Each episode counts with the mean wall time of the setting's stored episodes, or of all stored episodes if the
+    setting has none. The result is divided by the number of workers.
 
     Args:
-        planned: What is to run.
-        guess: Seconds per episode if no setting has stored episodes.
+        planned: The plan.
+        guess: Seconds per episode if nothing is stored.
+
+    Returns:
+        The seconds, and a text that says what the estimate is based on.
     """
     columns = EPISODES.c.work, sa.func.avg(EPISODES.c.wall_seconds), sa.func.count()
     query = sa.select(*columns).where(EPISODES.c.work.in_([setting.work for setting in planned.study.settings]))

@@ -1,8 +1,12 @@
-"""Executors run blocks, on this machine or on a cluster. Importing this module imports nothing heavy.
+"""Executors run groups of episodes in worker processes, here or on a cluster. This file imports nothing heavy.
 
 A new executor is a registered part: a class with the members of `Executor`, and a function `build(options, slots,
-threads, folder)` that returns one. `options` are its settings from `runtime.executor_options`, `slots` is
-`runtime.workers`, `threads` the number of threads of a process, `folder` a folder for its files, not yet created.
+threads, folder)` that returns an instance:
+
+- options: The executor's settings, from `runtime.executor_options`.
+- slots: Number of workers, from `runtime.workers`.
+- threads: Number of CPU threads per worker.
+- folder: A folder for the executor's own files. It does not exist yet.
 """
 
 from __future__ import annotations
@@ -26,27 +30,37 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"
 
 
 class WorkerLost(KervError):
-    """A worker process ended before its result: killed, out of memory, or preempted by the cluster."""
+    """Raised if a worker process ended without a result: killed, out of memory, or preempted by the cluster."""
 
 
 class Executor(Protocol):
-    """Runs functions in worker processes. `execute` decides which, and handles their results and failures."""
+    """Runs functions in worker processes. `execute` chooses the functions, and handles results and failures."""
 
     @property
     def slots(self) -> int:
         """Number of functions that may run at the same time."""
 
     def submit(self, work: Callable[[], T], /) -> Future[T]:
-        """Start a picklable function. Its future holds the result or the exception; WorkerLost if the process died."""
+        """Start a function that can be pickled.
+
+        Returns:
+            A future of its result or exception. The exception is WorkerLost if the process died.
+        """
 
     def close(self, abandon: bool) -> None:
-        """End the workers. With `abandon`, kill those that work."""
+        """End the workers. With `abandon`, kill those that are still working."""
 
 
 def settle(
     future: Future[Any], result: Callable[[], Any], explained: Callable[[Exception], Exception] = lambda error: error
 ) -> None:
-    """Set the result of a function, or its error as `explained` returns it."""
+    """Complete a future with a function's result, or with its exception.
+
+    Args:
+        future: The future to complete.
+        result: Called to get the result.
+        explained: Converts an exception to the one that is reported. By default it stays as it is.
+    """
     try:
         future.set_result(result())
     except Exception as error:  # noqa: BLE001 - the future holds any exception
@@ -54,11 +68,11 @@ def settle(
 
 
 def check_executor(runtime: RuntimeSettings) -> Any:
-    """Check and return the options of the chosen executor, without importing its package.
+    """Check the options of the chosen executor and return them, without importing the executor's package.
 
     Raises:
-        UnknownName: There is no such executor.
-        UsageError: An option is unknown or out of range, or a package is not installed.
+        UnknownName: The executor does not exist.
+        UsageError: An option is unknown or out of range, or the executor's package is not installed.
     """
     part = find("executor", runtime.executor)
     check_settings(runtime, "runtime")
@@ -80,11 +94,11 @@ class LocalOptions:
 
 @dataclass
 class SlurmOptions:
-    """Options of slurm, where a block is a job."""
+    """Options of the Slurm executor, which runs each block of episodes as a job."""
 
     cluster: str = "slurm"  # slurm | local (submitit's own processes on this machine)
     partition: str = ""  # empty: the cluster's default
-    minutes: int = number(120, 1, 100_000)  # longest time of a job
+    minutes: int = number(120, 1, 100_000)  # time limit of a job
     memory_gb: int = number(8, 1, 100_000)
     gpus: int = number(0, 0, 1024)
     setup: list[str] = field(default_factory=list)  # shell lines before the job's Python starts
@@ -92,10 +106,10 @@ class SlurmOptions:
 
 @dataclass
 class RayOptions:
-    """Options of ray, where a block is a task."""
+    """Options of the Ray executor, which runs each block of episodes as a task."""
 
-    address: str = ""  # of a running cluster, e.g. auto or ray://host:10001; empty: start Ray on this machine
-    gpus: float = number(0.0, 0, 1024)  # per block
+    address: str = ""  # running cluster, e.g. auto or ray://host:10001; empty: start Ray on this machine
+    gpus: float = number(0.0, 0, 1024)  # GPUs per block
 
 
 add("executor", "local", "kerv_cli.lab.executors.local:build", LocalOptions)

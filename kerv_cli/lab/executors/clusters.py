@@ -1,7 +1,7 @@
-"""Runs blocks as jobs of a Slurm cluster, through submitit, or as tasks of a Ray cluster.
+"""Executors for clusters: blocks of episodes run as Slurm jobs, through submitit, or as tasks of a Ray cluster.
 
-With `cluster: local` jobs are processes of this machine. Without an address Ray starts on this machine. The nodes of a
-cluster must share the results folder. A job that the cluster ends is a lost worker.
+With `cluster: local` the jobs are processes on this machine. Without an address Ray starts on this machine. The nodes
+of a cluster must share the results folder. If the cluster ends a job, the job counts as a lost worker.
 """
 
 from __future__ import annotations
@@ -70,9 +70,9 @@ for process, start in below.items():
 
 @contextlib.contextmanager
 def guard() -> Iterator[None]:
-    """End the processes that the block starts, and their children, with the block or with this process.
+    """End all processes started inside this `with` block, and their children, when the block or this process ends.
 
-    Another process does so, even if this one is killed. It needs /proc.
+    A separate guard process does this, so that it works even if this process is killed. It reads /proc (Linux).
     """
     mark = secrets.token_hex(8)
     command = [sys.executable, "-S", "-c", _GUARD, str(os.getpid()), mark]
@@ -85,7 +85,13 @@ def guard() -> Iterator[None]:
 
 
 def build_slurm(options: SlurmOptions, slots: int, threads: int, folder: Path) -> Executor:
-    """Return an executor whose jobs have `threads` processors each.
+    """Return an executor that submits Slurm jobs.
+
+    Args:
+        options: Partition, time limit, memory, ….
+        slots: Number of jobs that may run at the same time.
+        threads: Number of processors per job.
+        folder: Where submitit keeps its files.
 
     Raises:
         UsageError: This machine has no Slurm, or Slurm refuses the options.
@@ -114,7 +120,7 @@ def build_slurm(options: SlurmOptions, slots: int, threads: int, folder: Path) -
 
 
 class Jobs:
-    """Submits jobs. One thread polls them all."""
+    """Executor that submits Slurm jobs. A single thread checks which jobs have ended."""
 
     def __init__(self, jobs: Any, slots: int, poll_seconds: float, stack: contextlib.ExitStack) -> None:
         self.slots, self._stack = slots, stack
@@ -125,7 +131,7 @@ class Jobs:
         threading.Thread(target=self._watch, daemon=True).start()
 
     def submit(self, work: Callable[[], T], /) -> Future[T]:
-        """Queue a job."""
+        """Queue a function as a job, and return the future of its result."""
         future: Future[T] = Future()
         job = self._jobs.submit(work)
         with self._changed:
@@ -141,7 +147,7 @@ class Jobs:
                 settle(future, job.result, functools.partial(_job_error, job))
 
     def close(self, abandon: bool) -> None:
-        """Cancel the jobs that run or wait. With `abandon`, wait until they have ended, at most ten seconds."""
+        """Cancel all jobs that run or wait. With `abandon`, wait up to ten seconds until they have ended."""
         self._closed.set()
         with self._changed:
             jobs = list(self._open.values())
@@ -162,7 +168,13 @@ def _job_error(job: Any, error: Exception) -> Exception:
 
 
 def build_ray(options: RayOptions, slots: int, threads: int, folder: Path) -> Executor:
-    """Connect to the cluster, or start a Ray with as many processors as the slots need.
+    """Connect to a Ray cluster, or start Ray on this machine if `options.address` is empty.
+
+    Args:
+        options: The cluster's address and GPUs per task.
+        slots: Number of tasks that may run at the same time.
+        threads: Number of processors per task.
+        folder: Not used.
 
     Raises:
         UsageError: The cluster cannot be reached.
@@ -184,7 +196,10 @@ def build_ray(options: RayOptions, slots: int, threads: int, folder: Path) -> Ex
 
 
 def _check_reachable(address: str) -> None:
-    """Refuse a cluster at `host:port` or `ray://host:port` that does not answer. Ray itself would try for minutes."""
+    """Refuse a cluster at `host:port` or `ray://host:port` that does not answer within seconds.
+
+    Ray itself would try for minutes.
+    """
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not port.isdigit():
         return
@@ -195,7 +210,7 @@ def _check_reachable(address: str) -> None:
 
 
 class Tasks:
-    """Submits Ray tasks without Ray's retries, because `execute` decides about lost blocks."""
+    """Executor that submits Ray tasks. Ray's own retries are off, because `execute` decides about lost work."""
 
     def __init__(self, slots: int, threads: int, gpus: float, stack: contextlib.ExitStack) -> None:
         import ray
@@ -207,7 +222,7 @@ class Tasks:
         self._open: list[Any] = []
 
     def submit(self, work: Callable[[], T], /) -> Future[T]:
-        """Start a task."""
+        """Start a function as a task, and return the future of its result."""
         reference = self._call.remote(work)
         self._open.append(reference)
         outer: Future[T] = Future()
@@ -215,7 +230,7 @@ class Tasks:
         return outer
 
     def close(self, abandon: bool) -> None:
-        """Leave the cluster. With `abandon`, kill its tasks."""
+        """Leave the cluster. With `abandon`, kill the tasks first."""
         import ray
 
         if abandon:

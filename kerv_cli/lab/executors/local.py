@@ -1,4 +1,4 @@
-"""Runs blocks in processes of this machine (loky). A single worker is this process itself."""
+"""Executor for this machine. Work runs in worker processes (loky); a single worker is this process itself."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ T = TypeVar("T")
 
 
 def build(options: Any, slots: int, threads: int, folder: Path) -> Executor:
-    """Return an executor: this process for one slot, else one process per slot."""
+    """Return an executor: this process itself for one slot, else one process per slot."""
     return InProcess() if slots == 1 else Processes(slots, threads)
 
 
 class InProcess:
-    """Runs each function at once in this process. A KeyboardInterrupt reaches the caller."""
+    """Runs each function immediately in this process. A KeyboardInterrupt reaches the caller."""
 
     slots = 1
 
     def submit(self, work: Callable[[], T], /) -> Future[T]:
-        """Run a function."""
+        """Run a function, and return a completed future."""
         future: Future[T] = Future()
         settle(future, work)
         return future
 
     def close(self, abandon: bool) -> None:
-        """Do nothing."""
+        """Do nothing: there is no worker process."""
 
 
 class Processes:
-    """Has one loky pool per worker, so that a worker that dies loses only its own block."""
+    """Runs functions in worker processes. Each has its own loky pool, so that a crash loses only one block."""
 
     def __init__(self, slots: int, threads: int) -> None:
         check_workers()
@@ -46,7 +46,7 @@ class Processes:
         self._all: list[Any] = []
 
     def submit(self, work: Callable[[], T], /) -> Future[T]:
-        """Give a function to a free worker, or start one."""
+        """Give a function to a free worker process, or start a new one. Return the future of its result."""
         pool = self._free.pop() if self._free else self._new_pool()
         outer: Future[T] = Future()
         pool.submit(work).add_done_callback(lambda inner: self._settle(outer, inner, pool))
@@ -69,7 +69,7 @@ class Processes:
     def _new_pool(self) -> Any:
         from joblib.externals.loky import ProcessPoolExecutor
 
-        # loky replaces a worker whose memory grew and warns of it; no work is lost
+        # loky warns when it replaces a worker that uses too much memory; no work is lost
         warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given", category=UserWarning)
         pool = ProcessPoolExecutor(
             max_workers=1,
@@ -81,6 +81,6 @@ class Processes:
         return pool
 
     def close(self, abandon: bool) -> None:
-        """End the workers, or kill them."""
+        """End the worker processes after their work; with `abandon`, kill them."""
         for pool in list(self._all):
             pool.shutdown(wait=True, kill_workers=abandon)
