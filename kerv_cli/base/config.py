@@ -1,6 +1,7 @@
-"""Compose the settings of a command from `conf/`, files and overrides. The only module that uses Hydra.
+"""Compose the settings of a command from `conf/`, method or study files, and overrides. Only this module uses Hydra.
 
-Overrides are checked before torch or MuJoCo load. A mistake is one line; in a file it names the file and the line.
+Overrides are `key=value` arguments. They are checked before torch or MuJoCo load. An error message is one line, and
+names the file and the line if the mistake is in a file.
 """
 
 from __future__ import annotations
@@ -25,16 +26,18 @@ from kerv_cli.base.settings import choices_of
 T = TypeVar("T")
 
 PRESETS = ("method", "study")
-"""Groups whose files hold overrides of a command. A path to such a file can take the place of its name."""
+"""Groups of conf/ whose files set several settings at once. Such a file is chosen by its name or by its path."""
 MOST_POINTS = 10_000
-"""Maximum number of points of a grid."""
+"""Maximum number of combinations in a grid of settings."""
 
 
 def conf_dir() -> Path:
-    """Return `$KERV_CONF_DIR`, else the checkout's `conf/`, else the one inside the installed package.
+    """Return the folder of configuration files.
+
+    This is `$KERV_CONF_DIR` if it is set, else `conf/` of the checkout, else `conf/` inside the installed package.
 
     Raises:
-        UsageError: No configuration there.
+        UsageError: The folder has no configuration.
     """
     folder = os.environ.get("KERV_CONF_DIR")
     package = Path(__file__).resolve().parents[1]
@@ -46,7 +49,7 @@ def conf_dir() -> Path:
 
 
 def groups() -> dict[str, list[str]]:
-    """Return the groups of settings and the names in them: {"method": ["ar", "spec_vla", …], …}."""
+    """Return the groups of settings, each with the names that can be chosen: {"method": ["ar", "spec_vla", …], …}."""
     names = {d.name: {p.stem for p in d.glob("*.yaml")} for d in conf_dir().iterdir() if d.is_dir()}
     for group in SETTINGS_GROUPS:
         names.setdefault(group, set()).update(_parts_of(group))
@@ -54,7 +57,10 @@ def groups() -> dict[str, list[str]]:
 
 
 def _parts_of(group: str) -> dict[str, Part]:
-    """Return the parts that a group can choose. A prefill draft is a proposer that needs no states of the target."""
+    """Return the parts that can be chosen in a group of settings, by name.
+
+    For `prefill_draft` these are the proposers that can draft before the target's prefill.
+    """
     if group != "prefill_draft":
         return dict(parts(group))
     return {name: part for name, part in parts("proposer").items() if part.traits.get("when") == PREFILL}
@@ -64,12 +70,12 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
     """Return the settings of a command.
 
     Args:
-        command: Its name, with `_` for a space.
-        overrides: As typed: `method=kerv`, `threshold.r=5`, `task=[reach,push]`. Each key at most once.
-        schema: Dataclass of the settings.
+        command: The command's name, with `_` instead of a space.
+        overrides: Arguments as typed: `method=kerv`, `threshold.r=5`, `task=[reach,push]`. Each key at most once.
+        schema: Dataclass of the settings. Its defaults are used for everything that nothing else sets.
 
     Raises:
-        UsageError: An override that cannot be parsed, an unknown key or name, a wrong type, a value out of range.
+        UsageError: An override cannot be parsed, its key or a name is unknown, or its value is impossible.
     """
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
@@ -108,7 +114,7 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
 
 
 def _typed(overrides: Sequence[str], schema: type) -> dict[str, Any]:
-    """Parse overrides: key -> value. `task=a,b` needs no brackets."""
+    """Parse overrides into a map from key to value. A list of tasks needs no brackets: `task=a,b`."""
     lists_tasks = any(field.name == "task" and str(field.type) == "list[str]" for field in fields(schema))
     typed: dict[str, Any] = {}
     for override in overrides:
@@ -127,10 +133,14 @@ def _typed(overrides: Sequence[str], schema: type) -> dict[str, Any]:
 
 
 def preset_file(group: str, name: str) -> Path:
-    """Return the file of a preset: `name` is its path, or a name in `conf/`.
+    """Return the path of a method or study file.
+
+    Args:
+        group: `method` or `study`.
+        name: Name of a file in `conf/<group>` without its ending, or the path of any file that ends in .yaml or .yml.
 
     Raises:
-        UnknownName: No such name.
+        UnknownName: `conf/<group>` has no such file.
     """
     if name.endswith((".yaml", ".yml")):
         return Path(name).expanduser()
@@ -141,7 +151,16 @@ def preset_file(group: str, name: str) -> Path:
 
 
 def _read_preset(group: str, name: str) -> tuple[dict[str, str], list[tuple[str, Any]], dict[str, str]]:
-    """Return what a method or study file sets: choices of parts, values, and the file and line of each key."""
+    """Read a method or study file.
+
+    Args:
+        group: `method` or `study`. Empty: the command has no such file, and everything returned is empty.
+        name: As for `preset_file`.
+
+    Returns:
+        Group -> the part that the file chooses; (key, value) pairs that it sets; key -> `FILE:LINE: ` for error
+        messages.
+    """
     if not group:
         return {}, [], {}
     path = preset_file(group, name)
@@ -159,7 +178,7 @@ def _read_preset(group: str, name: str) -> tuple[dict[str, str], list[tuple[str,
 
 
 def _check(settings: Any) -> None:
-    """Check every setting against its range, and that every chosen part exists."""
+    """Check that every setting is in its range and every chosen part is registered. Raises UsageError."""
     check_settings(settings)
     for group in (name for name in SETTINGS_GROUPS if hasattr(settings, name)):
         part_of(group, getattr(settings, group).kind)
@@ -167,12 +186,16 @@ def _check(settings: Any) -> None:
 
 @functools.lru_cache(maxsize=4096)
 def _parsed(override: str) -> Any:
-    """Return Hydra's parse of an override."""
+    """Return an override as parsed by Hydra.
+
+    Raises:
+        UsageError: It cannot be parsed.
+    """
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
-    key, equals, value = override.lstrip("+").partition("=")  # open mappings take new keys without a plus
-    if not equals or not key or key[0] == "~":  # nothing is taken away from settings
+    key, equals, value = override.lstrip("+").partition("=")  # Hydra's `+key=` for new keys is accepted, not needed
+    if not equals or not key or key[0] == "~":  # Hydra's `~key`, which would delete a setting
         raise UsageError(f"'{override}' is not an override: write key=value, a list without spaces: task=[reach,push]")
     try:
         return OverridesParser.create().parse_overrides([override.lstrip("+")])[0]
@@ -183,7 +206,16 @@ def _parsed(override: str) -> Any:
 
 @functools.lru_cache(maxsize=256)
 def _composed(choices: tuple[tuple[str, str], ...], schema: type, conf: Path) -> Any:
-    """Return Hydra's composition of these choices, as typed nodes. It takes 0.1 s, so a study shares it."""
+    """Return the settings that Hydra composes for these choices. This takes 0.1 s, so the result is cached.
+
+    Args:
+        choices: (group, name) pairs, such as ("method", "kerv"). Later ones override earlier ones.
+        schema: Dataclass of the settings.
+        conf: Folder of the configuration files.
+
+    Raises:
+        UnknownName: A group has no such name.
+    """
     from hydra import compose as hydra_compose
     from hydra import initialize_config_dir
     from hydra.core.config_store import ConfigStore
@@ -197,12 +229,12 @@ def _composed(choices: tuple[tuple[str, str], ...], schema: type, conf: Path) ->
     base = OmegaConf.structured(schema)
     _open_mappings(base)
     for group in set(SETTINGS_GROUPS) & set(base):
-        base[group] = MISSING  # the defaults list chooses the part, and with it the class of its settings
+        base[group] = MISSING  # the choice below decides which settings class a group has
     store.store(name="base", node=base)
     store.store(name="own", node={"defaults": ["base", *({group: name} for group, name in choices), "_self_"]})
     for group in SETTINGS_GROUPS:
         for name, part in _parts_of(group).items():
-            own_file = (conf / group / f"{name}.yaml").is_file()  # it begins with the part's settings
+            own_file = (conf / group / f"{name}.yaml").is_file()  # it includes the part's settings as base_<group>
             _store_part(f"base_{group}" if own_file else group, name, part.settings)
     with initialize_config_dir(str(conf), version_base="1.3"):
         return hydra_compose("own")
@@ -210,7 +242,7 @@ def _composed(choices: tuple[tuple[str, str], ...], schema: type, conf: Path) ->
 
 @functools.cache
 def _store_part(group: str, name: str, settings: type) -> None:
-    """Make a part's settings known to Hydra, once per process: all of them take a third of a composition."""
+    """Register the settings class of a part with Hydra, once per process."""
     from hydra.core.config_store import ConfigStore
 
     ConfigStore.instance().store(group=group, name=name, node=settings(kind=name))
@@ -228,7 +260,7 @@ def _open_mappings(node: Any) -> None:
 
 
 def _keys(node: Any, prefix: str = "") -> Iterator[str]:
-    """Yield every dotted key of composed settings."""
+    """Yield the name of every setting in composed settings, such as `threshold.r`."""
     from omegaconf import DictConfig
 
     for name, child in node.items():
@@ -238,7 +270,11 @@ def _keys(node: Any, prefix: str = "") -> Iterator[str]:
 
 
 def as_overrides(*overrides: str, **settings: object) -> list[str]:
-    """Return overrides and keywords as they are typed: `episodes=3`, `task=[reach,push]`, `threshold.r=5`."""
+    """Turn keyword arguments into overrides as typed on the command line, and append them to `overrides`.
+
+    For example `episodes=3, task=["reach", "push"], threshold={"r": 5}` gives `episodes=3`, `task=[reach,push]`,
+    `threshold.r=5`.
+    """
 
     def typed(key: str, value: object) -> list[str]:
         if isinstance(value, Mapping):
@@ -255,10 +291,10 @@ def _text(value: object) -> str:
 
 
 def split(text: str) -> list[str]:
-    """Return the overrides in a line of text, which is split at white space outside quotes.
+    """Split a line of text into overrides at white space, except inside quotes.
 
     Raises:
-        UsageError: A quote or a backslash without its end.
+        UsageError: A quote is not closed, or the line ends with a backslash.
     """
     try:
         return shlex.split(text)
@@ -267,10 +303,12 @@ def split(text: str) -> list[str]:
 
 
 def expand(overrides: Sequence[str]) -> list[list[str]]:
-    """Return the points of a grid in Hydra's grammar, `threshold.r=0,3` or `threshold.r=range(0,4)`: overrides of each.
+    """Return all combinations of overrides with several values, each as a list of overrides.
+
+    Several values are written in Hydra's syntax: `threshold.r=0,3` or `threshold.r=range(0,4)`.
 
     Raises:
-        UsageError: An override that cannot be parsed, no point, or more than MOST_POINTS.
+        UsageError: An override cannot be parsed, or there are no or more than MOST_POINTS combinations.
     """
     from hydra.errors import HydraException
 
@@ -290,5 +328,5 @@ def expand(overrides: Sequence[str]) -> list[list[str]]:
 
 
 def swept_keys(overrides: Sequence[str]) -> list[str]:
-    """Return the keys of overrides that hold several values."""
+    """Return the keys of the overrides that have several values, such as `threshold.r=0,3`."""
     return [one.key_or_group for one in map(_parsed, overrides) if one.is_sweep_override()]

@@ -13,7 +13,7 @@ class KervError(Exception):
     exit_code = 1
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _unpickled, (type(self), str(self))  # worker processes hand it on, whatever arguments its class takes
+        return _unpickled, (type(self), str(self))  # so that workers can send any subclass, whatever its arguments
 
 
 def _unpickled(kind: type[KervError], message: str) -> KervError:
@@ -21,11 +21,11 @@ def _unpickled(kind: type[KervError], message: str) -> KervError:
 
 
 class UsageError(KervError):
-    """The request itself is wrong: unknown name, wrong key, impossible value.
+    """The user asked for something impossible, such as an unknown name or a value out of range.
 
     Args:
-        message: One line.
-        key: The dotted setting that is wrong, if the message is about one.
+        message: Error message, one line.
+        key: Name of the wrong setting, such as `threshold.r`. Empty if the message is not about a setting.
     """
 
     exit_code = 2
@@ -37,7 +37,13 @@ class UsageError(KervError):
 
 
 class UnknownName(UsageError):
-    """A name that nothing has. The message names the nearest ones."""
+    """A name does not exist. The message suggests similar names, or lists all.
+
+    Args:
+        kind: Kind of thing that is named, such as `task`, for the message.
+        name: The unknown name.
+        names: The known names.
+    """
 
     def __init__(self, kind: str, name: str, names: Iterable[str]) -> None:
         names = list(names)
@@ -46,14 +52,14 @@ class UnknownName(UsageError):
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return `did you mean a or b?` with at most three known names that look alike, or an empty string."""
+    """Return `did you mean a or b?` with at most three known names similar to `name`. Empty if none is similar."""
     names = {one.lower(): one for one in known}
     near = [names[one] for one in difflib.get_close_matches(name.lower(), names)]
     return f"did you mean {' or '.join(near)}?" if near else ""
 
 
 class Interrupted(KervError):
-    """Ctrl-C. The message says what is kept and that the same command goes on."""
+    """The user pressed Ctrl-C. The message says what is kept and how to continue."""
 
     exit_code = 130
 
@@ -63,7 +69,7 @@ class RenderingUnavailable(KervError):
 
 
 class CheckpointError(KervError):
-    """A checkpoint, drafter, dataset or manifest is missing, damaged or belongs to something else."""
+    """A stored file is missing, damaged, or does not fit the others: a checkpoint, drafter, dataset or manifest."""
 
 
 class StorageError(KervError):

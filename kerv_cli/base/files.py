@@ -1,4 +1,4 @@
-"""Atomic writes, readers of text, JSON and YAML, hashes. A written file or folder is complete or absent."""
+"""Write files and folders atomically (complete or not at all); read text, JSON and YAML; compute hashes."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from kerv_cli.base.errors import CheckpointError, StorageError, UsageError
 from kerv_cli.base.leftovers import clean, temporary_beside
 
 MOST_TEXT = 2**28
-"""Maximum size of a JSON or YAML file in bytes; kerv's own are far smaller."""
+"""Maximum size of a JSON or YAML file in bytes. kerv's own files are far smaller."""
 MOST_BYTES = 2**36
-"""Maximum size of a file of weights or of a table, bytes."""
+"""Maximum size of a file of weights or of a table in bytes."""
 
 _REFUSALS = {
     errno.ENOSPC: "the disk is full",
@@ -36,7 +36,11 @@ _REFUSALS = {
 
 @contextlib.contextmanager
 def storage_errors(path: Path) -> Iterator[None]:
-    """Turn OSErrors of a full, read-only or protected disk into a StorageError that names `path`."""
+    """Turn an OSError inside the block into a StorageError, if the disk is full, broken or cannot be written.
+
+    Args:
+        path: The file or folder that is written, for the error message.
+    """
     try:
         yield
     except OSError as error:
@@ -48,13 +52,13 @@ def storage_errors(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`. When the block ends well, it is synced and renamed to `path`.
+    """Write a file atomically: yield a temporary path, and rename it to `path` at the end of the block.
 
-    A reader sees the old file or the new one, never a part. The parent folder is created. When the block raises, the
-    temporary file is removed and `path` stays as it was.
+    Readers see the old file or the complete new one. The parent folder is created. If the block raises an exception,
+    the temporary file is removed and `path` stays unchanged.
 
     Raises:
-        StorageError: The disk is full or read-only, or the folder cannot be written.
+        StorageError: The disk is full or read-only, or permission is missing.
     """
     path = Path(path)
     temporary: Path | None = None
@@ -75,20 +79,21 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def write_folder(folder: Path, fill: Callable[[Path], object], replace: bool = False) -> bool:
-    """Write a folder atomically: `fill` gets a temporary one, which is synced and renamed.
+    """Write a folder atomically: fill a temporary folder, then rename it.
 
-    When `fill` raises, everything stays as it was.
+    If `fill` raises an exception, nothing changes.
 
     Args:
-        folder: The folder.
-        fill: Writes the content into the folder that it is given.
-        replace: Exchange an older folder of that name for the new one in one step. Otherwise the new one is discarded.
+        folder: Path of the finished folder.
+        fill: Function that writes the content into the temporary folder, its argument.
+        replace: What happens if `folder` exists and is not empty. True: the new folder replaces it in one step. False:
+            the existing folder stays, and the new one is discarded.
 
     Returns:
-        Whether the new folder is in place.
+        Whether `folder` has the new content.
 
     Raises:
-        StorageError: The disk is full or read-only, or the folder cannot be written.
+        StorageError: The disk is full or read-only, or permission is missing.
     """
     temporary = temporary_beside(folder)
     try:
@@ -109,7 +114,7 @@ def write_folder(folder: Path, fill: Callable[[Path], object], replace: bool = F
 
 
 def _rename_once(temporary: Path, folder: Path) -> bool:
-    """Rename a folder to `folder`; return False if that exists already and is not empty."""
+    """Rename `temporary` to `folder`. Return False if `folder` exists already and is not empty."""
     try:
         os.rename(temporary, folder)
     except OSError as error:
@@ -120,7 +125,7 @@ def _rename_once(temporary: Path, folder: Path) -> bool:
 
 
 def _exchange(a: Path, b: Path) -> None:
-    """Put folder `a` in the place of `b`: in one step, or after removing `b` if the file system cannot."""
+    """Replace folder `b` by folder `a`: in one step if the file system can, else `b` is removed first."""
     libc = ctypes.CDLL(None, use_errno=True)
     if hasattr(libc, "renameat2"):
         here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
@@ -131,7 +136,7 @@ def _exchange(a: Path, b: Path) -> None:
 
 
 def visible(folder: Path) -> list[Path]:
-    """Return the paths in a folder by name, without hidden ones; empty if there is no such folder."""
+    """Return the paths in a folder in alphabetical order, without hidden ones. Empty if the folder does not exist."""
     try:
         return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     except OSError:
@@ -140,12 +145,12 @@ def visible(folder: Path) -> list[Path]:
 
 @functools.cache
 def _clean_once(folder: Path) -> None:
-    """Remove what a killed predecessor of this command left in a folder, once per process."""
+    """Remove temporary files of killed processes from a folder. Later calls of this process do nothing."""
     clean(folder)
 
 
 def sync(path: Path) -> None:
-    """Sync a file, or the entries of a folder, to the disk."""
+    """Flush a file, or the list of names in a folder, to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -157,7 +162,7 @@ def write_bytes(path: Path, content: bytes) -> None:
     """Write a file atomically.
 
     Raises:
-        StorageError: The disk is full or read-only, or the folder cannot be written.
+        StorageError: The disk is full or read-only, or permission is missing.
     """
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
@@ -172,17 +177,21 @@ def write_json(path: Path, value: Any) -> None:
     """Write a value as indented JSON atomically; raises as `write_bytes`.
 
     Raises:
-        ValueError: NaN or infinity, which JSON lacks.
+        ValueError: The value contains NaN or infinity, which JSON cannot express.
     """
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 def regular(path: Path, most: int = MOST_BYTES) -> Path:
-    """Return the path of a file that can be read to its end. Use it for files that come from elsewhere.
+    """Return the path if it is a regular file of limited size. Use this before reading files of unknown origin.
+
+    Args:
+        path: The file.
+        most: Maximum size in bytes.
 
     Raises:
-        OSError: It is missing, or a folder, a pipe or a device, on which a reader would wait.
-        ValueError: It has more than `most` bytes.
+        OSError: The file is missing, or it is a folder, a pipe or a device. Reading a pipe could wait forever.
+        ValueError: The file is larger than `most`.
     """
     status = os.stat(path)
     if not stat.S_ISREG(status.st_mode):
@@ -193,10 +202,11 @@ def regular(path: Path, most: int = MOST_BYTES) -> Path:
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file of at most MOST_TEXT bytes; raises as `regular`.
+    """Return the text of a file.
 
     Raises:
-        ValueError: It is not UTF-8.
+        OSError: The file is missing or not a regular file.
+        ValueError: The file is larger than MOST_TEXT bytes, or not UTF-8.
     """
     return regular(path, MOST_TEXT).read_text(encoding="utf-8")
 
@@ -205,7 +215,7 @@ def read_json(path: Path) -> Any:
     """Return the value in a JSON file.
 
     Raises:
-        CheckpointError: The file is missing, not a regular one, too large or not JSON.
+        CheckpointError: The file is missing, not a regular file, too large, or not JSON.
     """
     try:
         return json.loads(read_text(path))
@@ -219,7 +229,7 @@ def read_mapping(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file; raises as `read_json`.
 
     Raises:
-        CheckpointError: It holds something else.
+        CheckpointError: The JSON value is not an object.
     """
     value = read_json(path)
     if not isinstance(value, dict):
@@ -228,11 +238,11 @@ def read_mapping(path: Path) -> dict[str, Any]:
 
 
 def read_yaml(path: Path) -> Any:
-    """Return the plain values in a YAML file.
+    """Return the value in a YAML file. YAML tags that would construct Python objects are refused.
 
     Raises:
-        OSError: As `regular`.
-        ValueError: It is not YAML, or as `regular`.
+        OSError: The file is missing or not a regular file.
+        ValueError: The file is too large or not YAML.
     """
     import yaml
 
@@ -243,14 +253,17 @@ def read_yaml(path: Path) -> Any:
 
 
 def read_yaml_lines(path: Path, what: str) -> tuple[dict[str, Any], dict[str, int]]:
-    """Return the mapping in a YAML file, and the line of each dotted key.
+    """Read a YAML file that contains a mapping, and note the line of each key for error messages.
 
     Args:
         path: The file.
-        what: How errors call it.
+        what: Name of the file in error messages.
+
+    Returns:
+        The mapping, and the line number of each key. Nested keys are joined by dots, such as `threshold.r`.
 
     Raises:
-        UsageError: It cannot be read, is no mapping, or gives a key twice.
+        UsageError: The file cannot be read, contains no mapping, or gives a key twice.
     """
     import yaml
 
@@ -284,10 +297,10 @@ def read_yaml_lines(path: Path, what: str) -> tuple[dict[str, Any], dict[str, in
 
 
 def sha256_of(path: Path) -> str:
-    """Return the hex SHA-256 of a file. It is read once per process while inode, size and time stay the same.
+    """Return the hexadecimal SHA-256 of a file. The result is cached until the file changes.
 
     Raises:
-        CheckpointError: The file is missing or unreadable.
+        CheckpointError: The file is missing or cannot be read.
     """
     try:
         status = os.stat(path)

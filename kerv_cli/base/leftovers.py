@@ -1,6 +1,6 @@
-"""Names of files and folders that are being written, and their removal after their process has died.
+"""Temporary names for files and folders that are being written, and the removal of those whose process was killed.
 
-Such a name is hidden and names its process: `.<name>.<host>.<process>-<8 digits>.tmp`.
+A temporary name is hidden and contains the process: `.<name>.<host>.<process id>-<8 digits>.tmp`.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from collections.abc import Iterator
 from pathlib import Path
 
 OTHER_HOSTS_STALE_HOURS = 7 * 24.0
-"""A temporary file of another machine is taken for a dead process's after this many hours."""
+"""After this many hours a temporary file of another machine counts as left over by a killed process."""
 
 _NAME = re.compile(r"\..+\.(?P<host>[^/]+?)\.(?P<pid>\d+)-[0-9a-f]{8}\.tmp")
 
 
 def temporary_beside(path: Path) -> Path:
-    """Return a new hidden name beside `path` that names this machine and process."""
+    """Return a new temporary path in the same folder as `path`. Its name contains this machine and process."""
     mark = f"{socket.gethostname().replace('.', '-')}.{os.getpid()}-{secrets.token_hex(4)}"
     return path.with_name(f".{path.name[:150]}.{mark}.tmp")
 
 
 def is_left_over(path: Path) -> bool:
-    """Return whether `path` is temporary and its process has ended."""
+    """Return whether `path` has a temporary name and the process that wrote it has ended."""
     match = _NAME.fullmatch(path.name)
     if match is None:
         return False
@@ -35,12 +35,12 @@ def is_left_over(path: Path) -> bool:
         return not is_alive(int(match["pid"]))
     try:
         return time.time() - path.stat().st_mtime > 3600 * OTHER_HOSTS_STALE_HOURS
-    except OSError:  # its owner was faster
+    except OSError:  # it was renamed or removed meanwhile
         return False
 
 
 def left_over(root: Path) -> Iterator[Path]:
-    """Yield what dead processes left anywhere below `root`. Links are not followed."""
+    """Yield the temporary files and folders of ended processes, anywhere below `root`. Links are not followed."""
     for folder, folders, files in os.walk(root):
         paths = [Path(folder, name) for name in (*folders, *files) if is_left_over(Path(folder, name))]
         folders[:] = [name for name in folders if Path(folder, name) not in paths]
@@ -48,7 +48,11 @@ def left_over(root: Path) -> Iterator[Path]:
 
 
 def clean(folder: Path) -> list[Path]:
-    """Remove what dead processes left in `folder` itself, and return the paths."""
+    """Remove the temporary files and folders of ended processes from `folder`, not from its subfolders.
+
+    Returns:
+        The paths that were left over.
+    """
     paths = [path for path in folder.glob(".*.tmp") if is_left_over(path)]
     for path in paths:
         remove(path)
@@ -56,7 +60,7 @@ def clean(folder: Path) -> list[Path]:
 
 
 def remove(path: Path) -> None:
-    """Remove a file or a folder. What cannot be removed stays."""
+    """Remove a file, or a folder with its content. Files in a folder that cannot be removed are skipped."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -64,7 +68,7 @@ def remove(path: Path) -> None:
 
 
 def is_alive(pid: int) -> bool:
-    """Return whether a process of this machine has that number."""
+    """Return whether a process with this id exists on this machine."""
     try:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):

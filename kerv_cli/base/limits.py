@@ -1,4 +1,4 @@
-"""The range of every setting. It is stated beside the default, and checked whenever settings are composed or read."""
+"""Fields of settings dataclasses, with a description and the allowed values, and the checks of these values."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from kerv_cli.base.errors import UnknownName, UsageError
 
-MOST_TOKENS = 65_536  # of a draft or its tree
-MOST_BINS = 65_536
-MOST_DECODES = 1_000_000  # of an episode, in which a setting may count
+MOST_TOKENS = 65_536  # limit of settings that count tokens of a draft or nodes of its tree
+MOST_BINS = 65_536  # limit of settings that are distances between tokens
+MOST_DECODES = 1_000_000  # limit of settings that count decodes of an episode
 
 PLAIN_NAME = re.compile(r"\w[\w.+-]{0,199}")
-"""Names of folders in the results folder: no separators, not hidden, never `..`."""
+"""Pattern of names that can be used for a folder in the results folder: no slash, no leading dot."""
 
 
 def setting(default: Any, help: str = "", **metadata: Any) -> Any:
     """Return a field of a settings dataclass.
 
     Args:
-        default: A value, or a dataclass or function that makes one.
-        help: What the setting is, in one line without its default, for `--help` and `--cfg`.
-        **metadata: Further facts about the field.
+        default: The default value, or a function (such as a dataclass) that makes it.
+        help: Description for `--help` and `--cfg`, one line.
+        **metadata: Entries of the field's metadata: `limits`, `names` (allowed values) or `group` (of conf/).
     """
     metadata |= {"help": help} if help else {}
     if callable(default):
@@ -35,9 +35,14 @@ def setting(default: Any, help: str = "", **metadata: Any) -> Any:
 
 
 def limits(least: float = -math.inf, most: float = math.inf, above: float = -math.inf) -> dict[str, Any]:
-    """Return metadata for a field whose numbers lie in `least` ≤ value ≤ `most` and above `above`.
+    """Return the metadata that restricts a field to a range of numbers, or each number of a list or mapping.
 
-    They hold for the value itself, or for each element of a list. None is allowed, NaN is not.
+    None is always allowed, NaN never.
+
+    Args:
+        least: The smallest allowed value.
+        most: The greatest allowed value.
+        above: A value must be greater than this.
     """
     return {"limits": (least, most, above)}
 
@@ -45,19 +50,33 @@ def limits(least: float = -math.inf, most: float = math.inf, above: float = -mat
 def number(
     default: float | None, least: float = -math.inf, most: float = math.inf, above: float = -math.inf, help: str = ""
 ) -> Any:
-    """Return a `setting` with `limits`."""
+    """Return a field of a settings dataclass that holds a number.
+
+    Args:
+        default: The default value. None means that the number is optional.
+        least: The smallest allowed value.
+        most: The greatest allowed value.
+        above: A value must be greater than this.
+        help: Description for `--help` and `--cfg`, one line.
+    """
     return setting(default, help, **limits(least, most, above))
 
 
 def choice(default: str, *names: str, help: str = "") -> Any:
-    """Return a `setting` that is one of `names`. The default is one of them."""
+    """Return a field of a settings dataclass whose value must be one of `names`."""
     return setting(default, help, names=names)
 
 
 def field_of(schema: type, key: str) -> tuple[Field[Any] | None, Any]:
-    """Return the field of a dotted key of a settings class, and its default.
+    """Find a setting by its name.
 
-    Both are None for a key that only a chosen part has.
+    Args:
+        schema: Dataclass of a command's settings.
+        key: Name of the setting, such as `runtime.device`.
+
+    Returns:
+        Its dataclass field and its default. Both are None if the default settings do not have it, because only some
+        choice of a part does.
     """
     value, at = schema(), None
     for name in key.split("."):
@@ -67,15 +86,19 @@ def field_of(schema: type, key: str) -> tuple[Field[Any] | None, Any]:
 
 
 def description(at: Field[Any]) -> str:
-    """Return what a setting is: its `help`, after the names that it can have."""
+    """Return the description of a setting: its allowed names, if there are any, then its `help` text."""
     return ": ".join(filter(None, (" | ".join(at.metadata.get("names", ())), at.metadata.get("help", ""))))
 
 
 def check_name(name: str, what: str) -> str:
-    """Return `name`, which must be a plain folder name.
+    """Check that a name can be used for a folder, and return it.
+
+    Args:
+        name: The name.
+        what: What is named, text for the error message.
 
     Raises:
-        UsageError: It is not.
+        UsageError: The name contains other characters than PLAIN_NAME allows.
     """
     if not PLAIN_NAME.fullmatch(name):
         raise UsageError(
@@ -85,10 +108,10 @@ def check_name(name: str, what: str) -> str:
 
 
 def check_label(label: str) -> str:
-    """Return the label of a setting, which must be one printable line.
+    """Check the label of one of a study's settings, and return it.
 
     Raises:
-        UsageError: It is not.
+        UsageError: The label is empty, too long, or not one printable line.
     """
     if not 0 < len(label) <= 1000 or not label.isprintable():
         raise UsageError(f"'{' '.join(label[:80].split())}' names no setting: write one line of text")
@@ -96,16 +119,16 @@ def check_label(label: str) -> str:
 
 
 def check_settings(settings: Any, what: str = "") -> None:
-    """Check a dataclass of settings and those inside it: types of elements, limits, choices.
+    """Check all values in a settings dataclass and in the dataclasses inside it.
 
-    A dataclass can check its fields together in a method `check_together`.
+    If a dataclass has a method `check_together(prefix)`, it is called to check settings that depend on each other.
 
     Args:
         settings: The dataclass.
-        what: Its dotted key in messages; empty for the root.
+        what: Name of the dataclass in error messages, such as `runtime`. Empty for the whole settings.
 
     Raises:
-        UsageError: The first setting that is wrong.
+        UsageError: A value is not allowed. The message is about the first one.
     """
     prefix = f"{what}." if what else ""
     for at, element in _declared(type(settings)):  # type: ignore[arg-type]
@@ -126,7 +149,10 @@ def check_settings(settings: Any, what: str = "") -> None:
 
 @functools.cache
 def _declared(kind: type) -> tuple[tuple[Field[Any], type | None], ...]:
-    """Return the fields of a dataclass, each with the type of its elements if it is a list or dict of plain values."""
+    """Return the fields of a dataclass, each with the type of its elements.
+
+    That type is None for a field that is not a list or dict of plain values.
+    """
     hints = get_type_hints(kind)
 
     def element(name: str) -> type | None:

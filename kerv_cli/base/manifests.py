@@ -1,4 +1,4 @@
-"""Read JSON that describes an artifact into a dataclass. Every field is checked."""
+"""Read the JSON file that describes an artifact into a dataclass, and check every field."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from kerv_cli.base.limits import check_settings
 T = TypeVar("T")
 
 _UNKNOWN = "unexpected_keyword_argument"
-"""Pydantic's name for a field that a dataclass does not have."""
+"""Pydantic's type of error for a field that the dataclass does not have."""
 
 
 @functools.cache
@@ -31,7 +31,7 @@ def _adapter(kind: Any) -> Any:
 
 
 def _forbid_unknown(kind: Any) -> None:
-    """Make pydantic refuse unknown fields, NaN and infinity, in a dataclass and in those that its fields hold."""
+    """Make pydantic refuse unknown fields, NaN and infinity in a dataclass and in the dataclasses inside it."""
     if dataclasses.is_dataclass(kind) and not hasattr(kind, "__pydantic_config__"):
         setattr(kind, "__pydantic_config__", {"extra": "forbid", "allow_inf_nan": False})  # noqa: B010
         for hint in get_type_hints(kind).values():
@@ -41,16 +41,17 @@ def _forbid_unknown(kind: Any) -> None:
 
 
 def read(kind: type[T], value: Any, what: str, tolerant: bool = False) -> T:
-    """Return plain values as an instance of a dataclass, with the dataclasses inside it.
+    """Convert a JSON value to a dataclass, with the dataclasses inside it.
 
     Args:
         kind: The dataclass.
-        value: Plain values, as JSON has them.
-        what: How messages call them.
-        tolerant: Leave out unknown fields, such as those of a newer kerv, instead of refusing them.
+        value: The JSON value.
+        what: Name of the value in the error message, such as its file.
+        tolerant: Whether to ignore unknown fields, which a newer version of kerv may have written. Otherwise they are
+            an error.
 
     Raises:
-        CheckpointError: A field is missing, unknown or of another type. The message names the first one.
+        CheckpointError: A field is missing, unknown or of a wrong type. The message names the first such field.
     """
     from pydantic import ValidationError
 
@@ -64,13 +65,13 @@ def read(kind: type[T], value: Any, what: str, tolerant: bool = False) -> T:
             return read(kind, _without(value, [one["loc"] for one in error.errors() if one["type"] == _UNKNOWN]), what)
         where = ".".join(map(str, first["loc"])) or "the whole"
         raise CheckpointError(f"{what} is damaged: {where}: {first['msg'].lower()}") from error
-    except KervError as error:  # what the dataclass itself refuses, and settings out of range
+    except KervError as error:  # from the dataclass's own checks, or from check_settings
         raise CheckpointError(f"{what} is damaged: {error}") from error
     return checked
 
 
 def _without(value: Any, fields: list[tuple[int | str, ...]]) -> Any:
-    """Return a copy of plain values without these fields, at any depth."""
+    """Return a copy of a JSON value without some fields. A field is given by the path of keys and indices to it."""
     value = copy.deepcopy(value)
     for *path, name in fields:
         del functools.reduce(operator.getitem, path, value)[name]
@@ -78,27 +79,34 @@ def _without(value: Any, fields: list[tuple[int | str, ...]]) -> Any:
 
 
 def read_file(kind: type[T], path: Path) -> T:
-    """Return a JSON file as an instance of a dataclass. Unknown fields are left out.
+    """Read a JSON file into a dataclass. Unknown fields are ignored.
 
     Raises:
-        CheckpointError: The file is missing, not JSON, or does not fit.
+        CheckpointError: The file is missing or not JSON, or a field is missing or of a wrong type.
     """
     return read(kind, read_mapping(path), str(path), tolerant=True)
 
 
 def content_of(key: Sequence[str], chunk: int, target: str, files: Mapping[str, str]) -> str:
-    """Return the hash by which others name a datastore, over its keys, chunk and target (docs/formats.md)."""
+    """Return the hash that identifies a datastore's content (docs/formats.md).
+
+    Args:
+        key: Parts of the prompt that form the search keys.
+        chunk: H, control steps per stored chunk.
+        target: Hash of the target's weights.
+        files: Name -> hash of the datastore's files.
+    """
     text = json.dumps([key, chunk, target, sorted(files.items())])
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def check_files(folder: Path, files: Mapping[str, str], again: str) -> None:
-    """Check that the files in a folder are those that its manifest names.
+    """Check that the files in a folder have the hashes that its manifest names.
 
     Args:
         folder: The folder.
-        files: Name -> SHA-256.
-        again: What to do if they are not.
+        files: Name of each file -> its SHA-256.
+        again: What the user should do otherwise, text for the error message.
 
     Raises:
         CheckpointError: A file is missing or changed.

@@ -11,10 +11,10 @@ from kerv_cli.base.limits import check_name
 
 
 def results_dir(results: str) -> Path:
-    """Return the results folder.
+    """Return the path of the results folder, which need not exist.
 
     Raises:
-        UsageError: It is a file, or not a path.
+        UsageError: The path is a file, or no file system accepts it.
     """
     path = as_path(results)
     if path.exists() and not path.is_dir():
@@ -23,13 +23,13 @@ def results_dir(results: str) -> Path:
 
 
 def check_writable(results: str) -> Path:
-    """Refuse a results folder that cannot be written, before anything is computed for it. Leaves no trace.
+    """Check that the results folder can be written, before anything is computed. Nothing is created.
 
     Returns:
-        The folder, or the nearest folder above it that exists.
+        The folder, or if it does not exist the nearest folder above it that does.
 
     Raises:
-        UsageError: It is a file, or lies below one.
+        UsageError: The path is a file, or below a file.
         StorageError: The disk is full or read-only, or permission is missing.
     """
     folder = results_dir(results)
@@ -37,7 +37,7 @@ def check_writable(results: str) -> Path:
     if not parent.is_dir():
         raise UsageError(f"results={results}: {parent} is a file, name a folder")
     try:
-        # nameless where the file system can: nothing stays when the process is killed here
+        # a file without a name, if the file system has such: nothing is left if the process is killed here
         with storage_errors(folder), tempfile.TemporaryFile(dir=parent):
             pass
     except OSError as error:
@@ -46,20 +46,20 @@ def check_writable(results: str) -> Path:
 
 
 def artifact(results: str, kind: str, name: str) -> Path:
-    """Return the folder of an artifact: results/artifacts/<kind>/<name>, or `name` itself if it has a slash.
+    """Return the folder of an artifact: <results>/artifacts/<kind>/<name>, or the path `name` if it contains a slash.
 
     Raises:
-        UsageError: Neither a plain folder name nor a path.
+        UsageError: `name` can be neither a folder's name nor a path.
     """
     plain = "/" not in name
     return results_dir(results) / "artifacts" / kind / check_name(name, f"{kind} name") if plain else as_path(name)
 
 
 def as_path(text: str) -> Path:
-    """Return a path that a user wrote.
+    """Return a path that the user typed. `~` becomes the home folder.
 
     Raises:
-        UsageError: No file system takes it.
+        UsageError: No file system accepts such a path.
     """
     if "\0" in text or any(len(part.encode()) > 255 for part in text.split("/")) or len(text) > 4000:
         raise UsageError(f"'{text[:80]}…' is no path")

@@ -1,4 +1,4 @@
-"""Let worker processes end together with the process that started them, even if that one is killed."""
+"""Make worker processes end when the process that started them ends, even if it is killed."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ import time
 from kerv_cli.base.errors import KervError
 
 WATCH_SECONDS = 1.0
-"""Seconds between two looks at whether the parent process lives."""
+"""Seconds between two checks whether the parent process is alive."""
 
 _PR_SET_PDEATHSIG = 1
 
 
 def end_with(parent: int) -> None:
-    """End this process within seconds of its parent's end.
+    """Make this process end when its parent process ends, at most a few seconds later.
 
-    On Linux the kernel does it, even if this process is stopped.
+    On Linux the kernel ends it, even if it is suspended.
 
     Args:
-        parent: Number of the parent process.
+        parent: Process id of the parent.
     """
     with contextlib.suppress(OSError, AttributeError):  # not Linux
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -38,10 +38,10 @@ def end_with(parent: int) -> None:
 
 
 def check_workers() -> None:
-    """Refuse worker processes on a machine where they could not wait for each other.
+    """Check that this machine can run worker processes, which need semaphores.
 
     Raises:
-        KervError: No semaphores; on Linux because of /dev/shm.
+        KervError: Semaphores cannot be created. On Linux the reason is that /dev/shm cannot be used.
     """
     try:
         multiprocessing.get_context("fork").Lock()
@@ -50,6 +50,10 @@ def check_workers() -> None:
 
 
 def begin_worker(parent: int) -> None:
-    """Start a worker process: it ends with its parent, and only the parent handles Ctrl-C."""
+    """Prepare this process as a worker: it ends when its parent ends, and leaves Ctrl-C to the parent.
+
+    Args:
+        parent: Process id of the parent.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with(parent)

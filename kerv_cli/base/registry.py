@@ -1,10 +1,10 @@
-"""The parts that kerv is put together from, by kind and name: proposers, artifacts, targets, environments, commands.
+"""The registry of parts, by kind and name. Parts are proposers, artifacts, targets, environments, commands, ….
 
-Names, settings and needs of a part are known without importing torch or MuJoCo. `build` names the code that makes the
-part, `module:function` or `module:Class.method`; the module is imported when the part is built.
+A part's name, settings and required artifacts are known without importing torch or MuJoCo. Its `build` names the code
+that makes it, as `module:function` or `module:Class.method`. That module is imported when the part is built.
 
-A package adds parts by an entry point of the group `kerv.parts`, a file by `KERV_PLUGINS=module,…`. Its module is
-imported and registers its parts.
+Plugins register parts of their own when they are imported. kerv imports the modules that installed packages name in the
+entry point group `kerv.parts`, and those in the environment variable KERV_PLUGINS (separated by commas).
 """
 
 from __future__ import annotations
@@ -40,47 +40,50 @@ MODULES = (
     "kerv_cli.methods.certified",
     "kerv_cli.lab.executors",
 )
-"""Modules that register kerv's own parts when they are imported. None imports anything heavy. Messages list parts in
-this order.
+"""Modules that register kerv's own parts when they are imported. They import neither torch nor MuJoCo.
+
+Error messages list parts in this order.
 """
 
 METHOD_KINDS = ("prefill_draft", "proposer", "acceptance", "threshold", "rectifier", "boundary", "skip")
 """The parts of a method, in the order in which a decode uses them."""
 
 PART_GROUPS = (*METHOD_KINDS, "datastore")
-"""Settings of a rollout whose choices are parts; YAML files in conf/<group>/ are further choices."""
+"""Groups of a rollout's settings that choose a part, as in `proposer=drafter`. YAML files in conf/<group>/ are further
+choices."""
 
 SETTINGS_GROUPS = (*PART_GROUPS, "drafter")
-"""All groups of settings whose choices are parts: those of a rollout, and what `kerv train drafter` trains."""
+"""All groups of settings that choose a part: those of a rollout, and `drafter=` of `kerv train drafter`."""
 
 DRAFTING = "draft"
-"""Cost of a proposer whose draft is made of forwards that follow the target's shape (docs/measuring.md)."""
+"""Kind of cost of a proposer that drafts with a drafter layer of the target's shape (docs/measuring.md)."""
 
 PREFILL, STATES = "prefill", "states"
-"""When a proposer can draft: before the prefill, or only behind it because it reads the target's hidden states."""
+"""When a proposer can draft: before the prefill, or only after it, because it reads the target's hidden states."""
 
 
 @dataclass
 class NoSettings:
-    """Settings of a part that has none but its name."""
+    """Settings of a part that has no settings except its name."""
 
     kind: str = "none"
 
 
 @dataclass(frozen=True)
 class Part:
-    """One choice among the parts of a kind.
+    """A registered part: one of the choices of its kind, such as the proposer `drafter`.
 
     Args:
         kind: proposer, acceptance, threshold, rectifier, boundary, skip, datastore, predictor, artifact, drafter,
             target, environment, stress, executor, column or command.
         name: The name by which it is chosen.
-        build: `module:function` or `module:Class.method`. Its arguments are documented where the kind is used,
-            those of a method's parts in `methods/context.py`.
+        build: The code that makes it, as `module:function` or `module:Class.method`. For the parts of a method,
+            `methods/context.py` describes the arguments. Empty: choosing this name means having no such part.
         settings: Dataclass of its settings, with defaults and limits.
-        needs: Kinds of artifacts that these settings need; for an artifact, those that it is made from.
-        colour: 0xRRGGBB of its rows, lines and timeline.
-        traits: What others need to know of the part. docs/extending.md lists their names.
+        needs: Function of its settings that returns the kinds of artifacts that must exist to use it. For an artifact,
+            those that it is made from.
+        colour: Colour in tables and plots, 0xRRGGBB. None: no colour of its own.
+        traits: Further properties that other modules read. docs/extending.md lists them.
     """
 
     kind: str
@@ -93,16 +96,19 @@ class Part:
 
     @property
     def absent(self) -> bool:
-        """Whether it stands for the absence of a part, such as `proposer=none`."""
+        """Whether choosing this name means having no such part, as in `proposer=none`."""
         return not self.build
 
     @property
     def default(self) -> Any:
-        """Its default settings."""
+        """The part's default settings."""
         return self.settings(kind=self.name)
 
     def built(self, *arguments: Any, **keywords: Any) -> Any:
-        """Import and call `build`; return None for an absent part."""
+        """Import the code that makes the part, call it with these arguments, and return its result.
+
+        Returns None for a part that is absent, such as `proposer=none`.
+        """
         return load(self.build)(*arguments, **keywords) if self.build else None
 
 
@@ -110,10 +116,10 @@ _PARTS: dict[str, dict[str, Part]] = {}
 
 
 def register(part: Part) -> Part:
-    """Add a part. The same code can register a name again, for example when a module is reloaded.
+    """Add a part to the registry. A module that is reloaded can register its parts again.
 
     Raises:
-        UsageError: Another part of that kind has the name.
+        UsageError: A part of the same kind and name, but with a different `build`, is registered already.
     """
     other = _PARTS.setdefault(part.kind, {}).get(part.name)
     if other is not None and other.build != part.build:
@@ -131,16 +137,16 @@ def add(
     colour: int | None = None,
     **traits: Any,
 ) -> None:
-    """Register a part with these fields.
+    """Register a part; see `Part`.
 
     Args:
-        kind: Kind of part.
-        name: Its name.
-        build: `module:function` that makes it.
+        kind: Kind of part, such as `proposer`.
+        name: The name by which it is chosen.
+        build: The code that makes it, as `module:function`. Empty: the name means having no such part.
         settings: Dataclass of its settings.
-        needs: Kinds of artifacts that it needs, or a function of its settings.
-        colour: 0xRRGGBB.
-        **traits: What others need to know of the part.
+        needs: Kinds of artifacts that must exist to use it, or a function of its settings that returns them.
+        colour: Colour in tables and plots, 0xRRGGBB.
+        **traits: Further properties that other modules read. docs/extending.md lists them.
     """
     register(Part(kind, name, build, settings, needs if callable(needs) else lambda _: needs, colour, traits))
 
@@ -155,17 +161,17 @@ def add_drafter(
     colour: int | None = None,
     **traits: Any,
 ) -> None:
-    """Register a drafter with weights: its artifact, its training and its proposer.
+    """Register everything about a trained drafter: its artifact, its training and its proposer.
 
     Args:
         kind: Name of the artifact and of the proposer.
-        build: `module:Class` of a `TrainableDrafter` (`kerv_cli/methods/drafters.py`).
-        settings: Dataclass of its shapes and training.
+        build: Subclass of `TrainableDrafter` (`kerv_cli/methods/drafters.py`), as `module:Class`.
+        settings: Dataclass of the settings of its shapes and training.
         proposer: Dataclass of the settings of its proposer.
-        name: What `kerv train drafter drafter=NAME` calls it; empty: `kind`.
-        sees: Whether it needs a target with cameras.
-        colour: 0xRRGGBB of its rows, lines and timeline.
-        traits: Those of the proposer.
+        name: Its name in `kerv train drafter drafter=NAME`. Empty: the same as `kind`.
+        sees: Whether it needs a target that reads images.
+        colour: Colour in tables and plots, 0xRRGGBB.
+        **traits: Further properties of the proposer. docs/extending.md lists them.
     """
     add("artifact", kind, build, sees=sees)
     add("drafter", name or kind, build, settings)
@@ -173,10 +179,10 @@ def add_drafter(
 
 
 def load(name: str) -> Any:
-    """Import the object that `module:attribute` or `module:attribute.attribute` names.
+    """Import an object by its name, written as `module:attribute` or `module:attribute.attribute`.
 
     Raises:
-        UsageError: No such module or attribute.
+        UsageError: The module cannot be imported, or it has no such attribute.
     """
     module, _, attribute = name.partition(":")
     try:
@@ -190,15 +196,15 @@ def load(name: str) -> Any:
 
 
 def find(kind: str, name: str, what: str = "") -> Part:
-    """Return the part of a kind and name.
+    """Return a registered part.
 
     Args:
-        kind: Kind of part.
-        name: Its name.
-        what: How the message calls the kind.
+        kind: Kind of part, such as `proposer`.
+        name: Name of the part.
+        what: Text for the error message instead of the kind.
 
     Raises:
-        UnknownName: There is none. The message names the nearest ones.
+        UnknownName: No part of this kind has the name. The message suggests similar names.
     """
     by_name = parts(kind)
     if not isinstance(name, str) or name not in by_name:  # a damaged file may hold anything
@@ -207,32 +213,36 @@ def find(kind: str, name: str, what: str = "") -> Part:
 
 
 def part_of(group: str, name: str) -> Part:
-    """Return the part that a group of settings chooses. The part of a prefill draft is an ordinary proposer.
+    """Return the part that a group of settings chooses.
+
+    Args:
+        group: Name of the group, such as `acceptance`. Parts of the group `prefill_draft` are proposers.
+        name: Name of the part.
 
     Raises:
-        UnknownName: There is none.
+        UnknownName: No such part is registered.
     """
     return find("proposer" if group == "prefill_draft" else group, name, f"{group}.kind")
 
 
 def parts(kind: str) -> Mapping[str, Part]:
-    """Return all parts of a kind by name, in the order of registration."""
+    """Return the parts of a kind as a map from name to part, in the order of registration."""
     load_plugins()
     return _PARTS.get(kind, {})
 
 
 def kinds() -> tuple[str, ...]:
-    """Return every kind that has parts."""
+    """Return the kinds of all registered parts."""
     load_plugins()
     return tuple(_PARTS)
 
 
 @functools.cache
 def load_plugins() -> None:
-    """Register kerv's own parts, then those of installed packages and of `KERV_PLUGINS`.
+    """Register kerv's own parts, then those of plugins: installed packages and the modules in `KERV_PLUGINS`.
 
     Raises:
-        UsageError: A plugin cannot be imported. The message names file and line.
+        UsageError: A plugin cannot be imported. The message names its file and line.
     """
     for name in MODULES:
         importlib.import_module(name)
@@ -246,7 +256,10 @@ def load_plugins() -> None:
 
 
 def _place_of(error: Exception) -> str:
-    """Return `FILE:LINE: ` of an error in a plugin; empty if the plugin was not found."""
+    """Return the place of an error in a plugin as `FILE:LINE: `, text for the error message.
+
+    It is empty if the plugin was not found.
+    """
     if isinstance(error, SyntaxError):
         return f"{error.filename}:{error.lineno}: "
     frames = reversed(traceback.extract_tb(error.__traceback__)[2:])

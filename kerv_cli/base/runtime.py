@@ -1,4 +1,4 @@
-"""Device, number format and threads of a process."""
+"""Choose the device, number format and number of threads of this process."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch
 
 
 def set_up(settings: RuntimeSettings) -> tuple[str, torch.dtype]:
-    """Apply runtime settings to this process.
+    """Set the number of torch's threads, and resolve the device.
 
     Returns:
-        The device and the number format.
+        The device (`auto` is resolved to cpu or cuda), and the number format.
 
     Raises:
-        UsageError: No such device here, or a setting out of range.
+        UsageError: The device does not exist on this machine, or a setting is out of range.
     """
     check_settings(settings, "runtime")
     device = settings.device

@@ -1,6 +1,6 @@
-"""Settings that all commands share, as plain dataclasses. Each field states type, default, range and description once.
+"""Settings that several commands share, as dataclasses. A field states its type, default, range and description.
 
-Nothing heavy is imported here, so a wrong override is answered before torch or MuJoCo load.
+Neither torch nor MuJoCo is imported here, so a mistyped override is reported at once.
 """
 
 from __future__ import annotations
@@ -17,12 +17,20 @@ S = TypeVar("S")
 
 
 def chosen(kind: str, name: str = "none") -> Callable[[], Any]:
-    """Return a function that makes the settings of a part: the default of a group."""
+    """Return a function that makes the default settings of a part, as the default of a dataclass field."""
     return lambda: find(kind, name).default
 
 
 def part(kind: str, name: str = "none", help: str = "") -> Any:
-    """Return a field with the settings of a part of a kind. The field's name is a group of conf/."""
+    """Return a dataclass field that holds the settings of a part, such as a proposer.
+
+    The field must have the name of a group in conf/. On the command line that name chooses another part.
+
+    Args:
+        kind: Kind of part.
+        name: Name of the part that is chosen by default.
+        help: Description for `--help`.
+    """
     return setting(chosen(kind, name), help, group=name)
 
 
@@ -33,9 +41,9 @@ class RuntimeSettings:
     device: str = setting("cpu", "cpu, cuda or auto")
     dtype: str = choice("float32", "float32", "bfloat16", "float16", help="number format of the models")
     threads: int = number(1, 1, 256, help="torch's threads in each process")
-    executor: str = setting("local", "sweeps: what runs the blocks: local (processes here), slurm, ray")
-    workers: int = number(1, 1, 4096, help="sweeps: blocks that run at the same time")
-    executor_options: dict[str, Any] = setting({}, "see kerv_cli/lab/executors/__init__.py")
+    executor: str = setting("local", "sweeps: where episodes run: local (processes on this machine), slurm, ray")
+    workers: int = number(1, 1, 4096, help="sweeps: number of processes that run episodes at the same time")
+    executor_options: dict[str, Any] = setting({}, "options of slurm or ray (kerv_cli/lab/executors/__init__.py)")
 
 
 @dataclass(kw_only=True)
@@ -43,9 +51,9 @@ class CommandSettings:
     """Settings of every command."""
 
     groups: ClassVar[Mapping[str, str]] = {}
-    """Groups of conf/ -> default choice, in the order of composition: a later one outranks an earlier one."""
+    """Group of conf/ -> the file that is chosen by default. If two groups set the same key, the later one wins."""
 
-    results: str = setting("results", "folder of everything that kerv makes")
+    results: str = setting("results", "folder that kerv writes everything to")
     store: str = setting(
         "", "database, postgresql://USER@HOST/DB; empty: $KERV_STORE, else SQLite in the results folder"
     )
@@ -53,7 +61,7 @@ class CommandSettings:
 
 @dataclass(kw_only=True)
 class RunSettings(CommandSettings):
-    """Settings of every command that computes."""
+    """Settings of every command that runs a model or a simulator."""
 
     groups: ClassVar = {"runtime": "cpu"}
 
@@ -62,31 +70,41 @@ class RunSettings(CommandSettings):
 
 @dataclass(kw_only=True)
 class TaskSettings(RunSettings):
-    """Settings of every command that works on tasks."""
+    """Settings of every command that takes a list of tasks."""
 
     task: list[str] = setting(
-        [], "tasks and suites: reach, drawer-open, MT10, …; empty: those that the target was trained on"
+        [], "tasks and suites: reach, drawer-open, MT10, …; empty: the tasks that the target was trained on"
     )
 
 
 def choices_of(schema: type) -> dict[str, str]:
-    """Return the groups that these settings choose from -> the default choice, in the order of composition."""
+    """Return the groups of conf/ that a command uses, each with the name that is chosen by default.
+
+    If two groups set the same key, the later one wins.
+
+    Args:
+        schema: Dataclass of the command's settings.
+    """
     parts = {at.name: str(at.metadata["group"]) for at in fields(schema) if "group" in at.metadata}
     return parts | dict(getattr(schema, "groups", {}))
 
 
 def read_settings(schema: type[S], plain: Mapping[str, Any]) -> S:
-    """Return settings from nested dicts and lists, the inverse of `asdict`. Each part gets its own settings class.
+    """Return a dataclass of settings from nested dicts and lists. This is the inverse of `asdict`.
+
+    Args:
+        schema: The dataclass.
+        plain: Stored settings. Those of a part (such as `proposer`) become an instance of that part's settings class.
 
     Raises:
-        CheckpointError: They are not such settings.
-        UnknownName: A part that is not registered here.
+        CheckpointError: A setting is missing, unknown or of a wrong type.
+        UnknownName: A part is not registered, for example because its plugin is not installed.
     """
     settings = manifests.read(schema, plain, "a stored setting")
     for group in SETTINGS_GROUPS:
         value = getattr(settings, group, None)
         if not isinstance(value, Mapping):
-            continue  # the settings name no such part: its default
+            continue  # no settings of this part were stored, so the defaults stay
         part_settings = part_of(group, value["kind"]).settings
         setattr(settings, group, manifests.read(part_settings, value, f"a stored setting's {group}"))
     return settings

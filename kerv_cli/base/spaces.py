@@ -1,7 +1,7 @@
-"""Action and observation spaces as data. Numbers of a robot or simulator stand in environments only.
+"""Action and observation spaces, which describe a robot as data. Only environments contain robot-specific numbers.
 
-An environment has an `ActionSpace` and an `ObservationSpace`. Every artifact made from it stores them: target, drafter,
-datastore, calibration. Artifacts of different action spaces cannot be used together (`check_same`).
+An environment has an `ActionSpace` and an `ObservationSpace`. Every artifact that is made from it stores them: target,
+drafter, datastore, calibration. Artifacts with different action spaces cannot be used together (`check_same`).
 
 Notation (docs/methods.md §0): D degrees of freedom (DoFs) per control step, H control steps per chunk, N = H · D
 tokens; token j belongs to control step j // D and DoF j % D.
@@ -21,10 +21,15 @@ from kerv_cli.base.errors import CheckpointError, KervError
 
 @dataclass(frozen=True)
 class Group:
-    """A kinematic group: neighbouring DoFs that are drafted and accepted together, such as position or rotation."""
+    """A kinematic group: neighbouring DoFs that are drafted and accepted together, such as position or rotation.
+
+    Args:
+        name: Name of the group.
+        size: Number of DoFs in it.
+    """
 
     name: str
-    size: int  # DoFs
+    size: int
 
 
 @dataclass(frozen=True)
@@ -34,18 +39,18 @@ class ActionSpace:
     Args:
         names: Names of the D DoFs, in the order of the tokens.
         groups: Kinematic groups in order. Their sizes add up to D.
-        strict: DoFs whose drafted tokens must equal the target's. They are held, never extrapolated: a gripper opens or
-            closes.
+        strict: Names of the strict DoFs, such as a gripper. Their drafted tokens must equal the target's, and a
+            prediction repeats their last value instead of extrapolating it.
         control_hz: Control steps per second.
-        low: (D,) environment units; the action that -1 of the normalised range means. An environment gives its limits,
-            a policy the 1st percentile of its demonstrations.
-        high: (D,) environment units; the action that 1 means, or the 99th percentile.
+        low: (D,) the action in environment units that the normalised value -1 stands for. An environment gives its
+            limits, a policy the 1st percentile of its demonstrations.
+        high: (D,) the action that the normalised value 1 stands for: the limits, or the 99th percentile.
         bins: Number of edges on [-1, 1]. A token is the index of one of the bins - 1 intervals (OpenVLA: 256 edges).
-        end_token: Whether the upper end has a token of its own, which decodes like the last interval. Published OpenVLA
-            checkpoints were trained with it.
+        end_token: Whether there is one more token for the value 1. It decodes to the centre of the last interval.
+            Published OpenVLA checkpoints were trained with it.
 
     Raises:
-        ValueError: The numbers do not fit together.
+        ValueError: The fields contradict each other.
     """
 
     names: tuple[str, ...]
@@ -72,7 +77,7 @@ class ActionSpace:
             raise ValueError(f"bins {self.bins} must be at least 3, control_hz {self.control_hz} above 0")
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON; `end_token` only if it is set."""
+        """Return the fields as values for JSON. `end_token` is left out if it is false."""
         plain = asdict(self)
         if not self.end_token:
             del plain["end_token"]
@@ -85,7 +90,7 @@ class ActionSpace:
 
     @property
     def tokens(self) -> int:
-        """Size of the vocabulary."""
+        """Number of different action tokens."""
         return self.bins - 1 + self.end_token
 
     @cached_property
@@ -95,28 +100,28 @@ class ActionSpace:
 
     @cached_property
     def centres(self) -> np.ndarray:
-        """(tokens,) normalised value of every token."""
+        """(tokens,) normalised value that each token decodes to, the centre of its interval."""
         inner = (self.edges[:-1] + self.edges[1:]) / 2
         return np.append(inner, inner[-1]) if self.end_token else inner
 
     @cached_property
     def middle(self) -> np.ndarray:
-        """(D,) middle of every DoF's limits, environment units."""
+        """(D,) middle between `low` and `high`, environment units."""
         return (np.asarray(self.high) + np.asarray(self.low)) / 2
 
     @cached_property
     def half(self) -> np.ndarray:
-        """(D,) half of every DoF's range, environment units."""
+        """(D,) half the distance between `low` and `high`, environment units."""
         return (np.asarray(self.high) - np.asarray(self.low)) / 2
 
     @cached_property
     def is_strict(self) -> np.ndarray:
-        """(D,) bool, which DoFs are strict."""
+        """(D,) bool: which DoFs are strict, that is, their tokens must equal the target's."""
         return np.array([name in self.strict for name in self.names])
 
     @cached_property
     def bounds(self) -> tuple[tuple[int, int], ...]:
-        """For each DoF, the first DoF of its group and one past the last."""
+        """For each DoF, its kinematic group as (index of the first DoF, index after the last)."""
         ranges, first = [], 0
         for group in self.groups:
             ranges += [(first, first + group.size)] * group.size
@@ -124,10 +129,13 @@ class ActionSpace:
         return tuple(ranges)
 
     def dofs_of(self, name: str) -> slice:
-        """Return the DoFs of a kinematic group.
+        """Return the indices of the DoFs in a kinematic group, as a slice.
+
+        Args:
+            name: Name of the group.
 
         Raises:
-            KervError: No such group.
+            KervError: There is no such group.
         """
         first = 0
         for group in self.groups:
@@ -137,9 +145,14 @@ class ActionSpace:
         raise KervError(f"the actions have no group '{name}'")
 
     def segments(self, start: int, stop: int) -> Iterator[tuple[int, int, bool]]:
-        """Yield the groups between two chunk indices: first index, one past the last, whether all are strict.
+        """Divide a part of a chunk's tokens into kinematic groups.
 
-        A group that lies partly outside is cut.
+        Args:
+            start: Index of the first token.
+            stop: Index after the last token. A group that is only partly inside is cut.
+
+        Yields:
+            For each group: index of its first token, index after its last, whether all its DoFs are strict.
         """
         while start < stop:
             step, dof = divmod(start, self.dofs)
@@ -149,21 +162,21 @@ class ActionSpace:
             start = last
 
     def strict_tokens(self, size: int) -> np.ndarray:
-        """Return (size,) bool: which of a chunk's first `size` tokens belong to a strict DoF."""
+        """Return (size,) bool: which of a chunk's first `size` tokens belong to strict DoFs."""
         return np.resize(self.is_strict, size)
 
     def normalise(self, actions: np.ndarray) -> np.ndarray:
-        """Map (..., D) actions in environment units to [-1, 1], clipped."""
+        """Map actions (..., D) from environment units to [-1, 1]. Values outside are clipped."""
         low, high = np.asarray(self.low), np.asarray(self.high)
         return np.clip(2.0 * (actions - low) / (high - low) - 1.0, -1.0, 1.0)
 
     def unnormalise(self, values: np.ndarray) -> np.ndarray:
-        """Map (..., D) values in [-1, 1] to environment units."""
+        """Map normalised actions (..., D) in [-1, 1] to environment units."""
         low, high = np.asarray(self.low), np.asarray(self.high)
         return (values + 1.0) / 2.0 * (high - low) + low
 
     def bins_of(self, values: np.ndarray) -> np.ndarray:
-        """Return the int64 tokens of normalised values. Values at the ends belong to the outermost tokens."""
+        """Return the int64 tokens of normalised values. Values outside [-1, 1] get the first or last token."""
         return np.clip(np.digitize(values, self.edges) - 1, 0, self.tokens - 1).astype(np.int64)
 
     def values_of(self, tokens: np.ndarray) -> np.ndarray:
@@ -171,11 +184,11 @@ class ActionSpace:
         return self.centres[np.asarray(tokens)]
 
     def encode(self, actions: np.ndarray) -> np.ndarray:
-        """Return the (..., D) int64 tokens of actions in environment units."""
+        """Return the tokens (..., D) int64 of actions (..., D) in environment units."""
         return self.bins_of(self.normalise(actions))
 
     def decode(self, tokens: np.ndarray) -> np.ndarray:
-        """Return the (..., D) actions of tokens in environment units: the centres of their bins."""
+        """Return the actions (..., D) in environment units of tokens (..., D): the centres of their bins."""
         return self.unnormalise(self.values_of(tokens))
 
     def fitted(self, actions: np.ndarray) -> ActionSpace:
@@ -184,16 +197,17 @@ class ActionSpace:
         return replace(self, low=low, high=high)
 
     def check_same(self, other: ActionSpace, here: str, there: str, statistics: bool = False) -> None:
-        """Refuse another action space: names, groups, strict DoFs, bins and control rate.
+        """Check that another action space has the same names, groups, strict DoFs, bins and control rate.
 
         Args:
             other: The other space.
-            here: Name of this space's owner in the message.
-            there: Name of the other's owner.
-            statistics: Compare the normalisation too. With another one, the same token is another action.
+            here: What this space belongs to, text for the error message.
+            there: What the other space belongs to, text for the error message.
+            statistics: Whether to compare `low`, `high` and `end_token` too. If these differ, the same token means a
+                different action.
 
         Raises:
-            CheckpointError: They differ. The message names the first difference.
+            CheckpointError: The spaces differ. The message names the first difference.
         """
         normalisation = ("low", "high", "end_token") if statistics else ()
         for name in ("names", "groups", "strict", "bins", "control_hz", *normalisation):
@@ -208,9 +222,9 @@ class ActionSpace:
 
 
 def action_limits(low: np.ndarray, high: np.ndarray) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return the limits of an ActionSpace from the lowest and highest actions, (D,) each.
+    """Return `low` and `high` of an ActionSpace from the lowest and highest actions, (D,) each.
 
-    A DoF that never moves gets one unit to either side of its value.
+    A DoF that never moves gets the limits value - 1 and value + 1.
     """
     still = high - low < 1e-6
     low, high = np.where(still, low - 1.0, low), np.where(still, high + 1.0, high)
@@ -225,7 +239,12 @@ def _text(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Place:
-    """A position in the privileged state: `state[first : first + 3]`, metres."""
+    """A position that the task is about, such as the object's. In the simulator's state: `state[first : first + 3]`.
+
+    Args:
+        name: Name of the place.
+        first: Index of its x in the state. x, y and z are in metres.
+    """
 
     name: str
     first: int
@@ -233,17 +252,20 @@ class Place:
 
 @dataclass(frozen=True)
 class ObservationSpace:
-    """The observations of an environment besides images.
+    """The numbers that an environment observes besides images.
+
+    The privileged state is what only the simulator knows. A policy that reads images does not see it.
 
     Args:
-        proprioception: Names of its numbers. The first three are the end effector's position in metres.
-        state: Number of privileged numbers.
+        proprioception: Names of the numbers of proprioception, the robot's own measurements. The first three are the
+            end effector's position in metres.
+        state: Length of the privileged state. It begins with the proprioception.
         places: Positions in the state that a policy can estimate from images, such as object and goal.
-        centre: Middle of the workspace, metres.
-        extra_places: Further positions, only for a policy that is given the state.
-        extra: Further indices of the state that such a policy reads as they are.
-        previous: (how many numbers, first index of their copy from the step before), or None. Such a policy reads the
-            differences.
+        centre: Middle of the workspace in metres.
+        extra_places: Further positions, read only by a policy that gets the state.
+        extra: Indices of further numbers in the state, read only by such a policy.
+        previous: (count, index) if the state repeats its first `count` numbers, as they were one control step earlier,
+            from `index` on. A policy that gets the state reads the differences as velocities. None: it does not.
     """
 
     proprioception: tuple[str, ...]
@@ -255,19 +277,19 @@ class ObservationSpace:
     previous: tuple[int, int] | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
+        """Return the fields as values for JSON."""
         return asdict(self)
 
 
 @dataclass(frozen=True)
 class Observation:
-    """One observation, the input of a decode.
+    """What a policy observes before it decodes a chunk of actions.
 
     Args:
         proprioception: (p,) float64, the robot's own measurements.
-        state: (s,) float64, privileged.
+        state: (s,) float64, the simulator's privileged state.
         instruction: The task in words.
-        images: Camera name -> (h, w, 3) uint8, only those that were requested.
+        images: Camera name -> image (h, w, 3) uint8. Only cameras that the policy reads are included.
     """
 
     proprioception: np.ndarray
@@ -276,5 +298,5 @@ class Observation:
     images: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def with_images(self, images: Mapping[str, np.ndarray]) -> Observation:
-        """Return a copy with these images."""
+        """Return a copy of the observation with these images instead."""
         return replace(self, images=images)
