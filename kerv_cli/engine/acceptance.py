@@ -60,8 +60,9 @@ def accept_by_group(
     its DoF's limit of the target token after its parent, and if these distances sum to at most `group_limit`. A path
     ends before a group that is rejected or that is only partly in the tree.
 
-    `start` may be inside a group. Its remaining tokens are then judged as a group. Its committed tokens count with
-    distance 0: accepted paths end with whole groups, so these tokens came from the target, as bonus.
+    `start` may be inside a group. The group's remaining tokens are then judged alone. Its committed tokens count with
+    distance 0, because they came from the target: accepted paths end with whole groups, so only a bonus token can begin
+    one.
 
     Args:
         tree: The draft, n nodes.
@@ -104,12 +105,12 @@ def nearest_child(tree: TokenTree, node: int, target_tokens: Sequence[int]) -> i
 
 @dataclass(frozen=True)
 class DistanceRule:
-    """Base class of acceptance rules. Accepts a draft token within a largest distance, per DoF, to the target token."""
+    """Base class of acceptance rules: accepts a draft token if it is close enough to the target's, per DoF."""
 
     space: ActionSpace
 
     def of_drafts_from(self, proposer: str) -> DistanceRule:
-        """Return the rule that judges drafts of the proposer with this name. By default the rule itself."""
+        """Return the rule that judges drafts of this proposer. By default the rule itself, whatever the name."""
         return self
 
     def limits(self, r: int) -> tuple[int, ...]:

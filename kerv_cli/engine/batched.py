@@ -36,7 +36,7 @@ class BatchDecoder:
         self._caches: dict[int, Cache] = {}
 
     def new_episode(self) -> EpisodeState:
-        """Return the state of a further episode in the batch: its executed actions and positions."""
+        """Return an empty record of actions and positions for one more episode in the batch."""
         return EpisodeState(self.target.actions, self.target.cameras)
 
     @torch.inference_mode()
@@ -77,7 +77,7 @@ class BatchDecoder:
     def _encode(self, observations: Sequence[Observation]) -> list[Tensor]:
         """Return each prompt's embeddings (1, P, E).
 
-        On a CPU the observations are encoded one by one: with packed weights this is faster.
+        On a CPU the observations are encoded one by one, because this is faster there with kerv's packed weights.
         """
         if isinstance(self.target, EncodesMany) and self.target.device.type != "cpu":
             return list(self.target.encode_many(observations).split(1))

@@ -58,7 +58,14 @@ class ActionHistory:
 
 @dataclass(frozen=True)
 class Situation:
-    """The running episode as a method's parts see it: task, executed actions, measured positions."""
+    """The running episode as a method's parts see it.
+
+    Attributes:
+        task: Name of the task.
+        history: The last executed actions.
+        path: Measured positions of the end effector, (3,) each, metres, oldest first.
+        random: Random number generator for the boundary, seeded per episode.
+    """
 
     task: str
     history: ActionHistory
@@ -101,12 +108,12 @@ class EpisodeState:
 
 @dataclass(frozen=True)
 class Rejection:
-    """What a verification computed beyond the accepted path, after a rejected token.
+    """What a verification computed after a rejected draft token, beyond the accepted path.
 
     Attributes:
         draft: The draft's tokens after the rejected one.
-        target: The target's tokens after the rejected one and after each of `draft`. They are its predictions as if the
-            rejected token and `draft` had been committed.
+        target: The target's tokens after the rejected one and after each of `draft`: what it would decode if these had
+            been committed.
     """
 
     draft: tuple[int, ...] = ()
@@ -115,7 +122,7 @@ class Rejection:
 
 @dataclass(frozen=True)
 class Choice:
-    """A boundary's decision: which proposer drafts the next chunk."""
+    """Decision of a boundary (docs/methods.md §4.4): whether retrieval or the drafter drafts the next chunk."""
 
     mode: str  # the proposer's name
     metric: float | None = None  # F (docs/methods.md §4.4); None if the decision does not use it
@@ -161,7 +168,7 @@ class Chunk:
 
     @property
     def prompt(self) -> Tensor:
-        """The prompt's embeddings (1, P, E), computed when first read. A skipped chunk may never pay for encoding."""
+        """The prompt's embeddings (1, P, E), computed when first read. So skipped chunks need not pay for encoding."""
         if not isinstance(self.encoding, Tensor):
             self.encoding = self.encoding()
         return self.encoding
@@ -173,12 +180,12 @@ class Chunk:
 
     @property
     def remaining(self) -> int:
-        """Number of tokens still to be decoded; 0 after a rectifier ended the chunk."""
+        """Number of tokens still to be decoded. 0 if a prediction (a rectifier) ended the chunk early."""
         return 0 if self.closed is not None else self.size - len(self.tokens)
 
     @property
     def compensated(self) -> int:
-        """Number of action values that a rectifier predicted."""
+        """Number of action values that a rectifier predicted instead of the target."""
         return 0 if self.closed is None else max(0, self.closed.size - len(self.tokens))
 
     @property

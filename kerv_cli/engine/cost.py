@@ -115,10 +115,10 @@ def read_profile(path: Path) -> Profile:
 
 
 class Calls(NamedTuple):
-    """All m forwards, or all m drafts, of one kind in a number of decodes.
+    """All forwards, or all drafts, of one kind in several decodes. There are m of them.
 
     Attributes:
-        decode: (m,) index of the decode that each belongs to.
+        decode: (m,) index of the decode that made the call.
         rows: (m,) number of tokens processed, without the prompt's.
         with_prompt: (m,) bool, whether the prompt's tokens are processed too.
     """
@@ -130,13 +130,13 @@ class Calls(NamedTuple):
 
 @dataclass(frozen=True)
 class Work:
-    """What a number of decodes computed, as far as it costs time.
+    """What several decodes computed: their forwards, drafts and other recorded seconds, to be priced by the cost model.
 
     Attributes:
-        calls: Kind of cost -> its calls, for the kinds that depend on the target's size (`FORWARDS`).
+        calls: Kind of cost -> its forwards or drafts, for the kinds that depend on the target's size (`FORWARDS`).
         sources: Kind of cost -> (decodes,) bool, whether the decode used a proposer with this kind of cost.
         host: (decodes,) recorded seconds that do not depend on the target's size, without proposing.
-        propose: (decodes,) recorded seconds of proposing. 0 if the drafter drafted: `calls` has its cost.
+        propose: (decodes,) recorded seconds of proposing. 0 if the drafter drafted, because its cost is in `calls`.
     """
 
     calls: Mapping[str, Calls]
@@ -158,7 +158,7 @@ def work_of(
     size: int,
     drafter: tuple[int, int] | None = None,
 ) -> Work:
-    """Return what a number of decodes computed, from the columns of their records.
+    """Return what several decodes computed, from the columns of their records.
 
     Args:
         rounds: Name of a `Round` attribute -> its values (n,) over all rounds of all decodes: mode, proposer, start,
@@ -207,7 +207,7 @@ def work_of(
 
 
 def work_of_record(decode: DecodeRecord) -> Work:
-    """Return what a single decode computed, from its record."""
+    """Return what a single decode computed (forwards, drafts, other seconds), from its record."""
     names = ("mode", "proposer", "start", "tree_size", "accepted")
     return work_of(
         {name: np.array([getattr(one, name) for one in decode.rounds]) for name in names},

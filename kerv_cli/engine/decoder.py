@@ -26,7 +26,7 @@ from kerv_cli.engine.tree import TokenTree
 
 @dataclass(frozen=True)
 class Parts:
-    """The parts of a decoding method. With the defaults, the target decodes autoregressively."""
+    """The parts of a decoding method (docs/methods.md §2). With the defaults, the target decodes autoregressively."""
 
     acceptance: DistanceRule | None = None  # None: draft tokens must equal the target's
     threshold: Threshold | None = None  # None: r = 0
@@ -79,7 +79,7 @@ class Decoder(EpisodeState):
 
     @cached_property
     def autoregressive(self) -> Decoder:
-        """An autoregressive decoder of the same target. Deviations are differences from its actions."""
+        """An autoregressive decoder of the same target, to measure how far a method's actions deviate."""
         return Decoder(self.target, chunk=self.steps)
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
@@ -140,12 +140,15 @@ class Decoder(EpisodeState):
         stopwatch: Stopwatch | None = None,
         observation: Observation | None = None,
     ) -> Chunk:
-        """Decode the chunk for one prompt. A rectifier may have ended the returned chunk with predicted actions.
+        """Decode the chunk for one prompt.
 
         Args:
             prompt: The prompt's embeddings (1, P, E), or a function that computes them when they are first needed.
             stopwatch: Measures the phases; None for a new one.
             observation: Needed only by drafters that read images or states themselves.
+
+        Returns:
+            The finished chunk: N committed tokens, or fewer if a rectifier ended it with predicted actions.
         """
         stopwatch = stopwatch or Stopwatch(self.target.device)
         chunk = self._new_chunk(prompt, observation)
@@ -248,7 +251,7 @@ class Decoder(EpisodeState):
         return draft
 
     def verify(self, chunk: Chunk, draft: Draft) -> Verified:
-        """Run the target over the draft, and over the tokens before it that are not in the cache yet.
+        """Run the target over the draft, preceded by the tokens that are not in its cache yet.
 
         In the first round these are the prompt, later the last committed token.
         """

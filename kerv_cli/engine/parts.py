@@ -55,7 +55,7 @@ class Fixed:
 
 
 class Rectifier(Protocol):
-    """Completes a chunk by prediction after a rejected draft token (docs/methods.md §3.1)."""
+    """Completes a chunk with a prediction after a draft token was rejected (docs/methods.md §3.1)."""
 
     @property
     def uses_target_token(self) -> bool:
@@ -99,7 +99,7 @@ class Skip(ABC):
     phase = "propose"  # entry of `PHASES` that the time of `take` counts for
 
     def begin(self, task: str, seed: int) -> None:  # noqa: B027 - most rules keep nothing between decodes
-        """Start a new episode."""
+        """Start a new episode of `task` with this seed."""
 
     def finish(self, success: bool) -> None:  # noqa: B027
         """End the episode. `success` says whether the task was solved."""

@@ -71,7 +71,7 @@ class Delay:
 
 @dataclass(frozen=True)
 class DecodeRecord:
-    """What the decoder returned for one observation, the actions included, and how it was computed."""
+    """Result of decoding one observation: the actions to execute, and how they were computed."""
 
     tokens: tuple[int, ...]  # committed tokens in order: N of them, unless the rest of the chunk was dropped
     actions: np.ndarray  # (steps, D) float32, environment units, to be executed; steps ≤ H
@@ -99,7 +99,8 @@ class DecodeRecord:
     def unverified(self) -> int:
         """Number of executed tokens that the target did not verify.
 
-        All tokens of a skipped or parallel decode. In any other decode, the tokens that a rectifier filled in.
+        In a skipped or parallel decode these are all tokens. In any other decode they are those that a rectifier
+        predicted.
         """
         return len(self.tokens) if self.skipped or self.mode == PARALLEL else self.compensated
 

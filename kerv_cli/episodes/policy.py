@@ -51,8 +51,7 @@ def check(settings: RolloutSettings) -> dict[str, str]:
 
     Returns:
         Everything besides the settings that determines the results: a hash for each file with weights or data, and
-        under
-        `observation` what the target observes.
+        as `observation` what the target observes.
 
     Raises:
         UsageError: A number out of range, training seeds, a camera that the policy was not trained on, or parts that do

@@ -141,7 +141,7 @@ def _check_points(study: StudySettings, points: Mapping[str, Point], typed: Coll
 
 @contextmanager
 def _line_of(path: Path, typed: Collection[str], place: str, others: Mapping[str, str] = {}) -> Iterator[None]:
-    """Put the study's file and line before the message of a UsageError.
+    """Add the study's file and line to the message of a UsageError that is raised inside this `with` block.
 
     Args:
         path: The study's file.

@@ -21,14 +21,14 @@ class TimingSettings:
     """Settings `rollout.*`: what the world does while the policy decodes (docs/methods.md §8)."""
 
     clock: str = choice(WAITS, WAITS, REAL, help="whether the world waits while the policy decodes, or goes on")
-    latency: str = choice(MEASURED, MEASURED, CONSTANT, PROFILE, help="how long a decode takes for the world")
-    latency_ms: float = number(0.0, 0, 600_000, help="latency=constant: milliseconds of a decode")
-    profile: str = setting("", "latency=profile: a document of `kerv bench`, its path or its name in <results>/bench")
+    latency: str = choice(MEASURED, MEASURED, CONSTANT, PROFILE, help="clock=real: where latencies come from")
+    latency_ms: float = number(0.0, 0, 600_000, help="latency=constant: milliseconds per decode")
+    profile: str = setting("", "latency=profile: result file of `kerv bench`: its path, or its name in <results>/bench")
     ar_ms: float = number(
-        0.0, 0, 600_000, help="an autoregressive decode takes so long, others in proportion; 0: as measured or profiled"
+        0.0, 0, 600_000, help="scale latencies so that an autoregressive decode takes so many ms; 0: no scaling"
     )
-    delay_compensation: str = choice("none", "none", "chunk", help="chunk: leave a new chunk's stale actions out")
-    batch: int = number(1, 1, 1024, help="episodes that are decoded together; above 1: for success, without times")
+    delay_compensation: str = choice("none", "none", "chunk", help="chunk: drop actions that come too late")
+    batch: int = number(1, 1, 1024, help="episodes that are decoded together; above 1, no times are measured")
 
     def check_together(self, prefix: str) -> None:
         """Refuse settings that exclude each other.
@@ -66,7 +66,7 @@ class RolloutSettings(MethodSettings, TaskSettings):
     seed: int = number(EVALUATION_SEED, 0, 2**31 - 1, help="first seed; episode i has seed + i")
     world: RolloutWorldSettings = setting(RolloutWorldSettings, "camera, length of an episode, stress")
     rollout: TimingSettings = setting(TimingSettings, "what the world does while the policy decodes")
-    deviation_every: int = number(0, 0, 1_000_000, help="decodes between two deviation samples; 0: never")
+    deviation_every: int = number(0, 0, 1_000_000, help="compare every n-th decode with AR's actions; 0: never")
     record: int = number(1, -1, 1_000_000, help="episodes per task that are saved as .rrd; -1: all")
     record_size: int = number(240, 8, 4096, help="pixels of the recorded camera")
 
@@ -79,15 +79,15 @@ class RolloutSettings(MethodSettings, TaskSettings):
 class StudySettings:
     """Contents of a study's file, `conf/study/*.yaml`: which settings are compared with which baseline."""
 
-    name: str = setting("", "name in the results; empty: the file's")
-    title: str = setting("", "title of its tables and plots")
+    name: str = setting("", "name in the results; empty: the file's name")
+    title: str = setting("", "title of the tables and plots")
     baseline: str = setting("ar", "label of the setting that the others are compared with")
-    common: str = setting("", "overrides of every setting, e.g. task=MT10 episodes=20; the command line's outrank them")
+    common: str = setting("", "overrides of every setting, e.g. task=MT10 episodes=20; the command line overrides them")
     settings: dict[str, str] = setting({}, "label -> overrides; comma lists expand into a grid")
     axis: str = setting("", "key on the plot's x axis, e.g. threshold.r")
-    block: int = number(5, 1, 10_000, help="seeds for which the settings take turns in one process")
+    block: int = number(5, 1, 10_000, help="number of seeds for which the settings take turns in one process")
     repeats: int = number(1, 1, 1_000, help="how often every episode is measured")
-    note: str = setting("", "a sentence that says what to see, printed below the table")
+    note: str = setting("", "a sentence printed below the table, such as what to look for")
 
 
 @dataclass
@@ -99,13 +99,13 @@ class SweepSettings(CommandSettings):
 
     groups: ClassVar = {"study": "threshold"}
 
-    study: StudySettings = setting(StudySettings, "which settings are compared: a name of conf/study, or a file")
+    study: StudySettings = setting(StudySettings, "which settings are compared: a name in conf/study, or a file")
     until: str = choice(
         "done", "done", "decided", help="run every planned episode, or stop a setting once its question is answered"
     )
     # timed: settings that were not timed alternately with the baseline; changed: episodes that other code ran
     rerun: str = choice("never", "never", "timed", "changed", "all", help="which existing episodes run again")
-    loss: float = number(3.0, above=0, most=99.9, help="until=decided: is the loss of success below so many points?")
+    loss: float = number(3.0, above=0, most=99.9, help="until=decided: are fewer percentage points of success lost?")
 
 
 def settings_from(plain: Mapping[str, Any]) -> RolloutSettings:

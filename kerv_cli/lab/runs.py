@@ -42,8 +42,8 @@ _open: set[str] = set()
 class RunRow:
     """A row of the table `runs`: one command that was started.
 
-    Its `status` is `running`, `complete`, `failed` or `interrupted`. If the process is dead, `running` is read as
-    `interrupted`.
+    `status` is `running`, `complete`, `failed` or `interrupted`. A running command whose process is dead counts as
+    interrupted.
     """
 
     id: str
