@@ -1,8 +1,8 @@
-"""The inputs and outputs of a served policy, its messages (msgpack with numpy arrays), and the checks of both.
+"""Describe what a served policy reads and sends, and check and encode the messages (msgpack with numpy arrays).
 
-openpi's array is a map with the *bytes* keys __ndarray__ (true), data, dtype and shape; its scalar one with
-__npgeneric__, data and dtype. Only plain numbers are accepted: nothing is unpickled, and no array is larger than its
-own bytes.
+openpi sends an array as a map with the *bytes* keys __ndarray__ (true), data, dtype and shape, and a single number as a
+map with __npgeneric__, data and dtype. The checks accept only plain numbers: nothing is unpickled, and no array is
+larger than its own bytes.
 """
 
 from __future__ import annotations
@@ -19,9 +19,12 @@ from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
 from kerv_cli.worlds.views import frame_shape
 
 LARGEST = 4096
-"""Pixels of an image's longest side, for a policy that resizes images itself."""
+"""Most pixels of an image's longest side, for policies that resize images themselves."""
 OPEN = {"signed": 1.0, "signed_inverted": -1.0}
-"""Number that an open gripper is sent as; a closed one is its negative. LIBERO's simulator expects it inverted."""
+"""Gripper convention of the client -> number that means an open gripper. Its negative means closed.
+
+LIBERO's simulator needs the inverted convention.
+"""
 
 
 @dataclass(frozen=True)
@@ -29,15 +32,15 @@ class Interface:
     """What a policy reads and sends.
 
     Attributes:
-        actions: The policy's action space.
-        space: The environment's action space; the policy's if kerv has no such environment.
-        observation: The policy's observation space.
-        cameras: Images it reads.
-        size: Pixels of an image; 0 if it sees none.
-        privileged: Whether it reads the whole state.
-        images_alone: Whether it reads images of any size and no state, so that a message may lack the state.
-        gripper: How strict DoFs (a gripper: 0 closed to 1 open) are sent: `as_is`, or as in OPEN.
-        grip: The environment's actions that close and that open the gripper; empty if unknown.
+        actions: Action space of the policy.
+        space: Action space of the environment. If kerv does not know the environment, the policy's.
+        observation: Observation space of the policy.
+        cameras: Names of the images that the policy reads.
+        size: Side of an image in pixels. 0 if the policy reads no images.
+        privileged: Whether the policy reads the whole simulator state, not only proprioception.
+        images_alone: Whether the policy reads images of any size and no state. A message may then leave out the state.
+        gripper: How the gripper's value (0 closed to 1 open) is sent: `as_is`, or a key of OPEN.
+        grip: Actions of the environment that close and that open the gripper. Empty if unknown.
     """
 
     actions: ActionSpace
@@ -51,10 +54,15 @@ class Interface:
     grip: tuple[float, ...]
 
     def image(self, image: object, camera: str, key: str) -> np.ndarray:
-        """Check the image (h, w, 3) uint8 of a camera; `key` is its name in messages.
+        """Check an image that a client sent, and return it.
+
+        Args:
+            image: The image. Expected: (height, width, 3) uint8.
+            camera: The camera that it belongs to.
+            key: Its key in the message, for the error message.
 
         Raises:
-            UsageError: It has another size or type.
+            UsageError: It has another shape or type.
         """
         shape = frame_shape(camera, self.size)
         if isinstance(image, np.ndarray):
@@ -69,12 +77,17 @@ class Interface:
         raise UsageError(f"{key} is {came}, {wanted} uint8 is wanted")
 
     def numbers(self, values: object, key: str, message: Message) -> tuple[np.ndarray, np.ndarray]:
-        """Return proprioception (p,) and state (s,) from the `values` under `key` of a message.
+        """Return proprioception (p,) and privileged state (s,) that a client sent.
 
-        Numbers that the policy does not read are zero.
+        Numbers that the policy does not read are set to zero.
+
+        Args:
+            values: What the message holds under `key`. None if it holds nothing.
+            key: Key of the state in the message, for the error message.
+            message: The whole message, for the error message.
 
         Raises:
-            UsageError: They are missing, too few, too many or not finite.
+            UsageError: There are no numbers, too few or too many, or they are not finite.
         """
         few, many = len(self.observation.proprioception), self.observation.state
         if not many or (values is None and self.images_alone):
@@ -93,7 +106,14 @@ class Interface:
         return numbers[:few], np.concatenate([numbers, np.zeros(many - len(numbers))])
 
     def converted(self, actions: np.ndarray) -> np.ndarray:
-        """Return actions (H, D), environment units, as float64 with the client's convention of the gripper."""
+        """Convert actions to the client's gripper convention.
+
+        Args:
+            actions: (H, D) in environment units.
+
+        Returns:
+            (H, D) float64.
+        """
         values, strict = actions.astype(np.float64), self.actions.is_strict
         if self.gripper in OPEN:
             values[:, strict] = np.where(values[:, strict] > 0.5, OPEN[self.gripper], -OPEN[self.gripper])
@@ -101,40 +121,57 @@ class Interface:
 
 
 def keys_of(message: Message) -> str:
-    """Return the first keys of a message, for an error."""
+    """Return the first keys of a message as text for an error message."""
     return ", ".join(sorted(str(key)[:40] for key in message)[:8]) or "nothing"
 
 
 def text_of(value: object, key: str) -> str:
-    """Return a text of a message; raise UsageError if it is none."""
+    """Return a text that a client sent.
+
+    Args:
+        value: The value to check.
+        key: Its key in the message, for the error message.
+
+    Raises:
+        UsageError: The value is not a text.
+    """
     if not isinstance(value, str):
         raise UsageError(f"{key} is {type(value).__name__}, a text is wanted")
     return value
 
 
 def hand_of(observation: Observation) -> np.ndarray:
-    """Return the end effector's position (3,), metres; zeros if the observation does not have it."""
+    """Return the position (3,) of the end effector in metres. Numbers that the observation lacks are zero."""
     hand = np.zeros(3)
     hand[: len(observation.proprioception[:3])] = observation.proprioception[:3]
     return hand
 
 
 Message = Mapping[str, Any]
-"""A map that a client sent, as msgpack reads it. Nothing in it is checked."""
+"""A client's message as msgpack decodes it. Its values have not been checked."""
 
 
 def packed(value: object) -> bytes:
-    """Return a message of openpi."""
+    """Encode a message as openpi does."""
     return packed_as(value, _openpi_map)
 
 
 def unpacked(frame: bytes | str) -> Message:
-    """Return the content of a message of openpi; raise as `read_map`."""
+    """Decode a message that was encoded as openpi does.
+
+    Raises:
+        UsageError: It is not a msgpack map with text keys, or an array in it does not fit its bytes.
+    """
     return read_map(frame, _openpi_value)
 
 
 def packed_as(value: object, to_plain: Callable[[object], object]) -> bytes:
-    """Return a message of dicts, lists, texts, numbers and what `to_plain` turns into these."""
+    """Encode a message with msgpack.
+
+    Args:
+        value: Dictionaries, lists, texts, numbers, and objects that `to_plain` handles.
+        to_plain: Converts any other object to one of these types.
+    """
     import msgpack
 
     data: bytes = msgpack.packb(value, default=to_plain)
@@ -142,15 +179,20 @@ def packed_as(value: object, to_plain: Callable[[object], object]) -> bytes:
 
 
 def read_map(frame: bytes | str, from_map: Callable[[dict[Any, Any]], object]) -> Message:
-    """Return the content of a message; `from_map` turns each map within it into what it stands for.
+    """Decode a client's message with msgpack.
+
+    Args:
+        frame: The websocket message.
+        from_map: Called with every map inside the message. Returns the object that the map encodes, such as an array,
+            or the map itself.
 
     Raises:
-        UsageError: The message is no map with text keys, or holds an array that does not fit its bytes.
+        UsageError: The message is not a msgpack map with text keys, or an array in it does not fit its bytes.
     """
     import msgpack
 
     if isinstance(frame, str):
-        raise UsageError("a text frame came, messages are binary (msgpack)")
+        raise UsageError("a text message came: send binary messages (msgpack)")
     try:
         value = msgpack.unpackb(frame, object_hook=from_map, strict_map_key=True)
     except UsageError:
@@ -163,10 +205,15 @@ def read_map(frame: bytes | str, from_map: Callable[[dict[Any, Any]], object]) -
 
 
 def array_of(name: object, shape: object, data: object) -> np.ndarray:
-    """Return the array of this type and shape in these bytes.
+    """Build an array from the parts in which a message encodes it.
+
+    Args:
+        name: Name of the dtype: a bool, integer or float type.
+        shape: List of at most 8 integers.
+        data: The array's bytes.
 
     Raises:
-        UsageError: They do not fit together.
+        UsageError: A part is wrong, or the bytes do not fit shape and type.
     """
     dtype = _dtype(name)
     if not isinstance(shape, list) or not all(isinstance(n, int) and n >= 0 for n in shape) or len(shape) > 8:
@@ -177,6 +224,11 @@ def array_of(name: object, shape: object, data: object) -> np.ndarray:
 
 
 def _dtype(name: object) -> np.dtype:
+    """Return the dtype with this name.
+
+    Raises:
+        UsageError: It is not a bool, integer or float type.
+    """
     try:
         dtype = np.dtype(name) if isinstance(name, str) else None
     except TypeError:
@@ -187,6 +239,7 @@ def _dtype(name: object) -> np.dtype:
 
 
 def _openpi_map(value: object) -> object:
+    """Encode a numpy array or scalar as openpi's map."""
     if isinstance(value, np.ndarray):
         return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
     if isinstance(value, np.generic):
@@ -195,6 +248,7 @@ def _openpi_map(value: object) -> object:
 
 
 def _openpi_value(value: dict[Any, Any]) -> object:
+    """Decode openpi's map of an array or scalar. Return any other map unchanged."""
     if b"__ndarray__" in value:
         return array_of(value.get(b"dtype"), value.get(b"shape"), value.get(b"data"))
     if b"__npgeneric__" in value:

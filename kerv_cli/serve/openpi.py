@@ -1,7 +1,7 @@
-"""openpi's protocol, for robots.
+"""Speak openpi's protocol, which is meant for robots.
 
-After the handshake the server sends its metadata. Then every binary frame is an observation, answered by a chunk of
-actions, or by a text frame that says what was wrong with it.
+After the handshake the server sends its metadata. Then the client sends observations as binary websocket messages. The
+server answers each with a chunk of actions, or with a text message that says what is wrong with the observation.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ STATE, IMAGE, PROMPT, RESET, EXECUTED = "observation/state", "observation/image"
 
 
 def metadata(policy: Policy) -> dict[str, object]:
-    """Return the first message that a client gets."""
+    """Return the metadata that the server sends to a new client."""
     interface = policy.interface
     return {
         "server": "kerv",
@@ -40,10 +40,10 @@ def metadata(policy: Policy) -> dict[str, object]:
 
 
 def observation_of(interface: Interface, message: Message) -> Observation:
-    """Return the observation in a message.
+    """Read the observation from a client's message.
 
     Raises:
-        UsageError: Something is missing, of another size or type, or not finite; the line names it.
+        UsageError: A value is missing, has a wrong size or type, or is not finite. The error names it.
     """
     prompt = text_of(message.get(PROMPT, ""), PROMPT)
     images = {}
@@ -57,11 +57,12 @@ def observation_of(interface: Interface, message: Message) -> Observation:
 
 
 class OpenPi(Conversation):
-    """A robot, which executes what it is sent: one at a time, and silence means that it is gone.
+    """Serve one robot at a time. A robot that sends nothing for two minutes is disconnected.
 
     Attributes:
-        last: (H, D) actions of the last decode, environment units.
-        last_hand: (3,) position of the end effector at that decode, metres.
+        last: (H, D) actions of the latest answer, in environment units.
+        last_hand: (3,) position of the end effector when that answer was computed, in metres.
+        decodes: Number of answers so far.
     """
 
     seats, ping_s, idle_s = 1, 10.0, 120.0
@@ -72,19 +73,30 @@ class OpenPi(Conversation):
         self.decodes = 0
 
     def greeting(self) -> bytes:
-        """Return the metadata."""
+        """Return the metadata as the first message to the client."""
         return packed(metadata(self.policy))
 
     def answer(self, frame: bytes | str) -> Reply:
-        """Return the actions for the observation in a frame; raise as `act`."""
+        """Return the message with the actions for one observation.
+
+        Args:
+            frame: The client's websocket message.
+
+        Raises:
+            UsageError: The message or a value in it is wrong.
+        """
         values = self.act(unpacked(frame))
         return Reply(packed(values), values["policy_timing"]["infer_ms"] / 1000)
 
     def act(self, message: Message) -> dict[str, Any]:
-        """Return the actions (H, D) for the observation in a message, with times and forwards.
+        """Return the values of the answer to a client's message: actions (H, D), times, and number of target forwards.
+
+        Args:
+            message: The observation. Optional: `executed`, how many of the last actions were executed, and `reset`,
+                which begins a new episode.
 
         Raises:
-            UsageError: As `observation_of`, or a wrong `executed` or `reset`.
+            UsageError: A value is missing or wrong.
         """
         observation, executed = observation_of(self.interface, message), self._executed(message)
         hand, reset = hand_of(observation), message.get(RESET)
@@ -111,12 +123,15 @@ class OpenPi(Conversation):
         }
 
     def fault(self, line: str) -> str:
-        """Return the frame that says what was wrong."""
+        """Return the message that tells the client about an error. `line` is the error's text."""
         return f"kerv: {line}"
 
     def _executed(self, message: Message) -> np.ndarray:
-        """Return the actions executed since the last answer: all of its actions, or the first `executed` ones."""
+        """Return the actions that the robot has executed since the latest answer.
+
+        They are the first `executed` actions of that answer, or all of them if the message has no such value.
+        """
         count = message.get(EXECUTED, len(self.last))
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 0 <= count <= len(self.last):
-            raise UsageError(f"{EXECUTED}={str(count)[:40]}: 0 to {len(self.last)} control steps of the last answer")
+            raise UsageError(f"{EXECUTED}={str(count)[:40]}: must be 0 to {len(self.last)}, the control steps of the last answer")
         return self.last[: int(count)]

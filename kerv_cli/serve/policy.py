@@ -1,4 +1,4 @@
-"""The served policy: its interface, decoders that are warmed up, what it refuses to act on, and a client's episodes."""
+"""Serve a policy: load it, warm up its decoders, check states, and keep each client's episode."""
 
 from __future__ import annotations
 
@@ -34,25 +34,29 @@ from kerv_cli.worlds import specs
 from kerv_cli.worlds.spec import EnvironmentSpec
 
 VLA_EVAL = "vla_eval"
-"""The protocol whose clients name the task of every episode."""
+"""The protocol in which clients name the task of every episode."""
 WARM_UP = 4
-"""Decodes before a new decoder serves: first calls allocate memory and choose kernels."""
+"""Number of decodes before a new decoder serves. The first calls are slow: they allocate memory and choose kernels."""
 GATHER = 0.005
-"""Seconds that a batch waits for more clients."""
+"""Seconds that a batch waits for the observations of more clients."""
 
 
 class Policy:
-    """What is served. Its decoders share the weights; one decodes at a time, or several together.
+    """The policy and method that the server runs.
+
+    Every client gets its own decoder. All decoders share the weights. Only one decodes at a time, unless `batch` is
+    above 1: then the observations of several clients are decoded together.
 
     Attributes:
-        chunk: H, control steps of an answer.
-        by_task: Whether the method's parts differ between tasks, which the clients name.
-        range: Range of the states it may act on; None if its target does not say.
+        chunk: H, number of control steps in an answer.
+        by_task: Whether a decoder depends on the task, because calibrated values differ between tasks. Clients then
+            name the task.
+        range: The states on which the policy may act. None: any.
 
     Raises:
-        UnknownName: The policy's environment has no task of that name.
-        UsageError: Numbers out of range, or parts that do not belong together.
-        CheckpointError: No such policy, or an artifact of another one.
+        UnknownName: The policy's environment has no task with that name.
+        UsageError: A number is out of range, or parts of the method do not fit together.
+        CheckpointError: There is no such policy, or an artifact belongs to another policy.
     """
 
     def __init__(self, settings: ServeSettings) -> None:
@@ -81,6 +85,7 @@ class Policy:
         self._idle: list[Decoder] = [] if self.by_task else [first]
 
     def _interface(self, spec: EnvironmentSpec | None) -> Interface:
+        """Return what the policy reads and sends."""
         description = self.description
         return Interface(
             actions=description.actions,
@@ -95,6 +100,10 @@ class Policy:
         )
 
     def _range(self) -> StateRange | None:
+        """Return the states on which the policy may act.
+
+        None if its checkpoint stores no range, or if the policy reads no state.
+        """
         stored, interface = self.description.state_range, self.interface
         if stored is None or interface.images_alone:
             return None
@@ -103,31 +112,39 @@ class Policy:
         return StateRange(low, high, names, self.settings.margin)
 
     def _artifacts_with(self, trait: str) -> list[str]:
+        """Return the kinds of artifacts (trained or calibrated files) that the method uses and that have the trait."""
         return sorted(kind for kind in self.method.needs if find("artifact", kind).traits.get(trait))
 
     def _any_task(self) -> str:
-        """Return a task that the method can decode: the settings', or one for which it has levels."""
+        """Return a task with which a decoder can be built, for warming up.
+
+        It is the task in the settings, or any task for which the method was calibrated.
+        """
         if not self.by_task or self.settings.protocol != VLA_EVAL:
             return self.task
         artifact = self.artifacts.load(self._artifacts_with("by_task")[0])
         return next(iter(artifact.tasks), "")
 
     def lend_decoder(self, task: str) -> Decoder | EpisodeState:
-        """Return a decoder for one more client, or its part in a batch."""
+        """Return a decoder for a new client. If clients are decoded together, return a new episode's state instead."""
         if self._together is not None:
             return self._together.decoder.new_episode()
         return self._idle.pop() if self._idle else self._new_decoder(task)
 
     def take_back(self, decoder: Any) -> None:
-        """Keep a lent decoder for the next client, unless it depends on a task."""
+        """Keep a client's decoder for the next client. A decoder that depends on the task is dropped."""
         if isinstance(decoder, Decoder) and not self.by_task:
             self._idle.append(decoder)
 
     def decode(self, decoder: Any, observation: Observation) -> DecodeRecord:
-        """Decode a client's observation. One decoder works at a time.
+        """Decode the observation of one client. Calls from several threads wait for each other.
+
+        Args:
+            decoder: What `lend_decoder` returned for this client.
+            observation: The client's observation.
 
         Raises:
-            KervError: The decode computed numbers that are not finite.
+            KervError: The decode computed NaN or infinite numbers.
         """
         if self._together is not None:
             return self._together.decode(decoder, observation)
@@ -137,6 +154,7 @@ class Policy:
         return record
 
     def _new_decoder(self, task: str) -> Decoder:
+        """Build a decoder and warm it up."""
         with self._turn:
             decoder = self.method.decoder(self.artifacts.target, self.artifacts.load, task)
             decoder.target = Finite(decoder.target)
@@ -144,7 +162,7 @@ class Policy:
         return decoder
 
     def facts(self) -> dict[str, object]:
-        """Return what belongs to the policy's results: settings of a rollout, hashes, machine and versions."""
+        """Return what to store beside the policy's results: settings, hashes of its files, machine and versions."""
         shared = {setting.name: getattr(self.settings, setting.name) for setting in fields(MethodSettings)}
         settings = asdict(RolloutSettings(**shared))
         settings["runtime"]["device"] = self.artifacts.device
@@ -155,13 +173,20 @@ class Policy:
 
 @dataclass(frozen=True)
 class _Request:
+    """A client's observation that waits to be decoded in a batch."""
+
     episode: EpisodeState
     observation: Observation
     answer: Future[DecodeRecord] = field(default_factory=Future)
 
 
 class Together:
-    """Decodes the observations of up to `most` clients as one batch."""
+    """Decode the observations of several clients as one batch.
+
+    Args:
+        decoder: Decodes a batch.
+        most: Largest number of clients in a batch.
+    """
 
     def __init__(self, decoder: BatchDecoder, most: int) -> None:
         self.decoder, self.most = decoder, most
@@ -169,7 +194,10 @@ class Together:
         self._waiting: list[_Request] = []
 
     def decode(self, episode: EpisodeState, observation: Observation) -> DecodeRecord:
-        """Decode one client's observation. Whoever has the turn decodes for all who wait."""
+        """Decode one client's observation, together with those of other clients that wait at the same time.
+
+        Each client calls this in its own thread. The first to get the lock decodes for all that wait.
+        """
         mine = _Request(episode, observation)
         with self._arrived:
             self._waiting.append(mine)
@@ -183,7 +211,7 @@ class Together:
         return mine.answer.result()
 
     def _answer(self, batch: Sequence[_Request]) -> None:
-        """Decode the batch; if that fails, one by one, so that one client's fault is no other's."""
+        """Decode a batch. If that fails, decode one by one, so that one client's error does not reach the others."""
         target: Any = self.decoder.target
         try:
             records = self.decoder.decode([one.episode for one in batch], [one.observation for one in batch])
@@ -199,19 +227,19 @@ class Together:
 
 
 HOLD = "hold"
-"""Answer to a state out of range: the last action once more, instead of an error."""
+"""Value of `outside`: a state out of range is answered with the last action again, instead of an error."""
 LEAST_WIDTH = 1.0
-"""Width of the range of a number that hardly moved in the demonstrations, in its own unit."""
+"""Width assumed for the range of a number that hardly varied in the demonstrations, in the number's own unit."""
 
 
 class StateRange:
-    """The range of the states on which a policy may act.
+    """The states on which a policy may act: the range of its demonstrations plus a margin.
 
     Args:
-        low: (p,) lowest numbers of the demonstrations.
-        high: (p,) highest numbers.
-        names: Names of the first numbers.
-        margin: How many widths of the range are added on each side.
+        low: (p,) smallest numbers in the demonstrations.
+        high: (p,) largest numbers.
+        names: Names of the first numbers of the state, for error messages.
+        margin: How much to add on each side, as a multiple of the range's width.
     """
 
     def __init__(self, low: np.ndarray, high: np.ndarray, names: tuple[str, ...], margin: float) -> None:
@@ -219,7 +247,7 @@ class StateRange:
         self.low, self.high, self.names = low - added, high + added, names
 
     def outside(self, observation: Observation) -> str:
-        """Say which number is out of range; empty if none is."""
+        """Return a sentence about the first number that is out of range. Empty if all are in range."""
         numbers = observation.state[: len(self.low)]
         beyond = np.flatnonzero((numbers < self.low) | (numbers > self.high))
         if not len(beyond):
@@ -233,7 +261,7 @@ class StateRange:
 
 
 class Finite:
-    """A target that notes whether its prompts and logits are finite."""
+    """Wrap a target to find out whether its prompts and logits are finite."""
 
     def __init__(self, target: Target) -> None:
         self._target = target
@@ -243,19 +271,20 @@ class Finite:
         return getattr(self._target, name)
 
     def encode(self, observation: Observation) -> Tensor:
-        """Return the target's prompt."""
+        """Encode the observation and check the prompt."""
         return self._noted(self._target.encode(observation))
 
     def head(self, hidden: Tensor) -> Tensor:
-        """Return the target's logits."""
+        """Compute the logits and check them."""
         return self._noted(self._target.head(hidden))
 
     def _noted(self, numbers: Tensor) -> Tensor:
+        """Check the numbers without waiting for the device. `check` reads the result."""
         self._fine.append(torch.isfinite(numbers).all())
         return numbers
 
     def check(self) -> None:
-        """Raise KervError if the decode computed numbers that are not finite."""
+        """Raise KervError if any prompt or logits since the last call held NaN or infinite numbers."""
         fine, self._fine = self._fine, []
         if fine and not bool(torch.stack(fine).all()):
             raise KervError("the policy computed numbers that are not finite: no action is sent")
@@ -265,11 +294,11 @@ Log = Callable[[str], None]
 
 
 class Reply(NamedTuple):
-    """The answer to a frame.
+    """The answer to a client's message.
 
     Attributes:
-        frame: What is sent.
-        seconds: Inference time, NaN if it was not measured; None if nothing was decoded.
+        frame: The websocket message to send.
+        seconds: Inference time. NaN if it was not measured. None if nothing was decoded.
     """
 
     frame: bytes
@@ -277,14 +306,15 @@ class Reply(NamedTuple):
 
 
 class Conversation(abc.ABC):
-    """A client's episodes, decoded by a decoder of its own. A protocol is a subclass.
+    """One client's connection: its decoder and its episodes. Each protocol is a subclass.
 
     Attributes:
-        seats: Clients at a time.
-        ping_s: Seconds without an answer to a ping after which a client is gone; None sends no pings.
-        idle_s: Seconds without a message after which it is gone.
-        decoder: None before the first episode if it depends on the task.
-        last_ms: Milliseconds from the last decoded frame's arrival to the answer's end.
+        seats: Largest number of clients at a time.
+        ping_s: A client that does not answer a ping for this many seconds is disconnected. None: send no pings.
+        idle_s: A client that sends no message for this many seconds is disconnected.
+        task: Task of the current episode. Empty if unknown.
+        decoder: The client's decoder. If it depends on the task, None before the first episode.
+        last_ms: Milliseconds from the arrival of the last decoded message until its answer was sent. NaN before it.
     """
 
     seats: int
@@ -297,24 +327,33 @@ class Conversation(abc.ABC):
         self.decoder: Any = None if policy.by_task else policy.lend_decoder(self.task)
 
     def close(self) -> None:
-        """Give the decoder back, for the next client."""
+        """Give the decoder back for the next client."""
         self.policy.take_back(self.decoder)
 
     def begin(self, task: str, seed: int, hand: np.ndarray) -> None:
-        """Begin an episode with the end effector at `hand` (3,) metres.
+        """Begin an episode.
+
+        Args:
+            task: Name of the task. May be empty if the method does not depend on it.
+            seed: Seed of the episode.
+            hand: (3,) position of the end effector in metres.
 
         Raises:
-            CheckpointError: The method has no levels for the task.
+            CheckpointError: The method was not calibrated for the task.
         """
         if self.policy.by_task and (self.decoder is None or task != self.task):
             self.decoder, self.task = self.policy.lend_decoder(task), task
         self.decoder.reset(self.task or task, seed, hand)
 
     def holds(self, observation: Observation, has_last: bool) -> bool:
-        """Return whether the last action is executed again, because the policy may not act on this state.
+        """Return whether to execute the last action again, because the state is out of the policy's range.
+
+        Args:
+            observation: The observation with the state.
+            has_last: Whether the episode has a last action.
 
         Raises:
-            UsageError: It may not, and errors are wanted or the episode has no last action.
+            UsageError: The state is out of range, and `outside=refuse` is set or there is no last action.
         """
         why = self.policy.range.outside(observation) if self.policy.range else ""
         if why and not (self.policy.settings.outside == HOLD and has_last):
@@ -324,13 +363,17 @@ class Conversation(abc.ABC):
         return bool(why)
 
     def greeting(self) -> bytes | None:
-        """Return what the server says first; None if the client speaks first."""
+        """Return the first message that the server sends. None if the client speaks first."""
         return None
 
     @abc.abstractmethod
     def answer(self, frame: bytes | str) -> Reply | None:
-        """Return the answer to a frame, or None; raise KervError if something is wrong with it."""
+        """Return the answer to a websocket message, or None if it needs no answer.
+
+        Raises:
+            KervError: Something is wrong with the message.
+        """
 
     @abc.abstractmethod
     def fault(self, line: str) -> bytes | str:
-        """Return the frame that tells the client what was wrong with its last one."""
+        """Return the websocket message that reports an error to the client. `line` is the error's text."""

@@ -1,6 +1,7 @@
-"""The server: seats, silence and errors of clients over websockets, whatever their protocol (docs/serving.md).
+"""Serve clients over websockets, whatever their protocol (docs/serving.md).
 
-A connection stays open after an error, and the server after any client.
+This module limits the number of clients, drops silent ones and reports errors. A connection stays open after an error.
+The server keeps running after any client.
 """
 
 from __future__ import annotations
@@ -31,19 +32,19 @@ except ImportError as error:
 PROTOCOLS = {"openpi": "kerv_cli.serve.openpi:OpenPi", "vla_eval": "kerv_cli.serve.vla_eval:VlaEval"}
 HEALTH = ("/healthz", "/health")
 BUSY, GONE = 1013, 1001
-"""Websocket close codes: try again later; going away."""
+"""Websocket close codes: 1013 means "try again later", 1001 "going away"."""
 LARGEST_MESSAGE = 16 * 2**20
-"""Bytes of a message."""
+"""Most bytes of a client's message."""
 LONGEST = 500
-"""Letters of an error; a client's own words may be longer."""
+"""Most characters of an error message. Texts that a client sent may be longer and are cut."""
 PATIENCE = 1.0
-"""Seconds that a newcomer waits for a seat: a client that reconnects may be ahead of its own farewell."""
+"""Seconds that a new client waits for a free place: its own previous connection may just be closing."""
 FAREWELL = 2.0
-"""Seconds that a closing connection is waited for."""
+"""Seconds to wait for a connection to close."""
 
 
 class Latencies:
-    """Milliseconds of every decode, for the log."""
+    """Collect the times of a client's answers in milliseconds. `str` summarises them for the log."""
 
     def __init__(self) -> None:
         self.decode: list[float] = []  # inference
@@ -59,7 +60,13 @@ class Latencies:
 
 
 class PolicyServer:
-    """Serves one policy; `log` is called with every line."""
+    """Serve one policy to clients.
+
+    Args:
+        policy: The policy.
+        settings: Settings of the server.
+        log: Called with every line of the log.
+    """
 
     def __init__(self, policy: Policy, settings: ServeSettings, log: Log) -> None:
         self.policy, self.settings, self.log = policy, settings, log
@@ -69,7 +76,11 @@ class PolicyServer:
 
     @contextlib.contextmanager
     def listening(self, host: str, port: int) -> Iterator[Server]:
-        """Yield the listening server, which has `serve_forever()` and `shutdown()`; port 0 chooses a free one.
+        """Start to listen. Yield the server, which has `serve_forever()` and `shutdown()`.
+
+        Args:
+            host: Address to listen on.
+            port: Port to listen on. 0 chooses a free one.
 
         Raises:
             UsageError: The address cannot be used.
@@ -96,7 +107,7 @@ class PolicyServer:
             connection.close(GONE, "the server stops")
 
     def handle(self, connection: ServerConnection) -> None:
-        """Serve one connection, from its handshake to its end."""
+        """Serve one client until it disconnects. Runs in the client's thread."""
         who = _address(connection)
         if not self._seats.acquire(timeout=PATIENCE):
             count = self.protocol.seats
@@ -122,7 +133,17 @@ class PolicyServer:
             self.log(f"{who} disconnected{why}; {latencies}")
 
     def _talk(self, connection: ServerConnection, who: str, latencies: Latencies) -> None:
-        """Answer frames until the connection ends; raise ConnectionClosed, or TimeoutError for silence."""
+        """Answer messages until the connection ends.
+
+        Args:
+            connection: The connection.
+            who: The client's address, for the log.
+            latencies: Times of its answers are added here.
+
+        Raises:
+            ConnectionClosed: The client has left.
+            TimeoutError: The client was silent for too long.
+        """
         protocol = self.protocol(self.policy, lambda line: self.log(f"{who} {line}"))
         with contextlib.closing(protocol) as conversation:
             if (greeting := conversation.greeting()) is not None:
@@ -133,7 +154,14 @@ class PolicyServer:
     def reply(
         self, connection: ServerConnection, conversation: Conversation, frame: bytes | str, latencies: Latencies
     ) -> None:
-        """Answer one frame, or tell client and log in one line what was wrong with it."""
+        """Answer one message. If something is wrong with it, tell the client and write one line to the log.
+
+        Args:
+            connection: The connection.
+            conversation: The client's decoder and episodes.
+            frame: The client's websocket message.
+            latencies: The time of the answer is added here.
+        """
         began = time.perf_counter()
         try:
             reply = conversation.answer(frame)
@@ -157,6 +185,7 @@ class PolicyServer:
 
 
 def _address(connection: ServerConnection) -> str:
+    """Return the client's address as text for the log."""
     try:
         return str(connection.remote_address)
     except OSError:
@@ -164,7 +193,7 @@ def _address(connection: ServerConnection) -> str:
 
 
 def _one_line_logger(log: Log) -> logging.Logger:
-    """Return a logger for websockets that writes every error as one line, without a traceback."""
+    """Return a logger for websockets that writes each error as one line without a traceback."""
 
     class Lines(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
@@ -176,5 +205,5 @@ def _one_line_logger(log: Log) -> logging.Logger:
 
 
 def _health(connection: ServerConnection, request: Request) -> Response | None:
-    """Answer GET /healthz without a handshake."""
+    """Answer an HTTP request to /healthz or /health. Return None for all others, which are websocket connections."""
     return connection.respond(http.HTTPStatus.OK, "OK\n") if request.path in HEALTH else None

@@ -1,4 +1,4 @@
-"""Settings of the policy server."""
+"""Settings of `kerv serve`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kerv_cli.methods.settings import MethodSettings
 
 @dataclass
 class ServeSettings(MethodSettings):
-    """`kerv serve`: a policy and a method for clients over websockets (docs/serving.md)."""
+    """Serve a policy and a method to clients over websockets (docs/serving.md)."""
 
     groups: ClassVar = {"policy": "vision", "runtime": "cpu", "method": "ar"}
 

@@ -1,8 +1,8 @@
-"""vla-eval's protocol, version 1: a benchmark asks for an action at every control step.
+"""Speak vla-eval's protocol, version 1: a benchmark asks for one action at every control step.
 
-A message is a msgpack map of type, payload, seq and timestamp. Hello is answered by what the policy reads and sends. An
-observation is answered by one action, of a chunk that is decoded when the last one is used up. The package vla-eval is
-not needed here.
+A message is a msgpack map of type, payload, seq and timestamp. The server answers `hello` with what the policy reads
+and sends. It answers every observation with one action. A new chunk is decoded when the last one is used up. The
+package vla-eval is not needed here.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from kerv_cli.serve.policy import Conversation, Log, Policy, Reply
 
 PROTOCOL_VERSION = 1
 _FORMATS = {("position", 3): "delta_xyz", ("rotation", 3): "axis_angle"}
-"""Name and size of a group of DoFs -> vla-eval's name of its format."""
+"""Name and size of a group of DoFs -> the name that vla-eval gives this format."""
 
 
 def dim_specs(interface: Interface) -> dict[str, dict[str, dict[str, object]]]:
-    """Return what the policy sends (`action_spec`) and reads (`observation_spec`), as vla-eval's DimSpecs."""
+    """Describe what the policy sends (`action_spec`) and reads (`observation_spec`), in vla-eval's form (DimSpec)."""
     actions: dict[str, dict[str, object]] = {}
     ends = interface.converted(np.array([interface.actions.low, interface.actions.high]))
     for group in interface.actions.groups:
@@ -64,6 +64,7 @@ def dim_specs(interface: Interface) -> dict[str, dict[str, dict[str, object]]]:
 
 
 def _gripper_format(interface: Interface) -> str:
+    """Return vla-eval's name for the format of the gripper's value."""
     closes = interface.grip[0] if interface.grip else 0.0
     if interface.gripper in OPEN:
         closes = -OPEN[interface.gripper]
@@ -71,7 +72,7 @@ def _gripper_format(interface: Interface) -> str:
 
 
 def observation_params(interface: Interface) -> dict[str, object]:
-    """Return the arguments for a benchmark of the policy's own environment, unless its YAML sets them."""
+    """Return arguments for a benchmark that runs the policy's own environment. Its YAML file overrides them."""
     if not interface.grip or interface.images_alone:
         return {}
     if not interface.cameras:
@@ -80,7 +81,7 @@ def observation_params(interface: Interface) -> dict[str, object]:
 
 
 class _Episode:
-    """An episode in progress, from the message that begins it."""
+    """An episode in progress. `payload` is the content of the message that starts the episode."""
 
     def __init__(self, payload: Message) -> None:
         task, ids = (value if isinstance(value, dict) else {} for value in map(payload.get, ("task", "recording")))
@@ -97,7 +98,10 @@ class _Episode:
 
 
 class VlaEval(Conversation):
-    """A shard of a benchmark. It is silent while it builds a world and answers no ping then: none are sent."""
+    """Serve one worker (shard) of a vla-eval benchmark.
+
+    A worker is silent while it builds a simulator and then does not answer pings. So the server sends it none.
+    """
 
     seats, ping_s, idle_s = 64, None, 1800.0
 
@@ -107,23 +111,33 @@ class VlaEval(Conversation):
         self.sequence = 0
 
     def answer(self, frame: bytes | str) -> Reply | None:
-        """Return the answer to a message; raise KervError if something is wrong with it."""
+        """Return the answer to a message, or None if it needs no answer.
+
+        Raises:
+            KervError: Something is wrong with the message.
+        """
         message = read_map(frame, _value)
         kind, payload, sequence = str(message.get("type")), message.get("payload"), message.get("seq")
         self.sequence = sequence if isinstance(sequence, int) else 0
         if kind not in _HANDLERS or not isinstance(payload, dict):
-            raise UsageError(f"a message of type {kind[:40]}: {', '.join(_HANDLERS)} with a payload are known")
+            raise UsageError(f"a message of type {kind[:40]}: send {', '.join(_HANDLERS)}, each with a payload")
         return _HANDLERS[kind](self, payload)
 
     def fault(self, line: str) -> bytes:
-        """Return the message that ends the client's episode."""
+        """Return the message that ends the client's episode because of an error. `line` is the error's text."""
         return self._message("error", {"error": line})
 
     def _message(self, kind: str, payload: Mapping[str, object]) -> bytes:
+        """Encode a message of a type (`kind`) with its content."""
         message = {"type": kind, "payload": payload, "seq": self.sequence, "timestamp": time.time()}
         return packed_as(message, _plain)
 
     def _hello(self, payload: Message) -> Reply:
+        """Answer the first message of a connection with what the policy reads and sends.
+
+        Raises:
+            UsageError: The client speaks another version of the protocol.
+        """
         number = payload.get("protocol_version")
         if number != PROTOCOL_VERSION:
             raise UsageError(
@@ -142,9 +156,11 @@ class VlaEval(Conversation):
         return Reply(self._message("hello", about))
 
     def _start(self, payload: Message) -> None:
+        """Note that a new episode begins. The first observation builds its decoder and reports what is wrong."""
         self.episode = _Episode(payload)  # its first observation says what is wrong with it
 
     def _observe(self, payload: Message) -> Reply:
+        """Return the next action. Decode an observation first if the last chunk is used up."""
         episode = self.episode = self.episode or _Episode({})
         numbers = self.interface.numbers(payload.get("state", payload.get("states")), "state", payload)
         state = Observation(*numbers)
@@ -168,14 +184,29 @@ class VlaEval(Conversation):
         return self._act(episode, episode.left.popleft(), seconds)
 
     def _act(self, episode: _Episode, action: np.ndarray, seconds: float | None) -> Reply:
-        """Send an action (D,), environment units; `seconds` of inference were needed for it."""
+        """Return the message with an action.
+
+        Args:
+            episode: The current episode.
+            action: (D,) in environment units.
+            seconds: Inference time that was needed for it. None if nothing was decoded.
+        """
         space = self.interface.space
         episode.sent.append(np.clip(action, space.low, space.high).astype(np.float32))
         sent = self.interface.converted(action[None])[0].astype(np.float32)
         return Reply(self._message("action", {"actions": sent}), seconds)
 
     def _observation(self, episode: _Episode, payload: Message, numbers: tuple[np.ndarray, np.ndarray]) -> Observation:
-        """Return the observation in a payload; raise UsageError for an image that is missing or does not fit."""
+        """Read the observation from a message.
+
+        Args:
+            episode: The current episode, whose instruction is updated.
+            payload: Content of the message.
+            numbers: Proprioception and state, already checked.
+
+        Raises:
+            UsageError: An image is missing or has a wrong size or type.
+        """
         images = payload.get("images")
         images = images if isinstance(images, dict) else {}
         episode.instruction = text_of(payload.get("task_description", ""), "task_description")
@@ -188,7 +219,7 @@ class VlaEval(Conversation):
         return Observation(*numbers, episode.instruction, frames)
 
     def _end(self, payload: Message) -> None:
-        """Tell the decoder whether the episode succeeded, and store the episode if the harness records it."""
+        """End the episode. Store it if the benchmark records it."""
         episode, self.episode = self.episode, None
         metrics, elapsed = payload.get("metrics"), payload.get("elapsed_sec")
         metrics = metrics if isinstance(metrics, dict) else {}
@@ -207,6 +238,7 @@ class VlaEval(Conversation):
         write_served(path, record, episode.started, self.policy.facts())
 
     def _record(self, episode: _Episode, success: bool, elapsed: float) -> EpisodeRecord:
+        """Return the record of a finished episode. `elapsed` is its duration in seconds."""
         interface, steps = self.interface, len(episode.sent)
         has_hand = len(interface.observation.proprioception) >= 3 and not interface.images_alone
         return EpisodeRecord(
@@ -236,7 +268,7 @@ _HANDLERS: Mapping[str, Callable[[VlaEval, Message], Reply | None]] = {
 
 
 def _plain(value: object) -> object:
-    """Return a numpy value as vla-eval writes it; the server sends no images."""
+    """Convert a numpy value to the form in which vla-eval sends it."""
     if isinstance(value, np.ndarray):
         return {"__ndarray__": True, "data": value.tobytes(), "dtype": value.dtype.str, "shape": list(value.shape)}
     if isinstance(value, np.generic):
@@ -245,7 +277,10 @@ def _plain(value: object) -> object:
 
 
 def _value(value: dict[Any, Any]) -> object:
-    """Return an array of a message, or a function that decodes its image: most images are never used."""
+    """Decode a map inside a message, if it encodes an array or an image. Return any other map unchanged.
+
+    An image becomes a function that decodes it when called, because most images are never used.
+    """
     if value.get("__image__") and value.get("format") != "raw":
         return functools.partial(_image, value.get("data"))
     if value.get("__image__") or "__ndarray__" in value:
@@ -254,7 +289,11 @@ def _value(value: dict[Any, Any]) -> object:
 
 
 def _image(data: Any) -> np.ndarray:
-    """Return the pixels of a PNG or JPEG file; raise UsageError if it is none, or too large."""
+    """Decode a PNG or JPEG file to an image (height, width, 3).
+
+    Raises:
+        UsageError: It is neither PNG nor JPEG, is damaged, or is too large.
+    """
     from PIL import Image
 
     try:
