@@ -148,7 +148,7 @@ def frame_of(**changes: Any) -> bytes:
         (frame_of(executed=99), "executed=99: 0 to"),
         (frame_of(x={**BOMB, b"dtype": "|O"}), "booleans, integers and floats"),
         (b"\xc1garbage", "cannot be read as msgpack"),
-        ("text", "a text frame came"),
+        ("text", "a text message came"),
         (msgpack.packb([1, 2]), "the message is a list"),
         (msgpack.packb({}), "the message has nothing"),
     ],

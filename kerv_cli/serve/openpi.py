@@ -133,5 +133,7 @@ class OpenPi(Conversation):
         """
         count = message.get(EXECUTED, len(self.last))
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 0 <= count <= len(self.last):
-            raise UsageError(f"{EXECUTED}={str(count)[:40]}: must be 0 to {len(self.last)}, the control steps of the last answer")
+            raise UsageError(
+                f"{EXECUTED}={str(count)[:40]}: must be 0 to {len(self.last)}, the control steps of the last answer"
+            )
         return self.last[: int(count)]
