@@ -1,6 +1,7 @@
-"""The registered environments, their tasks and suites. Registers Meta-World and the kinds of stress.
+"""Find environments, their tasks and suites (named groups of tasks) by name.
 
-Imports nothing heavy: a spec imports numpy, a world its simulator.
+Registers Meta-World and the kinds of stress. Importing this package loads nothing heavy: numpy is imported with an
+environment's specification, and the simulator with its world.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ W = TypeVar("W", bound="WorldSettings")
 
 
 def specs() -> Mapping[str, EnvironmentSpec]:
-    """Return the specification of every registered environment by name."""
+    """Return name -> specification of every registered environment."""
     return {name: load(part.build) for name, part in parts("environment").items()}
 
 
@@ -28,7 +29,7 @@ def spec_of(task: str) -> EnvironmentSpec:
     """Return the environment that has a task.
 
     Args:
-        task: Full or short name.
+        task: Full or short name of the task.
 
     Raises:
         UnknownName: No environment has the task.
@@ -43,16 +44,27 @@ def spec_of(task: str) -> EnvironmentSpec:
 
 
 def instruction_of(task: str) -> str:
-    """Return the instruction of a task of any environment; errors as `spec_of`."""
+    """Return the instruction of a task.
+
+    Args:
+        task: Full or short name of a task of any environment.
+
+    Raises:
+        UnknownName: No environment has the task.
+        UsageError: Several environments have it.
+    """
     return spec_of(task).task(task).instruction
 
 
 def resolve_tasks(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the full names of tasks and suites (`MT10`, `mt50`) in order, each once.
+    """Return the full names of tasks, in the order in which they were named and without repetitions.
+
+    Args:
+        names: Full or short names of tasks, and names of suites such as `MT10` or `mt50`.
 
     Raises:
         UnknownName: A name is neither a task nor a suite.
-        UsageError: There is no name, or the tasks are of several environments, whose action spaces may differ.
+        UsageError: There is no name, or the tasks belong to several environments, whose action spaces may differ.
     """
     if not names:
         raise UsageError("name at least one task or suite: task=NAME")
@@ -70,12 +82,12 @@ def resolve_tasks(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def stands_for_tasks(name: str) -> bool:
-    """Return whether `name` is a task or a suite in small letters, as demonstrations of it are called."""
+    """Return whether `name` is a task or suite in small letters. Demonstrations have such a name by default."""
     return name == name.lower() and any(spec.expand(name) for spec in specs().values())
 
 
 def task_names() -> Iterator[str]:
-    """Yield the suites and tasks of all environments, for completion."""
+    """Yield the suites and tasks of all environments, for shell completion."""
     for part in parts("environment").values():
         if "names" in part.traits:  # `module:tuple`, importable without numpy
             yield from load(part.traits["names"])
@@ -85,11 +97,15 @@ def task_names() -> Iterator[str]:
 
 
 def settled(world: W, spec: EnvironmentSpec) -> W:
-    """Return world settings with the environment's own camera and horizon where `world` leaves them open.
+    """Fill in the environment's default camera and horizon where the settings leave them open.
+
+    Args:
+        world: Settings of the world.
+        spec: The environment.
 
     Raises:
         UnknownName: The environment has no such camera.
-        UsageError: The simulator cannot run that horizon.
+        UsageError: The simulator cannot run so many control steps.
     """
     camera = replace(world.camera, name=spec.camera_name(world.camera.name))
     return replace(world, camera=camera, horizon=spec.control_steps(world.horizon))

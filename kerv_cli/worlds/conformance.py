@@ -1,4 +1,4 @@
-"""Checks that an environment keeps the protocols of worlds and experts, on its first task."""
+"""Check that an environment keeps the rules for worlds and experts (`kerv doctor`), on its first task."""
 
 from __future__ import annotations
 
@@ -15,7 +15,12 @@ SIZE = 48  # pixels of a frame
 
 
 def check_environment(spec: EnvironmentSpec, seed: int) -> list[Finding]:
-    """Return one finding per check. `seed` is that of the first episode."""
+    """Check an environment and return one finding per check.
+
+    Args:
+        spec: The environment.
+        seed: Seed of the first episode.
+    """
     checks = {
         "same seed, same episode": _check_repeats,
         "another seed, another start": _check_starts_differ,
@@ -32,7 +37,7 @@ def _open(spec: EnvironmentSpec) -> World:
 
 
 def _check_repeats(spec: EnvironmentSpec, seed: int) -> str:
-    """Compare two episodes of one seed to the last bit, one with frames and one without."""
+    """Check that the same seed gives the same episode to the last bit, whether images are drawn or not."""
     states: list[list[np.ndarray]] = [[], []]
     for drawn in (False, True):
         random = np.random.default_rng(7)

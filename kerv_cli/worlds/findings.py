@@ -1,4 +1,4 @@
-"""Results of checks, for `kerv doctor`."""
+"""Run checks for `kerv doctor` and collect their results."""
 
 from __future__ import annotations
 
@@ -10,7 +10,13 @@ from kerv_cli.base.errors import KervError
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one check."""
+    """Result of one check.
+
+    Attributes:
+        what: What was checked.
+        ok: Whether the check passed.
+        says: What the check saw, or the error message.
+    """
 
     what: str
     ok: bool
@@ -24,7 +30,12 @@ def need(holds: object, message: str) -> None:
 
 
 def find(what: str, check: Callable[[], str]) -> Finding:
-    """Run a check, which returns what it saw. Any exception makes it fail."""
+    """Run a check. It fails if it raises any exception.
+
+    Args:
+        what: What is checked.
+        check: Does the check and returns a text about what it saw.
+    """
     try:
         return Finding(what, True, check())
     except KervError as error:

@@ -1,7 +1,7 @@
-"""Base of worlds that MuJoCo simulates, and their frames: offscreen, with an OpenGL backend that works here.
+"""Base class of worlds that MuJoCo simulates, and off-screen drawing of their images.
 
-Uses `mujoco.Renderer` directly: gymnasium's viewer draws garbage, without an error, as soon as several environments
-live in one process.
+It uses `mujoco.Renderer` directly. Gymnasium's viewer draws wrong images, without an error, if several environments
+exist in one process. The module also finds an OpenGL backend that works on this machine.
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ if TYPE_CHECKING:
 
 
 class MujocoWorld(World):
-    """A world with a MuJoCo model. What a stress changes in the model is restored at the next reset.
+    """A world with a MuJoCo model.
 
-    A subclass implements `_drawable` instead of `_draw`.
+    A stress may change the model. The next reset undoes the changes. A subclass implements `_drawable` instead of
+    `_draw`.
     """
 
     stressable = World.stressable | {"model"}
@@ -44,10 +45,10 @@ class MujocoWorld(World):
 
     @abstractmethod
     def _drawable(self) -> tuple[Model, Any]:
-        """Return the MjModel, and MjData in which all poses are up to date."""
+        """Return the model (MjModel), and its data (MjData) with all poses up to date."""
 
     def reset(self, seed: int) -> Observation:
-        """Restore the model, start the episode of a seed and apply its stress to the model."""
+        """Start the episode of a seed: restore the model, reset the simulator, then apply the stress to the model."""
         self._changes.restore()
         observation = super().reset(seed)
         if self.stress.changes_model:
@@ -83,20 +84,21 @@ _PROBE_SECONDS = 60.0
 
 
 def install_command() -> str:
-    """Return the shell command that installs both software OpenGL backends on Debian and Ubuntu."""
+    """Return the shell command that installs two software OpenGL backends (EGL and OSMesa) on Debian and Ubuntu."""
     sudo = "" if os.geteuid() == 0 else "sudo "
     return f"{sudo}apt-get install -y libegl1 libosmesa6 libgl1-mesa-dri libgl1"
 
 
 def choose_backend() -> str:
-    """Return the name of the OpenGL backend that draws the frames. Call it before mujoco is imported.
+    """Choose an OpenGL backend that works here and return its name. Call it before mujoco is imported.
 
-    Respects `MUJOCO_GL`. Without it, tries EGL, then OSMesa, each in a process of its own: a broken driver cannot harm
-    this one. Worker processes inherit the choice through `MUJOCO_GL` and `PYOPENGL_PLATFORM`.
+    The environment variable `MUJOCO_GL` decides if it is set. Otherwise EGL and then OSMesa are tried, each in its own
+    process, so that a broken driver cannot crash this one. Worker processes inherit the choice through `MUJOCO_GL` and
+    `PYOPENGL_PLATFORM`.
 
     Raises:
-        RenderingUnavailable: Nothing can draw here, `MUJOCO_GL` switches drawing off, or mujoco was already imported
-            without a headless backend.
+        RenderingUnavailable: No backend can draw here, `MUJOCO_GL` switches drawing off, or mujoco was already imported
+            without an off-screen backend.
     """
     backend, error = find_backend()
     if error:
@@ -106,7 +108,11 @@ def choose_backend() -> str:
 
 @functools.cache
 def find_backend() -> tuple[str, str]:
-    """Return the backend, and an error message if there is none. Probes once per process."""
+    """Find an OpenGL backend that works here. It is searched once per process.
+
+    Returns:
+        The backend's name, empty if there is none; and an error message, empty if there is a backend.
+    """
     # Software rendering with a thread pool per context is slower for small frames and crowds out other workers.
     os.environ.setdefault("LP_NUM_THREADS", "0")
     backend = os.environ.get("MUJOCO_GL", "").lower().strip()
@@ -125,6 +131,7 @@ def find_backend() -> tuple[str, str]:
 
 
 def _draws(backend: str) -> bool:
+    """Return whether a backend can draw here, which is tried in its own process."""
     environment = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
     command = [sys.executable, "-c", _PROBE]
     try:
@@ -135,25 +142,28 @@ def _draws(backend: str) -> bool:
 
 
 def load_mujoco() -> None:
-    """Import mujoco with a GL backend if there is one. Without one physics works, and opening a Camera fails."""
+    """Import mujoco with an OpenGL backend if one works here.
+
+    Without a backend the physics still works. Only opening a Camera fails.
+    """
     if find_backend()[1]:
         os.environ.setdefault("MUJOCO_GL", "disable")  # without it mujoco asks for glfw, which needs a display
     import mujoco  # noqa: F401
 
 
 class Camera:
-    """Draws one view of one model. Drawing reads the physics and never changes it."""
+    """Draw one view of a MuJoCo model. Drawing never changes the physics."""
 
     def __init__(self, model: mujoco.MjModel, config: CameraSettings, upside_down: bool) -> None:
-        """Open an offscreen context.
+        """Open an off-screen graphics context.
 
         Args:
             model: Model to draw.
-            config: View and size.
-            upside_down: Whether the view's raw images are rotated by 180 degrees.
+            config: View and size of the image.
+            upside_down: Whether the raw image must be rotated by 180 degrees.
 
         Raises:
-            RenderingUnavailable: The GL backend cannot open a context.
+            RenderingUnavailable: The OpenGL backend cannot open a context.
         """
         backend = choose_backend()
         import mujoco
@@ -181,7 +191,7 @@ class Camera:
         atexit.register(self.close)
 
     def render(self, data: mujoco.MjData) -> NDArray[np.uint8]:
-        """Return a frame (size, size, 3) of the state in `data`, uint8 RGB, upright."""
+        """Return the image (size, size, 3) of the state in `data` as uint8 RGB, upright."""
         fovy = self._model.cam_fovy[self._camera]
         self._model.cam_fovy[self._camera] = self.config.fovy  # views of one model may differ in it: set per frame
         self._renderer.update_scene(data, camera=self._camera)
@@ -191,7 +201,7 @@ class Camera:
         return np.ascontiguousarray(frame[::-1, ::-1] if self._upside_down else frame)
 
     def close(self) -> None:
-        """Free the context. Safe to call twice."""
+        """Free the graphics context. A second call does nothing."""
         atexit.unregister(self.close)
         self._renderer.close()
 
@@ -206,11 +216,14 @@ def _open_renderer(model: mujoco.MjModel, pixels: int) -> mujoco.Renderer:
 
 
 def box_average(pixels: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
-    """Return the means of factor x factor blocks, rounded to nearest, as a copy.
+    """Shrink an image: return the mean of every block of factor x factor pixels, rounded to the nearest integer.
 
     Args:
         pixels: (factor * n, factor * m, channels) uint8.
-        factor: 1 to 16, so that a block's sum fits 16 bits.
+        factor: 1 to 16, so that the sum of a block fits into 16 bits.
+
+    Returns:
+        (n, m, channels) uint8, a copy.
     """
     if factor == 1:
         return pixels.copy()

@@ -1,4 +1,4 @@
-"""Settings of worlds, cameras, stress and imported demonstrations."""
+"""Settings of worlds, cameras, stress, and imported demonstrations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from kerv_cli.base.registry import find
 from kerv_cli.base.settings import CommandSettings
 
 EVALUATION_SEED = 100_000
-"""First evaluation seed. Demonstrations use smaller seeds: training and evaluation never share an initial state."""
+"""First seed for evaluation. Demonstrations use smaller seeds, so training and evaluation share no initial state."""
 
 MOST_STRESS = 4
 """Highest level of every kind of stress."""
@@ -18,7 +18,7 @@ MOST_STRESS = 4
 
 @dataclass(unsafe_hash=True)  # a key of dictionaries; Hydra could not override a frozen one
 class CameraSettings:
-    """The policy's view: a camera of the environment, or several side by side (`views.views_of`)."""
+    """What the policy sees: one camera of the environment, or several views side by side (`views.views_of`)."""
 
     name: str = setting("", "camera, or several joined by + for views side by side; empty: the environment's first")
     fovy: float = number(45.0, above=0, most=179, help="vertical field of view, degrees")
@@ -28,7 +28,7 @@ class CameraSettings:
 
 @dataclass
 class WorldSettings:
-    """The simulated world of an episode."""
+    """Settings of the simulated world of an episode."""
 
     camera: CameraSettings = setting(CameraSettings, "the policy's view")
     horizon: int = number(0, 0, 1_000_000, help="control steps of an episode; 0: the environment's own")
@@ -36,18 +36,29 @@ class WorldSettings:
 
 @dataclass
 class StressSettings:
-    """A shift of a stated size, drawn per episode from task, seed, kind and level (docs/stress.md)."""
+    """Settings of a stress: a disturbance of known size (docs/stress.md).
+
+    It is drawn for every episode from task, seed, kind and level.
+    """
 
     kind: str = setting("none", "what is shifted: push, actuation, sensor, light, colour, camera or object")
     level: int = number(0, 0, MOST_STRESS, help="size of the shift; 0: none")
 
     @property
     def active(self) -> bool:
-        """Whether anything is shifted."""
+        """Whether there is any disturbance."""
         return self.kind != "none" and self.level > 0
 
     def check_together(self, prefix: str) -> None:
-        """Refuse an unknown kind (UnknownName) and a level without a kind (UsageError)."""
+        """Check that kind and level fit together.
+
+        Args:
+            prefix: Key of these settings on the command line, with a dot at its end, for the error message.
+
+        Raises:
+            UnknownName: There is no such kind.
+            UsageError: There is a level without a kind.
+        """
         find("stress", self.kind, f"{prefix}kind")
         if self.kind == "none" and self.level:
             raise UsageError(f"{prefix}level={self.level} without {prefix}kind: name what is shifted")
@@ -55,7 +66,7 @@ class StressSettings:
 
 @dataclass
 class RolloutWorldSettings(WorldSettings):
-    """The world of a rollout. It may be shifted from the one of the training."""
+    """Settings of a rollout's world, which a stress may make different from the world of training."""
 
     stress: StressSettings = setting(StressSettings, "shift of the world")
 

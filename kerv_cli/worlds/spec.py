@@ -1,4 +1,4 @@
-"""An environment: its constants as data (`EnvironmentSpec`), and the base class of its simulators (`World`)."""
+"""Describe an environment: its constants as data (`EnvironmentSpec`) and the base class of its simulators (`World`)."""
 
 from __future__ import annotations
 
@@ -20,34 +20,42 @@ from kerv_cli.worlds.task import Task
 from kerv_cli.worlds.views import views_of
 
 Expert: TypeAlias = Callable[[Observation], NDArray[np.float64]]
-"""Scripted controller of one task: observation to action (D,) within the limits. It keeps no memory."""
+"""Scripted controller of one task: maps an observation to an action (D,) within the limits. It has no memory."""
 
 _LACKS = {
     "position": "its actions have no group 'position'",
     "model": "its world has no MuJoCo model",
     "range": "its world cannot widen the range of initial states",
 }
-"""What a kind of stress can need, and the message for an environment that lacks it."""
+"""Something that a kind of stress needs -> error message for an environment that does not have it."""
 
 
 @dataclass(frozen=True)
 class Seeds:
-    """Three disjoint ranges of episode seeds. Training, tuning and reported episodes never share an initial state."""
+    """Three disjoint ranges of episode seeds.
+
+    They keep the initial states of training, tuning and reported episodes apart.
+
+    Attributes:
+        training: Seeds for demonstrations.
+        selection: Seeds for choosing settings and for calibration.
+        evaluation: Seeds for reported results.
+    """
 
     training: range = range(50_000)
     selection: range = range(50_000, 100_000)
     evaluation: range = range(100_000, 2**31)
 
     def check(self, seeds: Iterable[int], purpose: str, what: str) -> None:
-        """Refuse seeds that are not meant for a purpose.
+        """Refuse seeds that lie outside the range for a purpose.
 
         Args:
             seeds: Seeds to check.
             purpose: `training`, `selection` or `evaluation`.
-            what: Name of the seeds in the message.
+            what: What the user typed, for the error message.
 
         Raises:
-            UsageError: A seed lies outside the purpose's range.
+            UsageError: A seed is outside that range.
         """
         allowed: range = getattr(self, purpose)
         for seed in seeds:
@@ -61,25 +69,27 @@ class Seeds:
 
 @dataclass(frozen=True)
 class EnvironmentSpec:
-    """All constants of an environment, and where its simulator is.
+    """All constants of an environment, and the class of its simulator.
 
     Attributes:
         name: Name in the registry.
         actions: Action space, normalised by the environment's limits.
-        observation: Observation space. The privileged state begins with the proprioception.
-        tasks: Tasks by full name.
-        suites: Suite name in capitals to full task names.
+        observation: Observation space. The privileged state (all numbers of the simulator) begins with the
+            proprioception.
+        tasks: Full name -> task.
+        suites: Name of a suite, in capitals -> full names of its tasks.
         difficulties: Groups of tasks, in the order of tables.
-        horizon: Control steps of an episode, and the most that the simulator runs.
+        horizon: Default number of control steps of an episode. The simulator runs no more.
         cameras: Names of the cameras. The first is the default.
-        world_class: `module:class` of a `World`. Empty for a recording.
-        expert_class: `module:class`, called with (spec, task). Returns an `Expert`. Empty without experts.
-        upside_down: Cameras whose raw images are rotated by 180 degrees.
+        world_class: `module:class` of the `World`. Empty for a recorded dataset, in which nothing can be executed.
+        expert_class: `module:class` that is called with (spec, task) and returns an `Expert`. Empty if there are none.
+        upside_down: Cameras whose raw images must be rotated by 180 degrees.
         suffix: Ending of all full task names. Users may leave it out.
-        packages: Packages whose versions determine the physics.
-        grip: Actions of the strict DoFs that close and open the gripper. Empty without a gripper.
+        packages: Python packages whose versions determine the physics.
+        grip: Two values of the gripper's DoF: the one that closes it and the one that opens it. Empty if there is no
+            gripper.
         seeds: Ranges of episode seeds.
-        experts: Task to the name of its expert, for tasks whose expert is kerv's instead of the simulator's.
+        experts: Task -> name of its expert, for tasks in which kerv's expert replaces the simulator's.
     """
 
     name: str
@@ -100,11 +110,15 @@ class EnvironmentSpec:
     experts: Mapping[str, str] = field(default_factory=dict)
 
     def full_name(self, task: str) -> str | None:
-        """Return the task's full name, or None if this environment does not have it."""
+        """Return the full name of a task, or None if this environment does not have it.
+
+        Args:
+            task: Full or short name.
+        """
         return next((name for name in (task, task + self.suffix) if name in self.tasks), None)
 
     def task(self, name: str) -> Task:
-        """Return the task of a full or short name.
+        """Return the task with a full or short name.
 
         Raises:
             UnknownName: There is no such task.
@@ -115,16 +129,19 @@ class EnvironmentSpec:
         return self.tasks[full]
 
     def expand(self, name: str) -> tuple[str, ...]:
-        """Return the full names of a suite's tasks or of one task. Empty if there is neither."""
+        """Return the full names of the tasks for which `name`, a suite or a task, stands. Empty if it is neither."""
         full = self.full_name(name)
         return self.suites.get(name.upper()) or ((full,) if full else ())
 
     def camera_name(self, name: str) -> str:
-        """Return `name`, or the environment's first camera if it is empty. Joined names are several views.
+        """Check a camera's name and return it. If it is empty, return the environment's first camera.
+
+        Args:
+            name: One camera, or several views joined by `+`.
 
         Raises:
             UnknownName: The environment has no such camera.
-            UsageError: A view is impossible.
+            UsageError: A view has an impossible field of view.
         """
         for view in views_of(name) if name else ():
             if view.camera not in self.cameras:
@@ -132,28 +149,34 @@ class EnvironmentSpec:
         return name or self.cameras[0]
 
     def camera(self, settings: CameraSettings | None = None) -> CameraSettings:
-        """Return the settings with a camera of this environment, by default its first.
+        """Check camera settings and return them with the environment's first camera as default.
+
+        Args:
+            settings: The settings. None: all defaults.
 
         Raises:
             UnknownName: The environment has no such camera.
-            UsageError: A view is impossible or a number is out of range.
+            UsageError: A view has an impossible field of view, or a number is out of range.
         """
         settings = settings or CameraSettings()
         check_settings(settings, "camera")
         return replace(settings, name=self.camera_name(settings.name))
 
     def control_steps(self, horizon: int) -> int:
-        """Return the control steps of an episode. 0 means the environment's own horizon.
+        """Return the number of control steps of an episode.
+
+        Args:
+            horizon: The number to check. 0 stands for the environment's default.
 
         Raises:
-            UsageError: The simulator does not run that many.
+            UsageError: The simulator cannot run so many.
         """
         if not 0 <= horizon <= self.horizon:
             raise UsageError(f"horizon={horizon}: {self.name} runs 1 to {self.horizon} control steps")
         return horizon or self.horizon
 
     def check_stress(self, settings: StressSettings) -> None:
-        """Refuse a kind of stress that this environment cannot have.
+        """Refuse a kind of stress that is impossible in this environment.
 
         Raises:
             UnknownName: There is no such kind.
@@ -169,10 +192,10 @@ class EnvironmentSpec:
                 raise UsageError(f"world.stress.kind={settings.kind}: not possible in {self.name}: {why}")
 
     def standstill(self, opening: float) -> NDArray[np.float64]:
-        """Return the action (D,) that leaves the robot where it is.
+        """Return the action (D,) that keeps the robot where it is.
 
         Args:
-            opening: Present opening of the gripper, 0 closed to 1 open. It stays.
+            opening: Current opening of the gripper, from 0 (closed) to 1 (open). The action keeps it.
         """
         action = self.actions.middle.copy()
         if self.grip:
@@ -181,11 +204,16 @@ class EnvironmentSpec:
         return action
 
     def open_world(self, task: str, camera: CameraSettings | None = None, horizon: int = 0) -> World:
-        """Return a world of the task. It builds its simulator at the first reset.
+        """Return a world for a task. Its simulator is built at the first reset.
+
+        Args:
+            task: Full or short name.
+            camera: Default view of frames. None: the environment's first camera.
+            horizon: Control steps of an episode. 0: the environment's default.
 
         Raises:
             UnknownName: There is no such task or camera.
-            UsageError: The simulator cannot run that horizon, or the environment is a recording.
+            UsageError: The simulator cannot run so many control steps, or the environment is a recorded dataset.
         """
         if not self.world_class:
             raise UsageError(f"{self.name} is a recording: nothing can be executed in it")
@@ -193,7 +221,7 @@ class EnvironmentSpec:
         return world
 
     def expert(self, task: str) -> Expert:
-        """Return the scripted expert of the task.
+        """Return the scripted expert of a task.
 
         Raises:
             UnknownName: There is no such task.
@@ -206,23 +234,23 @@ class EnvironmentSpec:
 
 
 class World(ABC):
-    """One task's simulator, reused over episodes. Open it in the process that uses it.
+    """Simulator of one task, used for many episodes. Open it in the process that uses it.
 
     A subclass implements `_start`, `_advance`, `_draw` and `initial_state`. It builds its simulator at the first reset.
-    The same seed must give the same episode on every machine with the same simulator versions.
+    The same seed must give the same episode on every machine with the same versions of the simulator.
 
     Attributes:
-        spec: Environment.
-        task: Full name.
+        spec: The environment.
+        task: Full name of the task.
         instruction: Sentence that the policy reads.
         camera: Default view of `frame`.
-        horizon: Control steps of an episode.
-        steps: Control steps since the reset.
-        success: Success flag of the latest step. Later steps may lose it again.
+        horizon: Number of control steps of an episode.
+        steps: Number of control steps since the reset.
+        success: Success flag of the latest step. A later step may unset it.
         succeeded: Whether `success` was set at any step of this episode.
-        stress: Shift of the episodes, from the next reset on.
-        stressable: What a stress can change in this world (docs/stress.md). Add `range` if `_start` widens the range
-            of initial states by `stress.spread`.
+        stress: Disturbance of the episodes (docs/stress.md). A new value takes effect at the next reset.
+        stressable: What a stress can change in this world (docs/stress.md). Add `range` if `_start` widens the range of
+            initial states by the factor `stress.spread`.
     """
 
     stressable: ClassVar[frozenset[str]] = frozenset({"actions", "images"})
@@ -230,7 +258,7 @@ class World(ABC):
     def __init__(
         self, spec: EnvironmentSpec, task: str, camera: CameraSettings | None = None, horizon: int = 0
     ) -> None:
-        """Check names and numbers; errors as `EnvironmentSpec.open_world`."""
+        """Check the names and numbers. The arguments and errors are those of `EnvironmentSpec.open_world`."""
         entry = spec.task(task)
         self.spec, self.task, self.instruction = spec, entry.name, entry.instruction
         self.camera, self.horizon = spec.camera(camera), spec.control_steps(horizon)
@@ -240,20 +268,24 @@ class World(ABC):
 
     @abstractmethod
     def _start(self, seed: int) -> NDArray[np.float64]:
-        """Put the simulator into the episode's initial state. Return the privileged state (s,)."""
+        """Put the simulator into the initial state for a seed. Return the privileged state (s,)."""
 
     @abstractmethod
     def _advance(self, action: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
-        """Execute an action (D,) within the limits. Return the privileged state (s,) and the success flag."""
+        """Execute an action (D,), which is within the limits.
+
+        Returns:
+            The privileged state (s,) after the step, and the success flag.
+        """
 
     @abstractmethod
     def _draw(self, camera: CameraSettings) -> NDArray[np.uint8]:
-        """Return the image (size, size, 3) of one camera, uint8 RGB, upright."""
+        """Return the image (size, size, 3) of one camera as uint8 RGB, upright."""
 
     @property
     @abstractmethod
     def initial_state(self) -> NDArray[np.float64]:
-        """Numbers (n,) that, with the task, rebuild the episode's start, e.g. the object's position."""
+        """Numbers (n,) that, together with the task, determine the episode's start, such as the object's position."""
 
     @property
     def observation(self) -> Observation:
@@ -264,23 +296,23 @@ class World(ABC):
 
     @property
     def done(self) -> bool:
-        """Whether the episode succeeded at any step so far, or reached the horizon."""
+        """Whether the episode has succeeded at any step, or has reached the horizon."""
         self.observation  # noqa: B018 - raises before the first reset
         return self.succeeded or self.steps >= self.horizon
 
     @property
     def end_effector(self) -> NDArray[np.float64]:
-        """Position (3,) in metres: the first three numbers of the proprioception."""
+        """Position (3,) of the end effector in metres: the first three numbers of the proprioception."""
         return self.observation.proprioception[:3].copy()
 
     @property
     def gripper(self) -> float:
-        """Opening of the gripper, 0 closed to 1 open. 1 without a gripper."""
+        """Opening of the gripper, from 0 (closed) to 1 (open). 1 if there is no gripper."""
         names, values = self.spec.observation.proprioception, self.observation.proprioception
         return float(values[names.index("gripper")]) if "gripper" in names else 1.0
 
     def reset(self, seed: int) -> Observation:
-        """Start the episode of a seed and draw its stress.
+        """Start the episode of a seed. Draw its disturbance, if there is a stress. Return the first observation.
 
         Raises:
             UsageError: The seed is negative.
@@ -293,13 +325,13 @@ class World(ABC):
         return self._observe_state(state)
 
     def step(self, action: ArrayLike) -> Observation:
-        """Execute one control step.
+        """Execute one control step and return the observation after it.
 
         Args:
-            action: (D,) in environment units. It is clipped to the limits, then changed by the stress.
+            action: (D,) in environment units. It is clipped to the limits. Then a stress may change it.
 
         Raises:
-            KervError: The episode has ended or not begun, or the action is not D finite numbers.
+            KervError: The episode has not begun or has reached its horizon, or the action is not D finite numbers.
         """
         executed = np.asarray(action, dtype=np.float64)
         space = self.spec.actions
@@ -320,24 +352,36 @@ class World(ABC):
         return self._observation
 
     def frame(self, camera: CameraSettings | None = None) -> NDArray[np.uint8]:
-        """Return the current frame (size, size x views, 3) for a recording, uint8 RGB. A stress of images leaves it.
+        """Return the current image (size, size x views, 3) as uint8 RGB, for a recording.
+
+        A stress of images does not change it.
 
         Args:
-            camera: Another view than the world's own.
+            camera: The view to draw. None: the world's own view.
 
         Raises:
-            RenderingUnavailable: Nothing can be drawn here.
+            RenderingUnavailable: This machine cannot draw.
         """
         self.observation  # noqa: B018 - raises before the first reset
         return self._picture(self.camera if camera is None else self.spec.camera(camera), stressed=False)
 
     def observe(self, cameras: Sequence[str]) -> Observation:
-        """Return the latest observation with a new image of each of `cameras`. No other camera is drawn."""
+        """Return the latest observation with new images.
+
+        Args:
+            cameras: Names of the views to draw. No other view is drawn.
+        """
         seen = self.observation
         own = {name: self.spec.camera(replace(self.camera, name=name)) for name in cameras}
         return seen.with_images({name: self._picture(camera, stressed=True) for name, camera in own.items()})
 
     def _picture(self, camera: CameraSettings, stressed: bool) -> NDArray[np.uint8]:
+        """Draw all views of a camera setting side by side.
+
+        Args:
+            camera: The views and their size.
+            stressed: Whether a stress of images changes the image.
+        """
         parts = []
         for view in views_of(camera.name):
             image = self._draw(replace(camera, name=view.camera, fovy=view.fovy or camera.fovy))
@@ -345,7 +389,7 @@ class World(ABC):
         return np.concatenate(parts, axis=1)
 
     def close(self) -> None:
-        """End the episode. A subclass also frees its simulator; a later reset builds it anew."""
+        """End the episode. A subclass also frees its simulator, which a later reset builds again."""
         self._observation = None
 
     def __enter__(self) -> Self:

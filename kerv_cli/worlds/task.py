@@ -1,4 +1,4 @@
-"""A task, apart from the rest of an environment: completion lists tasks without importing numpy."""
+"""A task's name, instruction and difficulty. Shell completion can list tasks from here without importing numpy."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ class Task:
     """One manipulation task.
 
     Attributes:
-        name: Unique over all environments.
+        name: Full name. No other environment has a task with this name.
         instruction: Sentence that the policy reads.
-        difficulty: Group of tasks that tables average together.
+        difficulty: Name of a group of tasks. Tables also show averages over these groups.
     """
 
     name: str

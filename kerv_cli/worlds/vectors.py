@@ -1,6 +1,7 @@
-"""Lengths of vectors with the same last bit on every CPU.
+"""Compute lengths of vectors that have the same last bit on every CPU.
 
-numpy's norms call OpenBLAS, whose kernels differ in the last bit. Draws and worlds must not.
+numpy's norms call OpenBLAS, which rounds differently on different CPUs. Random numbers and simulations must not depend
+on the CPU.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ _SPLIT = 2.0**27 + 1.0  # Dekker's constant: splits a double into two halves who
 def length(vector: NDArray[np.float64]) -> float:
     """Return the length of a vector (n,).
 
-    The sum of squares is rounded once per number, like a fused multiply-add. OpenBLAS's AVX-512 kernels do the same for
-    up to 31 numbers, and they recorded the first datasets.
+    Each added square is rounded once, as in a fused multiply-add. OpenBLAS does the same for up to 31 numbers on CPUs
+    with AVX-512, on which the first datasets were recorded.
     """
     total = 0.0
     for number in vector.tolist():

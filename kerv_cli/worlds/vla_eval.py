@@ -1,7 +1,7 @@
-"""Meta-World as a benchmark of vla-eval: `benchmark: kerv_cli.worlds.vla_eval:MetaWorld` in its YAML.
+"""Offer Meta-World as a benchmark of vla-eval: `benchmark: kerv_cli.worlds.vla_eval:MetaWorld` in its YAML file.
 
-Any model server that takes an image, a sentence and four numbers of state meets kerv's tasks, initial states, cameras
-and stress. Episode i always has seed `seed` + i, so that evaluations of different servers are paired.
+So every model server that takes an image, a sentence and four numbers of state can be tested on kerv's tasks, initial
+states, cameras and stress. Episode i always has seed `seed` + i. So the episodes of different servers form pairs.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class MetaWorld(StepBenchmark):
         - An episode ends with the first step at which the task's success flag is set, or at the horizon (500).
         - Episode i starts from the initial state of seed `seed` + i, which is among the recorded metrics.
         - Images are upright; several cameras joined with `+` are one image, side by side.
-        - A stress shifts the world from the one of the training. It is drawn per task and seed.
+        - A stress disturbs the world (docs/stress.md). The disturbance is drawn from task and seed.
 
     Args:
         tasks: Tasks and suites, e.g. "reach" or ["MT10"].
@@ -48,7 +48,7 @@ class MetaWorld(StepBenchmark):
 
     @classmethod
     def configure_render(cls, mode: str) -> dict[str, str]:
-        """Choose MuJoCo's renderer."""
+        """Choose MuJoCo's OpenGL backend. Return the environment variables for it."""
         return dict(configure_mujoco_render(mode))
 
     def __init__(
@@ -80,12 +80,12 @@ class MetaWorld(StepBenchmark):
         self.world: World | None = None
 
     def get_tasks(self) -> list[dict[str, Any]]:
-        """Return the tasks. Their suite is their group of difficulty."""
+        """Return the tasks. The suite of each is its difficulty group."""
         tasks = (self.spec.tasks[name] for name in self.tasks)
         return [{"name": t.name, "suite": t.difficulty, "instruction": t.instruction, "seed": self.seed} for t in tasks]
 
     def reset(self, task: dict[str, Any]) -> Observation:
-        """Start the episode `episode_idx` of a task."""
+        """Start the episode number `episode_idx` of a task."""
         if self.world is None or self.world.task != task["name"]:
             self.cleanup()
             self.world = self.spec.open_world(task["name"], self.camera, self.horizon)
@@ -96,7 +96,11 @@ class MetaWorld(StepBenchmark):
         return self.seed + int(task.get("episode_idx", 0))
 
     def step(self, action: dict[str, Any]) -> StepResult:
-        """Execute an action of 4 numbers. Raises KervError for any other."""
+        """Execute an action of 4 numbers.
+
+        Raises:
+            KervError: The action is not 4 finite numbers, or the episode has ended.
+        """
         assert self.world is not None
         numbers = np.asarray(action.get("actions", action.get("action")), dtype=np.float64)
         observation, world = self.world.step(numbers), self.world
@@ -104,21 +108,25 @@ class MetaWorld(StepBenchmark):
         return StepResult(observation, float(world.success), world.done, {})
 
     def make_obs(self, raw_obs: Observation, task: dict[str, Any]) -> dict[str, Any]:
-        """Return the message to the model server."""
+        """Return the observation in the form that is sent to the model server."""
         assert self.world is not None
         images = self.world.observe([self.camera.name]).images if self.send_images else {}
         state = raw_obs.state if self.privileged else raw_obs.proprioception
         return {"images": images, "task_description": self.world.instruction, "state": state}
 
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
-        """Return success at any step, which episode it was, and where the hand is."""
+        """Return the success so far, the episode's seed and initial state, and the end effector's position."""
         world = self.world
         assert world is not None
         places = {"initial_state": world.initial_state.tolist(), "end_effector": world.end_effector.tolist()}
         return {"success": bool(world.succeeded), "seed": self._seed(self._task), **places}
 
     def get_hold_action(self, last_action: dict[str, Any] | None) -> dict[str, Any]:
-        """Return an action without displacement. The gripper continues as before, open at first."""
+        """Return an action that does not move the hand.
+
+        Args:
+            last_action: The previous action, whose gripper value is kept. None: the gripper is opened.
+        """
         action = self.spec.standstill(1.0)
         if last_action is not None:
             action[self.spec.actions.is_strict] = np.asarray(last_action["actions"])[self.spec.actions.is_strict]
@@ -129,18 +137,18 @@ class MetaWorld(StepBenchmark):
         return {"max_steps": self.horizon, "control_hz": self.spec.actions.control_hz}
 
     def get_action_spec(self) -> dict[str, DimSpec]:
-        """Describe an action: displacement and gripper."""
+        """Describe an action: displacement of the hand, and gripper."""
         return {"position": POSITION_DELTA, "gripper": DimSpec("gripper", 1, "binary_close_positive", (-1, 1))}
 
     def get_observation_spec(self) -> dict[str, DimSpec]:
-        """Describe an observation: one image, the instruction, the robot's state."""
+        """Describe an observation: one image, the instruction, and the robot's state."""
         names, numbers = self.spec.observation.proprioception, self.spec.observation.state
         state = (numbers, f"privileged{numbers}") if self.privileged else (len(names), "_".join(names))
         images = {self.camera.name: IMAGE_RGB} if self.send_images else {}
         return {**images, "language": LANGUAGE, "state": DimSpec("state", *state)}
 
     def render(self) -> np.ndarray | None:
-        """Return the current frame."""
+        """Return the current image, or None before the first reset."""
         return None if self.world is None else self.world.frame()
 
     def cleanup(self) -> None:

@@ -1,4 +1,4 @@
-"""A recorded set of demonstrations on disk, checked and read back."""
+"""Read a recorded set of demonstrations from disk and check it."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.task import Task
 
 OnProgress = Callable[[int, int], object]
-"""Called with (done, total) after every episode or batch of a long work."""
+"""Reports progress: called with (done, total) after every episode or batch."""
 
 FORMAT = 2
-"""Format of manifests."""
+"""Version of the manifest's format."""
 
 SPECS = SimpleNamespace()
-"""Specifications of recorded environments, as attributes."""
+"""Specifications of environments that exist only as recorded datasets, as attributes."""
 
 
 @dataclass(frozen=True)
 class EpisodeEntry:
-    """One episode in the manifest.
+    """One episode in the manifest of a dataset.
 
     Attributes:
         seed: Seed of the episode.
-        perturbed: Whether its execution was noisy.
-        steps: Control steps up to the success.
+        perturbed: Whether noise was added to the executed actions.
+        steps: Number of control steps until success.
         bytes: Size of its file.
         sha256: Hash of its file.
     """
@@ -50,13 +50,19 @@ class EpisodeEntry:
 
     @classmethod
     def of(cls, path: Path, episode: DemoEpisode) -> EpisodeEntry:
-        """Describe an episode that was saved to `path`."""
+        """Return the entry for an episode that was saved to `path`."""
         return cls(episode.seed, episode.perturbed, episode.steps, path.stat().st_size, sha256_of(path))
 
 
 @dataclass(frozen=True)
 class TaskEntry:
-    """The episodes of one task, by seed."""
+    """The episodes of one task in a manifest.
+
+    Attributes:
+        episodes: Recorded episodes, sorted by seed.
+        mean_steps: Mean number of control steps until success.
+        failed_seeds: Seeds in which the expert did not succeed.
+    """
 
     episodes: tuple[EpisodeEntry, ...]
     mean_steps: float = 0.0
@@ -65,21 +71,21 @@ class TaskEntry:
 
 @dataclass(frozen=True)
 class DemoManifest:
-    """The manifest of a dataset.
+    """The manifest of a dataset: what was recorded (docs/formats.md).
 
     Attributes:
-        format: Format of the manifest.
-        environment: Name of the tasks' environment.
-        actions: Its action space.
-        observation: Its observation space.
-        config: Fields of `DemoConfig` without the workers.
-        tasks: Episodes of each task.
+        format: Version of the manifest's format.
+        environment: Name of the environment.
+        actions: Action space of the environment.
+        observation: Observation space of the environment.
+        config: Fields of `DemoConfig` without `workers`.
+        tasks: Task -> its episodes.
         sha256: Hash over the hashes of all episode files.
-        versions: Versions of the packages that physics and frames depend on.
-        seeds: The first and the last seed.
-        episodes: Number of episodes.
-        missing: Number of requested episodes that failed.
-        instructions: Task to instruction, for recorded data whose tasks no registered environment has.
+        versions: Versions of the packages on which physics and images depend.
+        seeds: `first` and `last` seed.
+        episodes: Number of recorded episodes.
+        missing: Number of requested episodes that could not be recorded because experts failed.
+        instructions: Task -> instruction. Only for imported data, whose tasks belong to no registered environment.
     """
 
     format: int
@@ -99,13 +105,13 @@ class DemoManifest:
 def register_recorded(
     name: str, actions: ActionSpace, observation: ObservationSpace, instructions: Mapping[str, str], camera: str
 ) -> EnvironmentSpec:
-    """Register the environment of a dataset that exists only as a recording: nothing can be rolled out in it.
+    """Register an environment for a dataset that was imported. Nothing can be executed in such an environment.
 
     Args:
-        name: An identifier. In capitals it is the suite of all tasks.
+        name: Name of the environment. In capitals, it also names the suite of all tasks.
         actions: Action space.
         observation: Observation space.
-        instructions: Task to instruction.
+        instructions: Task -> instruction.
         camera: Name of the recorded view.
     """
     tasks = {task: Task(task, instruction, "recorded") for task, instruction in instructions.items()}
@@ -117,12 +123,22 @@ def register_recorded(
 
 
 def episode_path(folder: Path, task: str, seed: int) -> Path:
-    """Return the file of an episode within the dataset's folder."""
+    """Return the file of an episode.
+
+    Args:
+        folder: The dataset's folder.
+        task: Full name of the task.
+        seed: Seed of the episode.
+    """
     return folder / "episodes" / task / f"{seed:06d}.safetensors"
 
 
 def dataset_hash(tasks: Mapping[str, Any]) -> str:
-    """Return a SHA-256 over the hashes of the episode files. `tasks` is that of a manifest's JSON."""
+    """Return a SHA-256 over the hashes of all episode files.
+
+    Args:
+        tasks: The entry `tasks` of a manifest's JSON.
+    """
     digest = hashlib.sha256()
     for task, summary in sorted(tasks.items()):
         for episode in summary["episodes"]:
@@ -133,12 +149,12 @@ def dataset_hash(tasks: Mapping[str, Any]) -> str:
 def totals(
     entries: Mapping[str, Sequence[EpisodeEntry]], failed: Mapping[str, Sequence[int]], missing: int
 ) -> dict[str, Any]:
-    """Return the manifest's fields that sum up its episodes, as JSON.
+    """Return the manifest's fields that summarise its episodes, as JSON values.
 
     Args:
-        entries: Episodes of each task.
-        failed: Task to the seeds that failed.
-        missing: Number of requested episodes that failed.
+        entries: Task -> its recorded episodes.
+        failed: Task -> seeds in which the expert failed.
+        missing: Number of requested episodes that could not be recorded.
     """
     tasks = {}
     for task, rows in entries.items():
@@ -157,7 +173,12 @@ def totals(
 
 @dataclass(frozen=True)
 class DemoEntry(EpisodeEntry):
-    """An episode of a dataset, and its file."""
+    """An episode of a dataset on disk.
+
+    Attributes:
+        task: Full name of the task.
+        path: File of the episode.
+    """
 
     task: str
     path: Path
@@ -165,13 +186,13 @@ class DemoEntry(EpisodeEntry):
 
 @dataclass(frozen=True)
 class DemoDataset:
-    """A complete recording on disk.
+    """A complete set of recorded demonstrations on disk.
 
     Attributes:
         path: The dataset's folder.
         manifest: What was recorded.
-        episodes: One entry per episode, by task in the recording's order, then by seed.
-        views: Number of recorded views to read, from the left. 0 means all.
+        episodes: One entry per episode, by task in the order of recording, then by seed.
+        views: If images show several views side by side: how many of them to read, from the left. 0: all.
     """
 
     path: Path
@@ -181,15 +202,18 @@ class DemoDataset:
 
     @property
     def sha256(self) -> str:
-        """Hash over the hashes of all episode files. Two datasets with the same hash are the same."""
+        """Hash over the hashes of all episode files. Equal hashes mean equal datasets."""
         return self.manifest.sha256
 
     @classmethod
     def open(cls, path: Path) -> DemoDataset:
-        """Open a dataset. Checks that its files are there in full size; `load` checks their contents.
+        """Open a dataset. Check that all files exist and have their full size. `load` checks their contents.
+
+        Args:
+            path: The dataset's folder.
 
         Raises:
-            CheckpointError: There is no dataset, its recording was not finished, or it is damaged.
+            CheckpointError: There is no dataset, its recording is unfinished, or a file is damaged.
         """
         file = path / "manifest.json"
         if not file.exists():
@@ -218,10 +242,14 @@ class DemoDataset:
 
     @classmethod
     def joined(cls, parts: Sequence[DemoDataset]) -> DemoDataset:
-        """Return all episodes of `parts`, in order. The manifest is the first one's, with the tasks and hash of all.
+        """Join several datasets into one.
+
+        Returns:
+            All episodes of the parts, in order. The manifest is that of the first part, with the tasks of all parts and
+            a hash over all.
 
         Raises:
-            CheckpointError: They are of different environments or cameras.
+            CheckpointError: The parts have different environments, spaces or cameras.
         """
         if len(parts) == 1:
             return parts[0]
@@ -243,10 +271,10 @@ class DemoDataset:
         return cls(parts[0].path, replace(first, sha256=combined, config=config, tasks=tasks), episodes)
 
     def load(self, index: int) -> DemoEpisode:
-        """Read the episode of entry `index` of `episodes`.
+        """Read the episode at position `index` in `episodes`.
 
         Raises:
-            CheckpointError: The file changed since it was recorded.
+            CheckpointError: The file has changed since it was recorded.
         """
         entry = self.episodes[index]
         if sha256_of(entry.path) != entry.sha256:

@@ -1,4 +1,4 @@
-"""One demonstration episode in memory and as a file: safetensors with PNG frames, lossless and compact."""
+"""A demonstration episode in memory, and as a file: safetensors with lossless PNG images (docs/formats.md)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from kerv_cli.base.files import write_bytes
 from kerv_cli.worlds.demos.frames import LENGTH, EncodedFrames, encode_png, header_of
 
 FORMAT = "1"
-"""Format of episode files."""
+"""Version of the episode files' format."""
 _ARRAYS = {
     "frame_steps": "frame_steps",
     "states": "states",
@@ -24,24 +24,25 @@ _ARRAYS = {
     "executed": "executed",
     "initial_state": "rand_vec",  # its name in Meta-World
 }
-"""Attribute of an episode to the name of its tensor."""
+"""Attribute of an episode -> name of its tensor in the file."""
 
 
 @dataclass(frozen=True)
 class DemoEpisode:
-    """One successful episode of T control steps, up to and including the first success.
+    """A demonstration of T control steps. It ends with the first success.
 
     Attributes:
         task: Full name of the task.
         seed: Seed of the episode.
-        perturbed: Whether its execution was noisy.
+        perturbed: Whether noise was added to the executed actions.
         steps: T.
-        frames: (n, size, size x views, 3) uint8: the frames before the actions of `frame_steps`.
-        frame_steps: (n,) int64.
-        states: (T, s) float32: privileged state before each action. It begins with the proprioception.
-        labels: (T + tail, D) float32: the clean expert's clipped actions. The last `tail` are beyond the success.
-        executed: (T, D) float32: the actions that moved the robot.
-        initial_state: (n,) float64: the world's `initial_state`, e.g. placement of object and goal.
+        frames: (n, size, size x views, 3) uint8, the recorded images.
+        frame_steps: (n,) int64. Image i was drawn before the action of control step `frame_steps[i]`.
+        states: (T, s) float32, privileged state before each action. It begins with the proprioception.
+        labels: (T + tail, D) float32, the expert's actions, clipped and without noise. The last `tail` actions come
+            after the success.
+        executed: (T, D) float32, the actions that moved the robot.
+        initial_state: (k,) float64, the world's `initial_state`, such as the placement of object and goal.
     """
 
     task: str
@@ -57,12 +58,14 @@ class DemoEpisode:
 
     @property
     def end_effector(self) -> NDArray[np.float32]:
-        """Position of the end effector before each action, (T, 3) float32, metres."""
+        """Position of the end effector before each action, (T, 3) float32, in metres."""
         return self.states[:, :3]
 
 
 def save_episode(path: Path, episode: DemoEpisode) -> None:
-    """Write one episode, atomically. The PNGs of its frames are one tensor, with n + 1 offsets beside it.
+    """Write an episode to a file, atomically.
+
+    The PNG files of all images are stored end to end in one tensor. Another tensor holds their n + 1 offsets.
 
     Raises:
         StorageError: Writing failed.
@@ -89,9 +92,10 @@ def save_episode(path: Path, episode: DemoEpisode) -> None:
 
 
 def _with_sorted_metadata(data: bytes) -> bytes:
-    """Sort the keys of the metadata in the bytes of a safetensors file.
+    """Sort the keys of the metadata in a safetensors file, given and returned as bytes.
 
-    safetensors writes them in random order. Two recordings of one episode would have different hashes.
+    safetensors writes the keys in random order. Without sorting, two recordings of the same episode would have
+    different hashes.
     """
     header, start = header_of(data)
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
@@ -101,7 +105,7 @@ def _with_sorted_metadata(data: bytes) -> bytes:
 
 
 def load_episode(path: Path) -> DemoEpisode:
-    """Read one episode.
+    """Read an episode from a file.
 
     Raises:
         CheckpointError: The file is missing, damaged or of another format.

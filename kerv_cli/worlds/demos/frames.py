@@ -1,6 +1,6 @@
-"""Frames of demonstrations, kept as PNG in the episodes' files and decoded when they are used.
+"""Images of demonstrations, which stay PNG files inside the episodes' files until they are used.
 
-Training holds no frames in memory and no files open, so the size of a dataset does not matter.
+Training keeps no images in memory and no files open. So a dataset may have any size.
 """
 
 from __future__ import annotations
@@ -22,13 +22,14 @@ LENGTH = struct.Struct("<Q")  # a safetensors file begins with the length of its
 
 
 class EncodedFrames:
-    """Frames (n, size, width, 3) uint8.
+    """Images (n, size, width, 3) uint8 that are decoded when they are used.
 
     Attributes:
-        files: The files that hold them.
-        spans: (n, 3) int64: index in `files`, first byte of the PNG, one past its last byte.
+        files: Files that contain the PNG files.
+        spans: (n, 3) int64. For each image: index into `files`, position of the PNG's first byte, position after its
+            last.
         size: Height in pixels.
-        width: Width in pixels. Whatever a PNG shows to the right of it is cut off.
+        width: Width in pixels. Parts of a PNG further to the right are cut off.
     """
 
     def __init__(self, files: Sequence[Path], spans: NDArray[np.int64], size: int, width: int) -> None:
@@ -36,13 +37,13 @@ class EncodedFrames:
 
     @classmethod
     def of_file(cls, path: Path, offsets: NDArray[np.int64], size: int, width: int = 0) -> EncodedFrames:
-        """Return the frames of an episode's file.
+        """Return the images of an episode's file without decoding them.
 
         Args:
             path: The file.
-            offsets: (n + 1,) positions in its tensor `png`.
+            offsets: (n + 1,) positions of the PNG files in the tensor `png`.
             size: Height in pixels.
-            width: Width in pixels. 0 means square frames.
+            width: Width in pixels. 0: the images are square.
         """
         with path.open("rb") as file:
             length = file.read(LENGTH.size)
@@ -53,7 +54,7 @@ class EncodedFrames:
 
     @classmethod
     def joined(cls, parts: Sequence[EncodedFrames]) -> EncodedFrames:
-        """Return all frames of `parts`, in order."""
+        """Return the images of all parts, in order. All parts must have the same size."""
         firsts = np.cumsum([0, *(len(part.files) for part in parts[:-1])])
         spans = np.concatenate(
             [part.spans + np.array([first, 0, 0]) for part, first in zip(parts, firsts, strict=True)]
@@ -62,7 +63,7 @@ class EncodedFrames:
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
-        """Shape of the decoded frames, (n, size, width, 3)."""
+        """Shape of the decoded images, (n, size, width, 3)."""
         return len(self), self.size, self.width, 3
 
     def __len__(self) -> int:
@@ -75,18 +76,18 @@ class EncodedFrames:
         return self.pixels().astype(dtype or np.uint8, copy=False)
 
     def __getitem__(self, chosen: Any) -> Any:
-        """Return one frame, decoded, or those that a slice, mask or indices select, still encoded."""
+        """Return the decoded image for an integer; for a slice, mask or indices, return those images, not decoded."""
         if isinstance(chosen, int | np.integer):
             return self._decode(int(chosen))
         rows = chosen if isinstance(chosen, slice) else np.asarray(chosen)
         return EncodedFrames(self.files, self.spans[rows], self.size, self.width)
 
     def left(self, width: int) -> EncodedFrames:
-        """Return the same frames without everything to the right of `width` pixels: the first views of several."""
+        """Return the same images, cut off at the right to a smaller `width`, so that only the first views remain."""
         return EncodedFrames(self.files, self.spans, self.size, width)
 
     def pixels(self) -> NDArray[np.uint8]:
-        """Return the frames (n, size, width, 3), decoded on as many threads as this process may use."""
+        """Decode all images (n, size, width, 3), on several threads if the process has several CPU cores."""
         if not len(self):
             return np.zeros(self.shape, np.uint8)
         threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -96,6 +97,7 @@ class EncodedFrames:
             return np.stack(list(pool.map(self._decode, range(len(self)))))
 
     def _decode(self, i: int) -> NDArray[np.uint8]:
+        """Return the decoded image number i."""
         file_index, start, end = self.spans[i].tolist()
         with self.files[file_index].open("rb") as file:
             file.seek(start)
@@ -105,17 +107,17 @@ class EncodedFrames:
 
 
 def header_of(data: bytes) -> tuple[dict[str, Any], int]:
-    """Return the header of a safetensors file, and where its arrays begin.
+    """Return the header of a safetensors file, and the position at which its arrays begin.
 
     Args:
-        data: The file's bytes, its header at least.
+        data: Bytes of the file. The header suffices.
     """
     begin = LENGTH.size + LENGTH.unpack(data[: LENGTH.size])[0]
     return json.loads(data[LENGTH.size : begin]), begin
 
 
 def encode_png(frame: NDArray[np.uint8]) -> bytes:
-    """Encode a frame (h, w, 3) uint8 as PNG."""
+    """Return an image (height, width, 3) uint8 as a PNG file."""
     buffer = io.BytesIO()
     Image.fromarray(frame).save(buffer, format="PNG", compress_level=6)
     return buffer.getvalue()

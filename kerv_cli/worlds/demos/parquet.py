@@ -1,4 +1,7 @@
-"""Read Parquet files that other programs wrote, with a limit: a small file can stand for a huge table."""
+"""Read Parquet files that other programs wrote.
+
+The size in memory is limited, because a small file can contain a huge table.
+"""
 
 from __future__ import annotations
 
@@ -14,23 +17,23 @@ if TYPE_CHECKING:
     import pyarrow.parquet as pq
 
 MOST_EXPANDED = 2**30
-"""Bytes of a Parquet file's table in memory."""
+"""Largest size of a table in memory, in bytes."""
 _BATCH = 1024  # rows
 
 
 def foreign_table(
     source: Path | bytes, columns: Sequence[str] | None = None, where: tuple[str, Any] | None = None
 ) -> pa.Table:
-    """Return the table of a Parquet file, read part by part.
+    """Read a table from a Parquet file, part by part.
 
     Args:
-        source: The file, or its bytes.
-        columns: Only these, as far as the file has them.
-        where: Only the rows in which this column has this value.
+        source: The file's path or its bytes.
+        columns: Columns to read. Names that the file does not have are ignored. None: all columns.
+        where: (column, value). Read only the rows that have this value in this column. None: all rows.
 
     Raises:
-        OSError: The file is missing or no Parquet.
-        ValueError: It is damaged, or takes more than MOST_EXPANDED bytes.
+        OSError: The file is missing or is no Parquet file.
+        ValueError: The file is damaged, or takes more than MOST_EXPANDED bytes in memory.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -50,7 +53,7 @@ def foreign_table(
 
 
 def _may_hold(group: pq.RowGroupMetaData, column: str, value: Any) -> bool:
-    """Return whether a row group's statistics allow that a column has the value."""
+    """Return whether a part of a file (row group) can contain the value in a column, according to its statistics."""
     for number in range(group.num_columns):
         chunk = group.column(number)
         if chunk.path_in_schema == column and chunk.statistics is not None and chunk.statistics.has_min_max:

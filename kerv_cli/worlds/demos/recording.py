@@ -1,8 +1,10 @@
-"""Demonstrations: scripted experts, recorded to disk with clean labels.
+"""Record demonstrations: scripted experts solve tasks, and each episode is saved to disk.
 
-By default half of the episodes are executed with noise, so that they visit states off the expert's path. Their labels
-are still the expert's clean actions at those states. Only successful episodes are kept. An *actor*, e.g. a policy, can
-move the robot instead. Then the expert only labels the states (DAgger, Ross et al. 2011), and every episode is kept.
+By default, half of the episodes are executed with noise, so that they visit states off the expert's path. The recorded
+labels are still the expert's actions without noise. Only successful episodes are kept.
+
+Instead of the expert, an *actor* such as a policy can move the robot. Then the expert only labels the states that the
+actor visits (DAgger, Ross et al. 2011), and every episode is kept.
 
 On disk: `recording.json` (configuration and versions), `episodes/<task>/<seed:06d>.safetensors`,
 `failed/<task>/<seed:06d>.json` and, when the recording is complete, `manifest.json`.
@@ -39,25 +41,25 @@ from kerv_cli.worlds.vectors import unit_vector
 
 _SEEDS_PER_JOB = 10  # they share a simulator
 _EXTRA_SEEDS = 20
-"""A task tries this many seeds beyond the requested range, and one more per requested episode."""
+"""Failed seeds are replaced by seeds beyond the requested range: at most this many, plus one per requested episode."""
 
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """The configuration of a recording.
+    """What to record.
 
     Attributes:
         tasks: Tasks and suites of one environment.
-        episodes: Successful episodes per task.
-        first_seed: First seed of every task. Only training seeds are allowed.
-        perturbed: Share of episodes executed with noise. `is_perturbed` says which.
-        camera: View of the frames, by default the environment's first camera.
-        frame_stride: Control steps per recorded frame.
-        tail: Labels recorded beyond the success, for action chunks that begin near the end.
-        workers: Processes. The result does not depend on them.
-        horizon: Control steps within which the expert must succeed. 0 means the environment's.
-        policy: Hash of the actor's weights. Empty if the expert acts.
-        expert_share: Probability that the expert acts for one of the actor's chunks.
+        episodes: Number of successful episodes per task.
+        first_seed: First seed of every task. It must be a training seed.
+        perturbed: Share of episodes that are executed with noise. `is_perturbed` says which.
+        camera: View of the recorded images. Default: the environment's first camera.
+        frame_stride: Record an image at every n-th control step.
+        tail: Number of labels to record after the success. Action chunks that begin near the end need them.
+        workers: Number of processes. The result does not depend on it.
+        horizon: Number of control steps within which the expert must succeed. 0: the environment's default.
+        policy: Hash of the actor's weights. Empty if the expert moves the robot.
+        expert_share: Probability that the expert, not the actor, executes a chunk of actions.
     """
 
     tasks: tuple[str, ...]
@@ -82,30 +84,40 @@ class DemoConfig:
 
     @property
     def spec(self) -> EnvironmentSpec:
-        """The tasks' environment."""
+        """Environment of the tasks."""
         return spec_of(self.tasks[0])
 
 
 class Actor(Protocol):
-    """Moves the robot of a recording instead of the expert."""
+    """Moves the robot during a recording instead of the expert."""
 
     def reset(self, world: World, seed: int) -> None:
-        """Begin an episode in a world that was reset."""
+        """Begin an episode, after the world was reset."""
 
     def act(self, label: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the action (D,) to execute now. `label` is the expert's."""
+        """Return the action (D,) to execute now.
+
+        Args:
+            label: (D,) the expert's action in this state.
+        """
 
 
 MakeActor = Callable[[DemoConfig], Actor]
-"""Makes the actor of a recording, in the process that records. It must be picklable."""
+"""Creates the actor, in the process that records. It must be picklable."""
 
 
 def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None) -> DemoEpisode | None:
-    """Run one episode, moved by the expert or an actor.
+    """Run one episode and label every state with the expert's action.
+
+    Args:
+        world: World of the task.
+        seed: Seed of the episode.
+        config: What to record.
+        actor: Moves the robot. None: the expert does.
 
     Returns:
-        The episode. None if the expert did not succeed within the horizon, or so late that the simulator's horizon
-        leaves no room for the tail. An actor's episode ends there and is kept.
+        The episode. None if the expert did not succeed in time: within `config.horizon`, and early enough for the
+        simulator to run `config.tail` more steps. An actor's episode is kept even if it did not succeed.
     """
     expert = world.spec.expert(world.task)
     observation = world.reset(seed)
@@ -153,25 +165,25 @@ def record(
     on_progress: OnProgress = lambda done, total: None,
     make_actor: MakeActor | None = None,
 ) -> DemoManifest:
-    """Record demonstrations into a folder. An interrupted recording resumes.
+    """Record demonstrations into a folder. If the recording was interrupted, continue it.
 
-    A seed whose expert fails is replaced by the next one beyond the range, up to a limit. Which episodes come out does
-    not depend on the number of workers.
+    If the expert fails for a seed, the next seed after the requested range replaces it, up to a limit. The recorded
+    episodes do not depend on the number of workers.
 
     Args:
-        config: Configuration.
+        config: What to record.
         out: The dataset's folder.
         on_progress: Called after every few episodes.
-        make_actor: Makes the actor that moves the robot instead of the expert.
+        make_actor: Creates the actor that moves the robot. None: the expert does.
 
     Returns:
         The manifest, as written to `out/manifest.json`.
 
     Raises:
         UsageError: `out` holds demonstrations of another configuration.
-        RenderingUnavailable: No frame can be drawn here.
+        RenderingUnavailable: This machine cannot draw images.
         StorageError: Writing failed.
-        KervError: A task's expert never succeeded.
+        KervError: The expert of a task never succeeded.
     """
     choose_backend()
     identity = _identity(config)
@@ -189,7 +201,11 @@ def record(
 def _collect(
     config: DemoConfig, out: Path, on_progress: OnProgress, make_actor: MakeActor | None
 ) -> tuple[dict[str, list[EpisodeEntry]], dict[str, list[int]]]:
-    """Record the episodes. Return the manifest's entries and the failed seeds of each task."""
+    """Record all episodes.
+
+    Returns:
+        Task -> entries of its episodes for the manifest; and task -> seeds in which the expert failed.
+    """
     entries: dict[str, list[EpisodeEntry]] = {task: [] for task in config.tasks}
     failed: dict[str, list[int]] = {task: [] for task in config.tasks}
     seeds = {task: range(config.first_seed, config.first_seed + config.episodes) for task in config.tasks}
@@ -211,7 +227,7 @@ def _collect(
 
 
 def _identity(config: DemoConfig) -> dict[str, Any]:
-    """Return the manifest's fields that are known before the recording, as JSON."""
+    """Return the manifest's fields that are known before the recording, as JSON values."""
     settings = asdict(config) | {"noise_low": SIGMA[0], "noise_high": SIGMA[1], "burst_probability": BURST_PROBABILITY}
     del settings["workers"]
     spec = config.spec
@@ -230,7 +246,16 @@ def _identity(config: DemoConfig) -> dict[str, Any]:
 
 
 def _check_same_recording(out: Path, identity: dict[str, Any], packages: Sequence[str]) -> None:
-    """Write `recording.json`, or refuse a folder whose recording is another one."""
+    """Write `recording.json`, or check that the folder's recording has the same configuration.
+
+    Args:
+        out: The dataset's folder.
+        identity: The configuration, from `_identity`.
+        packages: Packages whose versions must be the same.
+
+    Raises:
+        UsageError: The folder holds demonstrations of another configuration.
+    """
     path = out / "recording.json"
     if not path.exists():
         write_json(path, identity)
@@ -254,6 +279,7 @@ _Outcomes = dict[int, EpisodeEntry | None]  # seed -> the manifest's entry, None
 def _run_jobs(
     config: DemoConfig, out: Path, jobs: Sequence[tuple[str, range]], make_actor: MakeActor | None
 ) -> Iterator[tuple[str, _Outcomes]]:
+    """Record all jobs, each a task with some seeds, in several processes. Yield the results as they come."""
     if config.workers == 1 or len(jobs) == 1:
         yield from (_record_seeds(config, out, task, seeds, make_actor) for task, seeds in jobs)
         return
@@ -274,13 +300,18 @@ def _run_jobs(
 def _record_seeds(
     config: DemoConfig, out: Path, task: str, seeds: Sequence[int], make_actor: MakeActor | None
 ) -> tuple[str, _Outcomes]:
-    """Record each seed that has no file yet. Runs in a worker."""
+    """Record each seed of a task that has no file yet. Runs in a worker process.
+
+    Returns:
+        The task; and seed -> entry for the manifest, None if the expert failed.
+    """
     actor = make_actor(config) if make_actor else None
     with config.spec.open_world(task, config.camera) as world:
         return task, {seed: _record_seed(config, out, world, seed, actor) for seed in seeds}
 
 
 def _record_seed(config: DemoConfig, out: Path, world: World, seed: int, actor: Actor | None) -> EpisodeEntry | None:
+    """Record one seed unless its file exists. Return its entry for the manifest, or None if the expert failed."""
     path, failure = episode_path(out, world.task, seed), out / "failed" / world.task / f"{seed:06d}.json"
     if failure.exists():
         return None
@@ -296,25 +327,39 @@ def _record_seed(config: DemoConfig, out: Path, world: World, seed: int, actor: 
 
 
 SIGMA = 0.2, 0.6
-"""Lowest and highest standard deviation of the Gaussian, where 1 is half of a DoF's range."""
+"""Lowest and highest standard deviation of the Gaussian noise, where 1 is half of a DoF's range."""
 BURST_PROBABILITY = 0.02
-"""Probability per step that a burst begins."""
+"""Probability that a burst of noise begins in a control step."""
 
 
 def is_perturbed(seed: int, fraction: float) -> bool:
-    """Return whether the episode of this seed is executed with noise. Such seeds are spread evenly."""
+    """Return whether the episode of a seed is executed with noise. Such seeds are spread evenly.
+
+    Args:
+        seed: Seed of the episode.
+        fraction: Share of episodes with noise.
+    """
     return int((seed + 1) * fraction) > int(seed * fraction)
 
 
 class Perturbation:
-    """One episode's noise: Gaussian, and bursts of 3 to 8 steps in one random direction. Strict DoFs stay clean.
+    """Noise for the actions of one episode.
+
+    It is Gaussian noise and, now and then, a burst: 3 to 8 control steps in one random direction. Strict DoFs (such as
+    a gripper) get no noise.
 
     Attributes:
-        sigma: Standard deviation of the Gaussian, drawn once.
+        sigma: Standard deviation of the Gaussian noise in this episode, where 1 is half of a DoF's range.
     """
 
     def __init__(self, task: str, seed: int, space: ActionSpace) -> None:
-        """Draw the noise from task and seed, for actions of this space."""
+        """Draw the noise of an episode from its task and seed.
+
+        Args:
+            task: Full name of the task.
+            seed: Seed of the episode.
+            space: Action space of the actions.
+        """
         self._random = np.random.default_rng([seed, *task.encode()])
         self.sigma = float(self._random.uniform(*SIGMA))
         self._burst_left = 0
@@ -324,7 +369,11 @@ class Perturbation:
         self._direction = np.zeros(len(self._half))  # normalised
 
     def __call__(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the action (D,) to execute instead of the clean one, within the limits."""
+        """Return the noisy action (D,) to execute, clipped to the limits.
+
+        Args:
+            action: (D,) the expert's action.
+        """
         dofs = len(self._half)
         noise = self._random.normal(0.0, self.sigma, size=dofs)
         if self._burst_left == 0 and self._random.random() < BURST_PROBABILITY:

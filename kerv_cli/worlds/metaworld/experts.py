@@ -1,4 +1,4 @@
-"""kerv's own experts, for tasks whose scripted expert in Meta-World teaches what does not solve them."""
+"""kerv's own scripted experts, for tasks in which demonstrations of Meta-World's expert teach a policy to fail."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from kerv_cli.worlds.vectors import length
 Array = NDArray[np.float64]
 
 GAIN = 15.0
-"""Hand displacement of an action per metre of distance. Actions saturate at 1, 7 cm away."""
+"""Action per metre of distance. Actions saturate at 1, which is reached at a distance of 7 cm."""
 
 
 class HandlePullSide:
-    """Grips the handle, lifts it slowly, and grips again after a slip.
+    """Grips the handle, lifts it slowly, and grips again if it slips.
 
-    Meta-World's expert lifts at full speed, so that the handle slips through the fingers. Once the hand is more than
-    3 cm above it, that expert goes down with closed fingers and presses the handle back. This one reads the phase of
-    the movement from the gripper's opening, so that an action depends on the state alone.
+    Meta-World's expert lifts at full speed, so the handle slips through the fingers. Once its hand is more than 3 cm
+    above the handle, it goes down with closed fingers and presses the handle back. kerv's expert derives the phase of
+    the movement from the gripper's opening. So each action depends only on the current state.
     """
 
     above = 0.1
-    """Metres above the handle at which the hand approaches."""
+    """Height above the handle at which the hand approaches, in metres."""
     far, near = 0.04, 0.02
-    """Horizontal metres from the handle. Beyond `far` the hand rises first, beyond `near` it does not go down."""
+    """Horizontal distances from the handle in metres. Beyond `far` the hand first rises, beyond `near` it stays up."""
     slipped = 0.05
-    """Metres above the handle from which on the fingers no longer hold it."""
+    """Height of the hand above the handle from which on the fingers no longer hold it, in metres."""
     low = 0.005
-    """Metres above the handle at which the fingers close."""
+    """Height of the hand above the handle at which the fingers close, in metres."""
     shut = 0.66
-    """Gripper opening below which the fingers hold the handle."""
+    """Opening of the gripper below which the fingers hold the handle."""
     lift = 0.4
-    """Upward action. The handle's damping needs a force in proportion to the speed."""
+    """Upward action while lifting. It must be small: the handle's damping resists in proportion to the speed."""
 
     def get_action(self, state: Array) -> Array:
-        """Return the action (4,) at a state (39,), not clipped."""
+        """Return the action (4,) for a state (39,), not clipped."""
         hand, opening, handle = state[:3], state[3], state[4:7]
         offset = hand - handle
         aside, height = length(offset[:2]), float(offset[2])
@@ -53,29 +53,29 @@ class HandlePullSide:
 
 
 class PegInsertSide:
-    """Opens the gripper before it goes down, carries the peg slowly, and goes on if the peg has slipped a little.
+    """Opens the gripper before going down, carries the peg slowly, and continues if the peg slips a little.
 
-    Meta-World's expert jerks the peg so that it slips. Once the peg hangs more than 2.5 cm below the hand, that expert
-    goes down to it with closed fingers and drags it along the table for the rest of the episode.
+    Meta-World's expert jerks the peg so that it slips. Once the peg hangs more than 2.5 cm below the hand, it goes down
+    to the peg with closed fingers and drags it along the table for the rest of the episode.
     """
 
     above = 0.15
-    """Metres above the peg at which the hand approaches."""
+    """Height above the peg at which the hand approaches, in metres."""
     aside = 0.04
-    """Horizontal metres from the peg beyond which the hand goes above it."""
+    """Horizontal distance from the peg beyond which the hand first moves above it, in metres."""
     held = 0.04
-    """Metres below the hand down to which a peg is in the fingers."""
+    """The peg counts as being in the fingers if it is at most this far below the hand, in metres."""
     open, shut = 0.6, 0.4
-    """Gripper openings. Above `open` the hand may go down, below `shut` the fingers hold the peg."""
+    """Openings of the gripper. Above `open` the hand may go down. Below `shut` the fingers hold the peg."""
     aligned = 0.03
-    """Metres from the hole's axis within which the peg may go in."""
+    """Distance from the hole's axis within which the peg may be inserted, in metres."""
     carry = 0.7
-    """Largest action of a hand that carries."""
+    """Largest action while carrying the peg."""
     before, behind, height = 0.05, -0.35, 0.16
-    """Position of the hand in metres: x before the hole and behind it, and z."""
+    """Goals of the hand in metres: x before the hole, x after it, and height z."""
 
     def get_action(self, state: Array) -> Array:
-        """Return the action (4,) at a state (39,), not clipped."""
+        """Return the action (4,) for a state (39,), not clipped."""
         hand, opening, peg, hole = state[:3], state[3], state[4:7], state[37]
         below = float(hand[2] - peg[2])
         gripper, most = -1.0, 1.0
@@ -95,10 +95,10 @@ class PegInsertSide:
 
 
 VERSION = "kerv 1"
-"""Name of these experts in recordings and in the identity of `policy=expert`. Raise it when their actions change."""
+"""Name of these experts in recordings and in the identity of `policy=expert`. Raise it if their actions change."""
 
 OURS: Mapping[str, Callable[[], HandlePullSide | PegInsertSide]] = {
     "handle-pull-side-v3": HandlePullSide,
     "peg-insert-side-v3": PegInsertSide,
 }
-"""Task to the expert that replaces Meta-World's."""
+"""Task -> class of the expert that replaces Meta-World's."""

@@ -1,4 +1,4 @@
-"""The specification of Meta-World v3."""
+"""The constants of Meta-World v3."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""The 50 tasks of Meta-World v3: names, instructions, difficulty groups, suites.
+"""The 50 tasks of Meta-World v3: names, instructions, difficulty groups and suites.
 
-The public table has the same sentence for push and push-back. The instructions in `tasks.csv`, at most ten lower-case
-words each, all differ and describe what the experts do. Join tasks by name, never by index: published tables order them
-differently.
+Meta-World's published instructions are the same for push and push-back. Those in `tasks.csv` all differ. They have at
+most ten lower-case words and describe what the experts do. Match tasks to published tables by name, not by position:
+the tables have other orders.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from kerv_cli.worlds.task import Task
 
 SUFFIX = "-v3"
 DIFFICULTIES = ("easy", "medium", "hard", "very_hard")
-"""The groups of published macro averages."""
+"""The difficulty groups over which publications average."""
 
 with Path(__file__).with_name("tasks.csv").open(encoding="utf-8") as _file:
     _rows = sorted((f"{row['task']}{SUFFIX}", row["instruction"], row["difficulty"]) for row in csv.DictReader(_file))
 
 TASKS: Mapping[str, Task] = {row[0]: Task(*row) for row in _rows}
-"""All 50 tasks by full name, in alphabetical order."""
+"""Full name -> task, all 50 in alphabetical order."""
 
 _MT10 = (
     "reach push pick-place door-open drawer-open drawer-close button-press-topdown peg-insert-side window-open "
@@ -32,7 +32,7 @@ SUITES: Mapping[str, tuple[str, ...]] = {
     "MT10": tuple(f"{task}{SUFFIX}" for task in _MT10.split()),
     "MT50": tuple(TASKS),
 }
-"""Suite name to full task names."""
+"""Name of a suite -> full names of its tasks."""
 
 NAMES = (*SUITES, *TASKS)
-"""Suites and tasks, for completion."""
+"""Names of suites and tasks, for shell completion."""

@@ -1,7 +1,7 @@
-"""Meta-World tasks as worlds, and their scripted experts.
+"""Run Meta-World's tasks and scripted experts as kerv's worlds and experts.
 
-Meta-World ignores `env.reset(seed=...)`. An episode follows from its initial state: the placement of object and goal,
-Meta-World's `rand_vec`, taken from `MT1(task, seed // 50)`.
+Meta-World ignores the seed in `env.reset(seed=...)`. The initial state alone determines an episode: the placement of
+object and goal (`rand_vec` in Meta-World). It is taken from Meta-World's benchmark `MT1(task, seed // 50)`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ _TASKS_PER_BENCHMARK = 50
 
 @functools.lru_cache(maxsize=256)
 def _placements(task: str, benchmark_seed: int) -> tuple[Any, ...]:
-    """Return the 50 `metaworld.Task`s of `MT1(task, benchmark_seed)`. Takes up to 1 s: it resets the task 100 times."""
+    """Return the 50 initial states (`metaworld.Task`) of `MT1(task, benchmark_seed)`.
+
+    It takes up to 1 s because Meta-World resets the task 100 times.
+    """
     load_mujoco()
     import metaworld
 
@@ -45,7 +48,7 @@ def _quiet_simulator() -> Iterator[None]:
 
 
 class MetaWorld(MujocoWorld):
-    """Seed s is task `s % 50` of `MT1(task, seed=s // 50)`."""
+    """A Meta-World task. Seed s is initial state number `s % 50` of `MT1(task, seed=s // 50)`."""
 
     stressable = MujocoWorld.stressable | {"range"}
 
@@ -53,7 +56,7 @@ class MetaWorld(MujocoWorld):
 
     @property
     def initial_state(self) -> NDArray[np.float64]:
-        """Object and goal placement of this episode, (3,) or (6,) float64, metres."""
+        """Placement of object and goal in this episode, (3,) or (6,) float64, in metres."""
         self.observation  # noqa: B018 - raises before the first reset
         return np.array(self._env._last_rand_vec, dtype=np.float64)
 
@@ -68,9 +71,10 @@ class MetaWorld(MujocoWorld):
 
     @contextlib.contextmanager
     def _wider_placement(self) -> Iterator[None]:
-        """Make resets move the placement horizontally away from the centre of its range by `stress.spread`.
+        """Make resets move object and goal away from the centre of their range, by the factor `stress.spread`.
 
-        The task can refuse a placement, e.g. an object too close to its goal. Then the move is halved until it accepts.
+        They move horizontally. The task can refuse a placement, for example an object too close to its goal. Then the
+        distance is halved until the task accepts.
         """
         env = self._env
         inside, space = env._last_rand_vec, env._random_reset_space
@@ -110,7 +114,7 @@ class MetaWorld(MujocoWorld):
         return model, data
 
     def close(self) -> None:
-        """Free simulator and graphics. The next reset builds them anew."""
+        """Free simulator and graphics. A later reset builds them again."""
         super().close()
         if self._env is not None:
             self._env.close()
@@ -118,10 +122,14 @@ class MetaWorld(MujocoWorld):
 
 
 class MetaWorldExpert:
-    """Scripted controller of one task: Meta-World's, or kerv's (`experts.OURS`)."""
+    """Scripted controller of one task: Meta-World's own, or kerv's replacement (`experts.OURS`)."""
 
     def __init__(self, spec: EnvironmentSpec, task: str) -> None:
-        """Find the controller. Raises UnknownName if there is no such task."""
+        """Find the controller of a task.
+
+        Raises:
+            UnknownName: There is no such task.
+        """
         name = spec.task(task).name
         load_mujoco()
         from metaworld.policies import ENV_POLICY_MAP
@@ -130,7 +138,7 @@ class MetaWorldExpert:
         self._policy: Any = {**ENV_POLICY_MAP, **OURS}[name]()
 
     def __call__(self, observation: Observation) -> NDArray[np.float64]:
-        """Return the expert's action (4,), clipped: raw outputs reach 25."""
+        """Return the expert's action (4,), clipped to the limits. The controllers' raw output reaches 25."""
         with _quiet_simulator():
             action = self._policy.get_action(observation.state)
         return np.clip(np.asarray(action, dtype=np.float64), *self._limits)

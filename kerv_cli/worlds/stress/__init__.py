@@ -1,6 +1,6 @@
-"""Stress: shifts of a stated size between the world of the training and the world of the evaluation (docs/stress.md).
+"""Stress: disturbances of known size, by which the evaluated world differs from that of training (docs/stress.md).
 
-The kinds are parts in the registry. A kind's module is imported when it is built.
+The kinds of stress are in the registry. The module of a kind is imported when it is used.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from kerv_cli.worlds.stress.base import NO_STRESS, Stress
 
 
 def build(settings: StressSettings) -> Stress:
-    """Return the stress of these settings. Level 0 is no stress.
+    """Return the stress that the settings describe. At level 0 it changes nothing.
 
     Raises:
         UnknownName: There is no such kind.

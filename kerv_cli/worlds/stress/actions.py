@@ -13,7 +13,13 @@ STUCK_SECONDS = 0.25
 
 
 class Bursts:
-    """Bursts of a fixed length that begin at random while none is running."""
+    """Bursts of a fixed duration that begin at random, one at a time.
+
+    Args:
+        per_second: Mean number of bursts that begin per second while no burst is running.
+        seconds: Duration of a burst.
+        control_hz: Control steps per second.
+    """
 
     def __init__(self, per_second: float, seconds: float, control_hz: float) -> None:
         self._steps = max(1, round(seconds * control_hz))
@@ -21,7 +27,7 @@ class Bursts:
         self._left = 0
 
     def next_step(self, random: np.random.Generator) -> tuple[bool, bool]:
-        """Return whether a burst runs in this control step, and whether it begins in it."""
+        """Return whether a burst runs in this control step, and whether it begins in this step."""
         begins = self._left == 0 and bool(random.random() < self._chance)
         if begins:
             self._left = self._steps
@@ -31,16 +37,16 @@ class Bursts:
 
 
 class Push(Stress):
-    """Bursts that drive the hand off in a random direction at full speed. Rotation and gripper stay the policy's.
+    """Bursts that push the hand in a random direction at full speed. Rotation and gripper are not changed.
 
-    A level is the number of bursts per second that begin while none is running.
+    Each level is the mean number of bursts that begin per second while no burst is running.
     """
 
     kind = "push"
     levels = (2.0, 4.0, 8.0, 14.0)
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """Fix the episode's random numbers."""
+        """Prepare the random numbers of an episode."""
         super().begin(task, seed, space)
         self._random = self.generator()
         self._bursts = Bursts(self.amount, PUSH_SECONDS, space.control_hz)
@@ -49,7 +55,7 @@ class Push(Stress):
         self._push = self._middle
 
     def act(self, action: Array, step: int) -> Array:
-        """Replace the action's position group during a burst."""
+        """Replace the position part of the action while a burst runs."""
         runs, begins = self._bursts.next_step(self._random)
         if begins:
             self._push = self._middle + unit_vector(self._random, len(self._half)) * self._half
@@ -61,17 +67,21 @@ class Push(Stress):
 
 
 class Actuation(Stress):
-    """White noise, wrong gains, and bursts in which one DoF sticks. Strict DoFs are executed as they are.
+    """Noise, wrong gains, and bursts in which one DoF is stuck.
 
-    A level is (noise, gain, stuck): standard deviation of the noise, where 1 is half of a DoF's range; largest relative
-    error of a DoF's gain, drawn per episode; bursts per second in which one DoF sticks.
+    Strict DoFs (those that must equal the target's token, such as a gripper) are not changed. Each level is (noise,
+    gain, stuck):
+
+    - noise: standard deviation of Gaussian noise, where 1 is half of a DoF's range
+    - gain: largest relative error of a DoF's gain, drawn once per episode
+    - stuck: bursts per second in which one DoF does not move
     """
 
     kind = "actuation"
     levels = ((0.3, 0.2, 0.5), (0.6, 0.4, 1.0), (0.9, 0.6, 1.5), (1.8, 0.8, 4.0))
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """Draw the gains of the DoFs."""
+        """Draw the gains of the DoFs for an episode."""
         super().begin(task, seed, space)
         self._random = self.generator()
         self._noise, gain, stuck = self.amount
@@ -83,7 +93,7 @@ class Actuation(Stress):
         self._stuck = 0
 
     def act(self, action: Array, step: int) -> Array:
-        """Add gains and noise to the action. A DoF that sticks stands still."""
+        """Apply gains and noise to the action. A stuck DoF does not move."""
         noise = self._random.normal(0.0, self._noise, len(self._half)) * self._half
         runs, begins = self._bursts.next_step(self._random)
         if begins:

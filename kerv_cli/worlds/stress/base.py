@@ -1,4 +1,4 @@
-"""Base of every kind of stress: its hooks in an episode, its random numbers and its changes of a model."""
+"""Base class of every kind of stress: what it may change in an episode, its random numbers, and changes of a model."""
 
 from __future__ import annotations
 
@@ -17,35 +17,35 @@ Model: TypeAlias = "mujoco.MjModel"
 
 
 class ModelChanges:
-    """Arrays of a MuJoCo model that a stress changes, with their original values."""
+    """Remembers the original values of a MuJoCo model's arrays that a stress changes."""
 
     def __init__(self) -> None:
         self._originals: list[tuple[NDArray[Any], NDArray[Any]]] = []
 
     def keep(self, *arrays: NDArray[Any]) -> None:
-        """Remember the values of views into a model. Call it before changing them."""
+        """Remember the current values of some arrays of a model. Call it before changing them."""
         self._originals.extend((array, array.copy()) for array in arrays)
 
     def restore(self) -> None:
-        """Write all values back, the last change first."""
+        """Restore the original values of all arrays, the last change first."""
         while self._originals:
             array, values = self._originals.pop()
             array[...] = values
 
 
 class Stress:
-    """A shift of a stated size, drawn anew for every episode. This base class shifts nothing.
+    """A disturbance of known size, drawn anew for every episode. This base class changes nothing.
 
-    A kind overrides the hooks that it needs. It takes random numbers from `generator` alone, so that every method meets
-    the same shift.
+    A subclass overrides `change`, `act` or `see`. It takes random numbers only from `generator`. So every method meets
+    the same disturbance.
 
     Attributes:
-        kind: Name.
-        levels: Size of the shift at each level, from 1 on.
+        kind: Name of the kind of stress.
+        levels: Size of the disturbance at level 1, 2, ….
         changes_model: Whether `change` does anything.
-        level: Chosen level. 0 is no shift.
-        amount: The entry of `levels` for the chosen level.
-        spread: Factor that widens the range of initial states around its centre.
+        level: Chosen level. 0: no disturbance.
+        amount: The entry of `levels` for the chosen level. None at level 0.
+        spread: Factor by which the range of initial states is widened around its centre. 1: unchanged.
     """
 
     kind: ClassVar[str] = "none"
@@ -58,29 +58,50 @@ class Stress:
         self.amount: Any = self.levels[level - 1] if level else None
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """Fix the episode's random numbers, before its reset.
+        """Prepare an episode, before its reset.
 
         Args:
             task: Full name of the task.
             seed: Seed of the episode.
-            space: Space of the actions that `act` gets.
+            space: Action space of the actions that `act` receives.
         """
         self._task, self._seed = task, seed
 
     def generator(self, purpose: str = "", step: int = 0) -> np.random.Generator:
-        """Return a generator that depends on task, seed, kind and level, and on purpose and control step, alone."""
+        """Return a random generator that depends only on task, seed, kind, level, and the arguments.
+
+        Args:
+            purpose: Distinguishes several generators of an episode, such as one per camera.
+            step: Control step.
+        """
         text = f"{self.kind} {self.level} {self._task} {purpose}"
         return np.random.default_rng([self._seed, step, *text.encode()])
 
     def change(self, model: Model, changes: ModelChanges) -> None:
-        """Change the MjModel of an episode that was just reset. Call `changes.keep` before each change."""
+        """Change the MuJoCo model of an episode after its reset.
+
+        Args:
+            model: The model.
+            changes: Call its `keep` with each array before changing the array.
+        """
 
     def act(self, action: Array, step: int) -> Array:
-        """Return the action (D,) to execute instead of the clipped `action`. Called once per control step, in order."""
+        """Return the action (D,) to execute. It is called once per control step, in order.
+
+        Args:
+            action: (D,) what the policy wants to execute, clipped to the limits.
+            step: Control step.
+        """
         return action
 
     def see(self, camera: str, image: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
-        """Return the image (size, size, 3) that the policy sees instead of `image` at a control step."""
+        """Return the image (size, size, 3) that the policy sees.
+
+        Args:
+            camera: Name of the view.
+            image: The undisturbed image.
+            step: Control step.
+        """
         return image
 
 
@@ -88,12 +109,12 @@ NO_STRESS = Stress()
 
 
 def factor_or_inverse(random: np.random.Generator, factor: float) -> float:
-    """Return `factor` or 1 / `factor`, each with probability one half."""
+    """Return `factor` or 1 / `factor`, each with probability 1/2."""
     return factor if random.random() < 0.5 else 1.0 / factor
 
 
 def robot_roots(model: Model) -> set[int]:
-    """Return the ids of the root bodies that an actuator moves."""
+    """Return the ids of the root bodies of robots, which are the bodies that an actuator moves."""
     import mujoco
 
     joints = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)

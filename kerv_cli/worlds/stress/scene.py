@@ -1,4 +1,4 @@
-"""Kinds of stress that change a MuJoCo model: how it looks (light, colour, camera), and the task's objects."""
+"""Kinds of stress that change a MuJoCo model: its looks (light, colour, camera) and the task's objects."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ from kerv_cli.worlds.stress.base import Model, ModelChanges, Stress, factor_or_i
 from kerv_cli.worlds.vectors import unit_vector
 
 WIDE = 0.35
-"""Metres. A fixed geom is background or table if it is a plane or its bounding sphere has at least this radius."""
+"""A fixed geom is background or table if it is a plane or its bounding sphere has at least this radius, in metres."""
 _FROM_MATERIAL = 0.5, 0.5, 0.5, 1.0  # rgba of a geom whose colour is its material's
 
 
 class Light(Stress):
-    """All lamps and the headlight are brighter or darker, and lamps shine from elsewhere.
+    """All lights are brighter or darker, and lamps shine from other directions.
 
-    A level is (gain, degrees): factor of all light, or its inverse; angle by which each lamp is turned about a random
-    axis through the origin.
+    Each level is (gain, degrees):
+
+    - gain: factor for the strength of all lights, or its inverse
+    - degrees: angle by which each lamp is rotated about a random axis through the origin
     """
 
     kind = "light"
@@ -25,7 +27,7 @@ class Light(Stress):
     levels = ((1.1, 10), (1.2, 15), (1.3, 20), (1.8, 45))
 
     def change(self, model: Model, changes: ModelChanges) -> None:
-        """Scale all light, and turn and move the lamps."""
+        """Scale all lights. Rotate the position and direction of the lamps."""
         gain, degrees = self.amount
         random, head = self.generator(), model.vis.headlight
         lights = (model.light_ambient, model.light_diffuse, model.light_specular)
@@ -41,9 +43,9 @@ class Light(Stress):
 
 
 class Colour(Stress):
-    """Floor, walls and table are painted, each body in one random colour. Sky, robot and objects keep theirs.
+    """Floor, walls and table get random colours, one per body. Sky, robot and objects keep theirs.
 
-    A level is the share of the random colour in the colour that multiplies a surface's texture.
+    Each level is the share of the random colour in the mixed colour. The mixed colour multiplies the texture.
     """
 
     kind = "colour"
@@ -51,7 +53,7 @@ class Colour(Stress):
     levels = (0.1, 0.2, 0.3, 0.45)
 
     def change(self, model: Model, changes: ModelChanges) -> None:
-        """Mix the colours of background and table with random ones."""
+        """Mix the colours of background and table with random colours."""
         share, random = self.amount, self.generator()
         changes.keep(model.geom_rgba)
         scenery = scenery_of(model)
@@ -65,9 +67,9 @@ class Colour(Stress):
 
 
 class CameraJitter(Stress):
-    """Every camera of the model is a little elsewhere and looks a little aside.
+    """Every camera of the model is slightly moved and turned.
 
-    A level is (metres, degrees): distance in a random direction; angle about a random axis.
+    Each level is (metres, degrees): distance in a random direction, and angle about a random axis.
     """
 
     kind = "camera"
@@ -104,14 +106,14 @@ def scenery_of(model: Model) -> list[int]:
 
 
 class Objects(Stress):
-    """Objects have another size, mass and friction, and begin in a wider range.
+    """Objects have another size, mass and friction, and start in a wider range.
 
-    Objects are the bodies on joints of their own that no robot moves. Meshes, and objects on a hinge or a slide, keep
-    their size. Friction is that of all geoms, because a contact has the larger one of its two, and the damping of the
-    objects' joints.
+    Objects are the bodies with their own joints that do not belong to a robot. The size changes only for objects that
+    move freely and have no mesh. The friction of all geoms changes, not only that of objects, because a contact uses
+    the larger of its two frictions. The damping of the objects' joints changes, too.
 
-    A level is (size, mass, friction, spread): factors that multiply or divide an object's, drawn per episode; factor of
-    the range of initial states around its centre.
+    Each level is (size, mass, friction, spread). The first three are factors by which a value is multiplied or divided,
+    drawn per episode. `spread` widens the range of initial states around its centre.
     """
 
     kind = "object"
@@ -145,12 +147,13 @@ class Objects(Stress):
 
 
 def objects(model: Model) -> list[int]:
-    """Return the ids of the bodies on joints of their own that are no part of a robot."""
+    """Return the ids of the bodies that have their own joints and do not belong to a robot."""
     robots = robot_roots(model)
     return [b for b in range(1, model.nbody) if model.body_dofnum[b] > 0 and model.body_rootid[b] not in robots]
 
 
 def _is_free_and_primitive(model: Model, body: int) -> bool:
+    """Return whether an object moves freely and has no mesh."""
     import mujoco
 
     free = model.jnt_type[model.body_jntadr[body]] == mujoco.mjtJoint.mjJNT_FREE
@@ -160,7 +163,14 @@ def _is_free_and_primitive(model: Model, body: int) -> bool:
 
 
 def _scale(model: Model, body: int, factor: float, moved: bool) -> None:
-    """Scale a body's geoms and sites around its origin. A part fixed to an object also moves along."""
+    """Scale the geoms and sites of a body around its origin.
+
+    Args:
+        model: The model.
+        body: Id of the body.
+        factor: Factor of the size.
+        moved: Whether the body is a part fixed to an object, whose position is scaled too.
+    """
     if moved:
         model.body_pos[body] *= factor
     model.body_ipos[body] *= factor
@@ -172,7 +182,14 @@ def _scale(model: Model, body: int, factor: float, moved: bool) -> None:
 
 
 def _weigh(model: Model, body: int, mass: float, size: float) -> None:
-    """Multiply a body's mass, and what MuJoCo derived from it when it compiled the model."""
+    """Scale the mass of a body, and the values that MuJoCo derives from the mass.
+
+    Args:
+        model: The model.
+        body: Id of the body.
+        mass: Factor of the mass.
+        size: Factor by which the body's size was scaled.
+    """
     model.body_mass[body] *= mass
     model.body_inertia[body] *= mass * size**2
     model.body_invweight0[body] /= mass

@@ -11,24 +11,27 @@ from kerv_cli.worlds.stress.base import Stress
 
 
 class Sensor(Stress):
-    """Images are noisy and blurred, or the one observed before. Recorded frames and the state stay clean.
+    """Images are noisy and blurred, or repeated. Recorded images and the state are not changed.
 
-    A level is (noise, blur, dropped): standard deviation per pixel and colour in grey levels of 255; standard deviation
-    of the Gaussian in hundredths of the image's height; probability that the policy sees the image observed before.
+    Each level is (noise, blur, dropped):
+
+    - noise: standard deviation for each pixel and colour, in grey levels from 0 to 255
+    - blur: standard deviation of the Gaussian, in hundredths of the image's height
+    - dropped: probability that the policy sees the previous image again
     """
 
     kind = "sensor"
     levels = ((16, 0.5, 0.1), (22, 0.65, 0.15), (30, 0.9, 0.2), (97, 3.0, 0.55))
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """Fix the episode's random numbers and forget the images of the last one."""
+        """Prepare an episode: forget the images of the previous one."""
         super().begin(task, seed, space)
         self._last: dict[str, NDArray[np.uint8]] = {}
 
     def see(self, camera: str, image: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
-        """Return the blurred and noisy image, or the last one of this camera.
+        """Return the blurred and noisy image, or this camera's previous image.
 
-        The random numbers follow from the control step, so that repeated calls in a step agree.
+        Repeated calls in the same control step use the same random numbers.
         """
         noise, blur, dropped = self.amount
         random = self.generator(camera, step)

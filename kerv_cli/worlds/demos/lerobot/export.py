@@ -1,8 +1,8 @@
-"""Writes demonstrations as a LeRobot dataset: one row per recorded frame, PNG images inside the tables.
+"""Write demonstrations as a LeRobot dataset. It has one row per recorded image, with PNG images inside the tables.
 
-`action` is the clean expert's, `action.executed` what moved the robot, `observation.state` the proprioception,
-`observation.environment_state` the privileged state. If frames were recorded every few control steps, the rows between
-them are left out and the rate is lower.
+`action` is the expert's action without noise, `action.executed` the action that moved the robot. `observation.state` is
+the proprioception, `observation.environment_state` the privileged state. If images were recorded only at every n-th
+control step, the other steps have no rows and the dataset's rate is lower.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ PICTURE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 
 @dataclass
 class Export:
-    """An export of `dataset`, and what it has written so far.
+    """A LeRobot dataset that is being written.
 
     Attributes:
-        dataset: Demonstrations.
-        tasks: Task to its index.
+        dataset: The demonstrations.
+        tasks: Task -> its index.
         rate: Rows per second.
-        episodes: Rows of the table of episodes.
-        values: Feature to the numbers (n, d) of each episode, for the statistics.
-        rows: Number of rows.
+        episodes: Rows of the table of episodes so far.
+        values: Feature -> its numbers (n, d) in each episode so far, for the statistics.
+        rows: Number of rows so far.
         image_shape: (height, width, channels) of an image.
     """
 
@@ -53,11 +53,18 @@ class Export:
 
     @property
     def image_keys(self) -> list[str]:
-        """The feature of each view of the frames."""
+        """Name of the image feature of each view."""
         return [f"{layout.IMAGES}{view}" for view in self.dataset.manifest.config["camera"]["name"].split(VIEWS)]
 
     def write(self, folder: Path, progress: OnProgress) -> None:
-        """Write all files. Each episode is a row group; the description comes last: without it there is no dataset."""
+        """Write all files. Each episode is a row group.
+
+        The description meta/info.json comes last. Without it, a folder is no dataset.
+
+        Args:
+            folder: Folder of the LeRobot dataset.
+            progress: Called after every episode.
+        """
         path = folder / layout.DATA.format(chunk_index=0, file_index=0)
         total = len(self.dataset.episodes)
         with atomic_path(path) as temporary:
@@ -75,7 +82,7 @@ class Export:
         write_json(folder / layout.INFO, self.info())
 
     def table(self, episode: DemoEpisode) -> pa.Table:
-        """Return an episode's rows, and note the episode."""
+        """Return the rows of an episode, and add the episode to the table of episodes and the statistics."""
         steps, columns = episode.frame_steps, {}
         keys, width = self.image_keys, len(self.dataset.manifest.observation.proprioception)
         for key, frames in zip(keys, np.split(np.asarray(episode.frames), len(keys), axis=2), strict=True):
@@ -118,7 +125,7 @@ class Export:
         return pa.table({**columns, layout.DONE: np.arange(count) == count - 1, **counters})
 
     def statistics(self, name: str) -> dict[str, Any]:
-        """Return the statistics of a feature for stats.json."""
+        """Return the statistics of a feature for meta/stats.json."""
         values = np.concatenate(self.values[name]).astype(np.float64)
         shape: tuple[int, ...] = (-1,)
         if name in self.image_keys:
@@ -127,7 +134,7 @@ class Export:
         return {key: np.reshape(x, shape).tolist() for key, x in found.items()} | {"count": [len(values)]}
 
     def info(self) -> dict[str, Any]:
-        """Return meta/info.json."""
+        """Return the contents of meta/info.json."""
         manifest = self.dataset.manifest
         image = {"dtype": "image", "shape": list(self.image_shape), "names": ["height", "width", "channels"]}
         vectors = {
@@ -159,7 +166,12 @@ class Export:
 
 
 def export(dataset: DemoDataset, folder: Path, progress: OnProgress) -> Export:
-    """Write `dataset` as a LeRobot dataset to `folder`.
+    """Write demonstrations as a LeRobot dataset.
+
+    Args:
+        dataset: The demonstrations.
+        folder: Folder of the LeRobot dataset. An older dataset in it is replaced.
+        progress: Called after every episode.
 
     Raises:
         UsageError: `folder` holds something else, or two tasks have the same instruction.

@@ -1,4 +1,4 @@
-"""Names and paths of a LeRobot dataset of version 3."""
+"""Names and paths in a LeRobot dataset of version 3."""
 
 VERSION = "v3.0"
 INFO, STATS, TASKS = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"
@@ -8,6 +8,6 @@ VIDEO = f"videos/{{video_key}}/{CHUNK}.mp4"
 STATE, ENVIRONMENT, ACTION, EXECUTED = "observation.state", "observation.environment_state", "action", "action.executed"
 IMAGES, DONE = "observation.images.", "next.done"
 COUNTERS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-"""Columns that every dataset has. Timestamps are seconds since the episode's start."""
+"""Columns that every dataset has. Timestamps are in seconds since the start of the episode."""
 EVERY_FRAME, EVERY_PIXEL = 10, 4
-"""Statistics of images are computed from every tenth frame, and from every fourth pixel per side."""
+"""The statistics of images use only every tenth image, and every fourth pixel in each direction."""

@@ -1,4 +1,4 @@
-"""Converts a LeRobot dataset of version 3 to demonstrations. Its images are in its tables, or in videos beside them."""
+"""Convert a LeRobot dataset of version 3 to demonstrations. Its images may be in its tables or in video files."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ OPENVLA = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
 
 @dataclass(frozen=True)
 class Source:
-    """A LeRobot folder.
+    """A LeRobot dataset to read.
 
     Attributes:
-        folder: The folder.
+        folder: Its folder.
         info: Contents of meta/info.json.
-        episodes: Rows of meta/episodes.
-        tasks: Instruction by task_index.
-        camera: Camera whose images are read.
-        key: Feature that holds them.
+        episodes: Rows of the tables in meta/episodes.
+        tasks: task_index -> instruction.
+        camera: Name of the camera to read.
+        key: Name of the feature with the camera's images.
     """
 
     folder: Path
@@ -52,11 +52,15 @@ class Source:
 
     @classmethod
     def open(cls, folder: Path, camera: str) -> Source:
-        """Read the description of a dataset. An empty `camera` means its first.
+        """Read the description of a dataset.
+
+        Args:
+            folder: Folder of the dataset.
+            camera: Camera to read. Empty: the first.
 
         Raises:
             UsageError: `folder` is a file.
-            CheckpointError: It holds no dataset of version 3, or a damaged one.
+            CheckpointError: There is no dataset of version 3, or it is damaged.
             UnknownName: The dataset has no such camera.
         """
         if folder.is_file():
@@ -84,7 +88,12 @@ class Source:
         return cls(folder, info, rows, tasks, camera, keys[camera])
 
     def names(self, feature: str, prefix: str) -> list[str]:
-        """Return the names of a vector's numbers, empty without it. Names that are incomplete become `prefix`_i."""
+        """Return a name for each number of a feature. Empty if the dataset does not have the feature.
+
+        Args:
+            feature: Name of the feature, such as `action`.
+            prefix: If the dataset does not name all numbers, they are named `prefix`_0, `prefix`_1, ….
+        """
         entry = self.info["features"].get(feature)
         if entry is None:
             return []
@@ -96,12 +105,25 @@ class Source:
         return [str(name) for name in names]
 
     def path(self, episode: Row, columns: str, form: str) -> Path:
-        """Return a file of an episode. Its chunk and number are in the columns that begin with `columns`."""
+        """Return the path of a data or video file of an episode.
+
+        Args:
+            episode: The episode's row in meta/episodes.
+            columns: The columns `columns`/chunk_index and `columns`/file_index of that row say which file it is.
+            form: Template of the path.
+        """
         indices = {f"{x}_index": int(episode[f"{columns}/{x}_index"]) for x in ("chunk", "file")}
         return self.folder / form.format(video_key=self.key, **indices)
 
     def table(self, episode: Row) -> pa.Table:
-        """Return the rows of one episode, in order."""
+        """Return the rows of one episode, in order.
+
+        Args:
+            episode: The episode's row in meta/episodes.
+
+        Raises:
+            CheckpointError: Rows are missing, or the file is damaged.
+        """
         path = self.path(episode, "data", self.info.get("data_path") or layout.DATA)
         table = _table(path, ("episode_index", int(episode["episode_index"])))
         if len(table) != int(episode["length"]):
@@ -109,7 +131,12 @@ class Source:
         return table
 
     def frames(self, episode: Row, table: pa.Table) -> np.ndarray:
-        """Return the frames (T, h, w, 3) uint8 of one episode."""
+        """Return the images (T, height, width, 3) uint8 of one episode.
+
+        Args:
+            episode: The episode's row in meta/episodes.
+            table: The episode's rows, from `table`.
+        """
         if self.info["features"][self.key]["dtype"] == "image":
             return np.stack([_picture(cell, self.folder) for cell in table[self.key].to_pylist()])
         path = self.path(episode, f"videos/{self.key}", self.info.get("video_path") or layout.VIDEO)
@@ -118,12 +145,18 @@ class Source:
 
 
 def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProgress) -> DemoDataset:
-    """Write the dataset's episodes as demonstrations in `folder` and open them.
+    """Convert a LeRobot dataset to demonstrations in a new folder, and open them.
+
+    Args:
+        settings: Settings of `kerv demos import`.
+        folder: The new folder.
+        progress: Called after every episode.
 
     Raises:
-        UsageError: There is no source, or the folder holds other demonstrations.
+        UsageError: There is no LeRobot dataset, or the new folder exists already.
+        UnknownName: The dataset has no such camera or strict DoF.
         CheckpointError: The dataset is damaged or of another version.
-        KervError: It holds videos, and the package av is missing.
+        KervError: The dataset contains videos, and the package av is not installed.
     """
     if folder.exists():
         raise UsageError(f"{folder} exists: give the new demonstrations another name")
@@ -138,7 +171,7 @@ def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProg
 
 
 def _import(source: Source, settings: DemosImportSettings, folder: Path, progress: OnProgress) -> None:
-    """Fill a new folder."""
+    """Write the demonstrations into an empty folder."""
     chosen = source.episodes[: settings.episodes or None]
     names = _task_names(source.tasks)
     entries: dict[str, list[EpisodeEntry]] = {}
@@ -178,6 +211,14 @@ def _import(source: Source, settings: DemosImportSettings, folder: Path, progres
 
 
 def _episode(source: Source, row: Row, names: Mapping[int, str], tail: int) -> DemoEpisode:
+    """Convert one episode.
+
+    Args:
+        source: The LeRobot dataset.
+        row: The episode's row in meta/episodes.
+        names: task_index -> name of the task.
+        tail: Number of copies of the last action to append to the labels.
+    """
     table = source.table(row)
     number = int(row["episode_index"])
     columns = {
@@ -204,10 +245,15 @@ def _episode(source: Source, row: Row, names: Mapping[int, str], tail: int) -> D
 
 
 def action_space(source: Source, settings: DemosImportSettings, actions: np.ndarray) -> ActionSpace:
-    """Return the space of recorded actions (n, D). Its limits are the smallest and largest that occur.
+    """Return the action space of a LeRobot dataset. Its limits are the smallest and largest recorded values.
+
+    Args:
+        source: The dataset.
+        settings: Settings of `kerv demos import`: names of the DoFs, and strict DoFs (such as a gripper).
+        actions: (n, D) all recorded actions.
 
     Raises:
-        UsageError: dofs=openvla for another number of DoFs than seven.
+        UsageError: `dofs=openvla` was chosen, but the actions do not have seven DoFs.
         UnknownName: A strict DoF does not exist.
     """
     names = tuple(source.names(layout.ACTION, "action"))
@@ -224,7 +270,11 @@ def action_space(source: Source, settings: DemosImportSettings, actions: np.ndar
 
 
 def _groups(names: Sequence[str], strict: Sequence[str]) -> tuple[Group, ...]:
-    """Return position, rotation and gripper for seven DoFs whose last is strict, else runs of strict and other DoFs."""
+    """Divide the DoFs into groups.
+
+    If there are seven and only the last is strict, the groups are position, rotation and gripper. Otherwise each run of
+    neighbouring strict or other DoFs is a group.
+    """
     if len(names) == 7 and tuple(strict) == tuple(names[-1:]):
         return Group("position", 3), Group("rotation", 3), Group("gripper", 1)
     runs = [(is_strict, len(list(run))) for is_strict, run in itertools.groupby(names, lambda name: name in strict)]
@@ -232,7 +282,10 @@ def _groups(names: Sequence[str], strict: Sequence[str]) -> tuple[Group, ...]:
 
 
 def _task_names(tasks: Mapping[int, str]) -> dict[int, str]:
-    """Return task_index to a name made from the instruction, fit for a folder and for a setting."""
+    """Return task_index -> name of the task, made from its instruction.
+
+    The name contains only characters that folders and settings allow.
+    """
     names: dict[int, str] = {}
     for number, text in tasks.items():
         name = re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:60] or f"task-{number}"
@@ -241,6 +294,11 @@ def _task_names(tasks: Mapping[int, str]) -> dict[int, str]:
 
 
 def _table(path: Path, where: tuple[str, Any] | None = None) -> pa.Table:
+    """Read a table. `where` is as in `foreign_table`.
+
+    Raises:
+        CheckpointError: The file is missing or damaged.
+    """
     try:
         return foreign_table(path, where=where)
     except (OSError, ValueError) as error:
@@ -248,6 +306,7 @@ def _table(path: Path, where: tuple[str, Any] | None = None) -> pa.Table:
 
 
 def _picture(cell: Row, folder: Path) -> np.ndarray:
+    """Decode an image from a cell of a table, which holds the image's bytes or its path below `folder`."""
     data = cell.get("bytes")
     try:
         with Image.open(io.BytesIO(data) if data else regular(folder / str(cell.get("path")))) as image:
@@ -257,7 +316,18 @@ def _picture(cell: Row, folder: Path) -> np.ndarray:
 
 
 def _video_frames(path: Path, start: float, rate: float, count: int) -> Iterator[np.ndarray]:
-    """Yield `count` frames of a video at start, start + 1 / rate, … seconds, each the nearest one."""
+    """Yield the frames of a video that are nearest to the times start, start + 1 / rate, ….
+
+    Args:
+        path: The video.
+        start: First time, in seconds.
+        rate: Frames per second.
+        count: Number of frames.
+
+    Raises:
+        KervError: The package av is not installed.
+        CheckpointError: The video is missing, damaged or too short.
+    """
     try:
         import av
     except ImportError as error:
