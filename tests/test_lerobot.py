@@ -112,7 +112,7 @@ def test_a_recording_cannot_be_rolled_out(results: Path) -> None:
     words = ["rollout", "task=BACK", "policy.target=rec", "method=ar", "episodes=1", "world.camera.size=56"]
     code, line = kerv(*words, f"results={results}")
     assert code == 2, line
-    assert "back is a recording: nothing can be executed in it" in line
+    assert "back is a recording: no episode can run in it" in line
 
 
 def edited(results: Path, tmp_path: Path, **changes: Any) -> Path:

@@ -108,7 +108,7 @@ ANSWERS = [
         "calibrate success",
         "is there, as a part of a shipped policy: policy.artifacts.certificate=NAME makes one of yours",
     ),
-    ("serve method=heisd", "its levels or drafts differ between tasks: name one with task=NAME"),
+    ("serve method=heisd", "its calibration or drafts differ between tasks: name one with task=NAME"),
     ("serve method=spec_vla proposer=retrieval task=rech", "unknown task 'rech': did you mean reach-v3?"),
     ("serve policy=expert", "policy=expert: it acts in the simulator's worlds and cannot be served"),
     ("demos policy=vision policy.target=nope task=reach", "train it with 'kerv train target name=nope'"),

@@ -145,7 +145,7 @@ def frame_of(**changes: Any) -> bytes:
         (frame_of(prompt=3), "prompt is int"),
         (frame_of(prompt="word " * 40), "has 40 words, the policy takes 10"),
         (frame_of(reset=np.zeros(3)), "reset is ndarray"),
-        (frame_of(executed=99), "executed=99: 0 to"),
+        (frame_of(executed=99), "executed=99"),
         (frame_of(x={**BOMB, b"dtype": "|O"}), "booleans, integers and floats"),
         (b"\xc1garbage", "cannot be read as msgpack"),
         ("text", "a text message came"),

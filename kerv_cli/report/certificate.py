@@ -53,7 +53,7 @@ def folder_of(resolved: ResolvedStudy) -> Path:
     """
     baseline, *candidates = _settings(resolved)
     if not candidates:
-        raise UsageError(f"study '{resolved.study.name}' has nothing but its baseline to certify")
+        raise UsageError(f"study '{resolved.study.name}' has only its baseline: add a setting to certify")
     _check_conditions(resolved)
     first, tasks = candidates[0], resolve_tasks(baseline.task)
     seeds = range(first.seed, first.seed + first.episodes)
@@ -110,7 +110,7 @@ def certify(
     """
     baseline, first = _settings(resolved)[:2]
     episodes = load_study(store, wanted).episodes
-    episodes = episodes[episodes["repeat"] == 0]  # a repeat is another time, not another pair
+    episodes = episodes[episodes["repeat"] == 0]  # a repeat measures the same world again: it is no further pair
     ar = episodes[episodes["label"] == resolved.study.baseline]
     candidates: list[Candidate] = []
     chosen, testing = None, True
@@ -155,7 +155,7 @@ def _candidate(
         testing: False after an earlier setting has failed: the setting gets no p-value.
     """
     ar, own = (pairs[f"success_{side}"].to_numpy(float) for side in ("baseline", "method"))
-    # (n,) values in a random order that has nothing to do with the tasks
+    # (n,) values in a random order, independent of the tasks
     seed = int.from_bytes(hashlib.sha256(str(len(ar)).encode()).digest()[:4], "big")
     values, bound = np.random.default_rng(seed).permutation((1 + ar - own) / 2), (1 + margin / POINTS) / 2
     p = p_value(values, bound, delta) if testing else None

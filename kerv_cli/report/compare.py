@@ -82,7 +82,7 @@ def pairs_to_compare(results: str, first: str, second: str) -> list[tuple[Side, 
     """
     ours, theirs = sides(results, first), sides(results, second)
     if ours[0].run.has_episodes != theirs[0].run.has_episodes:
-        raise UsageError(f"{ours[0].run.id} and {theirs[0].run.id} cannot be compared: one of them has no episodes")
+        raise UsageError(f"{ours[0].run.id} and {theirs[0].run.id} cannot be compared: only one of them has episodes")
     pairs = [(a, b) for a in ours for b in theirs if a.label == b.label]
     if len(pairs) < 2 and not (pairs and len(ours) == len(theirs) == 1):
         pairs = [(ours[0], side) for side in theirs if side != ours[0]]

@@ -80,7 +80,7 @@ def _choice(where: str, rows: Sequence[Row], loss: float) -> Choice:
     success = next((float(row["success"]) for row in rows if is_baseline(row)), math.nan)
     order = [] if success < verdict.SOLVED else safest_first(rows)
     best = _fastest(list(itertools.takewhile(lambda row: -POINTS * row["difference_low"] < loss, order)))
-    # a setting is shown only after all safer ones
+    # a setting is tested only after all safer ones have passed, so it needs the most pairs of all of these
     counts = (stats.PairedCounts(*(int(row[name]) for name in stats.PairedCounts._fields)) for row in order)
     pairs = itertools.accumulate((stats.pairs_to_settle(one, loss / POINTS) for one in counts), max)
     reached = {str(row["label"]): least for row, least in zip(order, pairs, strict=True) if math.isfinite(least)}

@@ -27,7 +27,7 @@ from kerv_cli.report.tables import csv_text, flatten, is_number, load_study, row
 PROJECT = "kerv"
 FILES = ("csv", "parquet", "db")
 """Export formats that need no tracker."""
-_AT_ONCE = 100  # episodes in memory
+_AT_ONCE = 100  # episodes in memory at a time
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def _to_csv(tracked: Tracked, folder: Path) -> str:
 
 
 def _to_trackio(tracked: Tracked, folder: Path) -> str:
-    os.environ.setdefault("TRACKIO_DIR", str(folder))  # read when trackio is imported
+    os.environ.setdefault("TRACKIO_DIR", str(folder))  # trackio reads it when it is imported
     import trackio
 
     trackio.init(project=PROJECT, name=tracked.name, config=tracked.config, embed=False)

@@ -63,7 +63,7 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, all_
     """
     pairs = paired(episodes, baseline)
     macro = averaging == MACRO
-    worlds = pairs[pairs["repeat"] == 0]  # a repeat is another time, not another world
+    worlds = pairs[pairs["repeat"] == 0]  # a repeat measures the same world again
     once = episodes[episodes["repeat"] == 0]
     timed = pairs if all_pairs else pairs[pairs["same_block"]]
     success = _averaged(once, macro, lambda group: stats.wilson(int(group["success"].sum()), len(group)))
@@ -176,7 +176,7 @@ def _speedup(pairs: pd.DataFrame, time: str, macro: bool) -> Estimate:
         macro: Whether to average times over difficulty groups.
     """
     blocks = pairs["block_method"].astype(str) + "|" + pairs["block_baseline"].astype(str)
-    blocks = blocks.groupby([pairs["task"], pairs["seed"]]).transform("first")  # repeats of a world belong together
+    blocks = blocks.groupby([pairs["task"], pairs["seed"]]).transform("first")  # repeats of a world count once
     return stats.speedup(
         pairs[f"{time}_baseline"].to_numpy(),
         pairs[f"{time}_method"].to_numpy(),

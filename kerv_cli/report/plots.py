@@ -38,7 +38,7 @@ STYLE: Any = {
 SUCCESS, SPEED = "success", "episode_speedup"
 UNITS = {SUCCESS: "success, % of episodes", SPEED: "speed: time per episode, baseline ÷ setting"}
 """Columns of a study's table that are drawn -> their axis labels."""
-_ACROSS = 4  # panels beside one another
+_ACROSS = 4  # panels in a row
 
 
 class Panel(NamedTuple):
@@ -230,7 +230,7 @@ def read_log(folder: Path) -> pd.DataFrame:
     rows = Curve.of(folder).read() if folder.parent.parent.name == "artifacts" else []
     if rows:
         return pd.DataFrame(rows)
-    path = folder / "log.csv"  # travels with an artifact, also without its database
+    path = folder / "log.csv"  # an artifact that was copied without its database still has this file
     try:
         return pd.read_csv(path)
     except (OSError, ValueError) as error:

@@ -100,7 +100,7 @@ def report(
         StorageError: The disk is full or read-only.
     """
     if on and not study:
-        raise UsageError(f"on={','.join(on)}: name the study whose decodes are to be priced, study=NAME")
+        raise UsageError(f"on={','.join(on)}: name the study to price with study=NAME")
     names = names_to_report(results, study)
     profiles, output = open_profiles(results, on), Report([], {})
     for name in names:

@@ -244,7 +244,7 @@ def _spread(effects: np.ndarray, strata: Sequence[str], clusters: Sequence[str])
     variance, freedom = 0.0, 0
     for number in np.unique(stratum):
         parts = sums[stratum == number]
-        # a single one-cluster stratum has nothing to be compared with: its whole sum counts
+        # only one stratum has a single cluster: there is no spread to estimate, so its squared sum counts
         variance += len(parts) * float(parts.var(ddof=1)) if len(parts) > 1 else float(parts[0]) ** 2
         freedom += len(parts) - 1
     return float(stdtrit(freedom, 0.975)) * math.sqrt(variance) if freedom else math.nan

@@ -149,7 +149,7 @@ def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
     texts = {
         name: episodes[name].astype(object) for name in ("label", "task", "block", "started", "device_name", "run")
     }
-    states = episodes["initial_state"].map(tuple)  # comparable
+    states = episodes["initial_state"].map(tuple)  # tuples can be compared
     episodes = episodes.assign(difficulty=episodes["task"].map(groups), initial_state=states, **columns, **texts)
     return episodes.astype(dict.fromkeys(("difficulty", "device", "dtype"), object))
 

@@ -197,7 +197,7 @@ def read_map(frame: bytes | str, from_map: Callable[[dict[Any, Any]], object]) -
         value = msgpack.unpackb(frame, object_hook=from_map, strict_map_key=True)
     except UsageError:
         raise
-    except Exception as error:  # msgpack raises many kinds, which mean the same
+    except Exception as error:  # msgpack raises many types of exceptions
         raise UsageError(f"the message cannot be read as msgpack ({type(error).__name__})") from error
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
         raise UsageError(f"the message is a {type(value).__name__}, a map with text keys is wanted")
@@ -220,7 +220,7 @@ def array_of(name: object, shape: object, data: object) -> np.ndarray:
         raise UsageError(f"an array of shape {str(shape)[:60]}: at most 8 whole numbers are wanted")
     if not isinstance(data, bytes) or math.prod(shape) * dtype.itemsize != len(data):
         raise UsageError(f"an array of shape {shape} and type {dtype} does not fit its bytes")
-    return np.frombuffer(data, dtype).reshape(shape).copy()  # bytes cannot be written to
+    return np.frombuffer(data, dtype).reshape(shape).copy()  # an array over bytes would be read-only
 
 
 def _dtype(name: object) -> np.dtype:

@@ -61,7 +61,7 @@ class Policy:
 
     def __init__(self, settings: ServeSettings) -> None:
         if settings.policy.kind != "model":
-            raise UsageError(f"policy={settings.policy.kind}: it acts in the simulator's worlds and cannot be served")
+            raise UsageError(f"policy={settings.policy.kind}: it needs the simulator and cannot be served")
         self.settings = settings
         self.artifacts = artifacts_of(settings)
         self.description = self.artifacts.description
@@ -76,7 +76,7 @@ class Policy:
         self.by_task = not self.task and bool(self._artifacts_with("by_task"))
         if self.by_task and settings.protocol != VLA_EVAL and self._artifacts_with("needs_task"):
             raise UsageError(
-                f"method={settings.method}: its levels or drafts differ between tasks: name one with task=NAME"
+                f"method={settings.method}: its calibration or drafts differ between tasks: name one with task=NAME"
             )
         self._turn = threading.Lock()
         first = self._new_decoder(self._any_task())

@@ -93,7 +93,7 @@ class PolicyServer:
                 compression=None,
                 max_size=LARGEST_MESSAGE,
                 process_request=_health,
-                origins=[None, *self.settings.origins],  # only web pages name one
+                origins=[None, *self.settings.origins],  # only web pages send an origin
                 ping_interval=self.protocol.ping_s,
                 ping_timeout=self.protocol.ping_s,
                 close_timeout=FAREWELL,
@@ -125,7 +125,7 @@ class PolicyServer:
             why = f": {frame.reason}" if frame and frame.reason else ""
         except TimeoutError:
             why = f": no message for {self.protocol.idle_s:g} s"
-            # it may never answer, and nobody waits for it
+            # close in a thread, because the client may never answer
             threading.Thread(target=connection.close, args=(GONE, why[2:]), daemon=True).start()
         finally:
             self._connections.discard(connection)

@@ -87,7 +87,7 @@ class _Episode:
         task, ids = (value if isinstance(value, dict) else {} for value in map(payload.get, ("task", "recording")))
         seed, index = (value if isinstance(value, int) else 0 for value in map(task.get, ("seed", "episode_idx")))
         self.task, self.seed = str(task.get("name", "")), max(0, seed + index)
-        self.ids: Message = ids  # the harness's names of the episode; empty if it does not record
+        self.ids: Message = ids  # ids under which the benchmark records the episode; empty if it does not
         self.started = datetime.now(UTC).isoformat(timespec="seconds")
         self.instruction, self.begun = "", False
         self.decodes: list[DecodeRecord] = []
@@ -141,7 +141,7 @@ class VlaEval(Conversation):
         number = payload.get("protocol_version")
         if number != PROTOCOL_VERSION:
             raise UsageError(
-                f"protocol version {str(number)[:20]} is not known here: this server speaks {PROTOCOL_VERSION}"
+                f"protocol version {str(number)[:20]} is unknown: this server speaks version {PROTOCOL_VERSION}"
             )
         params = observation_params(self.interface)
         about = {
@@ -157,7 +157,7 @@ class VlaEval(Conversation):
 
     def _start(self, payload: Message) -> None:
         """Note that a new episode begins. The first observation builds its decoder and reports what is wrong."""
-        self.episode = _Episode(payload)  # its first observation says what is wrong with it
+        self.episode = _Episode(payload)  # errors are reported at the first observation
 
     def _observe(self, payload: Message) -> Reply:
         """Return the next action. Decode an observation first if the last chunk is used up."""
@@ -170,9 +170,9 @@ class VlaEval(Conversation):
             episode.begun = True
         elif step == len(episode.path):
             self.decoder.observe(episode.sent[-1], hand)
-        episode.path[step:] = [hand]  # an observation that got an error has left its own there
+        episode.path[step:] = [hand]  # replace the position that a failed observation of this step left
         if self.holds(state, bool(episode.sent)):
-            episode.left.clear()  # what was planned before this state is not executed
+            episode.left.clear()  # drop the rest of the chunk: it was planned before this state
             return self._act(episode, episode.sent[-1], None)
         seconds = None
         if not episode.left:
@@ -303,5 +303,5 @@ def _image(data: Any) -> np.ndarray:
             return np.array(image)
     except KervError:
         raise
-    except Exception as error:  # Pillow raises many kinds, which mean the same
+    except Exception as error:  # Pillow raises many types of exceptions
         raise UsageError(f"an image cannot be read as PNG or JPEG ({type(error).__name__})") from error

@@ -40,7 +40,7 @@ class MujocoWorld(World):
         self, spec: EnvironmentSpec, task: str, camera: CameraSettings | None = None, horizon: int = 0
     ) -> None:
         super().__init__(spec, task, camera, horizon)
-        self._cameras: dict[CameraSettings, Camera] = {}  # each is opened when it is first drawn
+        self._cameras: dict[CameraSettings, Camera] = {}  # opened when first used
         self._changes = ModelChanges()
 
     @abstractmethod
@@ -74,7 +74,7 @@ _HEADLESS = ("egl", "osmesa")
 _PROBE = """
 import ctypes, sys
 if sys.platform == "linux":
-    ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG: it ends with its parent
+    ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG: end with the parent process
 import mujoco
 context = mujoco.GLContext(16, 16)
 context.make_current()
@@ -147,7 +147,7 @@ def load_mujoco() -> None:
     Without a backend the physics still works. Only opening a Camera fails.
     """
     if find_backend()[1]:
-        os.environ.setdefault("MUJOCO_GL", "disable")  # without it mujoco asks for glfw, which needs a display
+        os.environ.setdefault("MUJOCO_GL", "disable")  # otherwise mujoco tries glfw, which needs a display
     import mujoco  # noqa: F401
 
 
@@ -172,14 +172,14 @@ class Camera:
         self._model = model
         self._camera = int(model.camera(config.name).id)
         pixels = config.size * config.supersample
-        # The context reads them when it opens. Multisampling and shadow maps are most of a software frame's cost.
+        # The context reads these values when it opens. Multisampling and shadow maps cost most of the drawing time.
         model.vis.quality.offsamples = 0
         model.vis.quality.shadowsize = 0
         model.vis.global_.offwidth = max(int(model.vis.global_.offwidth), pixels)
         model.vis.global_.offheight = max(int(model.vis.global_.offheight), pixels)
         try:
             self._renderer = _open_renderer(model, pixels)
-        except Exception as error:  # each backend raises types of its own
+        except Exception as error:  # each backend raises its own types
             raise RenderingUnavailable(
                 f"OpenGL backend '{backend}' cannot draw here ({error}): {install_command()}"
             ) from error
@@ -193,7 +193,7 @@ class Camera:
     def render(self, data: mujoco.MjData) -> NDArray[np.uint8]:
         """Return the image (size, size, 3) of the state in `data` as uint8 RGB, upright."""
         fovy = self._model.cam_fovy[self._camera]
-        self._model.cam_fovy[self._camera] = self.config.fovy  # views of one model may differ in it: set per frame
+        self._model.cam_fovy[self._camera] = self.config.fovy  # set anew, because views of one model may differ
         self._renderer.update_scene(data, camera=self._camera)
         self._model.cam_fovy[self._camera] = fovy
         self._renderer.render(out=self._pixels)

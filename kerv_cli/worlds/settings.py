@@ -16,14 +16,14 @@ MOST_STRESS = 4
 """Highest level of every kind of stress."""
 
 
-@dataclass(unsafe_hash=True)  # a key of dictionaries; Hydra could not override a frozen one
+@dataclass(unsafe_hash=True)  # used as a dictionary key; not frozen, because Hydra must override it
 class CameraSettings:
     """What the policy sees: one camera of the environment, or several views side by side (`views.views_of`)."""
 
     name: str = setting("", "camera, or several joined by + for views side by side; empty: the environment's first")
     fovy: float = number(45.0, above=0, most=179, help="vertical field of view, degrees")
     size: int = number(96, 8, 4096, help="pixels of a view, square")
-    supersample: int = number(2, 1, 16, help="drawn pixels per shown pixel and side")
+    supersample: int = number(2, 1, 16, help="draw this many times as many pixels per side, then average")
 
 
 @dataclass
@@ -41,8 +41,8 @@ class StressSettings:
     It is drawn for every episode from task, seed, kind and level.
     """
 
-    kind: str = setting("none", "what is shifted: push, actuation, sensor, light, colour, camera or object")
-    level: int = number(0, 0, MOST_STRESS, help="size of the shift; 0: none")
+    kind: str = setting("none", "what is disturbed: push, actuation, sensor, light, colour, camera or object")
+    level: int = number(0, 0, MOST_STRESS, help="strength of the disturbance; 0: none")
 
     @property
     def active(self) -> bool:
@@ -61,14 +61,14 @@ class StressSettings:
         """
         find("stress", self.kind, f"{prefix}kind")
         if self.kind == "none" and self.level:
-            raise UsageError(f"{prefix}level={self.level} without {prefix}kind: name what is shifted")
+            raise UsageError(f"{prefix}level={self.level} without {prefix}kind: name what to disturb")
 
 
 @dataclass
 class RolloutWorldSettings(WorldSettings):
     """Settings of a rollout's world, which a stress may make different from the world of training."""
 
-    stress: StressSettings = setting(StressSettings, "shift of the world")
+    stress: StressSettings = setting(StressSettings, "disturbance of the world")
 
 
 @dataclass
@@ -80,8 +80,8 @@ class DemosImportSettings(CommandSettings):
     name: str | None = setting(None, "name of the demonstrations; null: the folder's")
     camera: str = setting("", "camera whose images are read; empty: the first")
     episodes: int = number(0, 0, 1_000_000, help="number of episodes, from the first; 0: all")
-    dofs: str = choice("own", "own", "openvla", help="names of the DoFs")
-    strict: list[str] | None = setting(None, "strict DoFs, never relaxed; null: those with gripper in their name")
+    dofs: str = choice("own", "own", "openvla", help="names of the DoFs: the dataset's own, or OpenVLA's")
+    strict: list[str] | None = setting(None, "DoFs that are never relaxed; null: those with gripper in their name")
     tail: int = number(
         8, 0, 1024, help="copies of the last action after an episode, for chunks that begin near its end"
     )

@@ -216,7 +216,7 @@ class EnvironmentSpec:
             UsageError: The simulator cannot run so many control steps, or the environment is a recorded dataset.
         """
         if not self.world_class:
-            raise UsageError(f"{self.name} is a recording: nothing can be executed in it")
+            raise UsageError(f"{self.name} is a recording: no episode can run in it")
         world: World = load(self.world_class)(self, task, camera, horizon)
         return world
 
@@ -339,7 +339,7 @@ class World(ABC):
             raise KervError(f"{self.task}: an action is {space.dofs} finite numbers, not {action!r}")
         self.observation  # noqa: B018 - raises before the first reset
         if self.steps >= self.horizon:
-            raise KervError(f"{self.task}: the episode ended at step {self.steps}, its horizon: reset the world")
+            raise KervError(f"{self.task}: the episode ended at step {self.steps}, the horizon: reset the world")
         executed = self.stress.act(np.clip(executed, space.low, space.high), self.steps)
         state, self.success = self._advance(executed)
         self.succeeded = self.succeeded or self.success

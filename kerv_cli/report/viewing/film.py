@@ -20,8 +20,8 @@ from kerv_cli.report.viewing.viewer import read_chunks
 
 RATE = 20
 """Largest number of pictures per second of simulated time."""
-PICTURE = 480  # pixels of its longer side, at least
-ROW = 22  # pixels of a line of tokens
+PICTURE = 480  # least pixels of a picture's longer side
+ROW = 22  # height in pixels of a row of tokens
 BACKGROUND = (13, 16, 17)
 
 Track = list[tuple[int, float, Any]]
@@ -46,7 +46,7 @@ def save_film(recording: Path, path: Path) -> Path:
     tracks = _tracks(recording)
     camera = tracks.get("/camera", [])
     if len(camera) < 2:
-        raise UsageError(f"{recording} shows no camera: roll out again with record=1")
+        raise UsageError(f"{recording} has no camera images: run the rollout again with record=1")
     seconds = camera[-1][1] / len(camera)
     stride = max(1, round(1 / (RATE * seconds)))
     pictures = [_picture(frame, step, tracks) for step, _, frame in camera[::stride]]

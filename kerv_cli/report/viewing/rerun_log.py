@@ -167,7 +167,7 @@ def _log_world(log: _Log, record: EpisodeRecord) -> None:
 def _log_tokens(log: _Log, record: EpisodeRecord) -> None:
     """Log for each decode: its mode, the outcome of each token of its chunk as coloured bars, and a table."""
     starts, names = np.asarray(record.decode_steps, dtype=np.int64), record.space.names
-    turns = [str(number % 2) for number in range(len(starts))]  # equal states would melt into one
+    turns = [str(number % 2) for number in range(len(starts))]  # the viewer joins equal neighbours, so alternate
     log.states("decodes", starts, turns, {"0": ("·", 0x55606BFF), "1": ("·", GREY)})
     modes = [decode.mode for decode in record.decodes]
     changes = [i for i in range(len(modes)) if i == 0 or modes[i] != modes[i - 1]]

@@ -99,7 +99,7 @@ def _start(command: list[str]) -> None:
             viewer = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True)
             status = viewer.wait(timeout=_START_SECONDS)
         except subprocess.TimeoutExpired:
-            viewer.returncode = 0  # it outlives this process: Popen must not warn of it
+            viewer.returncode = 0  # the viewer keeps running: without this, Popen would warn
             return
         except OSError as error:
             raise KervError(f"cannot start the Rerun viewer {command[0]}: {error.strerror}") from error
@@ -118,7 +118,7 @@ def read_chunks(path: Path) -> tuple[RrdReader, list[Chunk]]:
     from rerun.chunk import RrdReader
 
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # rerun only warns of a missing end
+        warnings.simplefilter("error")  # rerun only warns if the end of the file is missing
         try:
             reader = RrdReader(regular(path))
             chunks = list(reader.stream())

@@ -219,14 +219,14 @@ class DemoDataset:
         if not file.exists():
             command = f"'kerv demos {'task' if stands_for_tasks(path.name) else 'name'}={path.name}'"
             if (path / "recording.json").exists():
-                raise CheckpointError(f"the demonstrations in {path} are unfinished: run {command} again to go on")
+                raise CheckpointError(f"the demonstrations in {path} are unfinished: run {command} again to continue")
             raise CheckpointError(f"no demonstrations in {path}: record them with {command}")
         value = read_mapping(file)
         if value.get("format") != FORMAT:
             raise CheckpointError(f"{file} has format {value.get('format')}, this kerv reads {FORMAT}")
         manifest = read(DemoManifest, value, str(file))
         if manifest.sha256 != dataset_hash(value["tasks"]):
-            raise CheckpointError(f"{file} is damaged: its hash does not fit its episodes")
+            raise CheckpointError(f"{file} is damaged: its hash does not match its episodes")
         if manifest.instructions:
             camera, spaces = manifest.config["camera"]["name"], (manifest.actions, manifest.observation)
             register_recorded(manifest.environment, *spaces, manifest.instructions, camera)

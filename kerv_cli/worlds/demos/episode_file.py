@@ -84,10 +84,10 @@ def save_episode(path: Path, episode: DemoEpisode) -> None:
         "perturbed": str(episode.perturbed).lower(),
         "steps": str(episode.steps),
         "frame_size": str(height),
-        # square frames need no width, so that their files keep their bytes
+        # no width for square frames: older files have none, and equal episodes must have equal bytes
         **({"frame_width": str(width)} if width != height else {}),
     }
-    # save_file would hide a full disk behind an error type of its own.
+    # Not safetensors' save_file: on a full disk it raises its own type of error.
     write_bytes(path, _with_sorted_metadata(save(tensors, metadata=metadata)))
 
 

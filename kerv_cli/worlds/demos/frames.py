@@ -103,7 +103,7 @@ class EncodedFrames:
             file.seek(start)
             data = file.read(end - start)
         with Image.open(io.BytesIO(data)) as image:
-            return np.array(image)[:, : self.width]  # a copy: torch warns of memory that may not be written to
+            return np.array(image)[:, : self.width]  # a copy, because torch warns if memory is read-only
 
 
 def header_of(data: bytes) -> tuple[dict[str, Any], int]:

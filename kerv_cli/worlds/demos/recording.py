@@ -39,7 +39,7 @@ from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import EnvironmentSpec, World
 from kerv_cli.worlds.vectors import unit_vector
 
-_SEEDS_PER_JOB = 10  # they share a simulator
+_SEEDS_PER_JOB = 10  # seeds of a job share one simulator
 _EXTRA_SEEDS = 20
 """Failed seeds are replaced by seeds beyond the requested range: at most this many, plus one per requested episode."""
 
@@ -220,7 +220,7 @@ def _collect(
             entries[task] += [entry for entry in outcomes.values() if entry is not None]
             failed[task] += [seed for seed, entry in outcomes.items() if entry is None]
             on_progress(sum(map(len, entries.values())), config.episodes * len(config.tasks))
-        # one new seed per failure, in order: the outcome does not depend on how the work is divided
+        # one new seed per failure, in order, so that the result does not depend on the number of workers
         stops = {task: block.stop + config.episodes - len(entries[task]) for task, block in seeds.items()}
         seeds = {task: range(block.stop, min(stops[task], limit)) for task, block in seeds.items()}
     return entries, failed
@@ -242,7 +242,7 @@ def _identity(config: DemoConfig) -> dict[str, Any]:
         "config": settings,
         "versions": {name: version(name) for name in (*spec.packages, "numpy")} | {"python": platform.python_version()},
     }
-    return dict(json.loads(json.dumps(identity)))  # lists for tuples, as in the file
+    return dict(json.loads(json.dumps(identity)))  # turns tuples into lists, as in the file
 
 
 def _check_same_recording(out: Path, identity: dict[str, Any], packages: Sequence[str]) -> None:
@@ -287,7 +287,7 @@ def _run_jobs(
     from joblib import Parallel, delayed, parallel_config
     from joblib.externals.loky.process_executor import BrokenProcessPool
 
-    # loky starts fresh interpreters: a fork after this process has drawn would deadlock in the GL driver.
+    # loky starts new interpreters. A fork after this process has drawn would deadlock in the OpenGL driver.
     workers = {"n_jobs": min(config.workers, len(jobs)), "initializer": begin_worker, "initargs": (os.getpid(),)}
     with parallel_config(backend="loky", inner_max_num_threads=1, **workers):
         work = (delayed(_record_seeds)(config, out, task, seeds, make_actor) for task, seeds in jobs)

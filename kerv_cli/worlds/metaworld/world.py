@@ -41,7 +41,7 @@ def _placements(task: str, benchmark_seed: int) -> tuple[Any, ...]:
 
 @contextlib.contextmanager
 def _quiet_simulator() -> Iterator[None]:
-    # The experts warn in every second step about a range that the world clips anyway.
+    # The experts warn at every second step that an action is out of range. The world clips actions anyway.
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=r"Constant\(s\) may be too high")
         yield
@@ -82,7 +82,7 @@ class MetaWorld(MujocoWorld):
         outwards[2::3] = 0.0  # heights
         reset_model = env.reset_model
 
-        def reset_outside() -> Any:  # a reset calls it twice; it asks for placements until one suits it
+        def reset_outside() -> Any:  # a reset calls this twice; it asks for placements until it accepts one
             shares = (0.5**tries for tries in itertools.count())
 
             def placement() -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ from kerv_cli.worlds.vectors import unit_vector
 
 WIDE = 0.35
 """A fixed geom is background or table if it is a plane or its bounding sphere has at least this radius, in metres."""
-_FROM_MATERIAL = 0.5, 0.5, 0.5, 1.0  # rgba of a geom whose colour is its material's
+_FROM_MATERIAL = 0.5, 0.5, 0.5, 1.0  # rgba of a geom that takes its colour from its material
 
 
 class Light(Stress):
@@ -39,7 +39,7 @@ class Light(Stress):
         for lamp in range(model.nlight):
             turn = _random_turn(random, degrees).as_matrix()
             for vector in (model.light_dir[lamp], model.light_pos[lamp]):
-                vector[:] = sum((turn * vector).T)  # in this order on every CPU; `turn @ vector` is OpenBLAS's
+                vector[:] = sum((turn * vector).T)  # not `turn @ vector`: OpenBLAS rounds differently on different CPUs
 
 
 class Colour(Stress):
@@ -83,7 +83,7 @@ class CameraJitter(Stress):
         changes.keep(model.cam_pos, model.cam_quat)
         for camera in range(model.ncam):
             model.cam_pos[camera] += unit_vector(random, 3) * metres
-            turn = _random_turn(random, degrees)  # in the camera's own frame
+            turn = _random_turn(random, degrees)  # relative to the camera's own axes
             turned = Rotation.from_quat(model.cam_quat[camera], scalar_first=True) * turn
             model.cam_quat[camera] = turned.as_quat(scalar_first=True)
 

@@ -75,7 +75,7 @@ class Source:
         features = info["features"].items()
         keys = {n.removeprefix(layout.IMAGES): n for n, feature in features if feature["dtype"] in ("image", "video")}
         if not keys or layout.ACTION not in info["features"]:
-            raise CheckpointError(f"{folder} has no images or no {layout.ACTION}: it cannot be learned from")
+            raise CheckpointError(f"{folder} has no images or no {layout.ACTION}: a policy cannot be trained on it")
         if camera and camera not in keys:
             raise UnknownName("camera", camera, keys)
         camera = camera or next(iter(keys))
