@@ -196,7 +196,7 @@ BOMB = {"__image__": True, "format": "raw", "data": b"", "dtype": "<f8", "shape"
     ("kind", "payload", "said"),
     [
         ("hello", {"protocol_version": 9}, "protocol version 9 is unknown: this server speaks version 1"),
-        ("greeting", {}, "a message of type greeting: hello, episode_start, observation, episode_end"),
+        ("greeting", {}, "a message of type greeting: send hello, episode_start, observation, episode_end"),
         ("observation", [1], "a message of type observation"),
         ("observation", {"state": [0.0] * 4, "images": {"corner2": BLACK}}, "images of corner2"),
         ("observation", {"state": [0.0] * 4, "images": {"corner4": BLACK[:64, :64]}}, "images.corner4 is (64, 64, 3)"),
