@@ -110,7 +110,7 @@ ANSWERS = [
     ),
     ("serve method=heisd", "its calibration or drafts differ between tasks: name one with task=NAME"),
     ("serve method=spec_vla proposer=retrieval task=rech", "unknown task 'rech': did you mean reach-v3?"),
-    ("serve policy=expert", "policy=expert: it acts in the simulator's worlds and cannot be served"),
+    ("serve policy=expert", "policy=expert: it needs the simulator and cannot be served"),
     ("demos policy=vision policy.target=nope task=reach", "train it with 'kerv train target name=nope'"),
 ]
 """A line as typed -> what its answer says."""
