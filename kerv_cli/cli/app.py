@@ -1,6 +1,6 @@
-"""The `kerv` command: every registered command under its name. Nothing heavy is imported here.
+"""The `kerv` command with all registered subcommands. Neither torch nor MuJoCo is imported here.
 
-Each of kerv's own commands is a file beside this one.
+Each of kerv's own commands is in a file of this folder.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from kerv_cli.base.registry import parts
 from kerv_cli.cli.command import CONTEXT, commands_below, summary_of, typer_command
 from kerv_cli.cli.common import one_line_errors
 
-# kerv's own commands register themselves, in the order of the help
+# importing a module registers its commands; this is the order in the help
 # isort: off
 from kerv_cli.cli import demos, train, prepare, build, calibrate, rollout, sweep, serve, report, runs, view  # noqa: F401
 from kerv_cli.cli import bench, doctor  # noqa: F401
 # isort: on
 
-# Set before numpy loads: by default its products use every core, whatever runtime.threads says.
+# Set before numpy loads: by default its matrix multiplications use every core, whatever runtime.threads says.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 FAMILIES = {
@@ -30,21 +30,21 @@ FAMILIES = {
     "build": "Build artifacts that need no training.",
     "runs": "List, show, compare, repeat, export and remove runs: sweeps, rollouts, trainings, all that was made.",
 }
-"""First words that are not commands themselves."""
+"""Help for groups of commands, such as `kerv train`, that do nothing by themselves."""
 
 
 class Commands(TyperGroup):
-    """The registered commands whose names begin with `prefix`: kerv itself, `kerv train`, …."""
+    """A group of registered commands: all of `kerv`, or those whose names begin with `prefix`, such as `train `."""
 
     prefix = ""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Return the words that can follow."""
+        """Return the words that can be typed next."""
         names = (part.name.removeprefix(self.prefix) for part in commands_below(self.prefix))
         return list(dict.fromkeys(name.split()[0] for name in names))
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return the command, or the family of commands, of a word; None if there is neither."""
+        """Return the command or the group of commands with this name. None if there is neither."""
         name = self.prefix + cmd_name
         if name in parts("command"):
             return typer_command(parts("command")[name])
@@ -55,7 +55,11 @@ class Commands(TyperGroup):
         return family
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        """Return the command that the first words name: `demos export` is a command beside `demos`."""
+        """Find the command that the arguments begin with. Two words are tried first, as in `demos export`.
+
+        Returns:
+            The command's name, the command, and the arguments after it.
+        """
         name = " ".join(args[:2])
         if self.prefix + name in parts("command"):
             return name, typer_command(parts("command")[self.prefix + name]), args[2:]
@@ -65,7 +69,7 @@ class Commands(TyperGroup):
         return args[0], command, args[1:]
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """List the commands without importing what they run."""
+        """Write the list of commands to the help, without importing their functions."""
         rows = []
         for word in self.list_commands(ctx):
             name = self.prefix + word
@@ -77,16 +81,16 @@ class Commands(TyperGroup):
 
 
 class Kerv(Commands):
-    """The command `kerv` itself. It prints every error as one line."""
+    """The command `kerv` itself. It prints each error as one line."""
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
-        """Read kerv's own options, and print the help."""
+        """Parse the options of `kerv` itself, such as --version. Print an error as one line."""
         self.words = list(args)
         with one_line_errors(self.words):
             return super().make_context(info_name, args, parent, **extra)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command."""
+        """Run the command that was typed. Print an error as one line."""
         with one_line_errors(self.words):
             return super().invoke(ctx)
 
@@ -118,4 +122,4 @@ def kerv(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print versions and stop.")
     ] = False,
 ) -> None:
-    """Read the options of kerv itself."""
+    """Accept the options of `kerv` itself."""

@@ -1,4 +1,4 @@
-"""`kerv bench`: what a target's decodes cost, against the device's limits."""
+"""`kerv bench`: measure how long a target's decodes take, compared with what the device could do at best."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import print_table
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print the whole result as JSON in the last line.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Also print the whole result as JSON, in the last line.")]
 
 
 @command(
@@ -19,13 +19,13 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the whole result as 
     BenchSettings,
     keys="target dtype tokens repeats projected runtime.device runtime.dtype runtime.threads results",
     examples=("kerv bench", "kerv bench target=vla-150m dtype=bfloat16 projected=openvla-7b"),
-    typed={"target": "model"},  # to Hydra target= would be a choice among the files of conf/target
+    typed={"target": "model"},  # renamed, because Hydra would take target= as a choice among the files of conf/target
 )
 def bench(settings: BenchSettings, as_json: AsJson = False) -> None:
-    """Measure what a target's decodes cost, against the device's limits.
+    """Measure how long a target's decodes take, compared with what the device could do at best.
 
-    target= is a policy or a shape: vla-150m, smolvla, openvla-7b. 'kerv report study=NAME on=PROFILE' prices a study's
-    decodes with the profile.
+    target= is a policy, or a shape with random weights: vla-150m, smolvla, openvla-7b. 'kerv report study=NAME
+    on=PROFILE' estimates from the profile how long a study's decodes would take.
     """
     from kerv_cli.bench.machine import measure_machine
     from kerv_cli.bench.model import open_model

@@ -24,11 +24,11 @@ from kerv_cli.training.settings import BuildDatastoreSettings, BuildDrafterSetti
         "kerv build target grow=150m policy.target=mt10-vision name=mt10-150m",
         "kerv build target checkpoint=models/libero name=libero statistics=libero_spatial crop=true",
     ),
-    # to Hydra target= would be a choice among the files of conf/target
+    # renamed, because Hydra would take target= as a choice among the files of conf/target
     typed={"target": "family", "policy.target": "base"},
 )
 def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
-    """Make a target of a published checkpoint, which stays where it is, or of a policy with a larger trunk."""
+    """Make a target from a published checkpoint, which is not copied, or from a policy by enlarging its trunk."""
     if settings.grow.width:
         settings.family = "grown"
     importers = {name: part for name, part in parts("target").items() if "importer" in part.traits}
@@ -51,7 +51,7 @@ def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
     ),
 )
 def policy(settings: BuildPolicySettings) -> None:
-    """Fetch a policy of a release, which a wheel leaves out; its hashes are checked."""
+    """Download and install a released policy that is not part of the installed package; its hashes are checked."""
     from kerv_cli.lab.database import Database
     from kerv_cli.lab.runs import Run
     from kerv_cli.targets.release import install
@@ -71,7 +71,7 @@ def policy(settings: BuildPolicySettings) -> None:
     ),
 )
 def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
-    """Check a drafter in the public EAGLE or Spec-VLA layout and copy it beside its target."""
+    """Import a drafter in the public EAGLE or Spec-VLA layout for a target."""
     from kerv_cli.lab.runs import making
     from kerv_cli.methods.artifacts import Artifacts
     from kerv_cli.methods.eagle.drafter import import_drafter
@@ -92,7 +92,7 @@ def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
     ),
 )
 def datastore(settings: BuildDatastoreSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
-    """Store the demonstrations' action chunks under the target's own features, for retrieval."""
+    """Store the demonstrations' action chunks with the target's features as search keys, for drafts by retrieval."""
     from kerv_cli.lab.runs import making
     from kerv_cli.training.datastore import DatastoreBuild
 

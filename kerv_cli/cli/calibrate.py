@@ -1,4 +1,4 @@
-"""`kerv calibrate`: predictors, reference levels, boundary ranges and skip levels from demonstrations."""
+"""`kerv calibrate` and `kerv calibrate success`: fit constants of the methods, and certify their success."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from kerv_cli.training.settings import CalibrateSettings, CalibrateSuccessSettin
     examples=("kerv calibrate demos=mt10 name=mine", "kerv calibrate policy.target=mine demos=mine decodes=20 --plan"),
 )
 def calibrate(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
-    """Fit the kinematic predictors, each task's variability, the boundary's ranges and the skip levels."""
+    """Fit the constants of KERV and HeiSD: predictors, variability per task, boundary ranges and skip levels."""
     from kerv_cli.training.calibration import CalibrationRun
 
     run = CalibrationRun(settings)
@@ -39,7 +39,7 @@ def calibrate(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
 
 
 OF_TEST = {at.name for at in fields(CalibrateSuccessSettings)} - {at.name for at in fields(SweepSettings)}
-"""Settings of the test itself; all others are the study's."""
+"""Settings of the statistical test. All other settings belong to the study."""
 
 
 @command(
@@ -53,9 +53,9 @@ OF_TEST = {at.name for at in fields(CalibrateSuccessSettings)} - {at.name for at
     each="rollout",
 )
 def success(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: AsJson = False) -> None:
-    """Run a study's settings on selection seeds, the most cautious first, and certify which of them keep AR's success.
+    """Run a study's settings on seeds of their own, the most cautious first, and certify which keep AR's success.
 
-    Existing episodes are reused. Settle the number of episodes before you look.
+    Existing episodes are reused. Choose the number of episodes before you look at any result.
     """
     from kerv_cli.cli.episodes import planned_study, print_settings, print_study_plan, run_study
     from kerv_cli.episodes.resolve import resolve

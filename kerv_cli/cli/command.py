@@ -1,8 +1,14 @@
-"""What a command is: a registered part of the kind `command`.
+"""Declare the commands of `kerv`. A command is a function that is registered as a part of the kind `command`.
 
-Typer's command, the composition of its settings, `--cfg`, `--help` and completion derive from that declaration. The
-command's function takes what it names: `settings` (composed and checked), `overrides` (as typed), `names` (what
-is typed besides), `cfg` (if it prints settings itself), and options of its own in typer's notation.
+The rest is derived from the declaration: typer's command, the settings, `--cfg`, `--help` and completion. These
+parameters of the function have a meaning; it takes only those that it needs:
+
+- `settings`: The command's settings, composed and checked.
+- `overrides`: The `key=value` arguments as typed.
+- `names`: All other arguments, such as names of runs.
+- `cfg`: Whether --cfg was typed. Only for a command that prints its settings itself.
+
+Every other parameter is an option of the command in typer's notation.
 """
 
 from __future__ import annotations
@@ -31,16 +37,19 @@ F = TypeVar("F", bound=Callable[..., None])
 
 
 def command(name: str, settings: type = CommandSettings, keys: str = "", **traits: Any) -> Callable[[F], F]:
-    """Declare the function below as `kerv NAME`. Its docstring is the help.
+    """Decorate a function to make it the command `kerv NAME`. Its docstring becomes the help.
 
     Args:
-        name: Its name.
-        settings: Dataclass of its settings; NoSettings if it takes none.
-        keys: Settings that people use, for the help.
-        **traits: examples: command lines that work, for the help. names: help for what is typed besides overrides.
-            lists: settings whose lists need no brackets. typed: key on the command line -> the setting, if they differ.
-            writes: whether it stores results, so that a folder that cannot be written is refused first (default: true).
-            each: the command whose settings all other overrides go to.
+        name: Name of the command, such as `train target`.
+        settings: Dataclass of its settings. NoSettings if it has none.
+        keys: Names of the settings that `--help` lists, separated by spaces.
+        **traits: Optional properties:
+            examples: Command lines for the help.
+            names: Help text for arguments that are not `key=value`. Without it there are none.
+            lists: Settings whose value is a list and can be typed without brackets.
+            typed: Key on the command line -> name of the setting, for settings with two names.
+            writes: Whether the command writes to the results folder (default true). Then kerv checks first that it can.
+            each: Name of another command. Overrides that are no settings of this command are settings of that one.
     """
 
     def declare(run: F) -> F:
@@ -52,13 +61,13 @@ def command(name: str, settings: type = CommandSettings, keys: str = "", **trait
 
 
 def schemas_of(part: Part) -> list[type]:
-    """Return the class of the command's settings, then that of `each`."""
+    """Return the dataclass of a command's settings, then that of the command in its trait `each` if it has one."""
     others = [find("command", part.traits["each"])] if "each" in part.traits else []
     return [one.settings for one in (part, *others)]
 
 
 def top_keys(part: Part) -> list[str]:
-    """Return the names that the command takes before `=` or a dot."""
+    """Return the names that an override of this command can begin with: `threshold` for `threshold.r=5`."""
     if part.settings is NoSettings:
         return []
     schemas = schemas_of(part)
@@ -69,7 +78,7 @@ def top_keys(part: Part) -> list[str]:
 
 
 def typer_command(part: Part) -> TyperCommand:
-    """Make typer's command from a registered one. Its module is imported now."""
+    """Make a typer command from a registered command. This imports the module of its function."""
     run = load(part.build)
     parameters = inspect.signature(run, eval_str=True).parameters
     more = [one.replace(kind=one.KEYWORD_ONLY) for name, one in parameters.items() if name not in _ARGUMENTS]
@@ -98,7 +107,13 @@ def typer_command(part: Part) -> TyperCommand:
 
 @contextlib.contextmanager
 def _noted(overrides: list[str]) -> Iterator[None]:
-    """Note the command for the rows of the runs that it begins. `kerv prepare` runs commands within its own."""
+    """Remember the command line while the block runs, to store it with the runs that the command starts.
+
+    The previous one is restored afterwards, because `kerv prepare` runs other commands inside its own.
+
+    Args:
+        overrides: Command-line arguments after `kerv`.
+    """
     from kerv_cli.lab.command import set_command
 
     before = set_command(overrides)
@@ -109,7 +124,12 @@ def _noted(overrides: list[str]) -> Iterator[None]:
 
 
 def _flags(command: TyperCommand, options: Mapping[str, object]) -> list[str]:
-    """Return options as they are typed, without those that are left out."""
+    """Return the options that were given, as they are typed: `--plan`, `--to`, `csv`.
+
+    Args:
+        command: The command.
+        options: Name of the parameter -> value of each option.
+    """
     names = {param.name: param.opts[0] for param in command.params}
     given = [(names[name], value) for name, value in options.items() if value not in (None, False)]
     return [word for name, value in given for word in ([name] if value is True else [name, str(value)])]
@@ -125,14 +145,17 @@ def _option(name: str, default: object, annotation: object) -> inspect.Parameter
 
 
 def _typed_argument(part: Part) -> object:
-    """Return the argument for everything that is not an option. The help has sections of its own for it."""
+    """Return the annotation of the argument that takes everything except options. Typer's help does not show it."""
     metavar = "NAME" if "names" in part.traits else "KEY=VALUE"
     argument = typer.Argument(metavar=metavar, hidden=True, autocompletion=complete)
     return Annotated[list[str] | None, argument]
 
 
 def complete(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Return completions: `me` -> `method=`; `method=s` -> every method that begins so. bash splits at `=`."""
+    """Complete an override in the shell: `me` becomes `method=`, and `method=s` every method that begins with s.
+
+    bash passes `method`, `=` and `s` as three words, other shells pass one.
+    """
     part = parts("command")[" ".join(ctx.command_path.split()[1:])]
     keys, before = top_keys(part), [word for word in ctx.params.get("typed") or () if word != "="]
     if before and before[-1] in keys:
@@ -144,7 +167,7 @@ def complete(ctx: typer.Context, incomplete: str) -> list[str]:
 
 
 def _values(part: Part, key: str) -> list[str]:
-    """Return the names that a key can be set to; none if any value is possible."""
+    """Return the names that a setting can have. Empty if its value is not one of a list of names."""
     if key == "task":
         from kerv_cli.worlds import task_names
 
@@ -159,7 +182,16 @@ def _values(part: Part, key: str) -> list[str]:
 
 
 def _split(part: Part, typed: list[str], named: bool) -> tuple[list[str], list[str]]:
-    """Split what was typed into overrides and names."""
+    """Split the arguments into overrides (`key=value`) and names.
+
+    Args:
+        part: The command.
+        typed: The arguments.
+        named: Whether the command takes names. If not, all arguments are overrides.
+
+    Raises:
+        UnknownName: An argument looks like an override, but the command has no such setting.
+    """
     if not named:
         return typed, []
     keys = set(top_keys(part))
@@ -174,11 +206,16 @@ def _split(part: Part, typed: list[str], named: bool) -> tuple[list[str], list[s
 
 
 def _settings(part: Part, overrides: list[str], cfg: bool) -> Any:
-    """Return the command's settings. With --cfg they are printed and the command ends.
+    """Return the settings of a command. With --cfg print them and end the command instead.
+
+    Args:
+        part: The command.
+        overrides: The overrides as typed.
+        cfg: Whether --cfg was typed.
 
     Raises:
-        UsageError: As `config.compose`.
-        StorageError: As `places.check_writable`.
+        UsageError: An override is wrong, see `config.compose`.
+        StorageError: The command writes to the results folder, which cannot be written.
     """
     typed = part.traits.get("typed", {})
     pairs = [(typed.get(key, key), equals, value) for key, equals, value in (word.partition("=") for word in overrides)]
@@ -194,12 +231,12 @@ def _settings(part: Part, overrides: list[str], cfg: bool) -> Any:
 
 
 class CommandWithSettings(TyperCommand):
-    """A command whose help lists its settings."""
+    """A typer command whose help also lists settings, subcommands and examples."""
 
     part: Part
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        """Write the settings that people use, the commands below this one, and examples."""
+        """Add the most used settings, the subcommands and the examples to the help."""
         keys = [_row(self.part, key) for key in self.part.traits.get("keys", "").split()]
         below = [part for name, part in parts("command").items() if name.startswith(f"{self.part.name} ")]
         if keys:
@@ -215,12 +252,20 @@ class CommandWithSettings(TyperCommand):
 
 
 def summary_of(part: Part) -> str:
-    """Return a command's help up to the first full stop or semicolon."""
+    """Return the first sentence of a command's help, or its part before a semicolon."""
     return re.split(r"[.;]\s", part.traits.get("help", "") + " ")[0]
 
 
 def _row(part: Part, key: str) -> tuple[str, str]:
-    """Return (key=default, type and description) of a setting, for the help."""
+    """Return a line of the help about one setting.
+
+    Args:
+        part: The command.
+        key: The setting as typed on the command line.
+
+    Returns:
+        `key=default`, and the type with the description.
+    """
     name = part.traits.get("typed", {}).get(key, key)
     schema = next(schema for schema in schemas_of(part) if name.split(".")[0] in {at.name for at in fields(schema)})
     at, value = field_of(schema, name)
@@ -232,7 +277,13 @@ def _row(part: Part, key: str) -> tuple[str, str]:
 
 
 def _of_file(schema: type, key: str, default: object) -> object:
-    """Return the value of a dotted key in the file of conf/ that its group chooses, else `default`."""
+    """Return the default of a setting: its value in the file of conf/ that is chosen by default, else `default`.
+
+    Args:
+        schema: Dataclass of the command's settings.
+        key: Name of the setting, such as `runtime.device`. Its first part may be a group of conf/.
+        default: Default in the dataclass.
+    """
     group, *path = key.split(".")
     file = conf_dir() / group / f"{choices_of(schema).get(group)}.yaml"
     value = read_yaml(file) if path and file.is_file() else {}
@@ -255,5 +306,5 @@ def _plain(value: object) -> str:
 
 
 def commands_below(prefix: str) -> Iterator[Part]:
-    """Yield the commands whose names begin with `prefix`, in the order of registration."""
+    """Yield the commands whose names begin with `prefix`, such as `train `, in the order of registration."""
     return (part for name, part in parts("command").items() if name.startswith(prefix))

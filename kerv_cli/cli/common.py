@@ -1,4 +1,4 @@
-"""What commands share: options, errors as one line, progress bars, tables."""
+"""Helpers of all commands: common options, one-line errors, progress bars, tables."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON o
 
 
 def print_json(value: object) -> None:
-    """Print a value as indented JSON. NaN and infinity, which JSON lacks, become null."""
+    """Print a value as indented JSON. NaN and infinity, which JSON cannot express, become null."""
     typer.echo(json.dumps(_plain(value), indent=2, ensure_ascii=False))
 
 
@@ -40,7 +40,7 @@ def _plain(value: object) -> object:
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
-    if hasattr(value, "item"):  # of numpy
+    if hasattr(value, "item"):  # a number of numpy
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):
         return None
@@ -48,7 +48,12 @@ def _plain(value: object) -> object:
 
 
 def settings_yaml(settings: Any, indent: str = "") -> str:
-    """Return a dataclass of settings as YAML, for `--cfg`; a comment says what each setting is."""
+    """Return settings as YAML for `--cfg`, each with its description as a comment.
+
+    Args:
+        settings: A dataclass of settings.
+        indent: Spaces before every line.
+    """
     import yaml
 
     lines = []
@@ -66,17 +71,22 @@ def settings_yaml(settings: Any, indent: str = "") -> str:
 
 
 def print_notes(idle: Mapping[str, str]) -> None:
-    """Print a line on stderr for each override that has no effect.
+    """Print a line on standard error for each override that has no effect.
 
     Args:
-        idle: Override -> why.
+        idle: Override, such as `threshold.r=5` -> why it has no effect.
     """
     for override, reason in idle.items():
         typer.echo(f"note: {override} has no effect: {reason}", err=True)
 
 
 def print_plan(text: str, as_json: bool = False) -> None:
-    """Print what a command would do, for --plan, and end it."""
+    """Print what the command would do, and end it. For the option --plan.
+
+    Args:
+        text: The plan.
+        as_json: Print it as JSON.
+    """
     if as_json:
         print_json({"plan": text})
     else:
@@ -86,13 +96,13 @@ def print_plan(text: str, as_json: bool = False) -> None:
 
 @contextmanager
 def one_line_errors(words: Sequence[str]) -> Iterator[None]:
-    """Print every exception inside the block as one line, and exit.
+    """Print an exception that is raised inside the block as one line, and exit.
 
-    The exit code is a KervError's own, 2 for what typer cannot parse, 130 for Ctrl-C, 1 for others. KERV_TRACEBACK=1
-    raises the exception instead.
+    The exit code is `exit_code` of a KervError, 2 for a command line that cannot be parsed, 130 for Ctrl-C and 1 for
+    any other exception. With KERV_TRACEBACK=1 the exception is raised again, so that its traceback is shown.
 
     Args:
-        words: The command line.
+        words: Command-line arguments after `kerv`.
     """
     try:
         yield
@@ -103,7 +113,7 @@ def one_line_errors(words: Sequence[str]) -> Iterator[None]:
             _refuse("interrupted", Interrupted.exit_code, None)
         _refuse(str(error), error.exit_code, error)
     except typer.TyperException as error:
-        if "\n" in error.format_message():  # the help, where the command is left out
+        if "\n" in error.format_message():  # not an error: the help, because no command was typed
             raise
         _refuse(_parse_error(error, words), error.exit_code, error)
     except KeyboardInterrupt:
@@ -113,19 +123,24 @@ def one_line_errors(words: Sequence[str]) -> Iterator[None]:
         raise typer.Exit(1) from None
     except OSError as error:
         _refuse(f"{error.strerror or error}: {error.filename or ''}".rstrip(": "), 1, error)
-    except Exception as error:  # noqa: BLE001 - the edge: whatever it is, the user gets one line
+    except Exception as error:  # noqa: BLE001 - a user never sees a traceback
         _refuse(f"internal error, {type(error).__name__}: {error}; set KERV_TRACEBACK=1 to see where", 1, error)
 
 
 def _is_of_an_interrupt(error: BaseException | None) -> bool:
-    """Return whether an error began as Ctrl-C: OmegaConf may fail on a node that is half built."""
+    """Return whether an error was caused by Ctrl-C, which OmegaConf can turn into an error of its own."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None
 
 
 def _parse_error(error: Any, words: Sequence[str]) -> str:
-    """Return what typer cannot parse, and that settings have no dashes."""
+    """Return the text for typer's parse error. For an unknown option it adds how to write a setting.
+
+    Args:
+        error: Typer's exception.
+        words: Command-line arguments after `kerv`.
+    """
     name, message = getattr(error, "option_name", None), " ".join(error.format_message().split())
     if name is None or not message.startswith("No such option") or getattr(error, "possibilities", None):
         return message
@@ -134,7 +149,7 @@ def _parse_error(error: Any, words: Sequence[str]) -> str:
 
 
 def results_word(overrides: Iterable[str]) -> str:
-    """Return ` results=DIR` and ` store=URL`, if these overrides set them, for a command to type next."""
+    """Return ` results=DIR` and ` store=URL` as far as the overrides contain them, to append to a suggested command."""
     return "".join(f" {shlex.quote(word)}" for word in overrides if word.startswith(("results=", "store=")))
 
 
@@ -142,7 +157,7 @@ def _refuse(message: str, code: int, error: BaseException | None) -> None:
     if error is not None and os.environ.get("KERV_TRACEBACK"):
         raise error
     if code == Interrupted.exit_code:
-        # objects in the making cannot clean up behind themselves, e.g. a GL context: no news to the user
+        # half-built objects, such as a GL context, may fail to clean up: the user need not see that
         sys.unraisablehook = lambda unraisable: None
     typer.echo(f"kerv: {' '.join(message.split())}", err=True)
     raise typer.Exit(code)
@@ -150,14 +165,26 @@ def _refuse(message: str, code: int, error: BaseException | None) -> None:
 
 @contextmanager
 def at_work(what: str) -> Iterator[None]:
-    """Show a spinner on a terminal while libraries or weights load."""
+    """Show a spinner on a terminal while the block runs, for example while weights load.
+
+    Args:
+        what: Text beside the spinner.
+    """
     with console(stderr=True).status(what) if sys.stderr.isatty() else nullcontext():
         yield
 
 
 @contextmanager
 def progress_bar(title: str, record: Run | None = None) -> Iterator[Callable[..., None]]:
-    """Yield `advance(done, total, text="")`, which shows progress and notes it in the row of a run."""
+    """Show a progress bar while the block runs.
+
+    Args:
+        title: Text before the bar.
+        record: The command's row in the database, which also gets the progress. None: no row.
+
+    Yields:
+        `advance(done, total, text="")`. Call it to move the bar and to change the text after it.
+    """
     with _shown(title) as show:
 
         def advance(done: int, total: int, text: str = "") -> None:
@@ -170,9 +197,10 @@ def progress_bar(title: str, record: Run | None = None) -> Iterator[Callable[...
 
 @contextmanager
 def _shown(title: str) -> Iterator[Callable[..., None]]:
-    """Yield `advance(done, total, text="")`: a progress bar on a terminal, plain lines elsewhere.
+    """Show a progress bar on a terminal. Elsewhere print at most 10 lines of progress, 50 for a total of 2000 or more.
 
-    There are at most 10 lines with the time left, and 50 for totals from 2000 on.
+    Yields:
+        `advance(done, total, text="")` as in `progress_bar`.
     """
     if not sys.stderr.isatty():
         typer.echo(f"{title} …", err=True)
@@ -188,7 +216,7 @@ def _shown(title: str) -> Iterator[Callable[..., None]]:
 
 
 def _plain_lines(title: str) -> Callable[..., None]:
-    latest, first, began = -1, 0, 0.0  # what is resumed does not begin at 0
+    latest, first, began = -1, 0, 0.0  # first: where the count begins, above 0 for resumed work
 
     def advance(done: int, total: int, text: str = "") -> None:
         nonlocal latest, first, began
@@ -204,7 +232,7 @@ def _plain_lines(title: str) -> Callable[..., None]:
 
 
 def console(stderr: bool = False) -> Console:
-    """Return a rich console. Without a terminal it is 200 columns wide."""
+    """Return a rich console on standard output or standard error. If that is no terminal, it is 200 columns wide."""
     from rich.console import Console
 
     wide = None if (sys.stderr if stderr else sys.stdout).isatty() else 200
@@ -212,12 +240,12 @@ def console(stderr: bool = False) -> Console:
 
 
 def print_table(columns: Iterable[str], rows: Iterable[Iterable[object]], title: str | None = None) -> None:
-    """Print a table below its title.
+    """Print a table.
 
     Args:
-        columns: Its header.
-        rows: Its rows.
-        title: A line that is never wrapped, because it may hold a path to copy.
+        columns: Names of the columns.
+        rows: Cells of each row.
+        title: A line above the table. It is never wrapped, because it may contain a path to copy.
     """
     from rich.table import Table
 
@@ -230,7 +258,14 @@ def print_table(columns: Iterable[str], rows: Iterable[Iterable[object]], title:
 
 
 def print_figures(what: str, figures: Mapping[str, float], folder: object, as_json: bool = False) -> None:
-    """Print named numbers, four digits of each, and the folder of what they belong to."""
+    """Print named numbers with four digits each, and a folder.
+
+    Args:
+        what: Header of the table.
+        figures: Name -> number.
+        folder: Folder of the artifact that the numbers describe.
+        as_json: Print numbers and folder as JSON.
+    """
     if as_json:
         print_json({"folder": folder, **figures})
         return

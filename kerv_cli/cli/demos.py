@@ -1,4 +1,4 @@
-"""`kerv demos`: record the scripted experts; `kerv demos export` and `import`: LeRobot datasets."""
+"""`kerv demos`: record demonstrations of scripted experts, and export or import LeRobot datasets."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from kerv_cli.worlds.settings import DemosImportSettings
 
 @dataclass
 class DemosExportSettings(CommandSettings):
-    """`kerv demos export`: demonstrations for other tools."""
+    """Settings of `kerv demos export`."""
 
     format: str = choice("lerobot", "lerobot", help="a LeRobot dataset of version 3")
     demos: str = setting("mt10", DEMOS)
-    to: str = setting("", "folder; empty: <results>/lerobot/<demos>")
+    to: str = setting("", "folder to write to; empty: <results>/lerobot/<demos>")
 
 
 @command(
@@ -32,9 +32,9 @@ class DemosExportSettings(CommandSettings):
     examples=("kerv demos name=mine task=MT10 episodes=100", "kerv demos name=visited policy=vision task=reach --plan"),
 )
 def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
-    """Record successful expert episodes, plain and disturbed, as a dataset.
+    """Record successful episodes of the scripted experts, some of them disturbed, as a dataset.
 
-    With policy=vision it records the states that a policy visits by its method, labelled by the expert.
+    With policy=NAME a policy acts instead, and the expert labels the states that it reaches (DAgger).
     """
     from kerv_cli.lab.runs import making
     from kerv_cli.training.dagger import recording_of

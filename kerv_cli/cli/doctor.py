@@ -1,4 +1,4 @@
-"""`kerv doctor`: check this machine and say what to do about each failure."""
+"""`kerv doctor`: check this machine, and say how to fix each problem."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kerv_cli.bench.doctor import DoctorSettings, check_environment_of, check_ma
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, print_json, print_table
 
-Repair = Annotated[bool, typer.Option("--repair", help="Remove what killed commands left in the results.")]
+Repair = Annotated[bool, typer.Option("--repair", help="Remove temporary files that killed commands left behind.")]
 
 
 @command(
@@ -22,14 +22,14 @@ Repair = Annotated[bool, typer.Option("--repair", help="Remove what killed comma
     DoctorSettings,
     keys="target environment world.camera.size runtime.device runtime.threads results",
     examples=("kerv doctor", "kerv doctor target=mt10-vision"),
-    # to Hydra target= would be a choice among the files of conf/target
+    # renamed, because Hydra would take target= as a choice among the files of conf/target
     typed={"target": "policy.target"},
     writes=False,
 )
 def doctor(settings: DoctorSettings, repair: Repair = False, as_json: AsJson = False) -> None:
-    """Check rendering, simulator, torch, shipped policies, disk and display; say what to do about what is missing.
+    """Check rendering, simulator, torch, shipped policies, disk and display; say how to fix each problem.
 
-    With target=NAME or environment=NAME check whether that keeps its protocol.
+    With target=NAME or environment=NAME check only whether that target or environment behaves as kerv requires.
     """
     if repair:
         _repair(settings)
@@ -47,7 +47,7 @@ def doctor(settings: DoctorSettings, repair: Repair = False, as_json: AsJson = F
 
 
 def _repair(settings: DoctorSettings) -> None:
-    """Remove what killed commands left in the results, and print the names."""
+    """Remove the temporary files of killed commands from the results folder, and print their names."""
     paths = list(left_over(results_dir(settings.results)))
     for path in paths:
         remove(path)

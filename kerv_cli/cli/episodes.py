@@ -1,4 +1,4 @@
-"""What the commands that run episodes share: notes before, progress while, an estimate instead."""
+"""Helpers of the commands that run episodes: plan a study, estimate its duration, run it, print the results."""
 
 from __future__ import annotations
 
@@ -19,14 +19,22 @@ if TYPE_CHECKING:
     from kerv_cli.lab.study import InterimAnalysis
 
 SECONDS_PER_EPISODE = 1.0
-"""Before anything was measured; MT10 on one core takes 0.5 to 1.5."""
+"""Guess that is used before anything was measured. MT10 takes 0.5 to 1.5 s per episode on one core."""
 
 
 def planned_study(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
-    """Plan a study; print what runs, and which overrides have no effect, to standard error.
+    """Plan a study: find out which of its episodes must run. Print notes about it to standard error.
+
+    The notes name the overrides that have no effect, the number of episodes and tasks that the policy was not trained
+    on.
+
+    Args:
+        resolved: The study with all its settings.
+        command: Command-line arguments after `kerv`, to be stored with the episodes.
 
     Raises:
-        UsageError, CheckpointError: As `study.plan`.
+        UsageError: The study cannot run with these settings.
+        CheckpointError: The policy or an artifact that a method needs is missing or damaged.
     """
     from kerv_cli.episodes.resolve import idle_overrides
 
@@ -41,7 +49,7 @@ def planned_study(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
 
 
 def planned_rollout(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
-    """Plan a rollout, as `planned_study`; say where it goes on with an interrupted one."""
+    """Plan a rollout as `planned_study` plans a study. If it continues an interrupted rollout, print that."""
     _announce(resolved)
     with at_work("loading the policy"):
         from kerv_cli.lab.study import plan_rollout
@@ -55,7 +63,7 @@ def planned_rollout(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
 
 
 def _announce(resolved: ResolvedStudy) -> None:
-    """Print the number of episodes, before anything heavy loads."""
+    """Print the number of episodes, before torch and the simulator load."""
     settings, tasks = resolved.settings, resolved.tasks
     what = next(iter(settings)) if len(settings) == 1 else f"{len(settings)} settings"
     whose = _few(list(dict.fromkeys(setting.policy.target for setting in settings.values())), "targets")
@@ -64,7 +72,7 @@ def _announce(resolved: ResolvedStudy) -> None:
 
 
 def _warn_of_unseen(resolved: ResolvedStudy) -> None:
-    """Print the tasks that a policy was not trained on."""
+    """Print a warning with the tasks that a policy was not trained on."""
     from kerv_cli.episodes.policy import unseen_tasks
 
     settings = resolved.settings.values()
@@ -74,19 +82,24 @@ def _warn_of_unseen(resolved: ResolvedStudy) -> None:
 
 
 def _few(names: Sequence[str], what: str) -> str:
-    """Return the names; from four on, how many they are."""
+    """Return up to three names as a list, or the number of names as in `10 tasks`.
+
+    Args:
+        names: The names.
+        what: What they name, in plural.
+    """
     return ", ".join(names) if len(names) < 4 else f"{len(names)} {what}"
 
 
 def print_settings(resolved: ResolvedStudy) -> None:
-    """Print the study and each of its settings as YAML, for --cfg."""
+    """Print a study and each of its settings as YAML. For the option --cfg."""
     typer.echo(settings_yaml(resolved.study), nl=False)
     for label, settings in resolved.settings.items():
         typer.echo(f"--- # {label}\n{settings_yaml(settings)}", nl=False)
 
 
 def print_study_plan(planned: Plan, as_json: bool) -> None:
-    """Print which episodes would be run, why, and how long that takes."""
+    """Print which episodes would run, why, and how long that would take. For the option --plan."""
     from kerv_cli.lab.study import estimate, plan_rows
 
     rows, store, to_run, reused = plan_rows(planned), planned.store, planned.to_run, planned.existing
@@ -100,10 +113,13 @@ def print_study_plan(planned: Plan, as_json: bool) -> None:
 
 
 def run_study(resolved: ResolvedStudy, planned: Plan) -> Outcome:
-    """Run what a plan lacks, with progress.
+    """Run the missing episodes of a study and show the progress.
+
+    With until=decided the study ends as soon as its results are clear.
 
     Raises:
-        Interrupted: Ctrl-C. KervError: As `study.run`.
+        Interrupted: The user pressed Ctrl-C.
+        KervError: The study could not run, see `study.run`.
     """
     from kerv_cli.lab.plan import seed_blocks
     from kerv_cli.report.decide import confidence_of_a_look, judge
@@ -118,7 +134,12 @@ def run_study(resolved: ResolvedStudy, planned: Plan) -> Outcome:
 
 
 def run_planned(planned: Plan, analysis: InterimAnalysis | None = None) -> Outcome:
-    """Run what a plan lacks, with progress; see `study.run`."""
+    """Run the missing episodes of a plan and show the progress; raises as `study.run`.
+
+    Args:
+        planned: The plan.
+        analysis: Decides during the study whether it can end early. None: all episodes run.
+    """
     from kerv_cli.cli.progress import ProgressDisplay
     from kerv_cli.lab.study import run
     from kerv_cli.report.viewing import save_recording
@@ -128,7 +149,14 @@ def run_planned(planned: Plan, analysis: InterimAnalysis | None = None) -> Outco
 
 
 def print_study(table: DataFrame, store: StudyStore) -> None:
-    """Print a study's table, its note, and the command that measures the times that it lacks."""
+    """Print the table of a study and its note.
+
+    If times cannot be compared, because they were not measured in turn, print the command that measures them again.
+
+    Args:
+        table: Summary with one row per setting.
+        store: The study in the database.
+    """
     from kerv_cli.report.summary import SummaryTable, not_in_turn
     from kerv_cli.report.tables import values_of
 
@@ -147,7 +175,13 @@ def print_study(table: DataFrame, store: StudyStore) -> None:
 
 
 def print_verdict(table: DataFrame, store: StudyStore, loss: float) -> None:
-    """Print the last three lines of a study: the verdict, the page to open, the recording to watch."""
+    """Print the last three lines about a study: the verdict, the page to open, the recording to watch.
+
+    Args:
+        table: Summary with one row per setting.
+        store: The study in the database.
+        loss: Largest loss of success that is accepted, percentage points.
+    """
     from kerv_cli.report.decide import verdict_of
 
     typer.echo(f"verdict: {verdict_of(table, loss)[0]}")

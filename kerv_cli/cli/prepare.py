@@ -1,4 +1,4 @@
-"""`kerv prepare`: everything that methods need of a target, in order."""
+"""`kerv prepare`: make all artifacts of a target that methods need, in the right order."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kerv_cli.cli.common import ShowPlan, print_table, results_word
 from kerv_cli.training.settings import PrepareSettings
 
 NOT_OF_STEPS = ("for", "steps")
-"""Settings that the steps do not take. demos= is for all of them but the certificate."""
+"""Overrides that are not passed on to the commands of the single steps."""
 
 
 @command(
@@ -26,15 +26,15 @@ NOT_OF_STEPS = ("for", "steps")
     lists=("methods",),
 )
 def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = False) -> None:
-    """Make everything that methods need of a target, in order: drafters, datastore, calibration, certificate.
+    """Make all artifacts of a target that methods need, in order: drafters, datastore, calibration, certificate.
 
-    Existing artifacts are skipped. The same command goes on where it was interrupted.
+    Existing artifacts are skipped. The same command continues after an interruption.
     """
     from kerv_cli.training.preparation import THERE, Step
     from kerv_cli.training.preparation import plan as planned
 
     def line(step: Step) -> str:
-        """Return the step's command, as it can be typed alone."""
+        """Return the command line of a step, without `kerv`."""
         shared = [word for word in overrides if word.split("=")[0] not in NOT_OF_STEPS]
         if step.command[-1] == "success":
             shared = [word for word in shared if not word.startswith("demos=")]
@@ -45,7 +45,7 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
     if plan:
         return
     for kind in [step.kind for step in steps]:
-        # read anew: what was just made decides whether what is made from it is still good
+        # planned again before each step: an artifact that was just made can make a later one outdated
         step = next(step for step in planned(settings) if step.kind == kind)
         if step.state != THERE:
             typer.echo(f"\nkerv {line(step)}")
@@ -54,17 +54,20 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
 
 
 def run(line: Sequence[str]) -> None:
-    """Run a command of kerv in this process.
+    """Run another command of kerv in this process.
+
+    Args:
+        line: Command-line arguments after `kerv`.
 
     Raises:
-        KervError: As that command.
-        Interrupted: Ctrl-C.
-        typer.Exit: It failed and said why.
+        KervError: The command failed.
+        Interrupted: The user pressed Ctrl-C.
+        typer.Exit: The command failed, and has printed the reason.
     """
     name = max((name for name in parts("command") if " ".join(line).startswith(f"{name} ")), key=len)
     try:
         code = typer_command(parts("command")[name]).main(list(line[len(name.split()) :]), standalone_mode=False)
-    except typer.Abort:  # what typer makes of Ctrl-C
+    except typer.Abort:  # typer's exception for Ctrl-C
         raise Interrupted("interrupted: what is made is kept, the same command goes on there") from None
     if code:
         raise typer.Exit(code)

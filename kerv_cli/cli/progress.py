@@ -1,4 +1,4 @@
-"""Show the events of a running study: a progress bar on a terminal, plain lines elsewhere."""
+"""Show the progress of a running study: a bar on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -14,21 +14,24 @@ from kerv_cli.lab.events import BlockEnded, BlockStarted, BlockWaits, EpisodeEnd
 from kerv_cli.lab.plan import Block, Setting
 
 LOG_SECONDS = 30.0
-"""Seconds between two lines of progress without a terminal."""
+"""Minimum seconds between two lines of progress if there is no terminal."""
 
 
 class ProgressDisplay:
-    """The `on_event` callback of `study.run`; a context manager that ends the bar.
+    """Progress display of a study. Pass it to `study.run` as the callback for events, inside a `with` block.
 
-    The bar counts episodes. If episodes run in this process, `on_step` also moves it within an episode.
+    The bar counts episodes. `on_step` moves it within an episode that runs in this process.
+
+    Args:
+        console: Where to print. None: standard error.
     """
 
     def __init__(self, console: Console | None = None) -> None:
         self.console = console or Console(stderr=True)
         self._bar: bars.Progress | None = None
         self._task = bars.TaskID(0)
-        self._total = self._ended = 0  # episodes
-        self._part = 0.0  # of the episode that runs in this process
+        self._total = self._ended = 0  # numbers of episodes
+        self._part = 0.0  # finished share of the episode that runs in this process
         self._began = self._logged = 0.0
         self._blocks: dict[int, Block] = {}
 
@@ -42,7 +45,7 @@ class ProgressDisplay:
             self._bar.stop()
 
     def __call__(self, event: Event) -> None:
-        """Show an event."""
+        """Show an event of the study, such as the end of an episode."""
         if isinstance(event, Started):
             self._start(event)
         elif isinstance(event, BlockStarted):
@@ -60,9 +63,16 @@ class ProgressDisplay:
         self._show(self._now)
 
     def on_step(self, setting: Setting, task: str, seed: int, step: int) -> None:
-        """Show that `step` control steps of an episode were executed; at most one episode runs at a time."""
+        """Show the progress of the episode that runs in this process.
+
+        Args:
+            setting: Setting of the study.
+            task: Name of the task.
+            seed: Seed of the episode.
+            step: Number of control steps executed so far.
+        """
         horizon = int(setting.settings["world"]["horizon"])
-        # half an episode's share for a step at half the horizon: successful episodes end early and then jump
+        # relative to the maximum length: the bar jumps when an episode succeeds earlier
         self._part = min(1.0, step / max(1, horizon))
         self._show(f"{escape(setting.label)} on {task}, seed {seed}: step {step}")
 
@@ -82,7 +92,11 @@ class ProgressDisplay:
         self.console.print(line, soft_wrap=True, highlight=False)
 
     def _show(self, now: str) -> None:
-        """Move the bar; without one, print a line if the last one is old."""
+        """Move the bar. If there is none, print a line, but at most one per LOG_SECONDS.
+
+        Args:
+            now: What is running at the moment.
+        """
         if self._bar is not None:
             self._bar.update(self._task, completed=self._ended + self._part, count=self._count, description=now)
         elif time.monotonic() - self._logged > LOG_SECONDS:

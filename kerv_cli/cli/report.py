@@ -16,23 +16,23 @@ from kerv_cli.cli.common import AsJson, print_json, print_table
 
 @dataclass
 class ReportSettings(CommandSettings):
-    """`kerv report`."""
+    """Settings of `kerv report`."""
 
-    only: str | None = setting(None, "one study, by name or file; default: all that are there")
-    on: list[str] = setting([], "profiles of 'kerv bench' that price the study's decodes")
-    loss: float = number(3.0, above=0, most=99.9, help="--choose: bound on the loss of success, points")
+    only: str | None = setting(None, "one study, by name or file; default: all studies in the results folder")
+    on: list[str] = setting([], "profiles of 'kerv bench': estimate the study's times on those machines")
+    loss: float = number(3.0, above=0, most=99.9, help="largest loss of success that is accepted, percentage points")
 
 
 Publish = Annotated[
     bool,
     typer.Option(
-        "--publish", help="Write tables and plots where they are committed; refuse what may not be published."
+        "--publish", help="Write to tables/ and plots/ of the results; refuse studies that may not be published."
     ),
 ]
 
 
 Choose = Annotated[
-    bool, typer.Option("--choose", help="Say which setting to take: the Pareto front, and the fastest safe one.")
+    bool, typer.Option("--choose", help="Say which setting to use: the Pareto front, and the fastest one within loss=.")
 ]
 
 
@@ -41,12 +41,12 @@ Choose = Annotated[
     ReportSettings,
     keys="study results on loss",
     examples=("kerv report study=demo", "kerv report --choose study=threshold loss=5"),
-    # a folder of results; to Hydra study= would be a choice among the files of conf/study
+    # renamed, because Hydra would take study= as a choice among the files of conf/study
     typed={"study": "only"},
     lists=("on",),
 )
 def report(settings: ReportSettings, publish: Publish = False, choose: Choose = False, as_json: AsJson = False) -> None:
-    """Write CSV tables (per task and aggregated), plots and an HTML page of the studies."""
+    """Write CSV tables (per task and aggregated), plots and an HTML page about the studies."""
     from kerv_cli.cli.episodes import print_study, print_verdict
     from kerv_cli.episodes.resolve import study_name
     from kerv_cli.lab.store import StudyStore
@@ -77,7 +77,7 @@ def report(settings: ReportSettings, publish: Publish = False, choose: Choose = 
 
 
 def _print_choice(settings: ReportSettings, as_json: bool) -> None:
-    """Print the choice of one study, or of every study that has results."""
+    """Print which setting to use in the chosen study, or in each study with results."""
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.decide import choices
     from kerv_cli.report.report import names_to_report

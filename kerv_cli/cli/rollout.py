@@ -1,4 +1,4 @@
-"""`kerv rollout`: episodes of one method or of a grid, their figures and their Rerun files."""
+"""`kerv rollout`: run episodes of one method or of a grid of settings, print the results and write recordings."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ from kerv_cli.episodes.settings import RolloutSettings
 if TYPE_CHECKING:
     from kerv_cli.lab.store import StudyStore
 
-Many = Annotated[bool, typer.Option("-m", "--multirun", help="Comma lists form a grid; every point is run.")]
+Many = Annotated[
+    bool, typer.Option("-m", "--multirun", help="Run all combinations of settings with several values (a,b).")
+]
 
 
 @command(
@@ -40,7 +42,7 @@ Many = Annotated[bool, typer.Option("-m", "--multirun", help="Comma lists form a
 def rollout(
     overrides: list[str], cfg: bool = False, plan: ShowPlan = False, multirun: Many = False, as_json: AsJson = False
 ) -> None:
-    """Run episodes of one method; print success, forwards, acceptance and time; write one .rrd per task."""
+    """Run episodes of one method; print success, forwards, acceptance and time; record one episode per task."""
     from kerv_cli.episodes.identity import stress_text, without_effect
     from kerv_cli.episodes.resolve import resolve_rollout
 

@@ -1,4 +1,4 @@
-"""`kerv runs`: what a results folder holds: sweeps, rollouts and trainings, side by side, again, elsewhere or gone."""
+"""`kerv runs`: list, show, compare, repeat, remove, export and import runs. Runs are sweeps, rollouts and trainings."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class ImportSettings(CommandSettings):
-    """`kerv runs import`: recordings of vla-eval as a study (docs/vla_eval.md)."""
+    """Settings of `kerv runs import`. They are for recordings of vla-eval, which become a study (docs/vla_eval.md)."""
 
     name: str = setting("", "name of the study; empty: the names of its benchmarks")
-    baseline: str = setting("", "label of the setting that the others are compared with; empty: ar, else the first")
-    labels: list[str] = setting([], "labels of the recordings, in order; empty: methods, or names of servers")
+    baseline: str = setting("", "label of the setting that others are compared with; empty: ar, else the first one")
+    labels: list[str] = setting([], "label of each recording, in order; empty: its method, or the name of its server")
 
 
 RUNS = "NAME: runs (id, a unique part of it, or last) and results=DIR."
@@ -38,19 +38,25 @@ FILTERS = "NAME: kind=, method=, task=, state=, since= and results=DIR narrow th
 
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask; names must be whole.")]
 To = Annotated[str, typer.Option("--to", help="csv, parquet, db, trackio, wandb (offline) or mlflow.")]
-Folder = Annotated[Path | None, typer.Option("--dir", help="Where it is written; default results/exports.")]
+Folder = Annotated[Path | None, typer.Option("--dir", help="Folder to write to; default results/exports/FORMAT.")]
 
 
 def _command_on_runs(name: str, *examples: str) -> Callable[[F], F]:
-    """Declare a command whose names are runs."""
+    """Decorate a function to make it the command `kerv runs NAME`, whose arguments are names of runs."""
     return command(f"runs {name}", names=RUNS, keys="results", examples=examples)
 
 
 def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a run") -> list[str]:
-    """Return names as those of runs.
+    """Return the names of runs that were typed. The path of a study's file becomes the name of the study.
+
+    Args:
+        names: The names as typed.
+        least: Minimum number of names.
+        most: Maximum number of names.
+        what: What to name, text for the error message.
 
     Raises:
-        UsageError: Too few or too many.
+        UsageError: There are too few or too many names.
     """
     from kerv_cli.episodes.resolve import study_name
 
@@ -100,7 +106,7 @@ def _entry_row(run: RunEntry) -> dict[str, object]:
 
 @_command_on_runs("show", "kerv runs show last", "kerv runs show main --json")
 def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
-    """Show one run, ID or ID:SETTING: its command and figures, what it was made from, where it lies."""
+    """Show one run, ID or ID:SETTING: its command, its results, the artifacts it was made from, its folder."""
     from kerv_cli.catalogue.entries import disk_bytes, find_runs, parents, store_of
     from kerv_cli.report.compare import sides
     from kerv_cli.report.summary import SummaryTable
@@ -131,7 +137,7 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
 
 @_command_on_runs("compare", "kerv runs compare main:ar main:kerv", "kerv runs compare main last")
 def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
-    """Compare two runs, ID or ID:SETTING: what differs in settings beside what differs in results, with intervals."""
+    """Compare two runs, ID or ID:SETTING: differences in settings, and in results with confidence intervals."""
     from kerv_cli.report import compare as comparing
 
     runs = _run_names(names, 2, 2, "two runs, ID or ID:SETTING")
@@ -168,7 +174,7 @@ def _print_results(results: list[Row]) -> None:
 def rerun(
     settings: CommandSettings, names: list[str], overrides: list[str], plan: ShowPlan = False, as_json: AsJson = False
 ) -> None:
-    """Run a run again from what it stored, into a new folder, and say whether the tokens are the same."""
+    """Repeat a run with its stored settings under a new name, and say whether the tokens are the same."""
     from kerv_cli.catalogue.entries import find_run
 
     results, (name,) = settings.results, _run_names(names)
@@ -211,7 +217,7 @@ def rerun(
 
 @_command_on_runs("rm", "kerv runs rm last", "kerv runs rm main --yes")
 def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
-    """Remove runs and everything in their folders, after a question."""
+    """Remove runs and everything in their folders, after asking for confirmation."""
     from kerv_cli.catalogue.entries import check_removable, disk_bytes, find_run, remove
 
     runs = [find_run(settings.results, name, exact=yes) for name in _run_names(names, 1, 1000)]
@@ -235,7 +241,7 @@ def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
 def export(
     settings: CommandSettings, names: list[str], to: To = "csv", folder: Folder = None, as_json: AsJson = False
 ) -> None:
-    """Hand a run to a tracker, or write it as CSV, Parquet or a database that 'kerv runs import' reads."""
+    """Send a run to a tracker, or write it as CSV, Parquet or a database that 'kerv runs import' reads."""
     from kerv_cli.catalogue.entries import find_run
     from kerv_cli.report.export import FILES
     from kerv_cli.report.export import export as hand_over
@@ -261,7 +267,7 @@ def export(
     lists=("labels",),
 )
 def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False) -> None:
-    """Read runs of another results folder, or evaluations of vla-eval or lerobot as a study of paired episodes."""
+    """Import the runs of another results folder, or evaluations of vla-eval or lerobot as a study."""
     from kerv_cli.catalogue.evaluations import import_evaluations
     from kerv_cli.catalogue.folders import import_results, is_results
     from kerv_cli.lab.database import Database

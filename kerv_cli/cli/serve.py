@@ -1,4 +1,4 @@
-"""`kerv serve`: a policy for a robot that is not in this process."""
+"""`kerv serve`: serve a policy to robots or benchmarks in other processes."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from kerv_cli.serve.settings import ServeSettings
     ServeSettings,
     keys="protocol policy method task host port gripper batch origins",
     examples=("kerv serve policy=vision method=one_pass", "kerv serve protocol=vla_eval policy=state method=spec_vla"),
-    typed={"task": "task_name"},  # one task's name; elsewhere it is a list
+    typed={"task": "task_name"},  # renamed, because task= of other commands is a list
 )
 def serve(settings: ServeSettings, plan: ShowPlan = False) -> None:
-    """Answer observations with actions over websockets, to robots or benchmarks, with any method, until Ctrl-C."""
+    """Serve a policy with any method over websockets: observations in, actions out, until Ctrl-C."""
     from kerv_cli.serve.policy import Policy
     from kerv_cli.serve.server import PolicyServer
 

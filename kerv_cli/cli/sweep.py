@@ -1,4 +1,4 @@
-"""`kerv sweep`: run a study's settings over tasks and seeds; an interrupted sweep resumes."""
+"""`kerv sweep`: run a study, which compares several settings on the same tasks and seeds."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 def sweep(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Run a study: every setting on every task with the same seeds, in turn. Existing episodes are reused.
 
-    Without study= list the studies.
+    Without study= it lists all studies. The same command continues an interrupted study.
     """
     if not cfg and not any(word.split("=")[0].split(".")[0] == "study" for word in overrides):
         others = [word for word in overrides if not word.startswith(("results=", "store="))]
@@ -56,7 +56,7 @@ def sweep(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_js
 
 
 def _list_studies(as_json: bool) -> None:
-    """Print the studies of conf/ and how large each is."""
+    """Print the studies in conf/study and the number of episodes of each."""
     from kerv_cli.episodes.policy import tasks_of
 
     rows = []
@@ -96,7 +96,7 @@ def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, planned: Plan, as_
             with at_work("writing the page"):
                 from kerv_cli.report.report import write_study
 
-                # the study may hold tasks of other sweeps
+                # the study in the database may have more tasks, from earlier sweeps
                 is_whole = store.counts()[1] == len(data.study.episodes)
                 write_study(store, data if is_whole else load_study(store), resolved.sweep.loss)
             print_verdict(data.table, store, resolved.sweep.loss)

@@ -20,7 +20,7 @@ from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
     ),
 )
 def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
-    """Behaviour-clone the target on demonstrations."""
+    """Train a target policy on demonstrations by behaviour cloning."""
     typer.echo(f"target {settings.name}: {settings.train.steps} steps", err=True)
     from kerv_cli.training.target import TargetRun
 
@@ -37,7 +37,7 @@ def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJso
     ),
 )
 def drafter(settings: TrainDrafterSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
-    """Train a drafter, or with drafter=early the early one, on the target's own greedy decodes."""
+    """Train a drafter to imitate a target's greedy decodes. drafter=NAME chooses its kind, such as early."""
     typer.echo(f"{settings.drafter.kind} drafter of {settings.policy.target}: {settings.train.steps} steps", err=True)
     from kerv_cli.training.drafter import DrafterRun
 

@@ -1,4 +1,4 @@
-"""Runs a training for a command: progress, a tracker, curves and figures."""
+"""Run a training for a command, with progress, an experiment tracker and plots of its curves."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 def run_training(
     run: TrainingRun, plan: bool, as_json: bool, loading: str, training: str, command: Sequence[str] = ()
 ) -> None:
-    """Train with progress, or print the plan.
+    """Run a training and show its progress, or print the plan.
 
     Args:
         run: The training.
         plan: Print what would be trained, and end the command.
         as_json: Print the result as JSON.
-        loading: Title of the progress while data are read.
-        training: Title of the progress while it trains.
-        command: Words after `kerv` that go on with it; by default those that were typed.
+        loading: Title of the progress bar while data are read.
+        training: Title of the progress bar during training.
+        command: Command-line arguments after `kerv` that resume this training. Empty: those that were typed.
 
     Raises:
-        UsageError: Another process trains this.
+        UsageError: Another process is training the same artifact.
     """
     if plan:
         print_plan(run.plan(), as_json)

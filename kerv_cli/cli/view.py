@@ -1,4 +1,4 @@
-"""`kerv view`: open rollouts in Rerun."""
+"""`kerv view`: open recordings of episodes in the Rerun viewer."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ To = Annotated[Path | None, typer.Option("--to", help="Write a film of one recor
     writes=False,
 )
 def view(settings: CommandSettings, names: list[str], to: To = None) -> None:
-    """Open recordings in the Rerun viewer; without a display, name the command that opens them."""
+    """Open recordings in the Rerun viewer; without a display, print the command that opens them."""
     from kerv_cli.report.viewing.viewer import find_recordings, open_recording
 
     paths = [_place(settings.results, name) for name in names] or [Path(settings.results)]
@@ -40,10 +40,14 @@ def view(settings: CommandSettings, names: list[str], to: To = None) -> None:
 
 
 def _place(results: str, name: str) -> Path:
-    """Return a path as it is; for the name of a run its folder; for `last` the newest run with recordings.
+    """Return the recording, or the folder of recordings, that an argument means.
+
+    Args:
+        results: The results folder.
+        name: A path, the name of a run, or `last`: the newest run that has recordings.
 
     Raises:
-        UsageError: No such run.
+        UsageError: There is neither such a path nor such a run.
     """
     path = Path(name).expanduser()
     if path.exists() or path.suffix == ".rrd":
