@@ -1,1 +1,1 @@
-"""What a results folder holds, and what is imported into it."""
+"""Lists the contents of a results folder, runs stored studies again, and imports studies from elsewhere."""

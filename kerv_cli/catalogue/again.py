@@ -59,6 +59,6 @@ def _checked(setting: Setting, tasks: list[str], results: str) -> Setting:
         before, now = setting.identity.get(kind, "none"), identity.get(kind, "none")
         if kind != OBSERVATION and before != now:
             raise CheckpointError(
-                f"the {kind} of {setting.label} was {before[:12]} and is {now[:12]} now: it cannot run again"
+                f"the {kind} of {setting.label} has changed from {before[:12]} to {now[:12]}: it cannot run again"
             )
     return dataclasses.replace(setting, settings=stored, identity=identity)

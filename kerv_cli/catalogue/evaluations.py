@@ -167,7 +167,7 @@ def read_evaluations(path: Path) -> list[Evaluation]:
         files = [file for file in visible(path) if file.suffix == ".sqlite"] if path.is_dir() else [path]
         read, what = _read_recording, "recording of vla-eval"
     if not files:
-        raise UsageError(f"{path}: no recording of vla-eval, recording-….sqlite")
+        raise UsageError(f"{path} holds no recording of vla-eval (recording-….sqlite)")
     evaluations: list[Evaluation] = []
     for file in files:
         try:

@@ -179,7 +179,7 @@ def _of_cell(cell: Path, episodes: list[Episode]) -> Iterator[ImportedEpisode]:
         if sha256_of(cell / Path(file).name) != digest:
             raise CheckpointError(f"{file} has changed since it was written")
     if status.get("engine", 1) != ENGINE:
-        raise CheckpointError(f"engine {status['engine']} made its tokens, this kerv has engine {ENGINE}")
+        raise CheckpointError(f"it was decoded by engine version {status['engine']}, this kerv has version {ENGINE}")
     rows = {row["seed"]: row for row in foreign_table(cell / "episodes.parquet").to_pylist()}
     decodes = foreign_table(cell / "decodes.parquet")
     about = {"engine": 1, **{name: value for name, value in status.items() if name not in _NOT_OF_BLOCK}}

@@ -127,7 +127,7 @@ def check_one(path: Path, name: str, studies: int) -> None:
         UsageError: A name is given, and the number of studies is not 1.
     """
     if name and studies != 1:
-        raise UsageError(f"name={name}: {path} holds {studies} studies, a name is for one")
+        raise UsageError(f"name={name}: {path} holds {studies} studies, and name= needs exactly one")
 
 
 def episodes_in(connection: sa.Connection, settings: dict[int, Setting]) -> Iterator[ImportedEpisode]:

@@ -1,1 +1,1 @@
-"""The decode loop and what it asks of targets and of the parts of a method. It knows no method."""
+"""The decode loop, and the interfaces of targets and of a method's parts. No method is named here."""

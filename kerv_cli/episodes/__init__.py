@@ -1,1 +1,1 @@
-"""One episode: its settings, policy and clock, and what determines its result."""
+"""Runs single episodes: their settings, policy and clock, and what determines their result."""

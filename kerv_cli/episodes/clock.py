@@ -39,7 +39,7 @@ def steps_of(seconds: float, control_hz: float) -> int:
         KervError: The latency is negative or not finite.
     """
     if not 0 <= seconds < math.inf:
-        raise KervError(f"a decode cannot last {seconds} seconds: the latency's source is wrong")
+        raise KervError(f"the latency of a decode is {seconds} seconds, which cannot be")
     return math.ceil(round(seconds * control_hz, 6))
 
 
@@ -151,7 +151,7 @@ def latency_of(settings: RolloutSettings, target: TargetDescription | None, meas
     profile = _open_profile(settings)
     whole = profile.decode((settings.chunk or target.chunk) * target.actions.dofs)
     if ar_seconds and not whole:
-        raise UsageError(f"rollout.profile={timing.profile}: AR takes no time in it: nothing can be in proportion")
+        raise UsageError(f"rollout.profile={timing.profile}: its AR decode takes no time; leave out rollout.ar_ms")
     return profiled(profile, ar_seconds / whole if ar_seconds else 1.0)
 
 

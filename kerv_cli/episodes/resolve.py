@@ -175,7 +175,7 @@ def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
     others = [override for override in overrides if override not in tasks]
     varied = [key for key in swept_keys(others) if key != "method"] if multirun else []
     if "results" in varied:
-        raise UsageError("results= names one folder: a run lies in one place")
+        raise UsageError("results= cannot have several values: a rollout has one results folder")
     settings: dict[str, RolloutSettings] = {}
     points: dict[str, Point] = {}
     for words in expand(others) if multirun else [others]:

@@ -42,11 +42,11 @@ class TimingSettings:
         """
         if self.batch > 1 and self.clock == REAL:
             raise UsageError(
-                f"{prefix}batch={self.batch} with {prefix}clock=real: decodes of a batch have no times, use one of them"
+                f"{prefix}batch={self.batch} with {prefix}clock=real: decodes of a batch have no times, use only one"
             )
         if self.clock == REAL and self.latency == PROFILE and not self.profile:
             raise UsageError(
-                f"{prefix}latency=profile: name a document of 'kerv bench', {prefix}profile=mt10-vision-float32"
+                f"{prefix}latency=profile: name a document of 'kerv bench', such as {prefix}profile=mt10-vision-float32"
             )
 
 

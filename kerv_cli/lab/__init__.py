@@ -1,1 +1,1 @@
-"""Studies: plans, blocks, executors and the database."""
+"""Runs studies: plans which episodes to run, runs them through executors, and stores them in the database."""

@@ -62,13 +62,13 @@ class EpisodeEnd:
 
 @dataclass(frozen=True)
 class SettingFailed:
-    """A setting failed in a block of episodes. The other settings of the block go on.
+    """One of the compared settings failed in a block of episodes. The other settings of the block go on.
 
     Attributes:
         reason: The error in one line.
         trace: Its traceback.
         error: The error itself if it is a KervError, else None, because other errors may not be picklable.
-        episodes: The episodes that failed or that will not run. The first is the one that failed.
+        episodes: The episode that failed, and then the episodes that will not run because of it.
     """
 
     reason: str

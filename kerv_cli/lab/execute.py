@@ -53,7 +53,7 @@ Prepare = Callable[[Setting, str], RunEpisode]
 
 @dataclass(frozen=True)
 class Message:
-    """Message from a worker: an episode began, ended or failed. It began if `row` and `failure` are empty.
+    """Message from a worker: an episode began, ended or failed. If `row` and `failure` are empty, it began.
 
     Attributes:
         index: Index of the episode in its block.
@@ -182,7 +182,7 @@ class BlockRun:
 
 
 def failure_of(error: BaseException) -> events.SettingFailed:
-    """Describe an error in one line. For errors other than KervError, add the type and the file and line."""
+    """Describe an error in one line. For errors that are not KervErrors, add the type, file and line."""
     trace = "".join(traceback.format_exception(error))
     text = " ".join(str(error).split())
     if isinstance(error, KervError):
@@ -291,7 +291,11 @@ class _Sweep:
             shutil.rmtree(self.spool, ignore_errors=True)
 
     def _begin(self, executor: Executor, block: Block) -> None:
-        """Claim a block, remove episodes that another sweep has run in the meantime, and give it to the executor."""
+        """Reserve a block of episodes for this run, and give it to the executor.
+
+        If another run has reserved it, try again later. Episodes that another run has finished since the plan are left
+        out.
+        """
         name = f"{self.record.id}-{secrets.token_hex(4)}"
         if not self._claim(block, name):
             self.elsewhere.append(block)
@@ -365,7 +369,7 @@ class _Sweep:
             self.record.beat(len(self.outcome.done))
 
     def _write(self, attempt: _Attempt, one: Episode, message: Message) -> None:
-        """Commit an episode, its decodes and its link to the study."""
+        """Write an episode and its decodes to the database, and link the episode to the study."""
         work, task, seed, repeat = one.key
         row = {"work": work, "task": task, "seed": seed, "repeat": repeat, "block": attempt.id, **message.row}
         about = {"engine": ENGINE, "executor": self.runtime.executor, "workers": self.runtime.workers}
@@ -377,7 +381,7 @@ class _Sweep:
             linked = connection.execute(self.plan.store.update_of(one).values(episode_id=number, error=None)).rowcount
         if not linked:
             name = self.plan.study.name
-            raise KervError(f"study {name} was deleted while it ran: the same command begins it anew")
+            raise KervError(f"study {name} was deleted while it ran: run the same command to start it again")
 
     def _fail(self, attempt: _Attempt, one: Episode, failure: events.SettingFailed) -> None:
         """Note that a setting failed on a task. Its remaining episodes in the block will not run."""

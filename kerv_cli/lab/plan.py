@@ -42,7 +42,7 @@ K = TypeVar("K")
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """One setting of a study: a row of its table.
+    """One of the settings that a study compares: a method with all its options. It becomes a row of the study's table.
 
     Attributes:
         label: The setting's name in the study.
@@ -70,7 +70,7 @@ class Setting:
 
     @functools.cached_property
     def depends_on_order(self) -> bool:
-        """Whether an episode's result depends on the episodes before it, because a skip rule adapts."""
+        """Whether a result depends on earlier episodes, because a skip rule adapts (docs/methods.md §4.3)."""
         return depends_on_order(self.settings)
 
     def on(self, task: str) -> dict[str, Any]:
@@ -95,7 +95,7 @@ class Episode:
 
 @dataclass(frozen=True)
 class Study:
-    """Settings to compare, and the episodes that compare them.
+    """A comparison: the settings to compare, and all episodes to run with them.
 
     Attributes:
         name: Name in the database.
@@ -147,7 +147,7 @@ def all_episodes(
     tasks = list(dict.fromkeys(tasks))
     total = len(tasks) * repeats * sum(setting.settings["episodes"] for setting in settings)
     if total > MOST_EPISODES:
-        raise UsageError(f"the study has {total} episodes: at most {MOST_EPISODES}, plan fewer")
+        raise UsageError(f"the study has {total} episodes: at most {MOST_EPISODES} are allowed")
     seeds = {s.label: range(s.settings["seed"], s.settings["seed"] + s.settings["episodes"]) for s in settings}
     longest = max((len(one) for one in seeds.values()), default=0)
     return tuple(
@@ -307,7 +307,7 @@ def _turns(episodes: Iterable[Episode]) -> dict[tuple[str, int, int], list[Episo
 def _ordered_parts(episodes: Iterable[Episode], block: int) -> list[list[Episode]]:
     """Group the episodes whose results depend on their order, by setting, task, repeat and block of seeds.
 
-    Episodes of other settings are left out.
+    Episodes of settings whose results do not depend on order are left out.
     """
 
     def key(one: Episode) -> tuple[str, str, int, int]:
@@ -317,7 +317,9 @@ def _ordered_parts(episodes: Iterable[Episode], block: int) -> list[list[Episode
 
 
 def _keep_whole_orders(usable: dict[Episode, list[StoredEpisode]], block: int) -> None:
-    """Remove stored episodes that depend on their order, unless one block ran exactly the wanted seeds.
+    """Remove stored episodes that a study cannot reuse, because their results depend on the order of episodes.
+
+    They can be reused only if a single block ran exactly the wanted seeds.
 
     Args:
         usable: Episode -> its stored rows. It is changed.

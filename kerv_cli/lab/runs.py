@@ -100,7 +100,7 @@ class Run:
 
     Args:
         database: Where the row is written.
-        kind: sweep, rollout, import, or the kind of artifact that the command makes.
+        kind: sweep, rollout, import, or the kind of artifact (weights or data) that the command makes.
         name: Name of the study or artifact.
         command: Command-line arguments (without `kerv`) that resume the command. Empty: `current_command()`.
         total: Number of steps or episodes.
@@ -194,7 +194,7 @@ class Run:
 
 
 def name_in(results: str | Path, kind: str, folder: Path) -> str:
-    """Return the name of an artifact in the database.
+    """Return the name under which the database stores an artifact (weights or data).
 
     It is the folder's name, or the whole path for a folder outside `<results>/artifacts/<kind>`.
     """
@@ -202,7 +202,7 @@ def name_in(results: str | Path, kind: str, folder: Path) -> str:
 
 
 def making(results: str | Path, kind: str, folder: Path, command: Sequence[str] = ()) -> Run:
-    """Return the run (see `Run`) of a command that makes an artifact.
+    """Return the run (see `Run`) of a command that makes an artifact (weights or data).
 
     Args:
         results: The results folder.
@@ -214,7 +214,7 @@ def making(results: str | Path, kind: str, folder: Path, command: Sequence[str] 
 
 
 def command_to_go_on(results: str | Path, kind: str, folder: Path) -> tuple[str, ...]:
-    """Return the command-line arguments (without `kerv`) that resume an unfinished artifact.
+    """Return the command-line arguments (without `kerv`) that resume an unfinished artifact (weights or data).
 
     Empty if the artifact is complete, or if the database has no row for it.
     """
@@ -242,7 +242,7 @@ class Curve:
         return Curve(Database(results), kind, name_in(results, kind, folder))
 
     def write(self, history: Sequence[Mapping[str, float]]) -> None:
-        """Store these validations instead of earlier ones. Each maps names of metrics to values, and has a `step`."""
+        """Replace the stored validations with these. Each maps names of metrics to values, and has a `step`."""
         rows = [
             {"kind": self.kind, "name": self.name, "step": int(one["step"]), "metric": metric, "value": float(value)}
             for one in history
@@ -265,13 +265,13 @@ class Curve:
 
 
 def unfinished(database: Database, kind: str, command: Sequence[str]) -> RunRow | None:
-    """Return the newest row of a command. None if that row is complete, or if there is no row."""
+    """Return the newest row with these command-line arguments. None if it is complete, or if there is no row."""
     row = next((row for row in run_rows(database, kind) if row.command == tuple(command)), None)
     return None if row is None or row.status == COMPLETE else row
 
 
 def forget(database: Database, kind: str, name: str) -> None:
-    """Delete the rows of all commands that made this study or artifact, and its validation curve."""
+    """Delete all rows of commands that made this study or artifact (weights or data), and its validation curve."""
     with database.writing() as connection:
         for table in (RUNS, METRICS):
             connection.execute(sa.delete(table).where(table.c.kind == kind, table.c.name == name))

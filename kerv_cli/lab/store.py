@@ -82,7 +82,7 @@ class StudyStore:
 
     @property
     def root(self) -> Path:
-        """The study's folder."""
+        """The study's folder, `<results>/studies/<name>` or `<results>/rollouts/<name>`."""
         return self.database.results / _FOLDERS[self.kind] / self.name
 
     @property

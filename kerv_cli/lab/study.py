@@ -202,7 +202,7 @@ def run(
         except KeyboardInterrupt:
             existing, total = store.counts()
             raise Interrupted(
-                f"interrupted: {existing} of {total} episodes of {store.name} are kept, the same command goes on there"
+                f"interrupted: {existing} of {total} episodes of {store.name} are kept: run the same command to resume"
             ) from None
         finally:
             close_worlds()
