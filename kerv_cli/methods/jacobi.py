@@ -19,20 +19,22 @@ if TYPE_CHECKING:
 
 @dataclass
 class JacobiProposerSettings:
-    """PD-VLA: the next guess is the parallel argmax of the last one (§6)."""
+    """Jacobi decoding: guess all tokens, and take the target's argmax at all positions as the next guess (§6)."""
 
     kind: str = "jacobi"
-    depth: int = number(0, 0, MOST_TOKENS)  # tokens guessed at once; 0: all that are left
+    depth: int = number(0, 0, MOST_TOKENS)  # number of tokens guessed at once; 0: all remaining tokens
 
 
 class JacobiProposer(ChainProposer):
-    """Guesses all tokens and takes their parallel argmax as the next guess, up to the fixed point.
+    """Guesses the remaining tokens of a chunk. One forward gives the target's argmax at all positions: the next guess.
 
-    With strict acceptance the fixed point is the chunk of AR. The first guess is the target tokens after a rejection in
-    the in-prefill draft, then zero actions.
+    With strict acceptance this ends with the tokens of autoregressive decoding. If a prefill draft was rejected, the
+    first guess begins with the target's tokens after the rejection. All other tokens of the first guess are zero
+    actions.
 
     Attributes:
-        depth: Tokens guessed at once; 0 for all.
+        depth: Number of tokens guessed at once. 0: all remaining tokens.
+        guess: The present guess of the remaining tokens.
     """
 
     name = "jacobi"
@@ -47,20 +49,27 @@ class JacobiProposer(ChainProposer):
         return cls(settings.depth)
 
     def begin(self, chunk: Chunk) -> None:
-        """Make the first guess."""
+        """Make the first guess, after the prefill."""
         tokens = chunk.rejection.target[: chunk.remaining]
         self.guess = [*tokens, *[chunk.space.tokens // 2] * (chunk.remaining - len(tokens))]
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Return the present guess."""
+        """Return the present guess as one chain of at most `depth` tokens."""
         return [self.guess[: min(depth, self.depth or depth)]]
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
-        """Make the next guess: this round's target tokens after the committed ones, then the old guess."""
+        """Make the next guess: this round's target tokens after the committed tokens, then the rest of the old guess.
+
+        Args:
+            chunk: The chunk that is decoded.
+            first: Index in the chunk of the first newly committed position.
+            hidden: Not used.
+            target_tokens: The target's tokens at all positions of this round.
+        """
         accepted = len(chunk.tokens) - first - 2
         self.guess = [*target_tokens[accepted + 1 :], *self.guess[len(target_tokens) - 1 :]]
 
 
-# without the trait `chains`: its first guess is made after the prefill
+# it has no trait `chains`, because its first guess is made only after the prefill
 _BUILD = "kerv_cli.methods.jacobi:JacobiProposer.build"
 add("proposer", "jacobi", _BUILD, JacobiProposerSettings, colour=0x8A7FD4, when=STATES)

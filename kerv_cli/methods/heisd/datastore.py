@@ -1,13 +1,13 @@
-"""The datastore: action chunks of the demonstrations, searched by the target's encoding (docs/methods.md §4.1; HeiSD).
+"""The datastore: demonstrated action chunks, found by the similarity of observations (docs/methods.md §4.1; HeiSD).
 
-The key is the target's own prompt, pooled: the mean token of each chosen segment, L2-normalised, and the whole
-normalised again. It may be projected onto the directions that hold nearly all of the keys. The default is the scene
-segment alone: the encoder's positions of object and goal with hand and gripper. On MT10 the nearest neighbour by this
-key in another episode has the most similar chunk; pooled patch tokens make it worse. The stored value is the expert's
-next H actions as tokens.
+Each entry has a key and a chunk. The key is the observation as the target encodes it. For each chosen segment of the
+prompt, the mean token is L2-normalised. Then they are concatenated and normalised again. Optionally, keys are projected
+onto their leading directions. The default is the segment `scene` alone, which encodes hand, object and goal. On MT10
+this key finds the most similar chunks of other episodes. Adding vision tokens makes it worse. The chunk is the
+expert's next H actions, as tokens.
 
-On disk: `vectors.npy` (rows, d) float32 or float16, `payload.parquet`, `projection.npy` if keys are projected, and
-`manifest.json`. Rows are sorted by task, seed and step.
+A datastore is a folder with `vectors.npy` (rows, d) float32 or float16, `payload.parquet`, `manifest.json` and, if keys
+are projected, `projection.npy`. Rows are sorted by task, seed and step.
 """
 
 from __future__ import annotations
@@ -38,13 +38,18 @@ from kerv_cli.worlds import spec_of
 VECTORS, PAYLOAD, PROJECTION = "vectors.npy", "payload.parquet", "projection.npy"
 COLUMNS = {"seeds": "seed", "steps": "step", "left": "left"}
 AGAIN = "build one with 'kerv build datastore'"
-MARGIN = 8  # rows that Qdrant returns beyond k; if these may tie with the k-th too, all rows of the task are candidates
-ROUNDING = 1e-5  # bounds the rounding of a float32 product of unit vectors
+MARGIN = 8  # rows that Qdrant returns beyond k; if even the last may tie with the k-th, all rows of the task are used
+ROUNDING = 1e-5  # largest rounding error of a float32 dot product of two unit vectors
 
 
 @dataclass(frozen=True)
 class Shard:
-    """One task's part: its rows [first, last) and the seeds of its episodes."""
+    """The entries of one task.
+
+    Attributes:
+        rows: First row, and the row after the last.
+        seeds: Seeds of the episodes.
+    """
 
     rows: tuple[int, int]
     seeds: tuple[int, ...]
@@ -52,16 +57,21 @@ class Shard:
 
 @dataclass(frozen=True)
 class Manifest:
-    """`manifest.json`: the entries' keys and sizes, the target they were made for, and their seeds.
+    """Contents of a datastore's `manifest.json`.
 
     Attributes:
-        key: Segments of the prompt that are pooled.
-        width: Numbers of a key.
-        chunk: H.
+        format: Version of the file format.
+        kind: Always `datastore`.
+        key: Segments of the prompt from which keys are made, such as `scene`.
+        width: Numbers per key.
+        rows: Number of entries.
+        chunk: Number H of control steps per chunk.
         actions: The target's action space.
         target: Hash of the target's weights.
         demos: Hash of the demonstrations.
-        files: Name -> hash of the files beside this one.
+        files: Name -> hash of each file beside the manifest.
+        tasks: Full name of the task -> its rows and seeds.
+        provenance: How it was made.
     """
 
     format: Literal[2]
@@ -79,15 +89,23 @@ class Manifest:
 
     @property
     def content(self) -> str:
-        """Hash over keys, chunks and target. A rebuild from the same target and demonstrations keeps it."""
+        """Hash of the keys, the chunks and the target. It stays the same if an equal datastore is built again."""
         return content_of(self.key, self.chunk, self.target, self.files)
 
 
 def prompt_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) -> Tensor:
-    """Return the keys (B, d) float32 of length 1 of prompts (B, P, E), with d = segments · E.
+    """Make search keys from encoded observations.
+
+    Args:
+        prompt: (B, P, E) encoded prompts.
+        target: The target that encoded them.
+        segments: Names of the S segments of the prompt to use, such as `scene`.
+
+    Returns:
+        (B, S · E) float32 keys of length 1.
 
     Raises:
-        UnknownName: A segment that this target's prompt does not have.
+        UnknownName: The target's prompt has no such segment.
     """
     parts = target.segments
     for name in segments:
@@ -102,21 +120,21 @@ def _unit(vectors: Tensor) -> Tensor:
 
 
 def projected(keys: np.ndarray, projection: np.ndarray) -> np.ndarray:
-    """Return keys (n, d) along the directions projection (d, c): (n, c) float32 of length 1."""
+    """Project keys (n, d) onto the directions `projection` (d, c). Return (n, c) float32 of length 1."""
     vectors = keys @ projection
     units: np.ndarray = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
     return units.astype(np.float32)
 
 
 def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
-    """Check that no stored episode has the initial state of an evaluation episode.
+    """Refuse seeds that are not training seeds. Otherwise retrieval would know the evaluation's initial states.
 
     Args:
-        seeds: Seeds per task.
-        where: The folder, for the message.
+        seeds: Full name of the task -> seeds of its episodes.
+        where: The folder, for the error message.
 
     Raises:
-        CheckpointError: One is no training seed.
+        CheckpointError: A seed is not a training seed.
     """
     for task, numbers in seeds.items():
         training = spec_of(task).seeds.training
@@ -129,23 +147,33 @@ def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
 
 
 class Index(Protocol):
-    """Finds candidate rows. It may return more than k, because `best` ranks them."""
+    """A search for the most similar rows. It may return more rows than asked for, because `best` ranks them."""
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return rows, ascending, among which are the task's k best for a key.
+        """Return rows, in ascending order, that include the task's k rows most similar to a key.
 
         Args:
             key: (d,) float32.
-            task: Full name.
+            task: Full name of the task.
             k: Number of rows wanted.
-            without: Seed of an episode that is left out.
+            without: Seed of an episode to leave out. None: use all episodes.
         """
 
 
 def best(vectors: np.ndarray, rows: np.ndarray, key: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the k best of `rows` (ascending) and their scores float32, best first; equal scores in the rows' order.
+    """Return the k rows most similar to a key, and their similarities.
 
-    The last bit of a float32 product depends on a row's place in the matrix, so rows are compared in float64.
+    Dot products are computed in float64, because the last bit of a float32 result depends on a row's place in the
+    matrix.
+
+    Args:
+        vectors: (all rows, d) stored keys.
+        rows: Candidate rows, in ascending order.
+        key: (d,).
+        k: Number of rows wanted.
+
+    Returns:
+        The rows and their similarities float32, most similar first. Equally similar rows are in ascending order.
     """
     scores = np.einsum("ij,j->i", vectors[rows].astype(np.float64), key.astype(np.float64)).astype(np.float32)
     order = np.argsort(-scores, kind="stable")[:k]
@@ -153,13 +181,13 @@ def best(vectors: np.ndarray, rows: np.ndarray, key: np.ndarray, k: int) -> tupl
 
 
 class ExactIndex:
-    """datastore=exact, the default: one matrix product in this process."""
+    """datastore=exact, the default: compare the key with all entries of the task, in this process."""
 
     def __init__(self, store: Datastore, settings: object) -> None:
         self.store = store
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return candidate rows, also those that rounding may have put after the k-th."""
+        """Return the k best rows, and rows whose similarity equals the k-th up to rounding. See `Index.candidates`."""
         shard = self.store.shards[task]
         scores = self.store.vectors[shard] @ key
         if without is not None:
@@ -170,17 +198,22 @@ class ExactIndex:
 
 
 class QdrantIndex:
-    """datastore=qdrant: search by a server, or by the client itself, in a folder or in memory (the extra `qdrant`).
+    """datastore=qdrant: search with a Qdrant server, or with the client alone, in a folder or in memory.
 
-    Qdrant searches exactly within a task. `best` ranks its results again, so that the neighbours equal those of exact
-    search. A collection is named by the datastore's hash, so a folder or server keeps it for later processes.
+    It needs the extra `qdrant`. Qdrant searches exactly within a task, and `best` ranks its results again. So the
+    neighbours are those of datastore=exact. The collection is named after the datastore's hash, so that later processes
+    find it on the server or in the folder.
     """
 
     def __init__(self, store: Datastore, settings: QdrantSearchSettings) -> None:
-        """Open the collection of this datastore, and fill it if it is not complete.
+        """Open the Qdrant collection of this datastore, and fill it if it is incomplete.
+
+        Args:
+            store: The datastore.
+            settings: Address of the server, or the folder.
 
         Raises:
-            UsageError: qdrant-client is not installed, or the server or folder cannot be used.
+            UsageError: qdrant-client is not installed, or the server or the folder cannot be used.
         """
         if find_spec("qdrant_client") is None:
             raise UsageError("datastore=qdrant needs the extra: pip install 'kerv[qdrant]'")
@@ -200,7 +233,7 @@ class QdrantIndex:
                 self.client.upload_collection(self.name, store.vectors[rows], payloads, rows, wait=True)
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return candidate rows, see `Index`."""
+        """Return candidate rows. See `Index.candidates`."""
         m, store, shard = self.models, self.store, self.store.shards[task]
         must = [m.FieldCondition(key="task", match=m.MatchValue(value=task))]
         other = [] if without is None else [m.FieldCondition(key="seed", match=m.MatchValue(value=without))]
@@ -228,89 +261,89 @@ class QdrantIndex:
 
 @dataclass(frozen=True)
 class Neighbours:
-    """The k nearest entries, best first; equal scores in the datastore's order."""
+    """The k entries most similar to a key, most similar first. Equally similar entries keep the datastore's order."""
 
     similarity: np.ndarray  # (k,) float32, cosine
-    chunks: np.ndarray  # (k, N) int64 tokens
-    seeds: np.ndarray  # (k,) int64, the stored episodes
-    steps: np.ndarray  # (k,) int64, control step of the stored episode
-    left: np.ndarray  # (k,) int64, control steps from there to the stored episode's end
+    chunks: np.ndarray  # (k, N) int64, tokens of the stored chunk
+    seeds: np.ndarray  # (k,) int64, seed of the stored episode
+    steps: np.ndarray  # (k,) int64, control step of the entry in the stored episode
+    left: np.ndarray  # (k,) int64, control steps from the entry to the stored episode's end
 
 
 @dataclass(frozen=True)
 class Datastore:
-    """An opened datastore."""
+    """An open datastore: keys and chunks of the demonstrations, in memory."""
 
     manifest: Manifest
-    vectors: np.ndarray  # (rows, d) float32
-    tokens: np.ndarray  # (rows, N) uint8
-    seeds: np.ndarray  # (rows,) int64, as the next two
-    steps: np.ndarray
-    left: np.ndarray
-    shards: dict[str, slice]
-    projection: np.ndarray | None = None  # (pooled numbers, d)
-    search: Any = None  # settings of the search; None: exact. Each finds the same neighbours
+    vectors: np.ndarray  # (rows, d) float32, keys
+    tokens: np.ndarray  # (rows, N) uint8, chunks
+    seeds: np.ndarray  # (rows,) int64, seed of the episode
+    steps: np.ndarray  # (rows,) int64, control step in the episode
+    left: np.ndarray  # (rows,) int64, control steps to the episode's end
+    shards: dict[str, slice]  # full name of the task -> its rows
+    projection: np.ndarray | None = None  # (numbers before projection, d); None: keys are not projected
+    search: Any = None  # settings of the search; None: exact; every search finds the same neighbours
 
     @functools.cached_property
     def index(self) -> Index:
-        """The search."""
+        """The search that `search` chooses."""
         kind = self.search.kind if self.search else "exact"
         index: Index = registry.find("datastore", kind, "datastore.kind").built(self, self.search)
         return index
 
     @functools.cached_property
     def longest(self) -> float:
-        """Length of the longest vector."""
+        """Euclidean length of the longest key. It bounds the rounding errors of the search."""
         return float(np.linalg.norm(self.vectors, axis=1).max(initial=0.0))
 
     @classmethod
     def open(cls, folder: Path, description: TargetDescription, search: Any = None) -> Datastore:
-        """Open the datastore in `folder`, made for the target described.
+        """Open a datastore, and check that it was built for a target.
 
         Args:
-            folder: Its folder.
-            description: The target's.
-            search: Settings of the search; None for exact search.
+            folder: Folder of the datastore.
+            description: Description of the target.
+            search: Settings of the search. None: exact search.
 
         Raises:
-            CheckpointError: No datastore there, a damaged one, one that was built for another target, other action
-                statistics or another chunk length, or from evaluation seeds.
-            UsageError: An unknown search, one whose packages are not installed, or a server that does not answer.
+            CheckpointError: The datastore is missing or damaged. Or it was built for another target, other action
+                statistics or another chunk length. Or it was built from evaluation seeds.
+            UsageError: The search is unknown, its packages are not installed, or its server does not answer.
         """
         manifest = DatastoreArtifact().checked(folder, description)
         store = cls(manifest, **_arrays(folder, manifest), search=search)
-        _ = store.index  # a search that does not work is refused now
+        _ = store.index  # open the search now, so that a search that cannot work is refused at once
         return store
 
     @property
     def tasks(self) -> Collection[str]:
-        """Tasks that have entries."""
+        """Full names of the tasks that have entries."""
         return self.shards
 
     @property
     def content(self) -> str:
-        """Hash over keys, chunks and target, see `Manifest.content`."""
+        """Hash of the keys, the chunks and the target. See `Manifest.content`."""
         return self.manifest.content
 
     def pooled(self, prompt: Tensor, target: ReadableTarget) -> Tensor:
-        """Return the pooled prompt (p,) float32 for `key_of`, on the device; prompt (1, P, E)."""
+        """Pool a prompt (1, P, E) for `key_of`. Return (p,) float32, on the target's device."""
         return prompt_key(prompt, target, self.manifest.key)[0]
 
     def key_of(self, pooled: np.ndarray) -> np.ndarray:
-        """Return the key (d,) float32 of a pooled prompt (p,)."""
+        """Return the search key (d,) float32 of a pooled prompt (p,): the prompt itself, projected if keys are."""
         return pooled if self.projection is None else projected(pooled[None], self.projection)[0]
 
     def query(self, key: np.ndarray, task: str, k: int, without: int | None = None) -> Neighbours:
-        """Return the k nearest entries of a task, or all if there are fewer.
+        """Return the k entries of a task that are most similar to a key, or all entries if there are fewer.
 
         Args:
             key: (d,).
-            task: Full name.
+            task: Full name of the task.
             k: Number of entries.
-            without: Seed of an episode that is left out, for leave-one-episode-out measurements.
+            without: Seed of an episode to leave out, for leave-one-episode-out measurements. None: use all episodes.
 
         Raises:
-            UnknownName: A task that the datastore does not hold.
+            UnknownName: The datastore has no entries of this task.
         """
         if task not in self.shards:
             raise UnknownName("task of the datastore", task, self.shards)
@@ -321,7 +354,14 @@ class Datastore:
 
 
 def _arrays(folder: Path, manifest: Manifest) -> dict[str, Any]:
-    """Read a datastore's files and check them against its manifest."""
+    """Read the files of a datastore, and check that their shapes are those of the manifest.
+
+    Returns:
+        Name of a field of `Datastore` -> its value.
+
+    Raises:
+        CheckpointError: A file is damaged.
+    """
     try:
         vectors = np.load(folder / VECTORS).astype(np.float32, copy=False)
         payload = _read_payload(folder / PAYLOAD)
@@ -341,7 +381,7 @@ def _arrays(folder: Path, manifest: Manifest) -> dict[str, Any]:
 def _read_payload(path: Path) -> dict[str, np.ndarray]:
     import pyarrow.parquet as pq
 
-    # without pyarrow's dataset machinery, which takes several times as long for a small file
+    # ParquetFile, because pyarrow's datasets take several times as long for a small file
     with pq.ParquetFile(path) as file:
         table = file.read(use_threads=False)
     columns = {name: table[column].to_numpy() for name, column in COLUMNS.items()}
@@ -350,7 +390,7 @@ def _read_payload(path: Path) -> dict[str, np.ndarray]:
 
 
 class DatastoreArtifact(Artifact[Manifest]):
-    """The datastore's files."""
+    """The kind of artifact `datastore`."""
 
     kind = noun = "datastore"
     made, command, again = "built", ("build", "datastore"), AGAIN
@@ -361,15 +401,15 @@ class DatastoreArtifact(Artifact[Manifest]):
         return path / MANIFEST
 
     def read(self, path: Path) -> Manifest:
-        """Return the manifest. Its seeds must be training seeds."""
+        """Read the manifest, and check that all its seeds are training seeds."""
         manifest = super().read(path)
         check_seeds({task: shard.seeds for task, shard in manifest.tasks.items()}, path)
         return manifest
 
     def digest(self, path: Path, description: Manifest) -> str:
-        """Return `Manifest.content`."""
+        """Return the hash of the keys, the chunks and the target: `Manifest.content`."""
         return description.content
 
     def load(self, path: Path, artifacts: Artifacts) -> Datastore:
-        """Return the datastore, opened."""
+        """Open the datastore in `path`, with the search of the policy."""
         return Datastore.open(path, artifacts.description, artifacts.search)

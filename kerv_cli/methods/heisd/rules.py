@@ -1,8 +1,8 @@
-"""HeiSD's proposers, acceptance rules, verify-skip and boundaries (docs/methods.md §2.1, §4.2 to §4.4).
+"""HeiSD's proposers, acceptance rules, skip rule and boundaries (docs/methods.md §2.1, §4.2 to §4.4).
 
-A boundary chooses who drafts: retrieval or the drafter. R is the radius of curvature of the hand's measured path, D its
-length. A straight, fast reach (large R, large D) repeats demonstrated motion. A tight or slow path is precise work, for
-which the drafter is better.
+A boundary chooses for each chunk whether retrieval or the drafter drafts. It looks at the hand's last measured
+positions: R is their radius of curvature, D the length of their path. A straight, fast path (large R, large D) repeats
+demonstrated motion, so retrieval drafts. A curved or slow path is precise work, for which the drafter is better.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ from kerv_cli.methods.heisd import (
 from kerv_cli.methods.heisd.datastore import Datastore, Neighbours
 from kerv_cli.methods.spec_vla import RelaxedRule
 
-CROSS = 0.1  # probability that a path of retrieved groups changes to other neighbours
-LEAST = 3  # positions; fewer have no curvature
-STILL = 1e-3  # metres; a hand with a shorter path counts as still (in Meta-World a control step at full speed is 10 mm)
-COINCIDENT = 1e-7  # metres of spread; below it float32 positions are the same point
-STRAIGHT = 1e-6  # spread across the path by the spread along it; below it the points lie on a line
+CROSS = 0.1  # assumed probability that a path of retrieved groups changes to another neighbour after a group
+LEAST = 3  # minimum number of positions for a curvature
+STILL = 1e-3  # metres; a hand with a shorter path is at rest (in Meta-World, a control step at full speed is 10 mm)
+COINCIDENT = 1e-7  # metres; float32 positions with a smaller spread are the same point
+STRAIGHT = 1e-6  # points form a line if their spread across it is less than this share of the spread along it
 
 
 def neighbour_tree(
@@ -59,19 +59,20 @@ def neighbour_tree(
     depth: int | None = None,
     cross: float = CROSS,
 ) -> Draft:
-    """Return the neighbours' chunks after `start` committed tokens as one tree by kinematic group (§4.2).
+    """Merge the neighbours' chunks into one tree of kinematic groups (docs/methods.md §4.2).
 
-    A path consists of whole groups. After each it may go on with any neighbour's next group. But a group of strict DoFs
-    always comes from a neighbour that has the group before it too. The most probable groups are kept (*ours*): the i-th
-    neighbour weighs 1 / i, and a path changes to other neighbours with probability `cross`.
+    A kinematic group is the tokens of position, rotation or gripper of one control step. A path of the tree consists of
+    whole groups. After each group it may continue with any neighbour's next group. But a group of strict DoFs (the
+    gripper) must come from a neighbour that also has the path's previous group. The most probable groups are kept
+    (*ours*): the i-th neighbour has the weight 1 / i, and a path changes to another neighbour with probability `cross`.
 
     Args:
-        chunks: (k, N) tokens, best neighbour first.
-        start: Number of committed tokens.
+        chunks: (k, N) tokens, most similar neighbour first.
+        start: Number of committed tokens. The tree begins after them.
         space: The action space.
-        nodes: Most nodes of the tree.
-        depth: Most tokens of a path; None for up to the chunk's end.
-        cross: 0 merges only whole chunks.
+        nodes: Maximum number of nodes of the tree.
+        depth: Maximum number of tokens on a path. None: up to the chunk's end.
+        cross: Probability of a change after a group. 0: paths never change, so only whole chunks are merged.
     """
     stop = chunks.shape[1] if depth is None else min(chunks.shape[1], start + depth)
     continuations = _Continuations(chunks.tolist(), list(space.segments(start, stop)), cross)
@@ -88,11 +89,11 @@ def neighbour_tree(
     offer(ROOT, 0, continuations.everyone, continuations.everyone, 0.0)
     while waiting and len(tokens) < nodes:
         cost, _, node, level, group, last, whole = heappop(waiting)
-        known = 0  # leading tokens of the group that the tree already has
+        known = 0  # number of leading tokens of the group that are in the tree already
         while known < len(group) and (node, group[known]) in children:
             node, known = children[node, group[known]], known + 1
         if len(tokens) + len(group) - known > nodes:
-            continue  # a group is in the tree as a whole or not at all
+            continue  # never add a group in part
         for token in group[known:]:
             children[node, token] = len(tokens)
             parents.append(node)
@@ -104,14 +105,20 @@ def neighbour_tree(
 
 @functools.lru_cache(maxsize=4096)
 def _weight(members: int) -> float:
-    """Return the summed weight of a bit set of neighbours; the i-th, counted from 1, weighs 1 / i."""
+    """Return the summed weight of the neighbours in a bit set. The i-th neighbour, counted from 1, has weight 1 / i."""
     return sum([1 / (1 + i) for i in range(members.bit_length()) if members >> i & 1])
 
 
 class _Continuations:
-    """The groups that may follow a path.
+    """The kinematic groups that may follow a path of retrieved groups.
 
-    Two bit sets of neighbours describe a path: `last` have its last group, and `whole` among them have all its groups.
+    Two bit sets of neighbours describe a path. `last` are the neighbours that have its last group. `whole` are those
+    among them that have all its groups.
+
+    Args:
+        rows: Tokens of each neighbour's chunk, most similar neighbour first.
+        cuts: (first token, token after the last, whether it is strict) of each group.
+        cross: Probability that a path changes to another neighbour after a group.
     """
 
     def __init__(self, rows: list[list[int]], cuts: list[tuple[int, int, bool]], cross: float) -> None:
@@ -126,7 +133,16 @@ class _Continuations:
             self.levels.append((strict, list(givers.items())))
 
     def on(self, level: int, last: int, whole: int) -> Iterator[tuple[float, tuple[int, ...], int, int]]:
-        """Yield (−log probability, the group's tokens, the two sets of the longer path), best neighbour first."""
+        """List the groups that may follow a path, in the order of their best neighbours.
+
+        Args:
+            level: Number of groups that the path has.
+            last: Bit set of the neighbours that have the path's last group.
+            whole: Bit set of the neighbours that have all its groups.
+
+        Yields:
+            (−log probability of the group, its tokens, `last` and `whole` of the longer path).
+        """
         if level == len(self.levels):
             return
         strict, givers = self.levels[level]
@@ -144,7 +160,14 @@ class _Continuations:
 
 
 class RetrievalProposer(ChainProposer):
-    """The nearest stored chunks of the task, merged by kinematic group (docs/methods.md §4.2)."""
+    """Drafts the task's most similar stored chunks, merged into one tree (docs/methods.md §4.2).
+
+    Args:
+        datastore: The stored chunks.
+        target: The target, which encodes the observations.
+        neighbours: Number of stored chunks in the tree.
+        nodes: Maximum number of nodes of the tree.
+    """
 
     name = "retrieval"
 
@@ -155,18 +178,24 @@ class RetrievalProposer(ChainProposer):
 
     @classmethod
     def build(cls, settings: RetrievalProposerSettings | HybridProposerSettings, context: Context) -> RetrievalProposer:
-        """Build proposer=retrieval, and retrieval's part of proposer=hybrid."""
+        """Build proposer=retrieval, or the retrieval of proposer=hybrid."""
         return cls(context.artifact("datastore"), context.target, settings.neighbours, settings.nodes)
 
     def neighbours(self, chunk: Chunk) -> Neighbours:
-        """Return the task's entries nearest to this observation, searched once per chunk. Sets `chunk.similarity`."""
+        """Return the stored entries most similar to the chunk's observation, and set `chunk.similarity`.
+
+        The search runs once per chunk.
+        """
         if self._nearest is None or self._nearest[0] is not chunk:
             self._search(chunk, read(self.datastore.pooled(chunk.prompt, self.target))[0])
         assert self._nearest is not None
         return self._nearest[1]
 
     def prepare(self, chunk: Chunk) -> None:
-        """Add the pooled prompt, which the search key is made of, to `chunk.reads`."""
+        """On a GPU, add the pooled prompt to `chunk.reads`, so that it is copied together with other results.
+
+        The search starts as soon as it has arrived on the CPU.
+        """
         if not self.waits and (self._nearest is None or self._nearest[0] is not chunk):
             vector = self.datastore.pooled(chunk.prompt, self.target)
             chunk.reads.append((vector, lambda pooled: self._search(chunk, pooled)))
@@ -177,21 +206,21 @@ class RetrievalProposer(ChainProposer):
         chunk.similarity = float(self._nearest[1].similarity[0])
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """Return the neighbours' chunks as one tree."""
+        """Return the most similar stored chunks, as one tree of at most `depth` tokens per path."""
         chunks = self.neighbours(chunk).chunks[:, : chunk.size]
         return neighbour_tree(chunks, len(chunk.tokens), chunk.space, self.nodes, depth)
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Return each neighbour's remaining tokens as a chain, best neighbour first."""
+        """Return one chain per stored chunk: its tokens after the committed tokens. The most similar chunk is first."""
         start = len(chunk.tokens)
         return self.neighbours(chunk).chunks[:, start : min(chunk.size, start + depth)].tolist()
 
 
 class HybridProposer(Proposer):
-    """HeiSD: lets retrieval or the drafter draft, as the boundary says (docs/methods.md §4.4).
+    """HeiSD: drafts by retrieval or with the drafter, as the boundary chooses for each chunk (docs/methods.md §4.4).
 
     Attributes:
-        name: Of the one that drafts this chunk.
+        name: Name of the proposer that drafts the present chunk.
     """
 
     needs_states = True
@@ -207,32 +236,34 @@ class HybridProposer(Proposer):
         return cls(EagleDrafter.proposer(settings, context), RetrievalProposer.build(settings, context))
 
     def prepare(self, chunk: Chunk) -> None:
-        """Take the proposer that the boundary chose for this chunk."""
+        """Select the proposer that the boundary chose for this chunk, and prepare it."""
         assert chunk.choice is not None, "a hybrid proposer needs a boundary"
         self.chosen = self.proposers[chunk.choice.mode]
         self.name = self.chosen.name
         self.chosen.prepare(chunk)
 
     def begin(self, chunk: Chunk) -> None:
-        """Tell the chosen proposer."""
+        """Pass the prefill's results to the selected proposer."""
         self.chosen.begin(chunk)
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """Return the draft of the chosen proposer."""
+        """Return the draft of the selected proposer."""
         return self.chosen.propose(chunk, depth)
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
-        """Tell the chosen proposer."""
+        """Pass the newly committed tokens to the selected proposer."""
         self.chosen.committed(chunk, first, hidden, target_tokens)
 
 
 @dataclass(frozen=True)
 class GroupRule(DistanceRule):
-    """Accepts or rejects a kinematic group of one control step as a whole; strict DoFs must match.
+    """Accepts or rejects each kinematic group (position, rotation, gripper) of a control step as a whole.
+
+    Strict DoFs, such as the gripper, must equal the target's tokens.
 
     Attributes:
-        group_limit: Largest summed bias of a group, bins.
-        token_limit: Largest bias of a token, bins.
+        group_limit: Largest accepted sum of a group's distances to the target's tokens, in bins.
+        token_limit: Largest accepted distance of one token, in bins.
     """
 
     group_limit: int
@@ -244,23 +275,30 @@ class GroupRule(DistanceRule):
         return cls(context.target.actions, settings.group_limit, settings.token_limit)
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """Return the largest accepted distance per DoF, bins (D,): `token_limit` whatever r, 0 for strict DoFs."""
+        """Return the largest accepted distance of each of the D DoFs, in bins: `token_limit`, or 0 for strict DoFs.
+
+        The radius `r` is not used.
+        """
         return tuple(0 if strict else self.token_limit for strict in self.space.is_strict)
 
     def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
-        """Return the longest path of whole groups, by `accept_by_group`."""
+        """Return the longest accepted path of whole groups. See `accept_by_group` for the arguments."""
         limits, bounds = self.limits(r), self.space.bounds
         return accept_by_group(tree, target_tokens, start, limits, group_limit=self.group_limit, bounds=bounds)
 
 
 @dataclass(frozen=True, kw_only=True)
 class HybridRule(RelaxedRule):
-    """Judges retrieved drafts by group, all others within one radius."""
+    """Accepts retrieved drafts by kinematic group, and all other drafts token by token within a radius.
+
+    Attributes:
+        retrieved: The rule for retrieved drafts.
+    """
 
     retrieved: GroupRule
 
     def of_drafts_from(self, proposer: str) -> DistanceRule:
-        """Return the rule for drafts of `proposer`."""
+        """Return the rule for the drafts of the proposer with this name."""
         return self.retrieved if proposer == "retrieval" else self
 
 
@@ -272,23 +310,26 @@ def by_proposer(settings: HybridAcceptanceSettings, context: Context) -> HybridR
 
 
 class VerifySkip(Skip):
-    """Executes the best neighbour's chunk without verification if its similarity is at least s_min.
+    """Executes the most similar stored chunk without verification if its similarity is at least s_min.
 
-    It does so for at most `max_skips` decodes in a row, and with a boundary only where retrieval drafts. After a stored
-    episode was followed to its end, none of its chunks is executed unverified again in this episode. With `up` or
-    `down` above 0, s_min carries over between episodes: a failure raises it by `up` times the calibrated range, a
-    success lowers it by `down` times. Results then depend on the order of episodes and on the evaluator's success flag.
+    It skips at most `max_skips` verifications in a row. If there is a boundary, it skips only if that chooses retrieval.
+    If a stored episode was followed to its end, none of its chunks is executed without verification again in this
+    episode.
+
+    With `up` or `down` above 0, s_min changes after each episode. A failure raises it by `up` times the calibrated
+    range, a success lowers it by `down` times the range. Then results depend on the order of the episodes and on the
+    evaluator's success flag.
     """
 
     def __init__(
         self, settings: SimilaritySkipSettings, retrieval: RetrievalProposer, levels: tuple[float, float, float]
     ) -> None:
-        """Start with the calibrated level.
+        """Start with the calibrated s_min.
 
         Args:
-            settings: Those of skip=similarity.
-            retrieval: Finds the neighbours.
-            levels: The task's (low, s_min, high), cosines. Feedback moves s_min between low and high.
+            settings: Settings of skip=similarity.
+            retrieval: Finds the most similar stored chunks.
+            levels: The task's (low, s_min, high), as cosines. Feedback moves s_min between low and high.
         """
         self.settings, self.retrieval = settings, retrieval
         self.low, self.s_min, self.high = levels
@@ -297,7 +338,7 @@ class VerifySkip(Skip):
 
     @classmethod
     def build(cls, settings: SimilaritySkipSettings, context: Context) -> VerifySkip:
-        """Build skip=similarity. It shares the retrieval of the method's proposer, if that retrieves."""
+        """Build skip=similarity. If the method's proposer retrieves, both share one search."""
         proposer: Proposer | None = context.built["proposer"]
         retrieval = proposer.proposers["retrieval"] if isinstance(proposer, HybridProposer) else proposer
         if not isinstance(retrieval, RetrievalProposer):
@@ -307,18 +348,22 @@ class VerifySkip(Skip):
         return cls(settings, retrieval, context.calibration.skip_levels(context.task, retrieval.datastore.content))
 
     def begin(self, task: str, seed: int) -> None:
-        """Begin an episode."""
+        """Begin an episode: count skips from 0, and forget which stored episodes were followed to their end."""
         self.in_a_row = 0
         self.ended.clear()
 
     def finish(self, success: bool) -> None:
-        """End an episode."""
+        """End an episode: raise s_min after a failure, lower it after a success."""
         span = self.high - self.low
         s_min = self.s_min + span * (-self.settings.down if success else self.settings.up)
         self.s_min = min(self.high, max(self.low, s_min))
 
     def take(self, chunk: Chunk) -> bool:
-        """Fill the chunk with the best neighbour's tokens if it may be executed unverified -> whether it did."""
+        """Fill the chunk with the most similar stored chunk, if it may be executed without verification.
+
+        Returns:
+            Whether the chunk was filled.
+        """
         if chunk.choice is not None and chunk.choice.mode != "retrieval":
             self.in_a_row = 0
             return False
@@ -335,12 +380,16 @@ class VerifySkip(Skip):
 
 
 def radius_of_curvature(points: np.ndarray) -> float:
-    """Return the radius in metres of the circle through points (n, 3); infinite if there is no circle.
+    """Fit a circle to a path, and return its radius in metres.
 
-    The points are projected onto their best plane by singular values, then fitted by Taubin's algebraic method, which
-    is exact on arcs. Centred and scaled to unit mean square, the fit's smallest singular vector (a, b, c) over [(z − 1)
-    / 2, x, y] with z = x² + y² gives R = scale / |a|. Fewer than three points, a hand at rest and a straight line have
-    no circle.
+    The radius is infinite for fewer than three points, for a hand at rest and for a straight line. The points are
+    projected onto their best plane (by SVD). Taubin's algebraic method, which is exact on arcs, fits the circle. For
+    this, the points (x, y) are centred and scaled to a mean square of 1. With z = x² + y², let (a, b, c) be the right
+    singular vector of the matrix with rows [(z − 1) / 2, x, y] with the smallest singular value. Then the radius is
+    scale / |a|.
+
+    Args:
+        points: (n, 3) positions, metres.
     """
     points = np.asarray(points, dtype=np.float64)
     if len(points) < LEAST:
@@ -359,12 +408,19 @@ def radius_of_curvature(points: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class BoundaryRanges:
-    """Ranges of R and D over the training demonstrations: minimum and 95th percentile, metres.
+    """Ranges of the hand's radius of curvature R and path length D over the training demonstrations, in metres.
 
-    Infinite radii are left out: one straight reach would make every other radius zero.
+    A range goes from the minimum to the 95th percentile. Infinite radii of straight paths are left out, because with
+    them all other radii would be scaled to about 0.
+
+    Attributes:
+        radius_low: Minimum of R.
+        radius_high: 95th percentile of R.
+        length_low: Minimum of D.
+        length_high: 95th percentile of D.
 
     Raises:
-        CheckpointError: No range between finite numbers.
+        CheckpointError: A range is empty or not finite.
     """
 
     radius_low: float
@@ -379,14 +435,14 @@ class BoundaryRanges:
 
     @classmethod
     def fit(cls, paths: Iterable[np.ndarray], window: int) -> BoundaryRanges:
-        """Return the ranges over every window that decoding would see, also the short ones at an episode's beginning.
+        """Measure the ranges over every window that decoding would see, including short ones when an episode begins.
 
         Args:
-            paths: (T, 3) measured positions of whole episodes, metres.
-            window: Positions of a window.
+            paths: Measured hand positions of each episode, (T, 3) metres.
+            window: Number of positions in a window.
 
         Raises:
-            CheckpointError: No path bends, or none moves.
+            CheckpointError: No path is curved, or the hand never moves.
         """
         measured = []
         for path in paths:
@@ -401,9 +457,10 @@ class BoundaryRanges:
         return cls(float(radii.min()), next(high), float(lengths.min()), next(high))
 
     def normalise(self, radius: float, length: float) -> tuple[float, float]:
-        """Return (R̂, D̂), clipped to [0, 1].
+        """Scale a path's radius and length (metres) by the ranges. Return both in [0, 1].
 
-        R̂ is 1 for a straight reach and 0 for a hand at rest, both of infinite radius.
+        A straight path and a hand at rest have an infinite radius. It is scaled to 1 for the path and 0 for the hand at
+        rest.
         """
         scaled = 0.0
         if length >= STILL:
@@ -411,26 +468,35 @@ class BoundaryRanges:
         return scaled, min(1.0, max(0.0, (length - self.length_low) / (self.length_high - self.length_low)))
 
     def fused(self, radius: float, length: float, alpha: float) -> float:
-        """Return F = α·R̂ + (1 − α)·D̂, in [0, 1]."""
+        """Return F, the weighted sum of a path's scaled radius and scaled length, in [0, 1].
+
+        Args:
+            radius: Radius of curvature, metres.
+            length: Path length, metres.
+            alpha: Weight of the radius. The length has the weight 1 − alpha.
+        """
         radius, length = self.normalise(radius, length)
         return alpha * radius + (1 - alpha) * length
 
 
 class Seeded:
-    """Base of boundaries."""
+    """Base of boundaries, with a random generator per episode."""
 
     seed = 0
 
     def numbers(self, task: str, seed: int) -> np.random.Generator:
-        """Return an episode's generator. It depends on the boundary's seed, the task and the episode's seed alone."""
+        """Return the random generator of an episode.
+
+        It depends only on the boundary's seed, the task's full name and the episode's seed.
+        """
         return np.random.default_rng([self.seed, zlib.crc32(task.encode()), seed])
 
 
 @dataclass(frozen=True)
 class Random(Seeded):
-    """Retrieval with probability p, without looking at the path: a control.
+    """Chooses retrieval with probability p, else the drafter: a baseline that does not look at the path.
 
-    With 1 and 0 one proposer drafts all chunks.
+    With p = 1 retrieval drafts all chunks, with p = 0 the drafter does.
     """
 
     p: float
@@ -447,13 +513,22 @@ class Random(Seeded):
         return cls(float(settings.kind == "always_retrieval"))
 
     def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
-        """Choose retrieval with probability p, else the drafter."""
+        """Choose retrieval with probability p, else the drafter. The path is not used."""
         return Choice("retrieval" if rng.random() < self.p else "drafter")
 
 
 @dataclass(frozen=True)
 class Fused(Seeded):
-    """Retrieval if F ≥ F*; the drafter with fewer than three positions."""
+    """Chooses retrieval if F ≥ F*, where F is the weighted sum of the path's scaled curvature radius and length.
+
+    With fewer than three positions it chooses the drafter.
+
+    Attributes:
+        ranges: Ranges that scale radius and length.
+        alpha: Weight of the radius. The length has the weight 1 − alpha.
+        window: Number of newest positions to look at.
+        f_star: The limit F*.
+    """
 
     ranges: BoundaryRanges
     alpha: float
@@ -467,7 +542,12 @@ class Fused(Seeded):
         return cls(ranges, settings.alpha, settings.window, settings.f_star)
 
     def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
-        """Choose by F of the path's newest `window` positions (m, 3), metres."""
+        """Choose retrieval or the drafter from the path's newest `window` positions.
+
+        Args:
+            path: (m, 3) measured hand positions of the episode, metres.
+            rng: Not used.
+        """
         points = np.asarray(path)[-self.window :]
         if len(points) < LEAST:
             return Choice("drafter")

@@ -1,4 +1,4 @@
-"""KERV (docs/methods.md §3): a kinematic prediction after a rejection, and thresholds that follow the motion."""
+"""KERV (docs/methods.md §3): after a rejection, predict actions from the motion; adapt the threshold to the motion."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _PREDICTION = "kerv_cli.methods.kerv.prediction:"
 
-_sources = ("drafter", "datastore")  # each has a section
+_sources = ("drafter", "datastore")  # the calibration has a section for each
 add(
     "artifact",
     "calibration",
@@ -25,12 +25,12 @@ add(
     needs_task=True,
 )
 
-# --- predictors, and proposers that draft by them (§3.1, §6)
+# --- predictors, and proposers that draft with them (§3.1, §6)
 
 for _name, _fitted, _colour in (
     ("hold", False, 0xE69F00),
     ("linear", False, 0x0072B2),
-    ("kalman", True, 0xD55E00),  # a filter reads the noise that `kerv calibrate` fitted
+    ("kalman", True, 0xD55E00),  # Kalman filters need the noise that `kerv calibrate` fitted
     ("damped", True, 0xA0522D),
 ):
     _drafts = (_PREDICTION + "PredictionProposer.build", NoSettings, ("calibration",) if _fitted else ())
@@ -38,14 +38,14 @@ for _name, _fitted, _colour in (
     add("proposer", _name, *_drafts, colour=_colour, when=PREFILL, chains=True, predictor=_predictor)
 
 DRAFT = "draft"
-"""`rectifier.predictor` that fills from the rejected draft instead of from a kinematic predictor."""
+"""Value of `rectifier.predictor` that fills with the rejected draft instead of a kinematic prediction."""
 
 
 def find_predictor(name: str) -> Part:
-    """Return the proposer whose predictor has this name.
+    """Return the registered proposer that has the kinematic predictor of this name, such as `kalman`.
 
     Raises:
-        UnknownName: There is none.
+        UnknownName: No predictor has this name.
     """
     predictors = {key: part for key, part in parts("proposer").items() if "predictor" in part.traits}
     if name not in predictors:
@@ -58,18 +58,23 @@ def find_predictor(name: str) -> Part:
 
 @dataclass
 class CompensateSettings:
-    """KERV: predict the rest of the rejected control step, drop the rest of the chunk."""
+    """KERV: after a rejection, predict the rest of that control step, and drop the later steps of the chunk."""
 
     kind: str = "compensate"
-    predictor: str = "hold"  # a predictor, or draft: the rejected draft's remaining tokens (ours)
-    steps: int = number(1, 1, MOST_TOKENS)  # PL: control steps that a prediction may fill
-    use_target_token: bool = True  # ours: the target's token at the rejected position is kept; false: predicted (KERV)
-    min_verified: int = number(1, 0, MOST_TOKENS)  # DoFs of a step that must be known for it to be filled
-    rest: int = number(0, 0, MOST_DECODES)  # decodes without compensation after one (KERV: 4)
-    max_dropped: int = number(-1, -1, MOST_TOKENS)  # control steps that a compensation may drop; -1: any (KERV)
+    predictor: str = "hold"  # hold, linear, kalman, damped; or draft: the rejected draft's remaining tokens (ours)
+    steps: int = number(1, 1, MOST_TOKENS)  # control steps that a prediction may fill (paper: predict length PL)
+    use_target_token: bool = True  # true: keep the target's token at the rejected position (ours); false: predict it
+    min_verified: int = number(1, 0, MOST_TOKENS)  # fill a control step only if it has this many committed DoFs
+    rest: int = number(0, 0, MOST_DECODES)  # after a compensation, number of decodes without one (KERV: 4)
+    max_dropped: int = number(-1, -1, MOST_TOKENS)  # decode on if more control steps would be dropped; -1: never (KERV)
 
     def check_together(self, prefix: str) -> None:
-        """Refuse a predictor that does not exist, and a draft without the target's token before it."""
+        """Refuse an unknown predictor, and `predictor=draft` without the target's token before the draft's tokens.
+
+        Raises:
+            UnknownName: The predictor does not exist.
+            UsageError: `predictor=draft` is combined with `use_target_token=false`.
+        """
         if self.predictor != DRAFT:
             find_predictor(self.predictor)
         elif not self.use_target_token:
@@ -79,7 +84,7 @@ class CompensateSettings:
 
 
 def needs_of_compensation(settings: CompensateSettings) -> tuple[str, ...]:
-    """Return what the predictor reads."""
+    """Return the kinds of artifacts that the predictor needs."""
     return () if settings.predictor == DRAFT else find_predictor(settings.predictor).needs(None)
 
 
@@ -87,17 +92,21 @@ _compensation = (_PREDICTION + "Compensation.build", CompensateSettings)
 add("rectifier", "compensate", *_compensation, needs_of_compensation)
 
 
-# --- thresholds: the acceptance radius r, in bins (§3.2), kept as a real number and rounded for use
+# --- thresholds: the acceptance radius r in bins (§3.2). It is stored as a real number and rounded for use
 
 
 class RadiusRange:
-    """Settings with a smallest and a largest radius."""
+    """Base of settings with a smallest and a largest acceptance radius, in bins."""
 
     r_min: int
     r_max: int
 
     def check_together(self, prefix: str) -> None:
-        """Refuse radii that are not in order."""
+        """Refuse an `r_min` above `r_max`.
+
+        Raises:
+            UsageError: It is above.
+        """
         if self.r_min > self.r_max:
             raise UsageError(
                 f"threshold.r_min={self.r_min} threshold.r_max={self.r_max}: r_min must not be above r_max"
@@ -106,45 +115,51 @@ class RadiusRange:
 
 @dataclass
 class KinematicThresholdSettings(RadiusRange):
-    """KERV: the radius follows the kinematic variability K of the decode before.
+    """KERV: the acceptance radius r depends on the variability K, the mean distance of the last drafts to the target.
 
-    `change` is an ablation: the radius moves against the change of K.
+    With `kinematic`, r is large if K is small (docs/methods.md §3.2). With `change`, an ablation, r shrinks if K grows.
+    With `quoted`, the paper's formula, r only grows.
     """
 
     kind: str = "kinematic"
-    r_min: int = number(5, 0, MOST_BINS)
-    r_max: int = number(15, 0, MOST_BINS)
-    phi: float = number(2.0, above=0, most=50)
-    k_s: float | None = number(None, above=0, most=1e9)  # reference level of K; None: the task's, from the calibration
+    r_min: int = number(5, 0, MOST_BINS)  # smallest radius, bins
+    r_max: int = number(15, 0, MOST_BINS)  # largest radius, bins
+    phi: float = number(2.0, above=0, most=50)  # exponent φ of K / K_S
+    k_s: float | None = number(None, above=0, most=1e9)  # reference level K_S of K; None: the task's calibrated value
 
 
 @dataclass
 class ScheduleThresholdSettings(RadiusRange):
-    """KERV's public code, r = 3 + 12 exp(−(t / τ)³) in decode t: open loop, K is not used."""
+    """KERV's public code: the radius falls with the number t of decodes in the episode: 3 + 12 exp(−(t / τ)³).
+
+    The motion is not used.
+    """
 
     kind: str = "schedule"
-    r_min: int = number(3, 0, MOST_BINS)
-    r_max: int = number(15, 0, MOST_BINS)
-    phi: float = number(3.0, above=0, most=50)
-    tau: float = number(20.0, above=0, most=1e9)  # decodes
+    r_min: int = number(3, 0, MOST_BINS)  # smallest radius, bins
+    r_max: int = number(15, 0, MOST_BINS)  # radius of the first decode, bins
+    phi: float = number(3.0, above=0, most=50)  # exponent φ of t / τ
+    tau: float = number(20.0, above=0, most=1e9)  # time constant τ, in decodes
 
 
 def needs_of_variability(settings: KinematicThresholdSettings) -> tuple[str, ...]:
-    """Return the calibration if no reference level is given."""
+    """Return the kinds of artifacts needed: the calibration, if `k_s` is None."""
     return ("calibration",) if settings.k_s is None else ()
 
 
 class Kinematic:
-    """KERV, level form: r = r_min + (r_max − r_min) · exp(−(K / K_S)^φ), K of the last decode that compared anything.
+    """KERV: the acceptance radius r follows the variability K, the mean distance of draft tokens to target tokens.
 
-    An episode begins at K = K_S, the reference level.
+    r = r_min + (r_max − r_min) · exp(−(K / K_S)^φ). K is that of the last decode in which drafts were compared. K_S is
+    the task's reference level. An episode begins as if K were K_S.
     """
 
     def __init__(self, settings: KinematicThresholdSettings, context: Context) -> None:
-        """Take K_S of the task from the calibration, if the settings give none.
+        """Read the settings. If they contain no K_S, read the task's K_S from the calibration.
 
         Raises:
-            UsageError: A radius above the largest distance of two tokens.
+            UsageError: The largest radius is larger than the distance of any two tokens.
+            CheckpointError: The calibration has no K_S for the task.
         """
         context.check_radius("r_max", settings.r_max)
         self.r_min, self.r_max, self.phi = settings.r_min, settings.r_max, settings.phi
@@ -152,37 +167,45 @@ class Kinematic:
         self.reset()
 
     def reset(self) -> None:
-        """Set r as after a decode with K = K_S."""
+        """Begin an episode: set r as if the last decode had K = K_S."""
         self.r = self.level(self.k_s)
 
     def level(self, variability: float) -> float:
-        """Return r, not rounded, for K in normalised action units."""
+        """Return r, not rounded, for a K in normalised action units."""
         return falling(self.r_min, self.r_max, variability / self.k_s, self.phi)
 
     def radius(self) -> int:
-        """Return r rounded to the nearest bin."""
+        """Return the acceptance radius r, rounded to whole bins."""
         return nearest(self.r)
 
     def update(self, variability: float | None) -> None:
-        """Set r from K. A decode without K leaves it."""
+        """Set r for the next decode.
+
+        Args:
+            variability: K of the last decode. None: no draft was compared, and r stays.
+        """
         if variability is not None:
             self.r = self.level(variability)
 
 
 class Change(Kinematic):
-    """Ablation: r shrinks when K grows and grows when K shrinks.
+    """Ablation of KERV: the acceptance radius r shrinks if the variability K grows, and grows if K shrinks.
 
-    r ← clamp(r − (r_max − r_min) · sign(Δ) · (1 − exp(−|Δ / K_S|^φ)), r_min, r_max), Δ = K_t − K_{t−1} over decodes
-    that compared something. An episode begins with K_{t−1} = K_S.
+    r ← clamp(r − (r_max − r_min) · sign(Δ) · (1 − exp(−|Δ / K_S|^φ)), r_min, r_max). Δ is the change of K between the
+    last two decodes in which drafts were compared. An episode begins as if the last K were K_S.
     """
 
     def reset(self) -> None:
-        """Set r as after a decode with K = K_S, which is also the K to compare with."""
+        """Begin an episode: set r as if the last decode had K = K_S. The first change is measured from K_S."""
         super().reset()
         self.last = self.k_s
 
     def update(self, variability: float | None) -> None:
-        """Move r against the change of K. A decode without K leaves it."""
+        """Move r against the change of K.
+
+        Args:
+            variability: K of the last decode. None: no draft was compared, and r stays.
+        """
         if variability is None:
             return
         change = (variability - self.last) / self.k_s
@@ -192,17 +215,21 @@ class Change(Kinematic):
 
 
 class Quoted(Change):
-    """KERV's threshold as quoted (arXiv 2603.01581): r ← min(r + (r_max − r_min) · exp(−(|ΔK| / K_S)^φ), r_max).
+    """KERV's formula as printed (arXiv 2603.01581): r ← min(r + (r_max − r_min) · exp(−(|ΔK| / K_S)^φ), r_max).
 
-    The addend is never negative, so r climbs from r_min to r_max and stays there.
+    ΔK is the change of the variability K. The formula never makes r smaller, so r rises from r_min to r_max and stays.
     """
 
     def reset(self) -> None:
-        """Begin at r_min."""
+        """Begin an episode with r = r_min."""
         self.r, self.last = float(self.r_min), self.k_s
 
     def update(self, variability: float | None) -> None:
-        """Raise r by the less the more K changed. A decode without K leaves it."""
+        """Raise r: the larger the change of K, the less.
+
+        Args:
+            variability: K of the last decode. None: no draft was compared, and r stays.
+        """
         if variability is not None:
             change = abs(variability - self.last) / self.k_s
             self.r = min(self.r_max, self.r + falling(0, self.r_max - self.r_min, change, self.phi))
@@ -210,33 +237,38 @@ class Quoted(Change):
 
 
 class Schedule:
-    """Open loop: r(t) = r_min + (r_max − r_min) · exp(−(t / τ)^φ), t decodes into the episode.
+    """The acceptance radius falls with the number t of decodes in the episode. The motion is not used.
 
-    The defaults are KERV's public code: 3 + 12 · exp(−(t / τ)^3).
+    r(t) = r_min + (r_max − r_min) · exp(−(t / τ)^φ). The default settings are those of KERV's public code:
+    3 + 12 · exp(−(t / τ)^3).
     """
 
     def __init__(self, settings: ScheduleThresholdSettings, context: Context) -> None:
-        """Take the settings. The errors are those of `Kinematic`."""
+        """Read the settings.
+
+        Raises:
+            UsageError: The largest radius is larger than the distance of any two tokens.
+        """
         context.check_radius("r_max", settings.r_max)
         self.settings = settings
         self.reset()
 
     def reset(self) -> None:
-        """Start again at t = 0."""
+        """Begin an episode: t = 0."""
         self.decodes = 0
 
     def radius(self) -> int:
-        """Return r(t) rounded to the nearest bin."""
+        """Return the acceptance radius r(t), rounded to whole bins."""
         s = self.settings
         return nearest(falling(s.r_min, s.r_max, self.decodes / s.tau, s.phi))
 
     def update(self, variability: float | None) -> None:
-        """Increase t. K is not used."""
+        """Count a decode. Its variability is not used."""
         self.decodes += 1
 
 
 def falling(low: float, high: float, x: float, phi: float) -> float:
-    """Return low + (high − low) · exp(−x^φ): `high` at x ≤ 0, falling to `low`."""
+    """Return low + (high − low) · exp(−x^φ). It is `high` for x ≤ 0, and falls to `low` for large x."""
     if x <= 0:
         return float(high)
     power = math.exp(min(700.0, phi * math.log(x)))  # x^φ without overflow; exp(−e^700) is zero
@@ -244,7 +276,7 @@ def falling(low: float, high: float, x: float, phi: float) -> float:
 
 
 def nearest(r: float) -> int:
-    """Return r rounded to the nearest bin, halves up."""
+    """Round a radius to whole bins, halves up."""
     return math.floor(r + 0.5)
 
 

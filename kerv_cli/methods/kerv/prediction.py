@@ -1,7 +1,8 @@
-"""Kinematic prediction of the next actions: as a draft, and after a rejection (docs/methods.md §3.1).
+"""Predict the next actions from the last actions: as a draft, and after a rejection (docs/methods.md §3.1).
 
-Every predictor is a fixed linear function of its window, for a given noise and window length. The weights are computed
-once; a prediction is one small matrix product. Actions are normalised to [-1, 1]. The unit of time is a control step.
+For a given noise and window length, every prediction is a fixed linear function of the last actions. Its weights are
+computed once, so a prediction is one small matrix multiplication. Actions are normalised to [-1, 1]. The unit of time
+is a control step.
 """
 
 from __future__ import annotations
@@ -18,20 +19,21 @@ from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.kerv import DRAFT, CompensateSettings, find_predictor
 
-MINIMUM = 4  # actions that a prediction needs; longer windows were not measurably better on the demonstrations
-HORIZON = 8  # steps ahead that weights are computed for
+MINIMUM = 4  # minimum number of past actions; longer windows were not measurably better on the demonstrations
+HORIZON = 8  # number of control steps ahead for which weights are computed
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of a Kalman filter per DoF. Strict DoFs are held, so their entries are not used.
+    """Parameters of a Kalman filter, one number per DoF.
 
-    Only the ratio of q and r matters, because the prior is scaled by r.
+    Only the ratio of q and r matters, because the filter's first covariance is r. Numbers of strict DoFs (such as the
+    gripper) are not used, because predictions hold these DoFs at their last value.
 
     Attributes:
-        q: Variance of the random acceleration in one step.
-        r: Variance of the observation.
-        damping: Share of the velocity that is left after one step; 1 is the paper's constant velocity, less is *ours*.
+        q: Process noise: variance of the random acceleration per control step.
+        r: Measurement noise: variance of the observed actions.
+        damping: Factor of the velocity per control step. 1: constant velocity, as in the paper. Less than 1: *ours*.
     """
 
     q: tuple[float, ...]
@@ -41,22 +43,31 @@ class Noise:
 
 @functools.lru_cache(maxsize=64)
 def filter_state(ratio: float, window: int, damping: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the filter's state after `window` actions, and the transition F of the state [a, ȧ] in one step.
+    """Return the state of a Kalman filter as a linear function of the last actions.
 
-    Column i of the state (2, window) is what action i contributes. The filter begins on the first action with state
-    [a₀, 0] and covariance r · I. It predicts and updates once per further action. `ratio` is q / r.
+    The state is [action, velocity]. The filter begins at the first action with the state [a₀, 0] and the covariance
+    r · I. For each further action it predicts and updates once.
+
+    Args:
+        ratio: q / r, process noise by measurement noise.
+        window: Number of actions.
+        damping: Factor of the velocity per control step.
+
+    Returns:
+        Weights (2, window): weights times actions (oldest first) is the state after the last action. And the transition
+        matrix (2, 2) of the state in one control step.
     """
     from filterpy.kalman import KalmanFilter
 
     transition = np.array([[1.0, damping], [0.0, damping]])
     model = KalmanFilter(dim_x=2, dim_z=1)
     model.F, model.H = transition, np.eye(1, 2)
-    model.P, model.Q, model.R = np.eye(2), ratio * np.outer([0.5, 1.0], [0.5, 1.0]), np.eye(1)  # in units of r
+    model.P, model.Q, model.R = np.eye(2), ratio * np.outer([0.5, 1.0], [0.5, 1.0]), np.eye(1)  # all divided by r
     state = np.eye(2, 1)
     for i in range(1, window):
         state = transition @ np.pad(state, ((0, 0), (0, 1)))
         model.predict()
-        model.update(0.0)  # the gain does not depend on what is measured
+        model.update(0.0)  # any measurement gives the same gain
         innovation = -state[0]
         innovation[i] += 1.0
         state = state + model.K @ innovation[None]
@@ -64,20 +75,31 @@ def filter_state(ratio: float, window: int, damping: float) -> tuple[np.ndarray,
 
 
 def kalman_weights(q: float, r: float, window: int, horizon: int, damping: float = 1.0) -> np.ndarray:
-    """Return (horizon, window): row h − 1 times the window, oldest first, is the prediction h steps ahead."""
+    """Return the weights (horizon, window) of a Kalman filter's predictions for one DoF.
+
+    Row h − 1 times the last `window` actions (oldest first) is the prediction h control steps ahead.
+
+    Args:
+        q: Process noise.
+        r: Measurement noise.
+        window: Number of past actions.
+        horizon: Number of control steps ahead.
+        damping: Factor of the velocity per control step.
+    """
     state, transition = filter_state(q / r, window, damping)
     return np.stack([(np.linalg.matrix_power(transition, h) @ state)[0] for h in range(1, horizon + 1)])
 
 
 class Predictor:
-    """Predicts the next actions from the last ones. Strict DoFs are held at their last value.
+    """Base of predictors. They compute the next actions from the last actions. Strict DoFs keep their last value.
 
     Attributes:
-        least: Actions without which the weights are not defined.
+        name: Name of the predictor in settings.
+        least: Minimum number of past actions that the formula needs.
     """
 
     name = ""
-    least = 1  # actions without which the weights are not defined
+    least = 1
 
     def __init__(
         self,
@@ -87,41 +109,59 @@ class Predictor:
         window: int = WINDOW,
         horizon: int = HORIZON,
     ) -> None:
-        """Compute the weights.
+        """Compute the weights for all numbers of past actions from `minimum` to `window`.
 
         Args:
-            held: (D,) bool, DoFs that are never extrapolated.
-            noise: Fitted noise, for a filter.
-            minimum: Fewer actions give no prediction.
-            window: Most actions that count.
-            horizon: Most steps ahead.
+            held: (D,) bool. True: the DoF keeps its last value.
+            noise: Fitted noise of a Kalman filter. None for other predictors.
+            minimum: With fewer past actions there is no prediction.
+            window: Maximum number of past actions that are used.
+            horizon: Maximum number of control steps ahead.
         """
         self.held, self.dofs, self.noise = np.asarray(held, dtype=bool), len(held), noise
         self.minimum, self.window, self.horizon = minimum, window, horizon
         self.tables = {m: self._table(m) for m in range(minimum, window + 1)}
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return (horizon, window) of one DoF; here all weight is on the newest action."""
+        """Return the weights (horizon, window) for one DoF. Here, all weight is on the newest action.
+
+        Args:
+            dof: Index of the DoF.
+            window: Number of past actions.
+        """
         weights = np.zeros((self.horizon, window))
         weights[:, -1] = 1.0
         return weights
 
     def _table(self, window: int) -> np.ndarray:
-        """Return the weights (D, horizon, window)."""
+        """Return the weights (D, horizon, window) for all DoFs."""
         last = Predictor.weights(self, 0, window)
         return np.stack([last if self.held[dof] else self.weights(dof, window) for dof in range(self.dofs)])
 
     def predict(self, history: np.ndarray, steps: int) -> np.ndarray | None:
-        """Return the next `steps` actions (steps, D) in [-1, 1]; None for a history shorter than `minimum`.
+        """Predict the next actions.
 
-        history (m, D) is oldest first.
+        Args:
+            history: (m, D) past actions, oldest first.
+            steps: Number of actions to predict.
+
+        Returns:
+            (steps, D) in [-1, 1]. None if the history has fewer than `minimum` actions.
         """
         if len(history) < self.minimum:
             return None
         return self.predict_many(np.asarray(history, dtype=np.float64)[None], steps)[0]
 
     def predict_many(self, histories: np.ndarray, steps: int) -> np.ndarray:
-        """Return (B, steps, D) of histories (B, m, D) with m ≥ `minimum`."""
+        """Predict the next `steps` actions after each of B histories.
+
+        Args:
+            histories: (B, m, D) past actions, oldest first, with m ≥ `minimum`.
+            steps: Number of actions to predict.
+
+        Returns:
+            (B, steps, D) in [-1, 1].
+        """
         past = histories[:, -self.window :]
         table = self.tables[past.shape[1]][:, :steps]
         predicted: np.ndarray = np.einsum("dhm,bmd->bhd", table, past)
@@ -129,19 +169,19 @@ class Predictor:
 
 
 class Hold(Predictor):
-    """The last action again: the baseline of every prediction."""
+    """Repeats the last action: the baseline of every other prediction."""
 
     name = "hold"
 
 
 class Linear(Predictor):
-    """The line through the last two actions."""
+    """Continues the line through the last two actions."""
 
     name = "linear"
     least = 2
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return (horizon, window): 1 + h on the newest action, −h on the one before, for h steps ahead."""
+        """Return the weights (horizon, window): h steps ahead, 1 + h on the newest action and −h on the one before."""
         ahead = np.arange(1, self.horizon + 1)
         weights = np.zeros((self.horizon, window))
         weights[:, -1], weights[:, -2] = 1 + ahead, -ahead
@@ -149,29 +189,29 @@ class Linear(Predictor):
 
 
 class Kalman(Predictor):
-    """A Kalman filter per DoF (docs/methods.md §3.1), run from the window's first action."""
+    """A Kalman filter with constant velocity, per DoF (docs/methods.md §3.1)."""
 
     name = "kalman"
     least = 2
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return (horizon, window) of the filter with this DoF's noise."""
+        """Return the weights (horizon, window) of the filter with this DoF's noise."""
         assert self.noise is not None
         q, r, damping = self.noise.q[dof], self.noise.r[dof], self.noise.damping[dof]
         return kalman_weights(q, r, window, self.horizon, damping)
 
 
 class Damped(Kalman):
-    """A Kalman filter whose velocity is damped in every step (*ours*): actions are bounded, so no slope lasts."""
+    """A Kalman filter whose velocity fades (*ours*). Actions are bounded, so no velocity can last."""
 
     name = "damped"
 
 
 class Ridge(Predictor):
-    """SP-VLA: the line through the last `window` actions, by ridge regression on time.
+    """SP-VLA: continues the line through the last `window` actions, fitted by ridge regression on time.
 
     Attributes:
-        penalty: λ, on both coefficients.
+        penalty: Ridge penalty λ of slope and intercept.
     """
 
     name = "ridge"
@@ -181,9 +221,9 @@ class Ridge(Predictor):
         super().__init__(held, None, window, window, horizon)
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return (horizon, window): X' (XᵀX + λI)⁻¹ Xᵀ.
+        """Return the weights (horizon, window): X' (XᵀX + λI)⁻¹ Xᵀ.
 
-        The rows of X are (t, 1) for t = 0, 1, …; X' has later steps.
+        X has the row (t, 1) for each past control step t = 0, 1, …, and X' for each future step.
         """
         times = np.arange(window + self.horizon)
         rows = np.stack([times, np.ones(len(times))], 1)
@@ -197,7 +237,10 @@ PREDICTORS = {kind.name: kind for kind in (Hold, Linear, Kalman, Damped)}
 
 
 def predictor_of(settings: NoSettings, context: Context) -> Predictor:
-    """Return a predictor over the target's chunk. A filter's noise comes from the calibration."""
+    """Return the predictor with the name `settings.kind`, for as many control steps as the target's chunk has.
+
+    The noise of a Kalman filter comes from the calibration.
+    """
     kind, held, horizon = PREDICTORS[settings.kind], context.target.actions.is_strict, context.target.chunk
     if kind.name not in FILTERS:
         return kind(held, minimum=kind.least, horizon=horizon)
@@ -206,9 +249,9 @@ def predictor_of(settings: NoSettings, context: Context) -> Predictor:
 
 
 class PredictionProposer(ChainProposer):
-    """Drafts a kinematic prediction of the chunk (docs/methods.md §3.1, §6: `hold`, `kalman`).
+    """Drafts the chunk by predicting it from the last actions (docs/methods.md §3.1, §6).
 
-    Committed steps of the chunk count as executed. It drafts nothing while the history is too short.
+    Committed control steps of the chunk count as executed. While the history is too short, nothing is drafted.
     """
 
     def __init__(self, predictor: Predictor) -> None:
@@ -220,7 +263,7 @@ class PredictionProposer(ChainProposer):
         return cls(predictor_of(settings, context))
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Return the predicted tokens of the chunk's remaining places."""
+        """Return one chain of up to `depth` predicted tokens, after the committed tokens; none without history."""
         whole = len(chunk.tokens) // chunk.dofs
         pending = np.array(chunk.tokens[: whole * chunk.dofs], dtype=np.int64).reshape(whole, chunk.dofs)
         history = chunk.situation.history.values(chunk.space.values_of(pending))
@@ -232,12 +275,15 @@ class PredictionProposer(ChainProposer):
 
 
 class Compensation:
-    """KERV: keeps what was accepted, predicts the rest of that control step, drops the rest of the chunk.
+    """KERV: after a rejection, keeps the accepted tokens, predicts the rest of that control step and ends the chunk.
 
-    With `use_target_token` (ours) the target token at the rejected position is kept too: it is already computed.
-    `steps` (PL) lets the prediction fill further control steps. With `predictor: draft` (ours) the rejected draft's
-    remaining tokens fill first, because the draft knows the observation and a filter does not. After a compensation
-    there is none for `rest` decodes.
+    The settings change this:
+
+    - `use_target_token` (ours) also keeps the target's token at the rejected position, which is already computed.
+    - `steps` (the paper's predict length PL) lets the prediction fill further control steps.
+    - `predictor=draft` (ours) fills with the rejected draft's remaining tokens first. The draft knows the observation,
+      and a predictor does not.
+    - `rest` is the number of decodes without compensation after each compensation.
     """
 
     def __init__(self, settings: CompensateSettings, predictor: Predictor) -> None:
@@ -256,15 +302,19 @@ class Compensation:
         return self.settings.use_target_token
 
     def reset(self) -> None:
-        """Begin an episode."""
+        """Begin an episode: compensation is allowed at once."""
         self.resting = 0
 
     def next_decode(self) -> None:
-        """End a decode."""
+        """Count a finished decode, for the setting `rest`."""
         self.resting = max(0, self.resting - 1)
 
     def close(self, chunk: Chunk) -> bool:
-        """End the chunk after a rejection, if a prediction can fill what is missing -> whether it did."""
+        """End the chunk after a rejection, if the missing actions can be predicted.
+
+        Returns:
+            Whether the chunk was ended. If not, the target decodes on.
+        """
         if self.resting:
             return False
         tokens = chunk.tokens if self.settings.use_target_token else chunk.tokens[:-1]
@@ -285,10 +335,19 @@ def assemble(
     settings: CompensateSettings,
     drafted: Sequence[int] = (),
 ) -> np.ndarray | None:
-    """Return known tokens, then drafted ones, then the prediction as normalised actions (steps, D).
+    """Assemble the actions of a compensated chunk: known tokens, then drafted tokens, then predictions.
 
-    None if the history is too short to predict what is still missing. A step with fewer than `min_verified` known DoFs
-    is dropped, unless nothing would be left.
+    A control step with fewer than `min_verified` known DoFs is dropped, unless it is the chunk's first.
+
+    Args:
+        tokens: Known tokens of the chunk: accepted, or the target's.
+        chunk: The chunk.
+        predictor: Predicts the actions that are still missing.
+        settings: Settings of the compensation.
+        drafted: Tokens of the rejected draft that follow `tokens`. Empty: use predictions only.
+
+    Returns:
+        (steps, D) normalised actions. None if the history is too short for a prediction.
     """
     dofs, horizon = chunk.dofs, chunk.steps
     whole, part = divmod(len(tokens), dofs)
@@ -299,7 +358,7 @@ def assemble(
     flat[: len(values)] = values
     actions: np.ndarray = flat.reshape(steps, dofs)
     history = chunk.situation.history.values(actions[:whole])
-    if len(history):  # strict DoFs are held, whoever drafted; without a last value the draft's is the best there is
+    if len(history):  # strict DoFs keep their last value; only without one the draft's tokens are used for them
         flat[len(tokens) :][chunk.space.strict_tokens(flat.size)[len(tokens) :]] = np.nan
     if np.isnan(actions).any():
         predicted = predictor.predict(history, steps - whole)
