@@ -1,4 +1,4 @@
-"""Registers autoregressive decoding: no part of any kind (docs/methods.md §1)."""
+"""Registers the parts of autoregressive decoding: none that drafts, chooses or skips (docs/methods.md §1)."""
 
 from __future__ import annotations
 

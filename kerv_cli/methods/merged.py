@@ -1,4 +1,4 @@
-"""Drafts of several sources as one prefix tree (docs/methods.md §5, ours), e.g. of `one_pass`."""
+"""Merge the drafts of several proposers into one tree (docs/methods.md §5, ours). `method=one_pass` uses it."""
 
 from __future__ import annotations
 
@@ -21,19 +21,24 @@ if TYPE_CHECKING:
 
 @dataclass
 class MergedProposerSettings:
-    """Merges whole drafts of several sources into one prefix tree (§5, ours).
+    """Merge the whole-chunk drafts of several proposers into one prefix tree (docs/methods.md §5, ours).
 
-    The fallback sources draft only if no other is sure of its chunk, because every node costs time.
+    The proposers in `fallback` draft only if none in `sources` is sure of its chunk, because every node costs time.
     """
 
     kind: str = "merged"
-    sources: list[str] = field(default_factory=lambda: ["early"])
-    fallback: list[str] = field(default_factory=lambda: ["hold"])
-    nodes: int = number(48, 1, MOST_TOKENS)  # the last sources' chains are dropped first
-    neighbours: int = number(1, 1, MOST_TOKENS)  # retrieval: stored chunks
+    sources: list[str] = field(default_factory=lambda: ["early"])  # names of proposers that always draft
+    fallback: list[str] = field(default_factory=lambda: ["hold"])  # names of proposers that draft if no source is sure
+    nodes: int = number(48, 1, MOST_TOKENS)  # maximum number of tree nodes; the last drafts are dropped first
+    neighbours: int = number(1, 1, MOST_TOKENS)  # if retrieval drafts: number of stored chunks
 
     def check_together(self, prefix: str) -> None:
-        """Refuse settings without a source, or with one that cannot draft whole chains before the prefill."""
+        """Refuse empty `sources`, and proposers that cannot draft whole chunks before the prefill.
+
+        Raises:
+            UsageError: One of the two.
+            UnknownName: A proposer does not exist.
+        """
         if not self.sources:
             raise UsageError("merged: name at least one of sources")
         for name in (*self.sources, *self.fallback):
@@ -42,16 +47,20 @@ class MergedProposerSettings:
 
 
 def needs_of_sources(settings: MergedProposerSettings) -> tuple[str, ...]:
-    """Return the artifacts that the sources need together."""
+    """Return the kinds of artifacts that all these proposers need, without repetitions."""
     names = (*settings.sources, *settings.fallback)
     return tuple(dict.fromkeys(kind for name in names for kind in find("proposer", name).needs(None)))
 
 
 class MergedProposer(ChainProposer):
-    """Merges the chains of several sources into one prefix tree of at most `nodes` nodes.
+    """Merges the drafts of several proposers into one prefix tree of at most `nodes` nodes.
 
-    If there are too many, the last chains are dropped first. The fallback sources draft only if no other is sure of its
-    chunk.
+    Each draft is a chain: tokens one after another. If the tree has too many nodes, the last chains are dropped.
+
+    Args:
+        sources: Proposers that always draft.
+        nodes: Maximum number of nodes of the tree.
+        fallback: Proposers that draft only if no source is sure of its chunk.
     """
 
     def __init__(self, sources: Sequence[ChainProposer], nodes: int, fallback: Sequence[ChainProposer] = ()) -> None:
@@ -74,12 +83,12 @@ class MergedProposer(ChainProposer):
         return cls(sources, settings.nodes, fallback)
 
     def reset(self) -> None:
-        """Begin an episode."""
+        """Begin an episode, for all proposers."""
         for source in (*self.sources, *self.fallback):
             source.reset()
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """Return one prefix tree of all chains."""
+        """Return one prefix tree of all drafts, of at most `depth` tokens per path."""
         from kerv_cli.engine.draft import Draft
 
         chains = self.chains(chunk, depth)
@@ -90,7 +99,7 @@ class MergedProposer(ChainProposer):
         return Draft.of(tree.tokens, tree.parents)
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Return the chains of the sources, and of the fallback sources if no source is sure."""
+        """Return the drafts of the sources and, if no source is sure of its chunk, of the fallback proposers."""
         sources = list(self.sources)
         if not any(source.is_sure(chunk) for source in sources):
             sources += self.fallback

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 
 class ParallelPass(Skip):
-    """Decodes all tokens by one bidirectional pass of a parallel target.
+    """Decodes all tokens of a chunk in one bidirectional forward of a parallel target.
 
-    Each token is chosen without knowing the others, and none is verified.
+    Each token is chosen without knowing the others, and no token is verified.
     """
 
     phase = "prefill"
@@ -33,14 +33,19 @@ class ParallelPass(Skip):
         return cls(context.target)
 
     def take(self, chunk: Chunk) -> bool:
-        """Commit all tokens after one pass of the target. Always True."""
+        """Commit all tokens of the chunk after one forward of the target. Return True."""
         chunk.cache.length = 0
         hidden = self.target.parallel_pass(chunk.prompt, chunk.cache)
         chunk.commit_at_once(self.target.head(hidden[0, : chunk.size]).argmax(-1).tolist())
         return True
 
     def take_many(self, chunks: Sequence[Chunk], cache: Callable[[int], Cache]) -> None:
-        """Commit the tokens of several chunks with equally long prompts after one pass."""
+        """Commit all tokens of several chunks after one forward. Their prompts must be equally long.
+
+        Args:
+            chunks: The chunks.
+            cache: Returns an empty cache for a number of chunks.
+        """
         import torch
 
         prompt = torch.cat([chunk.prompt for chunk in chunks])
@@ -51,19 +56,19 @@ class ParallelPass(Skip):
 
 
 def is_parallel(target: object) -> bool:
-    """Return whether a target decodes all tokens at once (`engine.protocol.ParallelTarget`)."""
+    """Return whether a target decodes all tokens of a chunk in one forward (`engine.protocol.ParallelTarget`)."""
     return bool(getattr(target, "parallel", False))
 
 
 def check_parallel(parts: Mapping[str, Part], parallel: bool) -> None:
-    """Check that a parallel target decodes in its own way, without drafts, and no other target does.
+    """Check that a parallel target is used with skip=parallel and without drafts, and other targets without it.
 
     Args:
-        parts: Kind -> part of a method.
-        parallel: Whether the target is parallel.
+        parts: Kind -> part, for all parts of the method.
+        parallel: Whether the target decodes all tokens in one forward.
 
     Raises:
-        UsageError: They do not fit.
+        UsageError: The method cannot be used with the target.
     """
     has_pass = parts["skip"].name == "parallel"
     if has_pass and not parallel:
@@ -79,7 +84,7 @@ def check_parallel(parts: Mapping[str, Part], parallel: bool) -> None:
 
 
 def native_decoder(target: Any) -> Decoder:
-    """Return a decoder that decodes as the target was trained to: one token after the other, or all in one pass."""
+    """Return a decoder without drafts: one token after another, or all in one forward for a parallel target."""
     from kerv_cli.engine.decoder import Decoder, Parts
 
     return Decoder(target, Parts(skip=ParallelPass(target)) if is_parallel(target) else None)

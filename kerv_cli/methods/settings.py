@@ -1,4 +1,4 @@
-"""Settings of policies and of the methods by which they decode."""
+"""Settings of policies and of decoding methods."""
 
 from __future__ import annotations
 
@@ -19,15 +19,21 @@ def _unnamed() -> dict[str, str | None]:
 
 @dataclass
 class PolicySettings:
-    """What chooses the actions. Weights are named by folders of results/pretrained or results/artifacts, or paths."""
+    """The policy that chooses the actions.
 
-    kind: str = choice(MODEL, MODEL, EXPERT, help="expert: the environment's script, privileged, no decoding")
-    target: str = setting("mt10-vision", "the policy's weights")
+    The target and the artifacts are named by folders in results/pretrained or results/artifacts, or by paths.
+    """
+
+    kind: str = choice(MODEL, MODEL, EXPERT, help="expert: the environment's scripted policy, without decoding")
+    target: str = setting("mt10-vision", "name of the policy's weights, or a path")
     artifacts: dict[str, str | None] = setting(_unnamed, "artifacts.KIND=NAME; null: the one beside the target")
 
 
 def with_artifacts(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return stored settings with the names of artifacts in one mapping. Version 0.1.0 has a key for each kind."""
+    """Convert stored settings of version 0.1.0: move the names of artifacts into the mapping `policy.artifacts`.
+
+    Settings in the current format are returned unchanged.
+    """
     policy = settings.get("policy")
     if not isinstance(policy, Mapping) or "artifacts" in policy:
         return dict(settings)
@@ -36,26 +42,26 @@ def with_artifacts(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {**settings, "policy": {**kept, "artifacts": {kind: name for kind, name in named.items() if name}}}
 
 
-# descriptions of settings that several commands have
+# help text of a setting that several commands have
 POLICY = "what chooses the actions: vision, state, expert, … (conf/policy)"
 
 
 @dataclass(kw_only=True)
 class MethodSettings(RunSettings):
-    """A policy and the method by which it decodes. The parts are settings of the classes in kerv_cli/methods."""
+    """A policy and its decoding method. The settings of each part are a dataclass in kerv_cli/methods."""
 
     policy: PolicySettings = setting(PolicySettings, POLICY)
-    method: str = setting("ar", "how it decodes: ar, spec_vla, kerv, heisd, one_pass, … (conf/method)")
+    method: str = setting("ar", "decoding method: ar, spec_vla, kerv, heisd, one_pass, … (conf/method)")
     prefill_draft: Any = part("proposer", help="what drafts before the prefill")
     proposer: Any = part("proposer", help="what drafts after the prefill: none, drafter, retrieval, hold, …")
-    acceptance: Any = part("acceptance", "strict", "which drafted tokens count as right: strict, relaxed, …")
-    threshold: Any = part("threshold", "fixed", "how many bins a relaxed acceptance forgives: threshold.r")
-    rectifier: Any = part("rectifier", "reinfer", "what becomes of rejected tokens")
-    boundary: Any = part("boundary", "always", "where retrieved drafts are used")
+    acceptance: Any = part("acceptance", "strict", "which draft tokens are accepted: strict, relaxed, …")
+    threshold: Any = part("threshold", "fixed", "accepted distance of a draft token, in bins: threshold.r")
+    rectifier: Any = part("rectifier", "reinfer", "what happens after a rejection: reinfer (decode on), compensate")
+    boundary: Any = part("boundary", "always", "proposer=hybrid: when retrieval drafts and when the drafter")
     skip: Any = part("skip", help="which drafts are executed without verification")
-    chunk: int = number(0, 0, 1024, help="H, control steps decoded at once; 0: as many as the target was trained for")
-    datastore: Any = part("datastore", "exact", "what searches the stored chunks")
+    chunk: int = number(0, 0, 1024, help="control steps per chunk; 0: as many as the target was trained for")
+    datastore: Any = part("datastore", "exact", "how stored chunks are searched: exact, qdrant")
 
     def parts(self) -> dict[str, Any]:
-        """Return kind -> settings, for every part of the method."""
+        """Return kind -> settings, for all parts of the method."""
         return {kind: getattr(self, kind) for kind in METHOD_KINDS}

@@ -1,4 +1,4 @@
-"""SP-VLA's schedule (docs/methods.md §6.1): a regression where the motion is fast, the target where it is slow."""
+"""SP-VLA (docs/methods.md §6.1): a regression predicts the chunk if the hand is fast; else the target decodes it."""
 
 from __future__ import annotations
 
@@ -20,28 +20,34 @@ if TYPE_CHECKING:
 
 @dataclass
 class SpeedSkipSettings:
-    """Executes chunks of a ridge regression over the last actions while the hand is fast."""
+    """SP-VLA: while the hand is fast, execute a chunk that a ridge regression predicts from the last actions."""
 
     kind: str = "speed"
-    v_min: float = number(0.3, 0, 1000)  # speed of the hand from which on motion is intuitive, metres per second
-    v_max: float = number(1000.0, 0, 1000)  # … and up to which
-    buffer: int = number(6, 2, 10)  # n, last executed actions that the regression reads
-    share: float = number(0.5, 0, 1)  # τ, share of these above which the target must have decoded
-    penalty: float = number(1e-4, 0, 1e6)  # λ of the regression
+    v_min: float = number(0.3, 0, 1000)  # lowest hand speed at which the regression is used, metres per second
+    v_max: float = number(1000.0, 0, 1000)  # highest such speed
+    buffer: int = number(6, 2, 10)  # number of last actions that the regression reads (paper: n)
+    share: float = number(0.5, 0, 1)  # the target must have decoded more than this share of them (paper: τ)
+    penalty: float = number(1e-4, 0, 1e6)  # ridge penalty λ
 
     def check_together(self, prefix: str) -> None:
-        """Refuse speeds that are not in order."""
+        """Refuse a `v_min` above `v_max`.
+
+        Raises:
+            UsageError: It is above.
+        """
         if self.v_min > self.v_max:
             raise UsageError(f"skip.v_min={self.v_min:g} skip.v_max={self.v_max:g}: v_min must not be above v_max")
 
 
 class SpeedSkip(Skip):
-    """Fills a chunk by the regression if the hand is fast and the target decoded enough of the buffered actions.
+    """SP-VLA: executes a predicted chunk if the hand is fast and the target decoded enough of the last actions.
+
+    A ridge regression predicts the chunk from the last `buffer` executed actions. Otherwise the target decodes.
 
     Attributes:
-        decoded: Whether the target decoded each of the last executed actions.
-        executed: Actions of the episode so far.
-        by_target: Whether the chunk being executed is the target's.
+        decoded: For each of the last `buffer` actions, whether the target decoded it.
+        executed: Number of actions executed in this episode.
+        by_target: Whether the target decoded the last chunk.
     """
 
     def __init__(self, settings: SpeedSkipSettings, ridge: Ridge) -> None:
@@ -58,12 +64,16 @@ class SpeedSkip(Skip):
         return cls(settings, Ridge(target.actions.is_strict, settings.penalty, settings.buffer, target.chunk))
 
     def begin(self, task: str, seed: int) -> None:
-        """Begin an episode."""
+        """Begin an episode: forget the last actions."""
         self.decoded.clear()
         self.executed, self.by_target = 0, True
 
     def take(self, chunk: Chunk) -> bool:
-        """Fill the chunk if the motion is intuitive -> whether it did."""
+        """Fill the chunk with the prediction, if the hand is fast and the target decoded enough of the last actions.
+
+        Returns:
+            Whether the chunk was filled.
+        """
         executed = len(chunk.situation.path) - 1
         self.decoded.extend([self.by_target] * (executed - self.executed))
         self.executed = executed
@@ -75,7 +85,7 @@ class SpeedSkip(Skip):
         return True
 
     def _is_intuitive(self, situation: Situation, control_hz: float) -> bool:
-        """Return whether the hand's speed is in range and the target decoded more than `share` of the buffer."""
+        """Return whether the hand's speed is in range, and the target decoded more than `share` of the last actions."""
         speed = control_hz * math.dist(situation.path[-1], situation.path[-2])
         s = self.settings
         return s.v_min <= speed <= s.v_max and sum(self.decoded) > s.share * s.buffer

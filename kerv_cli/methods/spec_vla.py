@@ -1,4 +1,7 @@
-"""Spec-VLA's acceptance: token by token, strict or within one radius (docs/methods.md §2.1). Its drafter is `eagle`."""
+"""Spec-VLA's acceptance, token by token: equality, or a distance of at most r bins (docs/methods.md §2.1).
+
+Spec-VLA's drafter is in the folder `eagle`.
+"""
 
 from __future__ import annotations
 
@@ -16,18 +19,18 @@ if TYPE_CHECKING:
 
 @dataclass
 class RelaxedAcceptanceSettings:
-    """Spec-VLA: accepts a draft token within r bins of the target's."""
+    """Spec-VLA: accept a draft token if it is at most r bins from the target's token."""
 
     kind: str = "relaxed"
-    strict_dofs: bool = True  # ours: the action space's strict DoFs must match; the paper has one r for all
+    strict_dofs: bool = True  # true: strict DoFs, such as the gripper, must be equal (ours); false: r for all (paper)
 
 
 @dataclass(frozen=True)
 class RelaxedRule(DistanceRule):
-    """Accepts a draft token within r bins of the target's.
+    """Accepts a draft token if it is at most r bins from the target's token.
 
     Attributes:
-        strict_dofs: Whether the action space's strict DoFs must match exactly.
+        strict_dofs: Whether the tokens of strict DoFs, such as the gripper, must be equal.
     """
 
     strict_dofs: bool = True
@@ -38,28 +41,28 @@ class RelaxedRule(DistanceRule):
         return cls(context.target.actions, settings.strict_dofs)
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """Return the largest accepted distance per DoF, in bins (D,): r, or 0 for strict DoFs that must match."""
+        """Return the largest accepted distance of each of the D DoFs, in bins: r, or 0 for strict DoFs."""
         return tuple(0 if self.strict_dofs and strict else r for strict in self.space.is_strict)
 
 
 def strict(settings: NoSettings, context: Context) -> StrictRule:
-    """Build acceptance=strict: a draft token must equal the target's, so nothing is lost."""
+    """Build acceptance=strict: a draft token must equal the target's, so decoding is lossless."""
     return StrictRule(context.target.actions)
 
 
 @dataclass
 class FixedThresholdSettings:
-    """Spec-VLA: one radius."""
+    """Spec-VLA: the same acceptance radius in every decode."""
 
     kind: str = "fixed"
-    r: int = number(9, 0, MOST_BINS)
+    r: int = number(9, 0, MOST_BINS)  # largest accepted distance to the target's token, bins
 
 
 def fixed(settings: FixedThresholdSettings, context: Context) -> Fixed:
     """Build threshold=fixed.
 
     Raises:
-        UsageError: A radius above the largest distance of two tokens.
+        UsageError: The radius is larger than the distance of any two tokens.
     """
     context.check_radius("r", settings.r)
     return Fixed(settings.r)

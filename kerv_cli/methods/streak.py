@@ -1,4 +1,4 @@
-"""Drafts that are not verified: always (docs/methods.md §6), or while verifications agree with them (§4.5, ours)."""
+"""Execute drafts without verification: always (docs/methods.md §6), or as long as verifications agree (§4.5, ours)."""
 
 from __future__ import annotations
 
@@ -17,51 +17,59 @@ if TYPE_CHECKING:
     from kerv_cli.methods.context import Context
 
 TRUSTED, STREAK = "trusted", "streak"
-"""`DecodeRecord.reason`: executed unverified; verified because the verifications before do not allow more."""
+"""Values of `DecodeRecord.reason`: executed without verification; verified because no such decode was left."""
 
 
 @dataclass
 class StreakSkipSettings:
-    """Chunks that agree with their draft allow 1, 2, 4, … unverified decodes (§4.5).
+    """Execute 1, then 2, 4, … drafts without verification, as long as each verified chunk agrees with its draft (§4.5).
 
-    The draft is the in-prefill one; of `merged`, that of its first source.
+    The draft is the prefill draft. If that is merged, it is the draft of the first source.
     """
 
     kind: str = "streak"
-    most: int = number(8, 1)  # decodes in a row without a verification
-    opening: int = number(0, 0)  # decodes that an episode begins with, unverified
-    tolerance: float = number(0.05, 0)  # mean abs difference that still agrees, normalised; 0: accepted whole
+    most: int = number(8, 1)  # maximum number of decodes in a row without verification
+    opening: int = number(0, 0)  # number of decodes without verification when an episode begins
+    # largest mean absolute difference of a draft that agrees, normalised action units; 0: it must be accepted whole
+    tolerance: float = number(0.05, 0)
 
 
 class StreakSkip(Skip):
-    """Lets each verified chunk that agrees with its draft allow unverified decodes: 1, then 2, 4, … up to `most`.
+    """Executes drafts without verification, as long as verifications agree with the drafts.
 
-    A chunk that does not agree ends this. An episode begins with `opening` unverified decodes.
+    After a first verified chunk that agrees with its draft, 1 decode is not verified. Each further agreement doubles
+    the number, up to `most`. A chunk that does not agree resets it to 0. An episode begins with `opening` decodes
+    without verification.
 
     Attributes:
-        allowed: Unverified decodes after the last verification.
+        source: The proposer of the drafts.
+        allowed: Number of decodes that the last verification allowed without verification.
         left: How many of these are still to come.
-        chain: The source's draft of this chunk.
+        chain: The draft of the present chunk.
     """
 
     def __init__(self, settings: StreakSkipSettings, source: ChainProposer) -> None:
         self.settings, self.source = settings, source
-        self.allowed = 0  # unverified decodes after the last verification
-        self.left = 0  # of these, how many are still to come
-        self.chain: tuple[int, ...] = ()  # the source's draft of this chunk
+        self.allowed = 0
+        self.left = 0
+        self.chain: tuple[int, ...] = ()
 
     @classmethod
     def build(cls, settings: StreakSkipSettings, context: Context) -> StreakSkip:
         """Build skip=streak."""
         draft = context.built["prefill_draft"]
-        return cls(settings, getattr(draft, "sources", [draft])[0])  # of a merged draft its first source
+        return cls(settings, getattr(draft, "sources", [draft])[0])  # if the draft is merged, its first source
 
     def begin(self, task: str, seed: int) -> None:
-        """Begin an episode."""
+        """Begin an episode: allow `opening` decodes without verification."""
         self.allowed = self.left = self.settings.opening
 
     def take(self, chunk: Chunk) -> bool:
-        """Fill the chunk with the source's draft while unverified decodes are left -> whether it did."""
+        """Fill the chunk with the draft, if a decode without verification is left and the draft is a whole chunk.
+
+        Returns:
+            Whether the chunk was filled.
+        """
         chains = self.source.chains(chunk, chunk.size)
         self.chain = tuple(chains[0]) if chains else ()
         trusted = self.left > 0 and len(self.chain) == chunk.size
@@ -73,14 +81,15 @@ class StreakSkip(Skip):
         return True
 
     def verified(self, chunk: Chunk) -> None:
-        """Allow twice as many unverified decodes if the verified chunk agrees with the draft, else none."""
+        """Allow twice as many decodes without verification if the verified chunk agrees with its draft, else none."""
         self.allowed = min(self.settings.most, 2 * self.allowed or 1) if self._agrees(chunk) else 0
         self.left = self.allowed
 
     def _agrees(self, chunk: Chunk) -> bool:
-        """Return whether the draft was accepted whole or is on average within `tolerance` of the target's tokens.
+        """Return whether the draft was accepted whole, or differs from the target's tokens by at most `tolerance`.
 
-        Strict DoFs must be equal.
+        The difference is the mean absolute difference, in normalised action units. Strict DoFs, such as the gripper,
+        must be equal.
         """
         targets = chunk.targets_along(self.chain)
         if targets is None:
@@ -92,7 +101,7 @@ class StreakSkip(Skip):
 
 
 class AlwaysSkip(Skip):
-    """Executes every draft unverified. If the source has no whole chunk yet, the target decodes."""
+    """Executes every draft without verification. If there is no draft of a whole chunk, the target decodes."""
 
     def __init__(self, source: ChainProposer) -> None:
         self.source = source
@@ -103,7 +112,7 @@ class AlwaysSkip(Skip):
         return cls(context.built["prefill_draft"])
 
     def take(self, chunk: Chunk) -> bool:
-        """Fill the chunk with the source's draft -> whether there was one of all N tokens."""
+        """Fill the chunk with the draft, if it is a whole chunk. Return whether it was filled."""
         chains = self.source.chains(chunk, chunk.size)
         if not chains or len(chains[0]) < chunk.size:
             return False
@@ -111,7 +120,7 @@ class AlwaysSkip(Skip):
         return True
 
     def take_many(self, chunks: Sequence[Chunk], cache: Callable[[int], Cache]) -> None:
-        """Fill several chunks with the source's drafts."""
+        """Fill several chunks with their drafts. The cache is not used."""
         for chunk, tokens in zip(chunks, self.source.tokens_of(chunks), strict=True):
             chunk.skip(tokens, self.source.name)
 

@@ -11,15 +11,15 @@ from kerv_cli.methods.early import EarlySettings
 
 @dataclass
 class ScoutSettings(EarlySettings):
-    """Shapes of a scout: its stem, then the network of the early drafter (§5.1)."""
+    """Shapes of a scout: a vision encoder, then the network of the early drafter (docs/methods.md §5.1)."""
 
     kind: str = "scout"
-    channels: int = number(8, 1, 4096, help="of the stem's first stage")
-    keypoints: int = number(16, 1, 4096, help="image points of a view")
-    grid: int = number(4, 1, 512, help="rows and columns of cells of a view")
-    cell_width: int = number(48, 1, 4096, help="numbers of a cell")
-    cell_features: int = number(8, 1, 4096, help="of these, those that the network reads of each cell, beside the mean")
-    word_width: int = number(32, 1, 4096, help="numbers of a word")
+    channels: int = number(8, 1, 4096, help="channels of the vision encoder's first stage")
+    keypoints: int = number(16, 1, 4096, help="image points per camera view")
+    grid: int = number(4, 1, 512, help="each camera view is cut into grid × grid cells")
+    cell_width: int = number(48, 1, 4096, help="features per cell; their mean over all cells is read")
+    cell_features: int = number(8, 1, 4096, help="features read from each single cell")
+    word_width: int = number(32, 1, 4096, help="width of the word embeddings")
 
 
 add_drafter(

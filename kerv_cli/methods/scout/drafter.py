@@ -1,8 +1,9 @@
-"""The scout: network, proposer, training and files (docs/methods.md §5.1, ours).
+"""The scout: network, proposer and training (docs/methods.md §5.1, ours).
 
-It reads the image, the hand and the instruction, and nothing that the target computes. So unverified chunks never pay
-for the target's encoding, and an error in one encoder need not repeat in the other. After its stem and its estimated
-positions comes the network of the early drafter.
+A scout drafts from the image, the hand and the instruction. It needs nothing that the target computes. So chunks
+without verification never pay for the target's encoder, and an error of the target's encoder need not repeat in the
+scout's. A vision encoder (stem) and an estimate of the positions of object and goal feed the network of the early
+drafter.
 """
 
 from __future__ import annotations
@@ -44,9 +45,9 @@ from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
 
 class ScoutNetwork(Packable):
-    """From one observation to the logits (N, V) of a chunk.
+    """The network from an observation to the logits of a chunk (N tokens, V bins).
 
-    Shapes: B batch, p proprioception, K places, W words.
+    It also estimates the positions of the K places: the object and the goal.
     """
 
     centre: Tensor
@@ -65,13 +66,13 @@ class ScoutNetwork(Packable):
         """Build the network.
 
         Args:
-            settings: Its shapes.
+            settings: Shapes of the network.
             actions: The action space.
             observation: The observation space.
-            chunk: H.
-            views: Number of views in the camera's frame.
-            size: Pixels of a view.
-            words: Size of the target's vocabulary.
+            chunk: Number of control steps per chunk.
+            views: Number of camera views in the image, side by side.
+            size: Width and height of a view, in pixels.
+            words: Number of words in the target's vocabulary.
         """
         super().__init__()
         s = self.settings = settings
@@ -88,7 +89,7 @@ class ScoutNetwork(Packable):
         self.drafter = EarlyNetwork(s, actions, chunk, of_views + s.word_width + scene_width(observation))
 
     def forward(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
-        """Return logits (B, N, V), and estimated positions of the places (B, K, 3), metres."""
+        """Return the logits (B, N, V), and the estimated positions of the places (B, K, 3), in metres."""
         given = self.views(inputs)
         if self.packed is not None and not any(map(wants_gradient, given)):
             logits, places = self.packed(*given)
@@ -96,13 +97,27 @@ class ScoutNetwork(Packable):
         return self.network(*given)
 
     def views(self, inputs: Inputs) -> list[Tensor]:
-        """Return proprioception, the instruction's mean word, then the stems' tokens and points of each view."""
+        """Encode observations.
+
+        Returns:
+            The proprioception, the mean word embedding of the instruction, and for each camera view the features of its
+            cells and its image points.
+        """
         assert inputs.images is not None
         views = [stem(image) for stem, image in zip(self.stems, inputs.images.split(self.size, -1), strict=True)]
         return [inputs.proprioception, self.words(inputs.words).mean(1), *(part for view in views for part in view)]
 
     def see(self, proprioception: Tensor, words: Tensor, *views: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what the drafter's network reads (B, F) and the places' positions, from the results of `views`."""
+        """Compute the drafter's input features and the estimated positions of the places.
+
+        Args:
+            proprioception: (B, p) proprioception.
+            words: (B, word width) mean word embedding of the instruction.
+            views: For each camera view, the features of its cells and its image points, as from `views`.
+
+        Returns:
+            Features (B, F), and positions (B, K, 3) in metres.
+        """
         cells = [part for grid in views[::2] for part in (grid.mean(1), self.cells(grid).flatten(1))]
         located = self.locate(torch.cat([*views[1::2], hand_features(proprioception, self.centre), words], -1))
         places = located.unflatten(-1, (-1, 3)) * 0.1 + self.centre
@@ -110,12 +125,12 @@ class ScoutNetwork(Packable):
         return torch.cat([*cells, words, scene], -1), places
 
     def network(self, *given: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute `forward` by the modules, from the results of `views`."""
+        """Compute the result of `forward` with the PyTorch modules. The arguments are the results of `views`."""
         features, places = self.see(*given)
         return self.drafter.logits(features.to(self.drafter.head.weight.dtype)), places
 
     def pack_weights(self) -> Program | None:
-        """Return all after the stems, compiled; None in other formats than float32."""
+        """Return the compiled network after the vision encoders; None if the weights are not float32."""
         s = self.settings
         of_view = (1, s.grid**2, s.cell_width), (1, 2 * s.keypoints)
         shapes = [(1, len(self.observation.proprioception)), (1, s.word_width), *of_view * len(self.stems)]
@@ -123,7 +138,7 @@ class ScoutNetwork(Packable):
 
 
 class ScoutProposer(EarlyProposer):
-    """The scout's chunk, drafted once per observation, without the target's encoder."""
+    """Drafts chunks with the scout, once per observation. The target's encoder need not run."""
 
     name = "scout"
 
@@ -133,7 +148,7 @@ class ScoutProposer(EarlyProposer):
 
     @torch.inference_mode()
     def _rows(self, chunks: Sequence[Chunk]) -> Tensor:
-        """Return the drafts (B, N + 1) of chunks whose limits are equal, from their observations."""
+        """Draft several chunks with equal acceptance limits. The result (B, N + 1) is that of `EarlyNetwork.draft`."""
         seen = [chunk.observation for chunk in chunks if chunk.observation is not None]
         logits = torch.cat([self.scout(self.inputs(observation))[0] for observation in seen])
         return self.early.chosen(logits, radius_of(chunks))
@@ -141,22 +156,28 @@ class ScoutProposer(EarlyProposer):
 
 @dataclass(frozen=True)
 class ScoutExamples(Observations, Decodes):
-    """What a scout learns from: observations, and what the target says of them. Nothing privileged."""
+    """The n training examples of a scout: observations, and the target's tokens and estimated positions for them.
 
-    places: Tensor  # (n, K, 3) float32, positions that the target estimates, metres
+    The simulator's true positions are not used.
+    """
+
+    places: Tensor  # (n, K, 3) float32, positions estimated by the target, metres
 
 
 class ScoutDrafter(EarlyDrafter):
-    """The scout, for a target that sees. The first `train.scene_steps` train the stem and its positions alone."""
+    """The kind of artifact `scout`, for targets with cameras.
+
+    The first `train.scene_steps` steps of its training learn only to estimate positions.
+    """
 
     kind = noun = "scout"
     settings = ScoutSettings
 
     def network(self, settings: ScoutSettings, target: Any) -> ScoutNetwork:
-        """Return a fresh network that looks through the target's camera.
+        """Return a network with initial weights, for the target's camera views.
 
         Raises:
-            CheckpointError: The target does not see.
+            CheckpointError: The target has no camera.
         """
         target = check_sees(target)
         shape = len(target.encoders), target.settings.image_size, target.words.size
@@ -171,10 +192,12 @@ class ScoutDrafter(EarlyDrafter):
     def examples(
         self, target: Any, dataset: DemoDataset, settings: ScoutSettings, held_out: float, progress: OnProgress
     ) -> tuple[ScoutExamples, ScoutExamples]:
-        """Return the target's decodes and positions for about `settings.samples` observations, evenly spread.
+        """Decode about `settings.samples` observations with the target, spread evenly over all episodes.
+
+        The arguments and the result are those of `TrainableDrafter.examples`.
 
         Raises:
-            CheckpointError: The target does not see, or the frames are not of the size that it takes.
+            CheckpointError: The target has no camera, or the images have another size than the target takes.
         """
         check_sees(target)
         share = share_of(dataset, settings.samples, sees=True)
@@ -194,14 +217,18 @@ class ScoutDrafter(EarlyDrafter):
         return split(ScoutExamples.joined(parts), held_out)
 
     def prepare(self, network: Any, examples: Any) -> None:
-        """Nothing: what the stem sees is not known before it is trained."""
+        """Do nothing. The features cannot be standardised, because they change while the vision encoder is trained."""
 
     def outputs(self, training: Training, module: Any, examples: Any, indices: Tensor) -> tuple[Tensor, ...]:
-        """Return logits (B, N, V) and positions (B, K, 3)."""
+        """Run the network on the examples `indices` (B,). Return logits (B, N, V) and positions (B, K, 3)."""
         return module(examples.inputs(indices, training.target.device))
 
     def loss(self, training: Training, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Return the token loss plus the weighted position loss."""
+        """Return the loss of the examples `indices` (B,), and metrics to log.
+
+        The loss is the token loss plus the weighted position loss. In the first `train.scene_steps` steps it is the
+        position loss alone.
+        """
         train, device = training.settings.train, training.target.device
         labels = training.examples.places[indices].to(device)
         if step < train.scene_steps:
@@ -214,18 +241,18 @@ class ScoutDrafter(EarlyDrafter):
         return token + train.scene_weight * position, metrics
 
     def further_metrics(self, training: Training, *outputs: Tensor) -> Metrics:
-        """Return the median errors of the positions."""
+        """Return the median error of each estimated position, in centimetres."""
         error = (outputs[0] - training.held_out.places).norm(dim=-1).median(0).values
         names = [place.name.replace(" ", "_") for place in training.target.observation.places]
         return {f"{name}_error_cm": 100 * float(e) for name, e in zip(names, error, strict=True)}
 
 
 def check_sees(target: object) -> CompactTarget:
-    """Return the target, if it sees.
+    """Return the target, if it is a compact target with a camera.
 
     Raises:
-        CheckpointError: It is of another family, or reads the state.
+        CheckpointError: The target is of another family, or has no camera.
     """
     if not isinstance(target, CompactTarget) or not target.cameras:
-        raise CheckpointError("a scout looks through the camera of a compact target that sees; this target has none")
+        raise CheckpointError("a scout needs a compact target with a camera (policy=vision); this target has none")
     return target
