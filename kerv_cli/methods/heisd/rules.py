@@ -312,9 +312,8 @@ def by_proposer(settings: HybridAcceptanceSettings, context: Context) -> HybridR
 class VerifySkip(Skip):
     """Executes the most similar stored chunk without verification if its similarity is at least s_min.
 
-    It skips at most `max_skips` verifications in a row. If there is a boundary, it skips only if that chooses retrieval.
-    If a stored episode was followed to its end, none of its chunks is executed without verification again in this
-    episode.
+    It skips at most `max_skips` verifications in a row. With a boundary, it skips only if that chooses retrieval. If a
+    stored episode was followed to its end, none of its chunks is executed without verification again in this episode.
 
     With `up` or `down` above 0, s_min changes after each episode. A failure raises it by `up` times the calibrated
     range, a success lowers it by `down` times the range. Then results depend on the order of the episodes and on the
