@@ -14,10 +14,11 @@ Table = tuple[tuple[str, ...], list[tuple[object, ...]], str]
 
 
 def tables(calibration: Calibration, path: Path) -> Iterator[Table]:
-    """Yield up to three tables: motion per task, prediction errors, and thresholds for verify-skip.
+    """Yield two or three tables: motion per task, errors of the motion predictors, and thresholds for verify-skip.
 
-    The first holds the kinematic variability levels K_S and K of each task (docs/methods.md §3). The third, present
-    only if it was calibrated, says when a retrieved chunk may be executed without verification (§4).
+    The first holds K, a measure of how variable a task's motion is, and its reference level K_S (docs/methods.md §3).
+    The third says when a retrieved chunk may be executed without verification (§4). It is left out if that was not
+    calibrated.
 
     Args:
         calibration: The calibration.

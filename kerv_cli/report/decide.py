@@ -103,9 +103,10 @@ def _choice(where: str, rows: Sequence[Row], loss: float) -> Choice:
 def safest_first(rows: Sequence[Row]) -> list[Row]:
     """Return the settings in the order in which `--choose` tests them. The order does not depend on success.
 
-    Settings come first if a smaller share of their executed actions is unverified (rounded to whole per cent; settings
-    that decode nothing come last). Ties go to more target forwards per control step, then to the study's order.
-    The baseline, settings without pairs, and settings that were timed and were not faster are left out.
+    The setting with the smallest unverified share comes first: the share of executed actions that the target has not
+    verified, rounded to whole per cent. Settings that decode nothing come last. Ties go to more target forwards per
+    control step, then to the study's order. The baseline, settings without pairs, and settings that were timed and were
+    not faster are left out.
     """
 
     def order(row: Row) -> tuple[float, float]:
@@ -154,7 +155,7 @@ Group Sequential Methods, table 2.1).
 
 
 def confidence_of_a_look(looks: int) -> float:
-    """Return the confidence that an interval needs at each look, so that all looks together have 95 %.
+    """Return the confidence level of the interval at each look (interim analysis), so that all looks have 95 %.
 
     Args:
         looks: Number of planned looks.

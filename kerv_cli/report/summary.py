@@ -129,7 +129,12 @@ def lost_won(row: Row) -> str:
 
 
 def summary_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame:
-    """Return the rows of one averaging as text. Columns that are empty in every row are left out."""
+    """Return the rows of a study's table as text. Columns that are empty in every row are left out.
+
+    Args:
+        table: The study's table.
+        averaging: Take the rows that pool all tasks (MICRO) or that average over difficulty groups (MACRO).
+    """
     rows, columns = rows_of(table, averaging), _columns()
     frame = pd.DataFrame([{title: text(row) for title, text in columns.items()} for row in rows])
     is_used = ~frame.isin(["–", "0 %", ""]).all() | frame.columns.isin(frame.columns[:4])

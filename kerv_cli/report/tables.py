@@ -165,7 +165,8 @@ def _rows(data: StudyData, episodes: pd.DataFrame, averaging: str) -> Iterator[R
     Args:
         data: The study.
         episodes: Episodes to summarise.
-        averaging: MICRO, MACRO, or a name for the column `averaging` if they are of one task.
+        averaging: MICRO (pool all episodes), MACRO (average over difficulty groups), or any other name for the episodes
+            of one task.
     """
     by_label = {str(label): group for label, group in episodes.groupby("label", sort=False)}
     for label in data.study.labels:
@@ -184,7 +185,8 @@ def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataF
         label: Label of the setting.
         episodes: Its episodes.
         baseline: Episodes of the baseline. May be empty.
-        averaging: MICRO, MACRO, or a name for one task.
+        averaging: MICRO (pool all episodes), MACRO (average over difficulty groups), or any other name for the episodes
+            of one task.
     """
     tasks, setting = sorted(set(episodes["task"])), data.settings[label]
     stress, hashes = stress_of(setting.settings), without(setting.identity, {OBSERVATION})
@@ -286,7 +288,8 @@ def rows_of(table: pd.DataFrame, averaging: str | None = None) -> list[Row]:
 
     Args:
         table: The table.
-        averaging: Keep only rows with this averaging (MICRO or MACRO). None: keep all rows.
+        averaging: Keep only rows that pool all episodes (MICRO) or that average over difficulty groups (MACRO). None:
+            keep all rows.
     """
     rows = table if averaging is None else table[table["averaging"] == averaging]
     return [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]
@@ -302,9 +305,9 @@ _COLUMNS = (
 
 
 def latency_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of settings whose world goes on during a decode (`rollout.clock=real`), for the baseline too.
+    """Return the rows of settings whose world goes on during a decode (`rollout.clock=real`).
 
-    The added column `ar_latency_ms` is the mean latency of the baseline's decodes.
+    The baseline must have such a world, too. The added column `ar_latency_ms` is the mean latency of its decodes.
     """
     rows = table[table["averaging"] == MICRO]
     latencies = dict(zip(rows["label"], rows["felt_latency_ms"], strict=True))

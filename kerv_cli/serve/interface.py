@@ -121,7 +121,7 @@ class Interface:
 
 
 def keys_of(message: Message) -> str:
-    """Return the first keys of a message as text for an error message."""
+    """Return up to eight keys of a message as text for an error message."""
     return ", ".join(sorted(str(key)[:40] for key in message)[:8]) or "nothing"
 
 

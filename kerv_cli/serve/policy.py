@@ -236,8 +236,8 @@ class StateRange:
     """The states on which a policy may act: the range of its demonstrations plus a margin.
 
     Args:
-        low: (p,) smallest numbers in the demonstrations.
-        high: (p,) largest numbers.
+        low: (p,) lower ends of the demonstrations' range.
+        high: (p,) upper ends.
         names: Names of the first numbers of the state, for error messages.
         margin: How much to add on each side, as a multiple of the range's width.
     """
@@ -279,7 +279,7 @@ class Finite:
         return self._noted(self._target.head(hidden))
 
     def _noted(self, numbers: Tensor) -> Tensor:
-        """Check the numbers without waiting for the device. `check` reads the result."""
+        """Check the numbers without waiting for the device. `check` reads the result later."""
         self._fine.append(torch.isfinite(numbers).all())
         return numbers
 

@@ -108,7 +108,7 @@ def choose_backend() -> str:
 
 @functools.cache
 def find_backend() -> tuple[str, str]:
-    """Find an OpenGL backend that works here. It is searched once per process.
+    """Find an OpenGL backend that works here. The search runs once per process.
 
     Returns:
         The backend's name, empty if there is none; and an error message, empty if there is a backend.

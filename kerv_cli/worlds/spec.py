@@ -129,7 +129,7 @@ class EnvironmentSpec:
         return self.tasks[full]
 
     def expand(self, name: str) -> tuple[str, ...]:
-        """Return the full names of the tasks for which `name`, a suite or a task, stands. Empty if it is neither."""
+        """Return the full names of the tasks for which `name` stands. Empty if it is neither a suite nor a task."""
         full = self.full_name(name)
         return self.suites.get(name.upper()) or ((full,) if full else ())
 

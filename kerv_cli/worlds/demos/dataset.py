@@ -36,8 +36,8 @@ class EpisodeEntry:
 
     Attributes:
         seed: Seed of the episode.
-        perturbed: Whether noise was added to the executed actions.
-        steps: Number of control steps until success.
+        perturbed: Whether noise was added to the executed actions, or an actor moved the robot instead of the expert.
+        steps: Number of control steps, up to the success.
         bytes: Size of its file.
         sha256: Hash of its file.
     """

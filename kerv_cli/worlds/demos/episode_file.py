@@ -29,18 +29,20 @@ _ARRAYS = {
 
 @dataclass(frozen=True)
 class DemoEpisode:
-    """A demonstration of T control steps. It ends with the first success.
+    """A demonstration of T control steps.
+
+    It ends with the first success. If an actor moved the robot, it may end without success.
 
     Attributes:
         task: Full name of the task.
         seed: Seed of the episode.
-        perturbed: Whether noise was added to the executed actions.
+        perturbed: Whether noise was added to the executed actions, or an actor moved the robot instead of the expert.
         steps: T.
         frames: (n, size, size x views, 3) uint8, the recorded images.
         frame_steps: (n,) int64. Image i was drawn before the action of control step `frame_steps[i]`.
         states: (T, s) float32, privileged state before each action. It begins with the proprioception.
         labels: (T + tail, D) float32, the expert's actions, clipped and without noise. The last `tail` actions come
-            after the success.
+            after the episode's end.
         executed: (T, D) float32, the actions that moved the robot.
         initial_state: (k,) float64, the world's `initial_state`, such as the placement of object and goal.
     """

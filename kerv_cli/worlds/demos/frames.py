@@ -76,7 +76,11 @@ class EncodedFrames:
         return self.pixels().astype(dtype or np.uint8, copy=False)
 
     def __getitem__(self, chosen: Any) -> Any:
-        """Return the decoded image for an integer; for a slice, mask or indices, return those images, not decoded."""
+        """Select images.
+
+        An integer returns one decoded image (size, width, 3). A slice, mask or indices return the selected images as
+        `EncodedFrames`, not decoded.
+        """
         if isinstance(chosen, int | np.integer):
             return self._decode(int(chosen))
         rows = chosen if isinstance(chosen, slice) else np.asarray(chosen)

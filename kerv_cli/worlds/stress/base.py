@@ -17,7 +17,7 @@ Model: TypeAlias = "mujoco.MjModel"
 
 
 class ModelChanges:
-    """Remembers the original values of a MuJoCo model's arrays that a stress changes."""
+    """Remembers the original values of the arrays of a MuJoCo model that a stress changes."""
 
     def __init__(self) -> None:
         self._originals: list[tuple[NDArray[Any], NDArray[Any]]] = []
