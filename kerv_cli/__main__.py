@@ -1,4 +1,4 @@
-"""The `kerv` command, also `python -m kerv_cli`. Ctrl-C is handled before anything is imported."""
+"""Entry point of the command `kerv` and of `python -m kerv_cli`. Ctrl-C is handled before anything is imported."""
 
 import os
 import signal
@@ -8,8 +8,8 @@ from types import FrameType
 
 
 def main() -> None:
-    """Run the `kerv` script. SIGTERM, from schedulers and `timeout`, is Ctrl-C to every command."""
-    # one that is ignored stays so: a job in the background of a shell, or behind nohup
+    """Run the command `kerv`. SIGTERM, which schedulers and `timeout` send, has the same effect as Ctrl-C."""
+    # a signal that is ignored stays ignored: nohup, or a shell's job in the background
     ours = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) is not signal.SIG_IGN]
     for number in ours:
         signal.signal(number, _end)
@@ -22,18 +22,18 @@ def main() -> None:
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    """End the process while it loads. An exception could surface anywhere in the middle of an import."""
+    """End the process at once, while modules are loading: an exception inside an import could do harm anywhere."""
     os.write(2, b"kerv: interrupted\n")
     os._exit(130)
 
 
 _UNSAFE = ("<frozen importlib", f"{os.sep}sqlalchemy{os.sep}pool{os.sep}")
-"""Parts of file names whose code must not be interrupted. In the middle of an import, C++ code that runs Python while
-it loads would abort the process. SQLAlchemy's pool prints the traceback of an exception that interrupts it."""
+"""Code in files with these parts in their names must not be interrupted. An exception during an import can abort the
+process, if C++ code is running Python. SQLAlchemy's pool prints the traceback of an exception that interrupts it."""
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt. Inside code that is unsafe to interrupt, ask again a little later instead."""
+    """Raise KeyboardInterrupt. If the running code must not be interrupted, send the signal again a little later."""
     while frame is not None:
         if any(part in frame.f_code.co_filename for part in _UNSAFE):
             _ask_again(number)
@@ -44,7 +44,10 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
-    """Ask again for an interrupt that reached code which cannot raise, such as a finaliser or a library's callback."""
+    """Send Ctrl-C again if Python lost it, because it arrived in a finaliser or in a library's callback.
+
+    This replaces `sys.unraisablehook`, which gets every exception that cannot be raised.
+    """
     if unraisable.exc_type is KeyboardInterrupt:
         _ask_again(signal.SIGTERM if signal.getsignal(signal.SIGINT) is signal.SIG_IGN else signal.SIGINT)
     else:
@@ -52,13 +55,13 @@ def _unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
 
 
 def _unraisable_at_the_end(unraisable: "sys.UnraisableHookArgs") -> None:
-    """Ignore libraries' half-made objects that fail to clean up after Ctrl-C."""
+    """Hide exceptions of half-built objects that fail to clean up after Ctrl-C. Only a lost Ctrl-C is sent again."""
     if unraisable.exc_type is KeyboardInterrupt:
         _unraisable(unraisable)
 
 
 def _ask_again(number: int) -> None:
-    # to the main thread: where it waits for an answer, a signal to another one would not wake it
+    # sent to the main thread: if it waits for input, a signal to another thread would not wake it
     timer = threading.Timer(0.05, signal.pthread_kill, (threading.main_thread().ident, number))
     timer.daemon = True
     timer.start()

@@ -1,8 +1,8 @@
 """The commands as Python functions: `import kerv_cli as kerv`, then `kerv.rollout(method="one_pass", task="reach")`.
 
-Settings are those of the commands. Write them as they are typed (`"threshold.r=5"`) or as keywords: a list is a list, a
-mapping sets what lies below its key (`threshold={"r": 5}`), None is null. Nothing is printed. What kerv raises
-deliberately is a KervError, whose message is one line.
+The functions take the settings of the commands, as text (`"threshold.r=5"`) or as keyword arguments. For a setting with
+a dot in its name pass a mapping, `threshold={"r": 5}`. None means null. Nothing is printed. Errors are KervErrors with
+a message of one line.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command, where numpy is not loaded yet: times compare
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command does before numpy loads, so that times are equal
 
 import numpy as np
 import pandas as pd
@@ -41,29 +41,33 @@ TABLES = ("settings", "tasks", "episodes")
 
 @dataclass(frozen=True)
 class Study:
-    """The complete episodes of a sweep or a rollout. Every call reads them from the database."""
+    """The complete episodes of a sweep or a rollout. Each call of a method reads them from the database again.
+
+    Attributes:
+        store: The study in the database.
+    """
 
     store: StudyStore
 
     @property
     def name(self) -> str:
-        """The name that `load_study` and the commands take."""
+        """Name of the study, by which `load_study` and the commands find it."""
         return self.store.name
 
     @property
     def folder(self) -> Path:
-        """The folder with its files."""
+        """Folder with the study's files: report and recordings."""
         return self.store.root
 
     def to_pandas(self, table: str = "settings") -> pd.DataFrame:
-        """Return one of its tables. Their columns are in docs/methods.md, sections 7 and 8.
+        """Return a table of results. docs/methods.md §7 and §8 explain the columns.
 
         Args:
-            table: settings: a row per setting, over all tasks. tasks: a row per task and setting. episodes: a row per
-                setting, task, seed and repeat, with success, steps, forwards, seconds, tokens, ….
+            table: `settings` has a row per setting, over all tasks. `tasks` has a row per task and setting. `episodes`
+                has a row per episode, with success, steps, forwards, seconds, tokens, ….
 
         Raises:
-            UsageError: No such table, or no complete episode.
+            UsageError: There is no such table, or no complete episode.
             CheckpointError: The database is damaged.
         """
         if table not in TABLES:
@@ -76,15 +80,15 @@ class Study:
         return data.table[data.table["averaging"] == MICRO].reset_index(drop=True)
 
     def episodes(self) -> list[Row]:
-        """Return the rows of the table of episodes; errors as `to_pandas`."""
+        """Return the rows of the table `episodes` as dictionaries; errors as `to_pandas`."""
         return rows_of(self.to_pandas("episodes"))
 
     def report(self) -> list[Path]:
-        """Write a sweep's tables, plots and page, as `kerv report` does, and return their files.
+        """Write the tables, plots and page of a sweep, as `kerv report` does. Return their paths.
 
         Raises:
-            UsageError: It is a rollout.
-            KervError: As `kerv report`.
+            UsageError: The study is a rollout, which has no report.
+            KervError: The report could not be written.
         """
         if self.store.kind == ROLLOUT:
             raise UsageError(f"{self.name} is a rollout: kerv reports sweeps")
@@ -92,17 +96,17 @@ class Study:
 
 
 def rollout(*overrides: str, grid: bool = False, **settings: object) -> Study:
-    """Run episodes of one method, as `kerv rollout`. An interrupted rollout goes on.
+    """Run episodes of one method, as `kerv rollout` does. The same call continues an interrupted rollout.
 
     Args:
-        *overrides: Settings as they are typed: `"threshold.r=5"`.
-        grid: Texts with commas are grids, as with `-m`: `method="ar,one_pass"`.
-        **settings: Settings as keywords: `method="spec_vla", task="reach"`.
+        *overrides: Settings as text, such as `"threshold.r=5"`.
+        grid: Whether commas separate several values, as with -m. `method="ar,one_pass"` then runs both methods.
+        **settings: Settings as keywords, such as `method="spec_vla", task="reach"`.
 
     Raises:
-        UsageError: A setting that does not exist or cannot be.
-        CheckpointError: No such policy, or a damaged one.
-        Interrupted: Ctrl-C; complete episodes are kept.
+        UsageError: A setting does not exist, or its value is impossible.
+        CheckpointError: The policy, or an artifact that the method needs, is missing or damaged.
+        Interrupted: The user pressed Ctrl-C. Complete episodes are kept.
         KervError: An episode failed.
     """
     with chosen_store(as_overrides(*overrides, **settings)) as typed:
@@ -113,18 +117,20 @@ def rollout(*overrides: str, grid: bool = False, **settings: object) -> Study:
 
 
 def sweep(study: str | Path, *overrides: str, **settings: object) -> Study:
-    """Run the missing episodes of a study, as `kerv sweep`: every setting on every task with the same seeds, in turn.
+    """Run the missing episodes of a study, as `kerv sweep` does.
+
+    A study compares several settings. Each runs on every task with the same seeds, and they take turns.
 
     Args:
-        study: A name in conf/study, or the path of such a file.
-        *overrides: Settings as they are typed; they hold for each of the study's settings.
-        **settings: The same as keywords.
+        study: Name of a file in conf/study, or the path of such a file.
+        *overrides: Settings as text, such as `"episodes=5"`. They apply to each of the study's settings.
+        **settings: Settings as keywords, likewise.
 
     Raises:
-        UsageError: As `rollout`.
-        CheckpointError: As `rollout`.
-        Interrupted: As `rollout`.
-        KervError: Episodes failed; the others are kept.
+        UsageError: A setting does not exist, or its value is impossible.
+        CheckpointError: The policy, or an artifact that a method needs, is missing or damaged.
+        Interrupted: The user pressed Ctrl-C. Complete episodes are kept.
+        KervError: Some episodes failed. The others are kept.
     """
     with chosen_store(as_overrides(f"study={study}", *overrides, **settings)) as typed:
         resolved = resolve(typed)
@@ -139,30 +145,31 @@ def sweep(study: str | Path, *overrides: str, **settings: object) -> Study:
 
 
 def load_study(name: str, results: str | Path = "results", store: str = "") -> Study:
-    """Return a sweep or rollout of a results folder.
+    """Return an existing sweep or rollout.
 
     Args:
-        name: As `kerv runs show` takes it: its name, a unique part of it, `last`, or a study's file.
+        name: Its name or a unique part of it, `last`, or the path of a study's file.
         results: Folder that kerv writes to.
-        store: URL of its database; empty: KERV_STORE, else SQLite in the folder.
+        store: URL of the database. Empty: the environment variable KERV_STORE, else SQLite in the folder.
 
     Raises:
-        UsageError: None or several have that name, or it has no episodes.
+        UsageError: No study, or several, match the name; or the study has no episodes.
     """
     with chosen_store([f"store={store}"] if store else []):
         return Study(store_of(find_run(results_dir(str(results)), study_name(name))))
 
 
 def runs(results: str | Path = "results", store: str = "", **filters: str) -> pd.DataFrame:
-    """Return what a results folder holds, as `kerv runs list`: a row per sweep, rollout, training, …, the newest first.
+    """Return a table of all runs, as `kerv runs list` shows it: sweeps, rollouts, trainings, …, the newest first.
 
     Args:
         results: Folder that kerv writes to.
-        store: As for `load_study`.
-        **filters: kind, method, task (patterns such as `drawer*` too), state and since (ISO 8601, UTC).
+        store: URL of the database, as for `load_study`.
+        **filters: Conditions that runs must meet: `kind`, `method`, `task` (a name, or a pattern such as `drawer*`),
+            `state`, `since` (time in ISO 8601, UTC).
 
     Raises:
-        UsageError: No such filter or kind.
+        UsageError: There is no such filter or kind.
     """
     with chosen_store([f"store={store}"] if store else []):
         there = matching(find_runs(results_dir(str(results))), filters)
@@ -170,12 +177,15 @@ def runs(results: str | Path = "results", store: str = "", **filters: str) -> pd
 
 
 class Policy:
-    """A policy with a method, in this process. It answers what `kerv serve` answers (docs/serving.md).
+    """A policy that decodes with one method, in this process. `load_policy` makes it.
+
+    It gives the same answers as `kerv serve` (docs/serving.md).
 
     Attributes:
-        info: Its inputs and outputs: cameras, image_size (pixels), names of the numbers in the state, names and limits
-            of the D actions, control_hz, chunk (H control steps).
-        last: The whole last answer, with `policy_timing` (milliseconds) and `decode` (forwards, tokens, mode).
+        info: Description of inputs and outputs: cameras, image_size (pixels), names of the numbers in the state, names
+            and limits of the D actions, control_hz, chunk (H control steps).
+        last: The last answer with all details, such as `policy_timing` (milliseconds) and `decode` (forwards, tokens,
+            mode). Empty before the first.
     """
 
     def __init__(self, served: Served) -> None:
@@ -185,20 +195,25 @@ class Policy:
         self._begins = True
 
     def reset(self) -> None:
-        """Begin a new episode with the next observation: histories are forgotten."""
+        """Start a new episode with the next observation. The history of earlier actions is forgotten."""
         self._begins = True
 
     def act(self, observation: Message, executed: int | None = None) -> np.ndarray:
-        """Return the actions (h, D) to execute now, float64, environment units; h ≤ H.
+        """Return the next actions for an observation.
 
         Args:
-            observation: `observation/<camera>`: (size, size, 3) uint8; for several views side by side
-                (size, size × views, 3); `observation/image` if there is one camera. `observation/state`: the numbers
-                that `info` names, or the whole state; positions in metres. `prompt`: the instruction.
-            executed: Control steps of the last answer that were executed; None: all of them.
+            observation: Mapping with these keys:
+                `observation/<camera>`: Image (size, size, 3) uint8, or (size, size × views, 3) for several views side
+                    by side. With a single camera the key can be `observation/image`.
+                `observation/state`: The numbers that `info` names, or the whole state. Positions are in metres.
+                `prompt`: The instruction.
+            executed: Number of actions of the last answer that were executed. None: all of them.
+
+        Returns:
+            (h, D) float64 actions in environment units, to execute one per control step; h ≤ H.
 
         Raises:
-            UsageError: Something is missing, of another shape or type, or not finite; the message names it.
+            UsageError: A value is missing, has a wrong shape or type, or is not finite. The message names it.
         """
         extra = {} if executed is None else {EXECUTED: executed}
         self.last = self._client.act({**observation, **extra, RESET: self._begins})
@@ -210,18 +225,19 @@ class Policy:
 def load_policy(
     target: str = "mt10-vision", *overrides: str, method: str = "one_pass", task: str = "", **settings: object
 ) -> Policy:
-    """Return a policy that answers observations, warmed up.
+    """Load a policy that turns observations into actions. It is warmed up, so the first answer is not slower.
 
     Args:
-        target: Name of a policy of the results folder or of a shipped one, or the path of its folder.
-        *overrides: Settings of `kerv serve` as they are typed.
-        method: Name in conf/method, or the path of such a file.
-        task: Name of the task, for parts whose levels differ between tasks.
-        **settings: Settings of `kerv serve` as keywords: `gripper="signed"`, `results="results"`.
+        target: Name of a trained or shipped policy, or the path of its folder.
+        *overrides: Settings of `kerv serve` as text, such as `"threshold.r=5"`.
+        method: Name of a file in conf/method, or the path of such a file.
+        task: Name of the task. Needed only by methods with calibrated constants per task, such as KERV.
+        **settings: Settings of `kerv serve` as keywords, such as `gripper="signed"`.
 
     Raises:
-        UsageError: A setting that does not exist or cannot be.
-        CheckpointError: No such policy, or an artifact that the method needs is missing or of another policy.
+        UsageError: A setting does not exist, or its value is impossible.
+        CheckpointError: The policy is missing, or an artifact that the method needs is missing or belongs to another
+            policy.
     """
     typed = as_overrides(*overrides, **{"policy.target": target, "method": method, "task_name": task}, **settings)
     return Policy(Served(compose("serve", typed, ServeSettings)))

@@ -1,1 +1,1 @@
-"""How far a target's forwards are from what the device can do, and recorded decodes executed on other shapes."""
+"""Measure how long a target's forwards take, compared with what the device could do at best."""

@@ -1,4 +1,4 @@
-"""The highest speedup that a method can reach at measured latencies (docs/methods.md §5)."""
+"""Compute the highest speedup that a method can reach with measured latencies (docs/methods.md §5)."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from kerv_cli.methods.settings import EXPERT
 
 @dataclass(frozen=True)
 class MethodCeiling:
-    """Speedups over AR per decode if every draft were accepted whole.
+    """The highest speedup of a method over AR: every draft is accepted completely.
 
     Attributes:
-        how: The forwards that remain, in words.
-        free: If drafting cost nothing.
-        drafted: With the costs of the drafter, if the method uses it.
+        method: Name of the method.
+        how: The forwards that it still needs, as text.
+        free: Speedup if drafting took no time.
+        drafted: Speedup with the time of the drafter. The same as `free` if the method uses no drafter.
     """
 
     method: str
@@ -29,7 +30,12 @@ class MethodCeiling:
 
 
 def ceilings(profile: Profile, tokens: int) -> list[MethodCeiling]:
-    """Return the ceilings of the methods in conf/method at N = `tokens`. Methods that verify nothing have none."""
+    """Return the highest speedup of each method in conf/method. Methods without verification are left out.
+
+    Args:
+        profile: Measured latencies of the forwards.
+        tokens: N, tokens of a chunk.
+    """
     names = [name for name in groups()["method"] if name != EXPERT]
     candidates = (_ceiling(name, profile, tokens) for name in names)
     return [ceiling for ceiling in candidates if ceiling is not None]
@@ -55,7 +61,7 @@ def _ceiling(name: str, profile: Profile, tokens: int) -> MethodCeiling | None:
     if proposer.traits.get("cost") != DRAFTING:
         return MethodCeiling(name, "one verification", free, free)
     depth = min(int(getattr(settings.proposer, "depth", tokens)), tokens - 2)
-    rounds = math.ceil((tokens - 1) / (depth + 1))  # of chains that are always accepted whole
+    rounds = math.ceil((tokens - 1) / (depth + 1))  # each round commits the whole chain and one more token
     drafting = profile.seconds(DRAFTING, depth) if depth else 0.0
     decode = prefill + rounds * (profile.seconds("verify", 1 + depth) + drafting)
     return MethodCeiling(name, f"{rounds} × {depth} drafted", free, autoregressive / decode)

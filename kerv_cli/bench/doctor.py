@@ -1,4 +1,4 @@
-"""Checks of this machine, of a target and of an environment, for `kerv doctor`."""
+"""Check this machine, a target or an environment, for `kerv doctor`."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 
 @dataclass
 class DoctorSettings(RunSettings):
-    """`kerv doctor`. With a target or an environment it checks only that."""
+    """Settings of `kerv doctor`. If a target or an environment is given, it checks only that."""
 
     groups: ClassVar = {"world": "default", "runtime": "cpu"}
 
     policy: PolicySettings = setting(lambda: PolicySettings(target=""), "the target to check")
     environment: str | None = setting(None, "the environment to check")
-    seed: int = number(EVALUATION_SEED, 0, 2**31 - 1, help="of the world that is drawn")
+    seed: int = number(EVALUATION_SEED, 0, 2**31 - 1, help="seed of the scene that is rendered")
     world: WorldSettings = setting(WorldSettings, "camera and length of an episode")
 
 
@@ -58,7 +58,10 @@ def check_machine(settings: DoctorSettings) -> list[Finding]:
 
 
 def check_policy(settings: DoctorSettings) -> list[Finding]:
-    """Check on an observation of noise whether the target keeps its protocol."""
+    """Check on a random observation whether the target behaves as the engine requires.
+
+    Returns an empty list if no target is to be checked.
+    """
     if not settings.policy.target:
         return []
     import numpy as np
@@ -80,7 +83,10 @@ def check_policy(settings: DoctorSettings) -> list[Finding]:
 
 
 def check_environment_of(settings: DoctorSettings) -> list[Finding]:
-    """Check on its first task whether the environment keeps its protocol."""
+    """Check on its first task whether an environment behaves as kerv requires.
+
+    Returns an empty list if no environment is to be checked.
+    """
     if not settings.environment:
         return []
     from kerv_cli.worlds import specs
@@ -93,7 +99,10 @@ def check_environment_of(settings: DoctorSettings) -> list[Finding]:
 
 
 def _rendering(spec: EnvironmentSpec, settings: DoctorSettings) -> str:
-    """Draw frames of a world and time them. A backend can load and still draw nothing."""
+    """Render frames of an environment and time them. Return the result as text.
+
+    A frame must not be empty: a broken OpenGL backend can load without an error and render nothing.
+    """
     from kerv_cli.worlds.mujoco_world import choose_backend
 
     backend, first = choose_backend(), next(iter(spec.suites.values()), tuple(spec.tasks))[0]
@@ -137,7 +146,7 @@ def _disk(settings: DoctorSettings) -> str:
 
 
 def _database(settings: DoctorSettings) -> str:
-    """Return which database is in use; raises KervError if it does not answer."""
+    """Return which database is used, as text. Raises KervError if it does not answer."""
     from kerv_cli.lab.database import Database
     from kerv_cli.lab.runs import run_rows
 

@@ -1,4 +1,4 @@
-"""What a device can do, measured: bytes read and operations per second."""
+"""Measure what a device can do at best: bytes read per second and arithmetic operations per second."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from torch import Tensor
 from kerv_cli.targets.compact.bfloat16 import BlockedLinear, multiplies_bfloat16
 from kerv_cli.targets.compact.program import Program
 
-_BUFFER = 64 * 2**20  # float32 numbers, 256 MiB: a server's caches hold 100 MB and more
-_LEVELS = (2**20, 4 * 2**20, 16 * 2**20, 32 * 2**20)  # bytes of the buffers that show what a CPU's caches can do
-_ROWS, _WIDTH = 256, 4096
+_BUFFER = 64 * 2**20  # float32 numbers, 256 MiB: larger than the caches of a server, which hold 100 MB and more
+_LEVELS = (2**20, 4 * 2**20, 16 * 2**20, 32 * 2**20)  # bytes of the buffers that measure the bandwidth of CPU caches
+_ROWS, _WIDTH = 256, 4096  # of the matrix multiplication that measures operations per second
 REPEATS = 7
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What a device can do, the best of several repeats.
+    """The measured limits of a device, each the best of several repeats.
 
     Attributes:
-        bandwidth: Bytes per second that one pass over a buffer larger than all caches reads.
-        flops: Operations per second of a large product in the weights' number format.
-        caches: Bytes of a smaller buffer and the bandwidth of repeated passes over it, increasing.
+        bandwidth: Bytes per second when reading a buffer that is larger than all caches.
+        flops: Operations per second of a large matrix multiplication in the number format of the weights.
+        caches: (bytes, bandwidth) of smaller buffers that fit into caches, the smallest first. Empty on a GPU.
     """
 
     bandwidth: float
@@ -36,27 +36,27 @@ class Machine:
     caches: tuple[tuple[float, float], ...] = ()
 
     def bandwidth_of(self, read: float) -> float:
-        """Return the bandwidth of the smallest level that holds so many bytes."""
+        """Return the bandwidth of reading `read` bytes repeatedly: that of the smallest buffer which holds them."""
         return next((rate for size, rate in self.caches if read <= size), self.bandwidth)
 
     def bounds(self, read: float, flops: float) -> tuple[float, float]:
-        """Return the least seconds for reading so many bytes, and for so many operations."""
+        """Return the shortest possible seconds for reading `read` bytes, and for `flops` operations."""
         return read / self.bandwidth_of(read), flops / self.flops
 
     def best_of(self, other: Machine) -> Machine:
-        """Return the better rates of two measurements: other programs slow a machine down, none speeds it up."""
+        """Return the higher rate of two measurements in each field, because other programs can only slow one down."""
         caches = [(size, max(a, b)) for (size, a), (_, b) in zip(self.caches, other.caches, strict=True)]
         return Machine(max(self.bandwidth, other.bandwidth), max(self.flops, other.flops), tuple(caches))
 
 
 def synchronise(device: torch.device) -> None:
-    """Wait for the device's work."""
+    """Wait until a GPU has finished its work. Does nothing on a CPU."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
 def timed(work: Callable[[], object], device: torch.device, repeats: int) -> np.ndarray:
-    """Return the seconds (repeats,) of `work`, after two runs that do not count."""
+    """Run a function `repeats` times after two warm-up runs, and return the seconds (repeats,) of each run."""
     for _ in range(2):
         work()
     seconds = np.empty(repeats)
@@ -71,7 +71,12 @@ def timed(work: Callable[[], object], device: torch.device, repeats: int) -> np.
 
 @torch.inference_mode()
 def measure_machine(device: torch.device, dtype: torch.dtype) -> Machine:
-    """Measure the device's rates with this process's threads."""
+    """Measure the limits of a device with as many threads as torch has in this process.
+
+    Args:
+        device: The device.
+        dtype: Number format of the matrix multiplication.
+    """
 
     def rate(numbers: int) -> float:
         return 4.0 * numbers / float(timed(buffer[:numbers].sum, device, REPEATS).min())
@@ -84,7 +89,12 @@ def measure_machine(device: torch.device, dtype: torch.dtype) -> Machine:
 
 
 def product_with(weight: Tensor, dtype: torch.dtype) -> Callable[[Tensor], Tensor]:
-    """Return what multiplies rows with a weight as a forward on its device does in this number format."""
+    """Return a function that multiplies rows with a weight matrix, by the kernel that a target's forward would use.
+
+    Args:
+        weight: (outputs, inputs) float32. Its device decides about the kernel.
+        dtype: Number format of the multiplication.
+    """
     if weight.device.type == "cpu" and dtype == torch.bfloat16 and multiplies_bfloat16():
         return BlockedLinear(weight)
     if weight.device.type == "cpu" and dtype == torch.float32:

@@ -1,4 +1,4 @@
-"""The model that is measured: a policy's target, or a shape with random weights, and a drafter."""
+"""Open the model that `kerv bench` measures: a policy's target, or a shape with random weights; and a drafter."""
 
 from __future__ import annotations
 
@@ -35,12 +35,19 @@ from kerv_cli.training.imitation import vocabulary
 from kerv_cli.training.settings import TrainTargetSettings
 from kerv_cli.worlds.metaworld.spec import SPEC
 
-_SPARE = 1.15  # memory that must be free, over the weights: the prompt's encoder, caches, one layer twice
+_SPARE = 1.15  # free memory that is needed, relative to the weights: also for encoder, caches, a copy of one layer
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """A target's shape, its number of tokens, and the bytes of a weight and of a number in the cache."""
+    """The sizes of a target, from which the bytes and operations of its forwards are computed.
+
+    Attributes:
+        settings: Shapes of the target.
+        vocabulary: V, number of action tokens.
+        weight: Bytes of a weight, on average.
+        slot: Bytes of a number in the key/value cache.
+    """
 
     settings: TargetSettings
     vocabulary: int
@@ -53,10 +60,14 @@ class Sizes:
         return layer_weights(self.settings) * self.settings.layers + self.settings.width * self.vocabulary
 
     def forward(self, rows: int, cached: int) -> tuple[float, float]:
-        """Return the bytes and operations of a forward of `rows` tokens after `cached` ones.
+        """Return the bytes that a forward reads, and its number of arithmetic operations.
 
-        It reads every weight, key and value once. It takes two operations per weight and row, and four per number of
-        an attended key.
+        Every weight, key and value counts as read once. There are two operations per weight and token, and four per
+        channel of each key that a token attends to.
+
+        Args:
+            rows: Number of tokens in the forward.
+            cached: Number of earlier tokens in the cache.
         """
         s, weights = self.settings, self.trunk_weights
         read = weights * self.weight + 2.0 * s.layers * (cached + rows) * s.width * self.slot
@@ -64,10 +75,16 @@ class Sizes:
         return read, 2.0 * weights * rows + 4.0 * s.layers * s.width * attended
 
     def needs(self, kind: str, rows: int, prompt: int) -> tuple[float, float]:
-        """Return the bytes and operations of a kind of cost; zeros if they are not counted. prompt: P."""
+        """Return the bytes and operations of one phase of a decode, see `forward`. Zeros if they are not known.
+
+        Args:
+            kind: Kind of phase, see `phases.Phase`.
+            rows: Number of tokens or levels, see `phases.Phase`.
+            prompt: P, number of prompt tokens.
+        """
         s = self.settings
         drafter = float(layer_weights(s) + 2 * s.width**2 + s.width * self.vocabulary)
-        # passes over the drafter's weights, and rows in them; a level of its tree is eight wide
+        # number of passes over the drafter's weights, and of rows in all passes; its tree has eight nodes per level
         passes = {"feed": (1, rows), "draft": (rows - 1, rows - 1), "tree": (rows - 1, 8 * (rows - 1))}
         if kind in ("prefill", "verify"):
             return self.forward(rows, prompt if kind == "verify" else 0)
@@ -80,10 +97,11 @@ class Model:
     """The model that is measured.
 
     Attributes:
-        name: Of the policy or shape.
-        target: A ReadableTarget.
-        observation: Any of the target's environment.
-        is_shape: Whether the weights are random.
+        name: Name of the policy or of the shape.
+        target: The target, a ReadableTarget.
+        drafter: The policy's drafter, or one with random weights.
+        observation: The observation that is decoded, black images and zeros.
+        is_shape: Whether the target has random weights.
     """
 
     name: str
@@ -94,7 +112,7 @@ class Model:
 
     @property
     def sizes(self) -> Sizes:
-        """The target's shape; its caches are float32 on a CPU, where compiled weights stay as they are stored."""
+        """Sizes of the target. On a CPU its cache is float32, and compiled weights have their stored format."""
         slot, trunk = 4 if self.target.device.type == "cpu" else self.dtype.itemsize, self.target.trunk
         weight: float = self.dtype.itemsize
         if isinstance(getattr(trunk, "packed", None), Program):
@@ -103,7 +121,7 @@ class Model:
 
     @property
     def size(self) -> int:
-        """N, tokens of a chunk."""
+        """N, number of tokens in a chunk."""
         return int(self.target.chunk * self.target.actions.dofs)
 
     @property
@@ -117,8 +135,13 @@ class ShapeTarget(CompactTarget):
     """A compact target with random weights.
 
     It is built layer by layer in its final number format, so that memory never holds 7 B weights twice. On a CPU the
-    prompt's encoder stays float32, where it is compiled. Later layers hold the first one's numbers, shifted by a few
-    rows: a forward reads them from other memory, as in a trained target.
+    prompt's encoder stays float32, because only then it is compiled. All layers have the same random numbers, shifted
+    by a few rows. Each has its own memory, so a forward reads as much as in a trained target.
+
+    Args:
+        settings: Shapes.
+        device: Device of the weights.
+        dtype: Number format of the trunk's weights.
     """
 
     def __init__(self, settings: TargetSettings, device: torch.device, dtype: torch.dtype) -> None:
@@ -147,7 +170,7 @@ class ShapeTarget(CompactTarget):
 
 
 def shifted_layers(settings: TargetSettings, device: torch.device, dtype: torch.dtype) -> Iterator[Layer]:
-    """Yield the trunk's layers, frozen, one after the other."""
+    """Yield the decoder layers of a `ShapeTarget` one after the other; arguments as for that class."""
     torch.manual_seed(0)
     first = Layer(settings.width, settings.heads, settings.feed_forward).requires_grad_(False)
     for parameter in first.parameters():
@@ -169,11 +192,14 @@ def layer_weights(settings: TargetSettings) -> int:
 
 
 def open_model(settings: BenchSettings) -> Model:
-    """The policy or shape of `settings.model`, ready for inference, with its drafter; where there is none a random one.
+    """Open the policy or shape `settings.model` for inference, with its drafter.
+
+    A shape, or a policy without a drafter, gets a drafter with random weights.
 
     Raises:
-        UsageError: too little memory for the shape. UnknownName: neither a policy nor a shape.
-        CheckpointError: a damaged policy.
+        UsageError: There is too little memory for the shape.
+        UnknownName: There is neither a policy nor a shape of that name.
+        CheckpointError: The policy is damaged.
     """
     shapes = groups()["target"]
     if settings.model in shapes:
@@ -209,7 +235,7 @@ def _shape(settings: BenchSettings) -> Model:
 
 
 def shape_of(name: str, tokens: int) -> TargetSettings:
-    """Return a shape of conf/target that decodes chunks of at least so many tokens."""
+    """Return a shape of conf/target, with chunks of at least `tokens` tokens."""
     shape = compose("train_target", [f"target={name}"], TrainTargetSettings).target
     return replace(shape, chunk=-(-tokens // SPEC.actions.dofs))
 
@@ -222,12 +248,15 @@ def _drafter(target: ReadableTarget) -> EagleNetwork:
 
 
 def blank(target: Any) -> Observation:
-    """Return an observation of black images and zeros."""
+    """Return an observation for a target in which all images are black and all numbers 0."""
     return still_observation(target, target.observation, target.settings.image_size)
 
 
 def fastest(device: torch.device) -> torch.dtype:
-    """Return the number format in which a row times a large matrix is faster here, measured; bfloat16 on CUDA."""
+    """Return the faster number format on this device, float32 or bfloat16.
+
+    On a CPU this is measured by multiplying one row with a large matrix. On CUDA it is bfloat16.
+    """
     if device.type == "cuda":
         return torch.bfloat16
     if not multiplies_bfloat16():
@@ -241,7 +270,7 @@ def fastest(device: torch.device) -> torch.dtype:
 
 
 def free_memory(device: torch.device) -> float:
-    """Return the bytes that can be allocated."""
+    """Return the bytes of free memory on a device."""
     if device.type == "cuda":
         return float(torch.cuda.mem_get_info(device)[0])
     try:

@@ -1,4 +1,4 @@
-"""The costs of a decode, measured inside whole decodes of the engine's own loop on dummy drafts."""
+"""Measure how long each phase of a decode takes, in whole decodes by the engine with dummy drafts."""
 
 from __future__ import annotations
 
@@ -35,31 +35,33 @@ from kerv_cli.methods.scout.drafter import ScoutProposer
 from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.targets.compact.program import stored_bytes
 
-_WARM_UP = 2  # cycles that do not count
-_EVICTING = 16 * 2**20  # float32 numbers that are read between decodes: a simulator leaves nothing in the caches
+_WARM_UP = 2  # repeats that do not count
+_EVICTING = 16 * 2**20  # float32 numbers that are read before each decode, to empty the caches as a simulator does
 _TREE = (5, 8, 50)  # depth, children, nodes of EAGLE-2's tree
 _MERGED = 30  # nodes of a merged in-prefill draft
 _TASK = "reach-v3"
 SCOUT = "scout"
-"""A draft whose cost is measured here; prices of recorded decodes take the recorded seconds."""
+"""Kind of the phase in which a scout, the smallest drafter, drafts. It is measured for information only: estimates for
+other machines keep the recorded seconds."""
 
 Key = tuple[str, int]
-"""Kind of a cost, and its rows."""
+"""Kind and rows of a phase, see `Phase`."""
 
 
 @dataclass(frozen=True)
 class Phase:
-    """One measured cost.
+    """The measured time of one phase of a decode.
 
     Attributes:
-        kind: encode, prefill, verify, feed (the target's states into the drafter), draft (the drafter's chain), tree
-            (its tree), or a draft of the shipped policy: early, retrieval, scout.
-        rows: Forwarded tokens; tokens of a chain, levels of a tree.
-        seconds: The median.
-        least: The least of all repeats.
-        read: Bytes that it must read at least.
-        flops: Operations that it must do at least.
-        floor: Seconds that the device needs for them; 0 if they are not counted.
+        kind: encode, prefill, verify, feed (the drafter reads the target's hidden states), draft (the drafter drafts a
+            chain), tree (it drafts a tree), or a draft of the shipped policy: early, retrieval, scout.
+        rows: Number of tokens in the forward. For a drafted chain its tokens, for a tree its levels.
+        seconds: Median of all repeats.
+        p95: 95th percentile of all repeats.
+        least: Minimum of all repeats.
+        read: Bytes that must be read.
+        flops: Arithmetic operations that must be done.
+        floor: Shortest possible seconds for these bytes and operations on this device. 0 if they are not known.
     """
 
     kind: str
@@ -73,37 +75,37 @@ class Phase:
 
     @property
     def share(self) -> float:
-        """Floor ÷ median: 1 if the phase takes no longer than the device needs."""
+        """Floor ÷ median. It is 1 if the phase is as fast as the device allows."""
         return self.floor / self.seconds
 
     @property
     def name(self) -> str:
-        """The phase in words, for tables."""
+        """Name of the phase in tables."""
         if self.kind == "verify":
             return "one token" if self.rows == 1 else f"verify {self.rows}"
         return f"{self.kind} {self.rows}" if self.kind in FORWARDS[1:] else self.kind
 
     def as_dict(self) -> dict[str, float | str]:
-        """Return the fields, and rates in GB/s and GFLOP/s, as JSON values."""
+        """Return the fields for JSON, with name, share and the rates in GB/s and GFLOP/s."""
         rates = {"gb_per_s": self.read / self.seconds / 1e9, "gflop_per_s": self.flops / self.seconds / 1e9}
         return {"name": self.name, **asdict(self), **rates, "share": self.share}
 
 
 class Laps(Stopwatch):
-    """A stopwatch that keeps every lap: its phase and seconds."""
+    """A stopwatch that also keeps each lap as (phase, seconds), not only the sums per phase."""
 
     def __init__(self, device: torch.device) -> None:
         self.laps: list[tuple[str, float]] = []
         super().__init__(device)
 
     def lap(self, phase: str) -> None:
-        """End a lap of a phase."""
+        """End the present lap, and count it for a phase."""
         before = self.phases[phase]
         super().lap(phase)
         self.laps.append((phase, self.phases[phase] - before))
 
     def stop(self) -> float:
-        """Stop, and return all seconds."""
+        """Stop, and return the sum of all laps in seconds."""
         seconds = super().stop()
         if self.events is not None:
             pairs = itertools.pairwise(self.events)
@@ -112,7 +114,10 @@ class Laps(Stopwatch):
 
 
 class Dummy(Proposer):
-    """Draft a number of nodes: a chain, and more children of the root if the chunk has no room for a longer one."""
+    """A proposer that always drafts the same number of nodes, with meaningless tokens.
+
+    The nodes form a chain. If the chunk has no room for such a long chain, the rest are children of the root.
+    """
 
     name = "dummy"
 
@@ -120,13 +125,16 @@ class Dummy(Proposer):
         self.nodes = nodes
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """The dummy draft; see `Proposer.propose`."""
+        """Return the dummy draft; see `Proposer.propose`."""
         chain = min(self.nodes, depth)
         return Draft.of(range(self.nodes), [*range(-1, chain - 1), *[ROOT] * (self.nodes - chain)])
 
 
 def decoders(model: Model) -> list[Decoder]:
-    """Return decoders whose rounds have all sizes that a chunk can have. They accept everything that is drafted."""
+    """Return decoders that together measure forwards of many sizes. They accept every draft.
+
+    There are plain decoding, drafts before the prefill, dummy drafts after it, and the drafter's chain and tree.
+    """
     target, size = model.target, model.size
     rule, everything = RelaxedRule(target.actions, strict_dofs=False), Fixed(target.actions.tokens)
 
@@ -134,7 +142,7 @@ def decoders(model: Model) -> list[Decoder]:
         draft = Dummy(in_prefill) if in_prefill else None
         return Decoder(target, Parts(rule, everything, draft, proposer))
 
-    equal = [n - 1 for n in range(2, size) if size % n == 0]  # rounds of as many rows as the prefill commits tokens
+    equal = [n - 1 for n in range(2, size) if size % n == 0]  # draft sizes for which all rounds commit as many tokens
     every = [decoder(), *(decoder(n, Dummy(n)) for n in equal), decoder(0, Dummy(size - 2))]
     every += [decoder(size - 1), decoder(max(_MERGED, size - 1))]
     shapes = ((size - 2, 1, size - 2), (min(3, size - 2), 1, 3), _TREE)
@@ -144,7 +152,14 @@ def decoders(model: Model) -> list[Decoder]:
 def costs_of(decoder: Decoder, prompt: int, rounds: Sequence[Round], laps: Sequence[tuple[str, float]]) -> Iterator[
     tuple[Key, float]
 ]:  # fmt: skip
-    """Yield the costs in a decode and their seconds. A forward ends when the CPU has its argmax."""
+    """Yield kind, rows and seconds of each phase in a decode. A forward ends when the CPU knows its target tokens.
+
+    Args:
+        decoder: The decoder.
+        prompt: P, number of prompt tokens.
+        rounds: The rounds of the decode.
+        laps: (phase, seconds) as measured by `Laps`.
+    """
     seconds = {phase: sum(s for name, s in laps if name == phase) for phase in ("vision", "prefill", "verify")}
     yield ("encode", 1), seconds["vision"]
     yield ("prefill", prompt + rounds[0].tree_size), seconds["prefill"]
@@ -153,7 +168,8 @@ def costs_of(decoder: Decoder, prompt: int, rounds: Sequence[Round], laps: Seque
         yield ("verify", 1 + nodes.pop()), seconds["verify"] / (len(rounds) - 1)
     drafter = decoder.parts.proposer
     if isinstance(drafter, DrafterProposer):
-        # behind the limits of acceptance: the prompt's states, then by turns a draft and the states of its tokens
+        # after a first lap for the thresholds: the prompt's states are read; then in turn a draft is made, and the
+        # states of its tokens are read
         _, prompt_states, *turns = (s for name, s in laps if name == "propose")
         yield ("feed", prompt), prompt_states
         for one, drafting in zip(rounds[1:], turns[::2], strict=False):
@@ -165,10 +181,15 @@ def costs_of(decoder: Decoder, prompt: int, rounds: Sequence[Round], laps: Seque
 
 @torch.inference_mode()
 def measure(model: Model, machine: Machine, settings: BenchSettings) -> tuple[Machine, list[Phase]]:
-    """Time all decoders in turn, `repeats` times, then measure the machine again.
+    """Measure all phases: run all decoders in turn, `settings.repeats` times.
+
+    Args:
+        model: The model.
+        machine: Limits of the device. They are measured once more at the end, and the better ones count.
+        settings: Settings of the benchmark.
 
     Returns:
-        The machine's best rates, and the costs with floors at these rates.
+        The limits of the device, and the phases.
     """
     device, evicting = model.target.device, torch.ones(_EVICTING)
     every, seconds = decoders(model), dict[Key, list[float]]()
@@ -197,7 +218,14 @@ def measure(model: Model, machine: Machine, settings: BenchSettings) -> tuple[Ma
 def phases_of(
     seconds: Mapping[Key, Sequence[float]], sizes: Sizes, machine: Machine, drafts: Mapping[Key, tuple[float, float]]
 ) -> list[Phase]:
-    """Return the costs by kind and rows. seconds: of every repeat. drafts: bytes and operations of the sources."""
+    """Summarise measured times as phases.
+
+    Args:
+        seconds: Kind and rows of a phase -> seconds of each repeat.
+        sizes: Sizes of the target.
+        machine: Limits of the device.
+        drafts: Kind and rows of a draft -> bytes and operations of the network that makes it, zeros if there is none.
+    """
     order = (*FORWARDS, *source_methods(), SCOUT)
     phases, prompt = [], min(rows for kind, rows in seconds if kind == "prefill")
     for (kind, rows), times in sorted(seconds.items(), key=lambda item: (order.index(item[0][0]), item[0][1])):
@@ -210,7 +238,7 @@ def phases_of(
 
 @torch.inference_mode()
 def needs_of_draft(decoder: Any) -> tuple[float, float]:
-    """Return the bytes of the weights and the operations of a drafting network; zeros if it is none."""
+    """Return the bytes of the weights and the operations of a decoder's early draft. Zeros if no network makes it."""
     draft, target = decoder.parts.prefill_draft, decoder.target
     if not isinstance(draft, EarlyProposer):
         return 0.0, 0.0
@@ -224,14 +252,17 @@ def needs_of_draft(decoder: Any) -> tuple[float, float]:
 
 
 def source_methods() -> dict[str, str]:
-    """Return the kinds of proposers' own costs, each with the method whose decodes measure it."""
+    """Return the phases that only certain proposers have: kind of the phase -> method with which it is measured."""
     measured = [part.traits for part in parts("proposer").values() if "measured_by" in part.traits]
     return {traits["cost"]: traits["measured_by"] for traits in measured}
 
 
 def source_decoders(settings: BenchSettings) -> dict[str, Any]:
-    """The shipped policy's decoders that execute an early draft and a stored chunk: whatever the target, these drafts
-    do not grow with it. Empty where that policy is not there."""
+    """Return decoders of the shipped policy that measure early, retrieved and scout drafts, by the kind of the phase.
+
+    The time of these drafts does not depend on the size of the target. The result is empty if the shipped policy is
+    missing.
+    """
     words = [f"runtime.{name}={getattr(settings.runtime, name)}" for name in ("device", "threads")]
     try:
         return {

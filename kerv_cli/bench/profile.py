@@ -1,4 +1,4 @@
-"""Latency profiles from measured costs, here or projected onto another device and shape."""
+"""Make latency profiles from measured times, for this machine or estimated for another device and shape."""
 
 from __future__ import annotations
 
@@ -14,15 +14,20 @@ from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.engine.cost import FORWARDS, Profile
 from kerv_cli.targets.compact.settings import TargetSettings
 
-_PER_LAYER = 15e-6  # seconds per layer and pass below which projections do not go: kernels of a captured graph
-_HALF = 2  # bytes of a bfloat16
+_PER_LAYER = 15e-6  # least seconds of a layer in an estimate: the time of launching its kernels in a CUDA graph
+_HALF = 2  # bytes of a bfloat16 number
 
 Document = dict[str, Any]
-"""What a bench writes, as JSON."""
+"""Result of a benchmark for JSON (docs/formats.md)."""
 
 
 def profile_of(phases: Sequence[Phase], tokens: int) -> Profile:
-    """Return the profile of the medians of measured costs. tokens: N."""
+    """Return a profile, the median seconds of each phase by its number of rows.
+
+    Args:
+        phases: Measured phases.
+        tokens: N, tokens of a chunk.
+    """
     points = {
         kind: sorted((p.rows, p.seconds) for p in phases if p.kind == kind) for kind in (*FORWARDS, *source_methods())
     }
@@ -34,9 +39,19 @@ def profile_of(phases: Sequence[Phase], tokens: int) -> Profile:
 def projections(
     settings: BenchSettings, model: Model, machine: Machine, phases: Sequence[Phase]
 ) -> Iterator[tuple[str, Document]]:
-    """Yield every device of `projections` and its document, for the shape `projected` in bfloat16.
+    """Estimate the times of another shape in bfloat16 on other devices.
 
-    The rows after the prompt are those measured here.
+    The shape is `settings.projected`, the devices are those of `settings.projections`. Forwards have as many tokens
+    after the prompt as those that were measured here.
+
+    Args:
+        settings: Settings of the benchmark.
+        model: The measured model.
+        machine: Limits of this device.
+        phases: Measured phases.
+
+    Yields:
+        Name of a device, and the result for it.
     """
     shape = shape_of(settings.projected, model.size)
     sizes = Sizes(shape, model.target.actions.tokens, _HALF, _HALF)
@@ -62,9 +77,15 @@ def projections(
 
 
 def shares(phases: Sequence[Phase], machine: Machine) -> tuple[float, float]:
-    """Return the median floor ÷ time of costs bound by memory, and of costs bound by arithmetic.
+    """Return how much of the device's limits the measured forwards reach, as median of floor ÷ time.
 
-    Without costs of one kind the other kind's median stands for it.
+    Args:
+        phases: Measured phases.
+        machine: Limits of the device.
+
+    Returns:
+        Two medians: of phases in which reading takes longer, and of phases in which arithmetic takes longer. If there
+        are no phases of one kind, it gets the other's median.
     """
     by_bound: dict[bool, list[float]] = {True: [], False: []}
     for p in phases:
@@ -78,11 +99,17 @@ def shares(phases: Sequence[Phase], machine: Machine) -> tuple[float, float]:
 def projected(
     phases: Sequence[Phase], reached: tuple[float, float], here: Machine, there: Machine, layers: int
 ) -> list[Phase]:
-    """Project phases, with the bytes and operations that they need there, onto a device that is not at hand.
+    """Estimate the times of phases on another device. These are no measurements.
 
-    A time is the device's floor divided by the share of the floor that was reached here, and at least what so many
-    layers' kernels take. The encoder has no floor: it scales with bandwidth. Drafts of the shipped policy stay as they
-    are. This is no measurement.
+    A forward is assumed to reach the same share of the device's limits as here, and to take at least 15 µs per layer.
+    The encoder's time is scaled by the bandwidth. Drafts of the shipped policy keep their time.
+
+    Args:
+        phases: Phases with the bytes and operations of the shape on that device.
+        reached: Result of `shares`.
+        here: Limits of this device.
+        there: Limits of the other device.
+        layers: Number of decoder layers of the shape.
     """
     projections = []
     for p in phases:
@@ -97,6 +124,6 @@ def projected(
 
 
 def prompt_of(shape: TargetSettings) -> int:
-    """Return P of a shape: vision tokens, instruction, scene and proprioception."""
+    """Return P, the number of prompt tokens of a shape: vision, instruction, scene and proprioception."""
     vision = shape.grid**2 if shape.observation == "vision" else 0
     return vision + shape.instruction_tokens + shape.scene_tokens + 1

@@ -1,4 +1,4 @@
-"""One benchmark: what the device can do, what every phase costs, ceilings, and the document of them all."""
+"""Run a benchmark: limits of the device, times of all phases of a decode, highest speedups; and store the result."""
 
 from __future__ import annotations
 
@@ -22,7 +22,15 @@ from kerv_cli.targets.provenance import stamp
 
 @dataclass(frozen=True)
 class Bench:
-    """The results of a benchmark; the ceilings by N."""
+    """The results of a benchmark.
+
+    Attributes:
+        model: The measured model.
+        machine: Limits of the device.
+        phases: Measured times.
+        ceilings: N (tokens of a chunk) -> highest speedup of each method.
+        profile: Median times by kind and rows, from which the time of a decode can be computed.
+    """
 
     model: Model
     machine: Machine
@@ -32,17 +40,17 @@ class Bench:
 
     @property
     def dtype(self) -> str:
-        """Number format of the trunk."""
+        """Number format of the trunk, such as `float32`."""
         return str(self.model.dtype).removeprefix("torch.")
 
     @property
     def title(self) -> str:
-        """Target, number format, device, threads and the state of the caches, in words."""
+        """Title of the table of phases: target, number format, device, threads."""
         where = stamp(str(self.model.target.device))["device_name"]
         return f"{self.model.name}, {self.dtype}, {where}, {torch.get_num_threads()} thread, caches cold at first"
 
     def document(self) -> Document:
-        """Return the whole result as JSON values."""
+        """Return the whole result for JSON (docs/formats.md)."""
         device = self.model.target.device
         return {
             "target": self.model.name,
@@ -59,9 +67,17 @@ class Bench:
 
 
 def card_of(model: Model, machine: Machine, tokens: int) -> dict[str, Any]:
-    """Return bytes, operations and floors of the model on this machine; needs no forward of the trunk.
+    """Compute the least times that a model's forwards can take on this machine. No forward is executed.
 
-    A floor is the larger of two times: reading the weights from the cache level that holds them, and the arithmetic.
+    A floor consists of two times in seconds: for reading the weights and for the arithmetic. The larger one counts.
+
+    Args:
+        model: The model.
+        machine: Limits of the device.
+        tokens: N, tokens of a chunk.
+
+    Returns:
+        Sizes, rates and floors by name, see `tables.card_rows`.
     """
     prompt, s, sizes = model.target.max_prompt, model.target.settings, model.sizes
     needs = {
@@ -85,7 +101,13 @@ def card_of(model: Model, machine: Machine, tokens: int) -> dict[str, Any]:
 
 
 def run(settings: BenchSettings, model: Model, machine: Machine) -> Bench:
-    """Measure the opened model."""
+    """Measure a model and return the results.
+
+    Args:
+        settings: Settings of the benchmark.
+        model: The model, from `open_model`.
+        machine: Limits of the device. They are measured once more at the end, and the better ones count.
+    """
     machine, phases = measure(model, machine, settings)
     profile = profile_of(phases, model.size)
     by_tokens = {n: ceilings(profile, n) for n in settings.tokens}
@@ -93,7 +115,7 @@ def run(settings: BenchSettings, model: Model, machine: Machine) -> Bench:
 
 
 def write(settings: BenchSettings, bench: Bench) -> list[Path]:
-    """Write the document and the projections, and return their paths."""
+    """Write the result and the projections onto other devices as JSON files. Return their paths."""
     folder = results_dir(settings.results) / "bench"
     name = bench.model.name.rstrip("/").rsplit("/", 1)[-1]
     documents = {folder / f"{name}-{bench.dtype}.json": bench.document()}

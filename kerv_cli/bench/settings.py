@@ -13,7 +13,7 @@ PROJECTIONS = {"A100 80GB": [2039.0, 312.0], "H100 SXM": [3350.0, 989.0], "RTX 4
 
 @dataclass
 class BenchSettings(RunSettings):
-    """`kerv bench`: how far a target is from what the device can do."""
+    """Settings of `kerv bench`, which compares the times of a target with what the device could do at best."""
 
     model: str = setting("mt10-vision", "a policy, or a shape of conf/target with random weights")
     dtype: str = choice(
@@ -22,15 +22,22 @@ class BenchSettings(RunSettings):
         "float32",
         "bfloat16",
         "float16",
-        help="of a shape; auto: the faster one",
+        help="number format of a shape; auto: the faster one",
     )
-    repeats: int = number(30, 3, 100_000, help="of every measurement, for medians and 95th percentiles")
-    tokens: list[int] = setting([7, 16], "N, tokens of a chunk; of a shape: at most", **limits(4, 256))
-    projected: str = setting("", "a shape of conf/target whose profiles on `projections` are written too")
+    repeats: int = number(30, 3, 100_000, help="repeats of every measurement, for medians and 95th percentiles")
+    tokens: list[int] = setting([7, 16], "N, tokens of a chunk; a shape decodes the largest", **limits(4, 256))
+    projected: str = setting("", "a shape of conf/target: also estimate its times on the devices of projections=")
     projections: dict[str, list[float]] = setting(PROJECTIONS, "device -> published GB/s and dense bfloat16 TFLOP/s")
 
     def check_together(self, prefix: str) -> None:
-        """Raises UsageError without a chunk to measure, and for a device without its two figures."""
+        """Check settings that depend on each other.
+
+        Args:
+            prefix: Start of the settings' names in error messages.
+
+        Raises:
+            UsageError: `tokens` is empty, or a device of `projections` does not have two positive numbers.
+        """
         if not self.tokens:
             raise UsageError(f"{prefix}tokens=[]: name at least one N")
         for name, figures in self.projections.items():

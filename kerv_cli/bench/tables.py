@@ -1,4 +1,4 @@
-"""The tables of `kerv bench`."""
+"""Rows of the tables that `kerv bench` prints."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ PHASE_COLUMNS = ("phase", "median ms", "p95", "least", "GB/s", "GFLOP/s", "floor
 
 
 def card_rows(card: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return sizes, rates and floors in words, before the target is measured."""
+    """Return (name, value) rows about sizes of the model, limits of the device, and least times of forwards.
+
+    Args:
+        card: Result of `run.card_of`.
+    """
     rows = [
         ("weights that a forward reads", f"{card['weights'] / 1e6:.1f} M, {card['weight_bytes'] / 1e6:.1f} MB"),
         ("cache of prompt and chunk", f"{card['cache_bytes'] / 1e6:.2f} MB"),
@@ -27,7 +31,7 @@ def card_rows(card: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def phase_rows(phases: Sequence[Phase]) -> list[tuple[str, ...]]:
-    """Return a row per phase: times in milliseconds, rates, the floor, and how many floors the least time is."""
+    """Return a row per phase with the columns PHASE_COLUMNS. A floor is the least time that the device allows."""
     rows: list[tuple[str, ...]] = []
     for phase in phases:
         limits = ("–", "–", "–", "–")
@@ -40,7 +44,11 @@ def phase_rows(phases: Sequence[Phase]) -> list[tuple[str, ...]]:
 
 
 def ceiling_rows(by_tokens: Mapping[int, Sequence[MethodCeiling]]) -> list[tuple[str, ...]]:
-    """Return a row per method with three columns per N."""
+    """Return a row per method: its name, then for each N the remaining forwards and the two speedups.
+
+    Args:
+        by_tokens: N (tokens of a chunk) -> highest speedup of each method.
+    """
     by_method: dict[str, list[str]] = {}
     for ceilings in by_tokens.values():
         for one in ceilings:

@@ -1,4 +1,4 @@
-"""Registers kerv's own families of targets."""
+"""Register kerv's own families of targets: compact, grown and OpenVLA."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Attention of a trunk that decodes with a cache: the cache, its slots, the mask and the rotation.
+"""The key/value cache of a trunk, attention masks, and the rotation by rotary position embeddings.
+
+A slot is the place of one token's keys and values in the cache.
 
 Shapes: B batch, T new tokens, S cached tokens, A heads (of keys and values), C channels of a head.
 """
@@ -13,48 +15,68 @@ from kerv_cli.engine.transfer import upload
 
 
 class Cache:
-    """Keys and values of every layer in buffers (layers, 2, B, A, slots, C) with slots ≥ capacity.
+    """Keys and values of every layer and token.
 
-    Modules and packed weights order key channels differently, so they must not share a cache.
+    Args:
+        layers: Number of layers.
+        batch: B, number of sequences.
+        heads: A, number of heads.
+        capacity: Maximum number of tokens.
+        channels: C, channels of a head.
+        like: Tensor whose device and number format the cache gets.
+        fixed: Whether a forward attends to all slots under a mask, so that its shapes are always the same.
 
     Attributes:
-        fixed: Whether every forward has the same shapes: it attends to all slots under a mask.
-        length: The number of valid slots, from the first on.
+        buffer: (layers, 2, B, A, slots, C) keys and values. A fixed cache has one slot more than its capacity.
+        layers: (2, B, A, slots, C) per layer, views of the buffer.
+        length: Number of cached tokens. They are in the first slots.
     """
 
     def __init__(
         self, layers: int, batch: int, heads: int, capacity: int, channels: int, like: Tensor, fixed: bool = False
     ) -> None:
         self.fixed = fixed
-        slots = capacity + fixed  # a spare one, for the rows that fill up a graph's bucket
+        slots = capacity + fixed  # a spare slot, for the unused rows of a CUDA graph
         self.buffer = like.new_zeros((layers, 2, batch, heads, slots, channels))
         self.layers = list(self.buffer)  # (2, B, A, slots, C): keys, values
         self.capacity = capacity
         self.length = 0
 
     def compact(self, start: int, slots: Tensor) -> None:
-        """Commit a path: move the entries at `slots` (n,) to start, start + 1, … and set the length after them.
+        """Keep the tokens of an accepted path, and drop the rest of the draft tree.
+
+        The kept entries move to the slots start, start + 1, …. The length is set to the end of them.
 
         Args:
             start: The first slot to write.
-            slots: Slots in increasing order, none before `start`.
+            slots: (n,) slots of the kept tokens in increasing order, none before `start`.
         """
         n = slots.shape[0]
         self.buffer[..., start : start + n, :] = self.buffer.index_select(-2, slots)
         self.length = start + n
 
     def next_slots(self, tokens: int) -> Slots:
-        """Return the slots after the valid ones for a number of new tokens."""
+        """Return the slots for a number of new tokens, the first ones after the cached tokens."""
         start, stop = self.length, self.length + tokens
         return torch.arange(start, stop, device=self.buffer.device) if self.fixed else slice(start, stop)
 
 
 Slots = slice | Tensor
-"""Slots of a cache that a forward of T tokens writes: a slice, or for fixed shapes their indices (T,)."""
+"""Slots of a cache that a forward writes: a slice, or for a cache of fixed shapes indices (T,)."""
 
 
 def write(layer: Tensor, slots: Slots, k: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """Write k and v (B, A, T, C) into a layer (2, B, A, capacity, C). Return the keys and values to attend to."""
+    """Write the keys and values of new tokens to a layer's cache.
+
+    Args:
+        layer: (2, B, A, capacity, C) cache of the layer.
+        slots: Slots of the new tokens.
+        k: (B, A, T, C) keys.
+        v: (B, A, T, C) values.
+
+    Returns:
+        The keys and values to attend to, those of earlier tokens included.
+    """
     if isinstance(slots, Tensor):
         layer[0].index_copy_(2, slots, k)
         layer[1].index_copy_(2, slots, v)
@@ -65,18 +87,18 @@ def write(layer: Tensor, slots: Slots, k: Tensor, v: Tensor) -> tuple[Tensor, Te
 
 
 def attention_mask(seen: np.ndarray | Tensor | None, tokens: int, cache: Cache | None, like: Tensor) -> Tensor | None:
-    """Return the additive mask of new tokens after a cache: (T, S + T), or (T, slots) for a cache of fixed shapes.
+    """Return the additive attention mask of new tokens: 0 for tokens that are seen, -inf for hidden ones.
 
     Args:
-        seen: (T, M) bool: which of the newest M ≥ T tokens, the new ones last, each new token attends to. It attends to
-            all cached tokens before those. None means that new tokens are causal. A tensor must be on the device of
-            `like`.
-        tokens: T.
-        cache: Cache of earlier tokens.
+        seen: (T, M) bool, which of the last M ≥ T tokens each new token attends to. The T new tokens are the last of
+            these M. Cached tokens before them are always seen. None: new tokens are causal. A tensor must be on the
+            device of `like`.
+        tokens: T, number of new tokens.
+        cache: Cache of earlier tokens. None: there are none.
         like: Tensor whose device and number format the mask gets.
 
     Returns:
-        The mask. None if attention without one does the same.
+        (T, S + T), or (T, slots) for a cache of fixed shapes. None if no mask is needed.
     """
     cached, fixed = (cache.length, cache.fixed) if cache is not None else (0, False)
     stop = cached + tokens
@@ -98,5 +120,11 @@ def attention_mask(seen: np.ndarray | Tensor | None, tokens: int, cache: Cache |
 
 
 def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-    """Rotate x by its positions' cos and sin: (B, T, heads, C) by (T, 1, C), or (B, heads, T, C) by (T, C)."""
+    """Apply rotary position embedding.
+
+    Args:
+        x: (B, T, heads, C) queries or keys, or (B, heads, T, C).
+        cos: Cosines of the positions, (T, 1, C) for the first shape of x, (T, C) for the second.
+        sin: Sines, likewise. Those of the first half of the channels are negative.
+    """
     return torch.addcmul(x * cos, x.roll(x.shape[-1] // 2, -1), sin)

@@ -1,4 +1,7 @@
-"""Checkpoints: safetensors, and one JSON with settings, spaces, vocabulary and provenance. Nothing is pickled."""
+"""Read and write checkpoints: weights as safetensors, and a JSON description. Nothing is pickled.
+
+The description contains settings, action and observation space, vocabulary and provenance (docs/formats.md).
+"""
 
 from __future__ import annotations
 
@@ -21,14 +24,20 @@ if TYPE_CHECKING:  # torch is imported where weights are read or written: a desc
 FORMAT = 2
 WEIGHTS = "model.safetensors"
 FLOAT32, FLOAT16, INT8 = "float32", "float16", "int8"
-"""How weights are stored."""
+"""Number formats of stored weights."""
 SCALE = ".scale"
-"""Ending of the name of the tensor that holds an int8 matrix's scales, one per row."""
+"""The tensor `<name>.scale` contains the scales of the int8 matrix `<name>`, one per row."""
 
 
 @dataclass(frozen=True)
 class Description:
-    """The fields in the JSON of every artifact with weights. `sha256` is that of the weights' file."""
+    """The fields that the description of every artifact with weights has.
+
+    Attributes:
+        format: Version of the format, `FORMAT`.
+        kind: Kind of artifact, such as `target`.
+        sha256: Hash of the file of weights.
+    """
 
     format: int
     kind: str
@@ -37,18 +46,18 @@ class Description:
 
 @dataclass(frozen=True)
 class TargetDescription(Description):
-    """A target's JSON.
+    """The content of `target.json`.
 
     Attributes:
-        family: Name of the registered target that reads `settings`.
-        environment: Environment of the demonstrations that it was trained on.
-        settings: Settings of the family, `chunk` among them.
+        family: Registered kind of target, such as `compact`.
+        environment: Name of the environment that its demonstrations come from.
+        settings: Settings of the family. They always contain `chunk`.
         actions: Action space.
         observation: Observation space.
-        cameras: Names of the images that it reads.
+        cameras: Names of the camera images that it reads.
         words: Vocabulary of instructions.
         provenance: How it was made.
-        state_range: 0.1th and 99.9th percentile of the demonstrations' states (s,). None if not recorded.
+        state_range: The 0.1th and the 99.9th percentile of the demonstrations' states, (s,) each. None: not recorded.
     """
 
     family: str
@@ -67,41 +76,44 @@ class TargetDescription(Description):
 
     @property
     def chunk(self) -> int:
-        """H, the control steps that it was trained to decode at once."""
+        """H, number of control steps that the target was trained to decode at once."""
         return int(self.settings["chunk"])
 
     @property
     def origin(self) -> Mapping[str, Any]:
-        """Folder (`base`) and weights' hash (`sha256`) of the policy whose tokens it decodes; a grown target's base."""
+        """The policy whose tokens the target decodes: the hash of its weights as `sha256`.
+
+        For a grown target (docs/methods.md §0.2) this is the policy that was enlarged, with its folder as `base`.
+        """
         return self.settings.get("grown") or {"sha256": self.sha256}
 
     @property
     def parallel(self) -> bool:
-        """Whether it decodes all tokens of a chunk at once, and only so."""
+        """Whether the target decodes all tokens of a chunk in one forward, and cannot decode them one by one."""
         return bool(self.settings.get("parallel"))
 
     @property
     def tasks(self) -> list[str]:
-        """Tasks and suites that it was trained on, empty if unknown."""
+        """Tasks and suites that the target was trained on. Empty if unknown."""
         return list(self.provenance.get("settings", {}).get("task") or [])
 
     @property
     def demos(self) -> str:
-        """Name of the demonstrations that it was trained on, empty if unknown."""
+        """Name of the demonstrations that the target was trained on. Empty if unknown."""
         return self.provenance.get("settings", {}).get("demos") or ""
 
     def check_world(self, name: str, environment: str, actions: ActionSpace, size: int) -> None:
-        """Refuse a world that the target was not made for.
+        """Check that the target can act in an environment.
 
         Args:
-            name: Name of the target.
-            environment: Name of the world's environment.
+            name: Name of the target, for the error message.
+            environment: Name of the environment, for the error message.
             actions: Action space of the environment.
-            size: Pixels of the frames that the target would see.
+            size: Pixels per side of the images that the environment gives.
 
         Raises:
-            UsageError: The frames have another size.
-            CheckpointError: The action space is another one.
+            UsageError: The target was trained on images of a different size.
+            CheckpointError: The target has a different action space.
         """
         trained = self.settings.get("image_size", size)
         if self.cameras and size != trained:
@@ -109,14 +121,14 @@ class TargetDescription(Description):
         self.actions.check_same(actions, f"target '{name}'", f"environment {environment}")
 
     def check_autoregressive(self, what: str, why: str) -> None:
-        """Refuse a target that decodes in parallel.
+        """Check that the target decodes token by token.
 
         Args:
-            what: The setting that needs another target.
-            why: What this one lacks.
+            what: The setting that requires this, text for the error message.
+            why: Why the setting requires this, text for the error message.
 
         Raises:
-            UsageError: It is parallel.
+            UsageError: The target decodes all tokens at once.
         """
         if self.parallel:
             raise UsageError(f"{what}: the target decodes all tokens at once, {why}; choose one that is autoregressive")
@@ -126,7 +138,16 @@ T = TypeVar("T", bound=Description)
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> None:
-    """Write a safetensors file atomically. Raises StorageError if that fails."""
+    """Write a safetensors file atomically.
+
+    Args:
+        path: The file.
+        tensors: Name -> tensor.
+        metadata: Texts to store in the file. None: no texts.
+
+    Raises:
+        StorageError: The disk is full or read-only, or permission is missing.
+    """
     from safetensors.torch import save
 
     write_bytes(path, save({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, metadata))
@@ -137,10 +158,10 @@ def load_tensors(path: Path, what: str) -> dict[str, Tensor]:
 
     Args:
         path: The file.
-        what: Its name in messages.
+        what: What the file contains, text for the error message.
 
     Raises:
-        CheckpointError: It is missing, damaged, or holds numbers that are not finite.
+        CheckpointError: The file is missing or damaged, or contains NaN or infinity.
     """
     import torch
     from safetensors import SafetensorError
@@ -161,10 +182,13 @@ def load_tensors(path: Path, what: str) -> dict[str, Tensor]:
 
 
 def compact(state: Mapping[str, Tensor], stored: str) -> dict[str, Tensor]:
-    """Return the tensors as they are stored.
+    """Convert tensors to the number format in which they are stored.
 
-    float16 halves all floats. int8 stores every matrix as integers of -127 to 127 and a float16 scale per row, the
-    row's largest absolute value / 127, under `<name>{SCALE}`. Other floats become float16.
+    Args:
+        state: Name -> tensor.
+        stored: float32 changes nothing. float16 converts all floats. int8 converts matrices to integers from -127 to
+            127, with a float16 scale per row in `<name>.scale` (the row's largest absolute value / 127), and all other
+            floats to float16.
     """
     import torch
 
@@ -183,10 +207,10 @@ def compact(state: Mapping[str, Tensor], stored: str) -> dict[str, Tensor]:
 
 
 def expanded(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Invert `compact`: matrices with a scale become float32, the rest stays as it is."""
+    """Undo `compact`: multiply int8 matrices by their scales, which gives float32. Other tensors stay unchanged."""
     full = {}
     for name, tensor in tensors.items():
-        if not (name.endswith(SCALE) and name.removesuffix(SCALE) in tensors):  # a module's own may be called so
+        if not (name.endswith(SCALE) and name.removesuffix(SCALE) in tensors):  # a module may have its own `….scale`
             scale = tensors.get(name + SCALE)
             full[name] = tensor if scale is None else (tensor.float().flatten(1) * scale.float()).view(tensor.shape)
     return full
@@ -195,14 +219,14 @@ def expanded(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def save_module(
     folder: Path, kind: str, module: nn.Module, description: Mapping[str, Any], stored: str = FLOAT32
 ) -> str:
-    """Write the weights and, last, `<kind>.json`. Return the SHA-256 of the weights.
+    """Write the weights of a module, then their description `<kind>.json`. Return the SHA-256 of the weights.
 
     Args:
         folder: Folder to write to.
-        kind: Kind of artifact.
+        kind: Kind of artifact, such as `drafter`.
         module: Module whose weights are written.
-        description: Fields of the JSON.
-        stored: Number format of the weights. `load_state` converts them back to float32.
+        description: Fields of the description besides format, kind and sha256.
+        stored: Number format of the stored weights. `load_state` converts them back to float32.
     """
     folder.mkdir(parents=True, exist_ok=True)
     save_tensors(folder / WEIGHTS, compact(module.state_dict(), stored))
@@ -219,17 +243,23 @@ def target_fields(
     observation: ObservationSpace,
     **others: Any,
 ) -> dict[str, Any]:
-    """Return the fields of a target.json for `save_module`. The arguments are fields of `TargetDescription`."""
+    """Return the description of a target for `save_module`. The arguments are fields of `TargetDescription`."""
     spaces = {"actions": actions.as_dict(), "observation": observation.as_dict()}
     empty: dict[str, Any] = {"cameras": [], "words": [], "provenance": {}}
     return {"family": family, "environment": environment, "settings": dict(settings), **spaces, **empty, **others}
 
 
 def read_description(folder: Path, kind: str, schema: type[T]) -> T:
-    """Return the JSON beside the weights, checked against its schema and their hash.
+    """Return the description of an artifact. Check its fields, and that the weights have the hash in it.
+
+    Args:
+        folder: Folder of the artifact.
+        kind: Kind of artifact, such as `drafter`.
+        schema: Dataclass of the description.
 
     Raises:
-        CheckpointError: It is missing, of another version, damaged, or of other weights.
+        CheckpointError: The description or the weights are missing, damaged or of another version of kerv, or they do
+            not belong together.
     """
     description = described(folder, kind, schema)
     check_weights(folder, kind, description.sha256)
@@ -237,7 +267,11 @@ def read_description(folder: Path, kind: str, schema: type[T]) -> T:
 
 
 def described(folder: Path, kind: str, schema: type[T]) -> T:
-    """Return the JSON of a folder, checked against its schema but not against weights; errors as `read_description`."""
+    """Return the description of an artifact without checking its weights; arguments as `read_description`.
+
+    Raises:
+        CheckpointError: The description is missing, damaged or of another version of kerv.
+    """
     path = folder / f"{kind}.json"
     if not path.is_file():
         raise CheckpointError(f"no {kind} in {folder}: run 'kerv train {kind}', or name a folder that holds one")
@@ -247,10 +281,15 @@ def described(folder: Path, kind: str, schema: type[T]) -> T:
 
 
 def check_weights(folder: Path, kind: str, sha256: str) -> None:
-    """Check that the weights in `folder` are there and have this hash.
+    """Check that the weights in a folder have a hash.
+
+    Args:
+        folder: Folder of the artifact.
+        kind: Kind of artifact, for the error message.
+        sha256: The expected hash.
 
     Raises:
-        CheckpointError: They are not.
+        CheckpointError: The weights are missing, or have a different hash.
     """
     weights = folder / WEIGHTS
     if not weights.is_file():
@@ -261,7 +300,7 @@ def check_weights(folder: Path, kind: str, sha256: str) -> None:
 
 @functools.lru_cache(maxsize=256)
 def _read_description(path: Path, kind: str, schema: type[T], version: tuple[int, int, int]) -> T:
-    """Read the JSON file, once per process as long as its `version` (inode, size, time of change) stays the same."""
+    """Read a description. The result is cached until the file's `version` (inode, size, time of change) changes."""
     value = read_mapping(path)
     if (value.get("format"), value.get("kind")) != (FORMAT, kind):
         raise CheckpointError(f"{path} is not a {kind} of format {FORMAT}: it was written by another version of kerv")
@@ -269,10 +308,15 @@ def _read_description(path: Path, kind: str, schema: type[T], version: tuple[int
 
 
 def load_state(module: nn.Module, folder: Path, kind: str) -> None:
-    """Load the folder's weights into `module`.
+    """Load the weights in a folder into a module.
+
+    Args:
+        module: The module.
+        folder: Folder with `model.safetensors`.
+        kind: Kind of artifact, for the error message.
 
     Raises:
-        CheckpointError: They are missing, damaged, or do not fit the module.
+        CheckpointError: The weights are missing, damaged, or do not fit the module.
     """
     try:
         module.load_state_dict(expanded(load_tensors(folder / WEIGHTS, kind)))
@@ -282,10 +326,10 @@ def load_state(module: nn.Module, folder: Path, kind: str) -> None:
 
 
 def read_target(folder: Path) -> TargetDescription:
-    """Return a target's description; errors as `read_description`.
+    """Return the description of a target and check its weights; errors as `read_description`.
 
-    A family whose weights are in another folder checks them itself: its trait `weights` names a function of
-    (folder, description).
+    If the weights of a family of targets are elsewhere, the family's trait `weights` names the function that checks
+    them. Its arguments are the folder and the description.
     """
     description = described(folder, "target", TargetDescription)
     family = parts("target").get(description.family)
@@ -297,11 +341,19 @@ def read_target(folder: Path) -> TargetDescription:
 
 
 def load_target(folder: Path, device: str = "cpu", dtype: torch.dtype | None = None) -> tuple[Any, TargetDescription]:
-    """Return the target in `folder`, ready for inference, and its description. `dtype` is float32 by default.
+    """Load a target for inference.
+
+    Args:
+        folder: Folder of the target.
+        device: Device to load it to.
+        dtype: Number format of its weights. None means float32.
+
+    Returns:
+        The target and its description.
 
     Raises:
-        CheckpointError: It is missing or damaged.
-        UnknownName: Its family is not registered.
+        CheckpointError: The target is missing or damaged.
+        UnknownName: Its family is not registered, for example because a plugin is not installed.
     """
     import torch
 

@@ -1,7 +1,7 @@
-"""Checks that a target keeps the protocol. They need the target and one observation of its kind.
+"""Check that a target behaves as the engine requires. The checks need the target and one observation.
 
-Speculative decoding relies on them: a token's hidden state depends only on what it sees, however the tokens are split
-into forwards. `kerv doctor target=NAME` runs them on a folder, `check_target` on any object.
+Speculative decoding relies on this: a token's hidden state depends only on the tokens that it attends to, however the
+tokens are divided into forwards. `kerv doctor target=NAME` checks a stored target, `check_target` any object.
 
 Shapes: P prompt tokens, T tokens, E width, V action tokens.
 """
@@ -21,18 +21,24 @@ from kerv_cli.engine.protocol import Cache, Target
 from kerv_cli.worlds.findings import Finding, find, need
 
 TOLERANCE = {torch.float64: 1e-6, torch.float32: 2e-4, torch.bfloat16: 0.2, torch.float16: 0.05}
-"""Largest difference of logits relative to their spread, by number format. Sums in another order round differently."""
+"""Number format -> largest allowed difference of logits, in units of their standard deviation. A difference of this
+size can come from rounding."""
 MEMBERS = ("actions", "chunk", "cameras", "width", "max_prompt", "device")
 METHODS = ("encode", "embed", "new_cache", "forward", "head")
 TREE = Draft.of([0] * 7, [-1, 0, 0, 1, 1, 2, 4])
-"""The shape of a draft tree. Every check draws new tokens for it."""
+"""A draft tree, of which only the shape is used. Checks draw random tokens for its nodes."""
 Pairs = Iterable[tuple[Tensor, Tensor]]
-"""Hidden states (…, E) of one way to forward tokens, and of the plain way. Their logits must be equal."""
+"""Pairs of hidden states (…, E): computed as the engine does it, and as expected. Their logits must be equal."""
 
 
 @torch.inference_mode()
 def check_target(target: Target, observation: Observation) -> list[Finding]:
-    """Return one finding per check. The target must be able to encode `observation`."""
+    """Run all checks, and return one finding per check.
+
+    Args:
+        target: The target.
+        observation: An observation that the target can encode. Its values do not matter.
+    """
     trial, findings = Trial(target, observation), []
     for what, fault, check in CHECKS:
         findings.append(find(what, functools.partial(trial.compare, fault, check)))
@@ -42,18 +48,24 @@ def check_target(target: Target, observation: Observation) -> list[Finding]:
 
 
 class Trial:
-    """The checks on one observation. Every check compares with `plain`: one causal forward without a cache."""
+    """The checks of one target on one observation.
+
+    Most of them compare the result of a computation with that of `plain`, one causal forward without a cache.
+    """
 
     def __init__(self, target: Target, observation: Observation) -> None:
         self.target, self.observation = target, observation
         self.random = torch.Generator().manual_seed(0)
 
     def compare(self, fault: str, check: Callable[[Trial], Pairs]) -> str:
-        """Compare a check's pairs by their logits. Return the largest difference, in words.
+        """Run a check and compare the logits of its pairs.
 
         Args:
-            fault: What a difference larger than rounding means.
+            fault: What is wrong if they differ, text for the error message.
             check: The check.
+
+        Returns:
+            The largest difference, as text.
         """
         worst = 0.0
         for hidden, expected in check(self):
@@ -65,7 +77,7 @@ class Trial:
         return f"logits within {worst:.1g} of their spread" if worst else "as declared"
 
     def members(self) -> Pairs:
-        """Check that the protocol's members are there."""
+        """Check that the target has all required attributes and methods."""
         missing = [name for name in (*MEMBERS, *METHODS) if not hasattr(self.target, name)]
         need(not missing, f"{type(self.target).__name__} lacks {', '.join(missing)} (kerv_cli/engine/protocol.py)")
         need(not isinstance(self.target.cameras, str), "cameras is a text, must be a tuple of names")
@@ -74,7 +86,7 @@ class Trial:
         return ()
 
     def encode(self) -> Pairs:
-        """Check the prompt: shape, length, finite, the same twice."""
+        """Check that a prompt has the right shape and finite numbers, and is the same when encoded again."""
         prompt, width, longest = self.target.encode(self.observation), self.target.width, self.target.max_prompt
         right = prompt.ndim == 3 and len(prompt) == 1 and prompt.shape[2] == width
         need(right, f"encode gives {tuple(prompt.shape)}, must be (1, P, {width})")
@@ -87,7 +99,7 @@ class Trial:
         return ()
 
     def embed_and_head(self) -> Pairs:
-        """Check shapes and formats of `embed`, `forward` and `head`."""
+        """Check the shapes and number formats that `embed`, `forward` and `head` return."""
         width, count, dtype = self.target.width, self.target.actions.tokens, self.prompt.dtype
         embedded = self.target.embed(torch.tensor([[0, count - 1]], device=self.prompt.device))
         right = embedded.shape == (1, 2, width) and embedded.dtype == dtype
@@ -100,24 +112,31 @@ class Trial:
         return ()
 
     def draw(self, count: int) -> Tensor:
-        """Draw random tokens (1, count)."""
+        """Return random tokens (1, count)."""
         return torch.randint(self.target.actions.tokens, (1, count), generator=self.random).to(self.prompt.device)
 
     def positions(self, first: int, count: int) -> Tensor:
-        """Return `count` positions from `first` on."""
+        """Return the positions first, first + 1, … (count,)."""
         return torch.arange(first, first + count, device=self.prompt.device)
 
     def plain(self, tokens: Tensor) -> Tensor:
-        """Return hidden states (1, P + T, E) of prompt and tokens (1, T), forwarded at once without a cache."""
+        """Return the hidden states (1, P + T, E) of the prompt and tokens (1, T), in one forward without a cache."""
         x = torch.cat([self.prompt, self.target.embed(tokens)], 1) if tokens.shape[1] else self.prompt
         return self.target.forward(x, self.positions(0, x.shape[1]))
 
     def causality(self) -> Pairs:
-        """Check that a token does not see later ones."""
+        """Check that a token's hidden state does not depend on later tokens."""
         yield self.plain(self.tokens[:, :4]), self.plain(self.tokens)[:, : self.length + 4]
 
     def cached(self, lengths: Sequence[int]) -> tuple[Cache, Tensor]:
-        """Forward the prompt, then tokens in pieces of these lengths. Return the cache and their hidden states."""
+        """Forward the prompt with a cache, then the tokens in several forwards.
+
+        Args:
+            lengths: Number of tokens in each forward.
+
+        Returns:
+            The cache, and the hidden states (1, T, E) of the tokens.
+        """
         cache, first, hidden = self.target.new_cache(1, self.capacity), self.length, []
         self.target.forward(self.prompt, self.positions(0, first), cache)
         need(cache.length == first, f"the cache has length {cache.length} after a prompt of {first} tokens")
@@ -128,15 +147,19 @@ class Trial:
         return cache, torch.cat(hidden, 1)
 
     def pieces(self, *lengths: int) -> Pairs:
-        """Check that tokens after a cache, in pieces as decoding and verifying forward them, equal one forward."""
+        """Check that tokens in several forwards with a cache have the same hidden states as in one forward.
+
+        Args:
+            lengths: Number of tokens in each forward.
+        """
         size = sum(lengths)
         yield self.cached(lengths)[1], self.plain(self.tokens[:, :size])[:, -size:]
 
     def forward_tree(self) -> tuple[Cache, Tensor, Tensor]:
-        """Forward the third token, after two cached ones, and a tree after it.
+        """Forward a token and a draft tree after it in one forward, after two cached tokens.
 
         Returns:
-            The cache, the tree's tokens (1, n), hidden states (1, 1 + n, E).
+            The cache; the random tokens (1, n) of the tree; the hidden states (1, 1 + n, E) of token and tree.
         """
         (cache, _), drafted = self.cached([1, 1]), self.draw(len(TREE))
         x = self.target.embed(torch.cat([self.tokens[:, 2:3], drafted], 1))
@@ -144,14 +167,14 @@ class Trial:
         return cache, drafted, self.target.forward(x, positions, cache, TREE.visible(1))
 
     def tree(self) -> Pairs:
-        """Check that every node of a tree equals the last token of its own path, forwarded alone."""
+        """Check that a node of a draft tree has the same hidden state as in a forward of only its own path."""
         _, drafted, hidden = self.forward_tree()
         for node in range(len(TREE)):
             tokens = torch.cat([self.tokens[:, :3], drafted[:, TREE.tree.path_to(node)]], 1)
             yield hidden[:, node + 1], self.plain(tokens)[:, -1]
 
     def commit(self) -> Pairs:
-        """Check that decoding continues after a committed path."""
+        """Check that decoding can continue after the cache has kept only the accepted path of a tree."""
         (cache, drafted, _), path, start = self.forward_tree(), TREE.tree.path_to(6), self.length + 2
         cache.compact(start, torch.tensor([start, *(start + 1 + node for node in path)], device=self.prompt.device))
         length = start + 1 + len(path)
@@ -161,7 +184,7 @@ class Trial:
         yield hidden, self.plain(torch.cat([self.tokens[:, :3], drafted[:, path], last], 1))[:, -1:]
 
     def prefill_draft(self) -> Pairs:
-        """Check prompt and tree in one forward, as methods that draft before the prefill do it."""
+        """Check a forward of prompt and draft tree together, as methods do that draft before the prefill."""
         drafted, positions = self.draw(len(TREE)), TREE.positions(0, self.length, self.prompt.device)
         x, cache = torch.cat([self.prompt, self.target.embed(drafted)], 1), self.target.new_cache(1, self.capacity)
         hidden = self.target.forward(x, positions, cache, TREE.visible(self.length))
@@ -169,13 +192,13 @@ class Trial:
             yield hidden[:, self.length + node], self.plain(drafted[:, TREE.tree.path_to(node)])[:, -1]
 
     def reused_cache(self) -> Pairs:
-        """Check that a cache whose length was reset to 0 keeps nothing."""
+        """Check that nothing of its earlier content is left in a cache after its length is set to 0."""
         cache, _ = self.cached([5])
         cache.length = 0
         yield self.target.forward(self.prompt, self.positions(0, self.length), cache), self.plain(self.tokens[:, :0])
 
     def batch(self) -> Pairs:
-        """Check two prompts at once, as training a drafter does it."""
+        """Check that two prompts in one batch give the same hidden states as each alone."""
         prompts, positions = torch.cat([self.prompt, self.prompt.flip(1)]), self.positions(0, self.length)
         hidden = self.target.forward(prompts, positions, self.target.new_cache(2, self.capacity))
         for row, prompt in zip(hidden, prompts, strict=True):
@@ -206,4 +229,5 @@ CHECKS: tuple[tuple[str, str, Callable[[Trial], Pairs]], ...] = (
     ("batch", "a batch of two", Trial.batch),
     ("greedy chunk", "the chunk", Trial.greedy_chunk),
 )
-"""Name, what a failure means, and the check. Without a meaning, later checks need this one."""
+"""The checks in order: name, what is wrong if it fails, function. If the second is empty, all later checks need this
+one, and a failure ends the checks."""

@@ -1,4 +1,4 @@
-"""Folders of targets: shipped ones, trained ones, and what belongs to them."""
+"""Find the folders of targets, shipped or trained, and of the artifacts that belong to them."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ RELEASED = {
     "mt50-plain": "c2455773de37ced5e7a6db9bfda64a36375c27a7c62a8c2b354a9af55e548f54",
     "mt50-vision": "11cbcfd366f20df05355e5715afc4bb0d032547815b0e3821dd8ee66ea46727b",
 }
-"""Shipped policy to the SHA-256 of its target's weights. The wheel holds one of them, a checkout and a release all."""
+"""Name of each shipped policy -> SHA-256 of its target's weights. The wheel contains one policy, a checkout all."""
 
 RESUME = "resume.safetensors"
-"""File of a training's state in the folder of what it makes. No shipped artifact has it."""
+"""File in the folder of a trained artifact from which its training can resume. Shipped artifacts do not have it."""
 
 
 def shipped_dir() -> Path:
@@ -31,10 +31,15 @@ def shipped_dir() -> Path:
 
 
 def find_target(results: str, name: str) -> Path:
-    """Return the folder of a target: `name` itself if it is a path, else an artifact, else a shipped policy.
+    """Return the folder of a target.
+
+    Args:
+        results: The results folder.
+        name: Path of the folder, or the name of a target in the results folder, or of a shipped policy. They are tried
+            in this order. A path contains a slash.
 
     Raises:
-        UsageError: There is none of that name. The message lists what there is.
+        UsageError: There is no such target. The message lists the existing ones.
     """
     if "/" in name:
         folders = [as_path(name)]
@@ -57,14 +62,14 @@ def find_target(results: str, name: str) -> Path:
 
 
 def check_not_shipped(path: Path, word: str) -> None:
-    """Refuse to replace an artifact of a shipped policy.
+    """Check that writing an artifact does not replace one of a shipped policy.
 
     Args:
         path: Folder to write to.
-        word: Setting that names another folder, e.g. `policy.artifacts.scout`.
+        word: Setting that chooses another folder, such as `policy.artifacts.scout`. Text for the error message.
 
     Raises:
-        UsageError: The folder is beside the shipped target, and no training of the user's made it.
+        UsageError: The folder exists, belongs to a shipped policy, and was not made by a training of the user.
     """
     made_here = (path / RESUME).is_file()
     if path.exists() and (path.parent / "target" / "target.json").is_file() and not made_here:
@@ -72,17 +77,21 @@ def check_not_shipped(path: Path, word: str) -> None:
 
 
 def target_names(results: str) -> list[str]:
-    """Return the names of all targets: shipped ones, then those of the results folder."""
+    """Return the names of all targets: the shipped ones, then those in the results folder."""
     shipped = sorted(path.parent.parent.name for path in shipped_dir().glob("[!.]*/target/target.json"))
     stored = sorted(path.parent.name for path in (results_dir(results) / "artifacts/target").glob("[!.]*/target.json"))
     return list(dict.fromkeys([*shipped, *stored]))
 
 
 def beside(target: Path, kind: str) -> Path:
-    """Return the folder of a target's artifact of a kind.
+    """Return the folder in which an artifact of a target is searched by default. It need not exist.
 
-    A shipped policy has both side by side (`pretrained/<name>/target` and `<kind>`), a trained one has
-    `artifacts/target/<name>` and `artifacts/<kind>/<name>`. Any other target has a subfolder.
+    For a shipped target `pretrained/<name>/target` this is `pretrained/<name>/<kind>`, for a trained target
+    `artifacts/target/<name>` it is `artifacts/<kind>/<name>`. For any other target it is a subfolder `<kind>`.
+
+    Args:
+        target: Folder of the target.
+        kind: Kind of artifact, such as `drafter`.
     """
     if target.name == "target":
         return target.parent / kind

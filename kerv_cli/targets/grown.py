@@ -1,8 +1,9 @@
-"""A grown target: the tokens of a trained policy at the price of a larger trunk (docs/methods.md §0.2).
+"""A grown target: a trained policy whose trunk is enlarged, so that it costs more but gives the same tokens.
 
-Only the layers grow. The residual stream gets channels that stay zero, every layer more heads and hidden units whose
-output weights are zero, and further layers add nothing. In exact arithmetic the outputs are equal, and every weight is
-still read and multiplied. The folder holds a recipe; the weights are made when the target is loaded.
+It shows how a method behaves at the speed of a larger model (docs/methods.md §0.2). Only the layers grow. They get
+additional channels that stay zero, additional heads and hidden units whose output weights are zero, and additional
+layers that add nothing. The outputs are equal except for rounding, but every weight is read and multiplied. The folder
+of a grown target contains a recipe. The weights are made when it is loaded.
 """
 
 from __future__ import annotations
@@ -31,16 +32,16 @@ from kerv_cli.targets.folders import find_target
 from kerv_cli.targets.settings import BuildTargetSettings, GrowSettings
 
 STD = 0.02
-"""Spread of the weights that change nothing."""
+"""Standard deviation of the additional weights."""
 
 
 @dataclass
 class Recipe(GrowSettings):
-    """What a grown target's folder says: the shape, and the policy that it grows from.
+    """The content of a grown target's folder: the shape, and the policy that is enlarged.
 
     Attributes:
-        base: Folder of that policy's target.
-        sha256: Hash of its weights.
+        base: Folder of the policy's target.
+        sha256: Hash of the policy's weights.
     """
 
     base: str = ""
@@ -48,7 +49,7 @@ class Recipe(GrowSettings):
 
 
 def grow_stack(stack: LayerStack, shape: GrowSettings, layers: int) -> None:
-    """Replace the layers of a stack by larger ones that compute the same.
+    """Replace the layers of a stack by larger layers, and more of them, that compute the same function.
 
     Args:
         stack: A trunk or a drafter.
@@ -56,7 +57,7 @@ def grow_stack(stack: LayerStack, shape: GrowSettings, layers: int) -> None:
         layers: Number of new layers.
 
     Raises:
-        UsageError: The shape is smaller, or a head's channels are no multiple of the old ones.
+        UsageError: The new shape is smaller, or the channels of a head are no multiple of the old ones.
     """
     old: list[Any] = list(stack.layers)
     stack.packed = None
@@ -80,7 +81,7 @@ def grow_stack(stack: LayerStack, shape: GrowSettings, layers: int) -> None:
 
 
 def _grown_layer(old: Layer | None, stack: LayerStack, shape: GrowSettings, generator: torch.Generator) -> Layer:
-    """Make a layer with the output of `old`, or one that adds nothing."""
+    """Make a layer of the new shape that has the same output as `old`, or one that adds nothing if `old` is None."""
     new = Layer(shape.width, shape.heads, shape.feed_forward)
     width, channels, wide = stack.width, stack.width // stack.heads, shape.width // shape.heads
     with torch.no_grad():
@@ -91,15 +92,15 @@ def _grown_layer(old: Layer | None, stack: LayerStack, shape: GrowSettings, gene
         if old is None:
             return new
         for name in ("attention_norm", "feed_norm"):
-            # the mean square is over more channels: ε and gain make up for the zeros among them
+            # the mean square includes the additional zeros: a smaller ε and gain correct for that
             norm, small = getattr(new, name), getattr(old, name)
             norm.weight[:width] = small.weight * (width / shape.width) ** 0.5
             norm.eps = small.eps * width / shape.width
         rows = _head_rows(stack.heads, channels, wide)
         qkv = new.qkv.weight.view(3, shape.width, shape.width)
-        qkv[1, : stack.heads * wide] = 0.0  # keys of added channels, so that they do not count in a score
+        qkv[1, : stack.heads * wide] = 0.0  # additional channels of keys are 0, so that scores do not change
         for part, small in enumerate(old.qkv.weight.view(3, width, width)):
-            # scores are divided by the root of a head's channels
+            # attention divides scores by the square root of a head's channels, of which there are more now
             qkv[part, rows, :width] = small * ((wide / channels) ** 0.5 if part == 0 else 1.0)
         new.out.weight[:width, rows] = old.out.weight
         units = old.down.in_features
@@ -111,33 +112,38 @@ def _grown_layer(old: Layer | None, stack: LayerStack, shape: GrowSettings, gene
 
 
 def _head_rows(heads: int, channels: int, wide: int) -> Tensor:
-    """Return the new row of each old head channel, (heads · channels,).
+    """Return the index of each old head channel among the new ones, (heads · channels,).
 
-    Rotary pair i of `channels` has the frequency of pair i · wide / channels of `wide`.
+    A channel must keep its rotary frequency: pair i of the old head becomes pair i · wide / channels.
+
+    Args:
+        heads: Number of old heads.
+        channels: Channels of an old head.
+        wide: Channels of a new head.
     """
     half = torch.arange(channels // 2) * (wide // channels)
     return (torch.arange(heads)[:, None] * wide + torch.cat([half, half + wide // 2])).flatten()
 
 
 def _noise(shape: torch.Size, generator: torch.Generator) -> Tensor:
-    """Return weights that half precision holds without loss, as it does those of the policy."""
+    """Return random weights that half precision can hold without loss, like the policy's own weights."""
     return (torch.randn(shape, generator=generator) * STD).half().float()
 
 
 def recipe_of(description: TargetDescription) -> Recipe:
-    """Return the recipe of a grown target.
+    """Return the recipe in a grown target's description.
 
     Raises:
-        CheckpointError: The description holds none.
+        CheckpointError: The description contains no recipe.
     """
     return read(Recipe, description.settings.get("grown", {}), "a grown target's recipe")
 
 
 def check_weights(folder: Path, description: TargetDescription) -> None:
-    """Check that the policy that the target grows from is there, unchanged.
+    """Check that the weights of the policy that a grown target enlarges are unchanged.
 
     Raises:
-        CheckpointError: It is not.
+        CheckpointError: The policy is missing, or its weights have changed.
     """
     recipe = recipe_of(description)
     if checkpoint.read_target(Path(recipe.base)).sha256 != recipe.sha256:
@@ -145,7 +151,7 @@ def check_weights(folder: Path, description: TargetDescription) -> None:
 
 
 def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> CompactTarget:
-    """Load the base and grow its trunk."""
+    """Load the policy that the recipe names, and enlarge its trunk; arguments as `compact.folder.build`."""
     recipe = recipe_of(description)
     base = Path(recipe.base)
     target = build_compact(base, checkpoint.read_target(base), device, dtype)
@@ -156,13 +162,13 @@ def build(folder: Path, description: TargetDescription, device: str, dtype: torc
 
 
 def grow(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
-    """Write the recipe of `kerv build target grow=SHAPE policy.target=NAME`.
+    """Make a grown target, for `kerv build target grow=SHAPE policy.target=NAME`: write its recipe.
 
     Returns:
-        The target's folder, and figures for the user.
+        The target's folder; name -> number for the user, such as the number of weights.
 
     Raises:
-        UsageError: The policy is of another family, or does not fit into the shape.
+        UsageError: The policy is no compact target, or it does not fit into the new shape.
     """
     base = find_target(settings.results, settings.base).resolve()
     description = checkpoint.read_target(base)

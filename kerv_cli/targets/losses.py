@@ -1,4 +1,4 @@
-"""Losses that targets and drafters share."""
+"""Training losses of targets and drafters."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from torch import Tensor
 
 
 def soft_labels(tokens: int, sigma: float) -> Tensor:
-    """Return a row per true bin (V, V): a discrete Gaussian of `sigma` bins. The identity for sigma 0.
+    """Return the probabilities (V, V) that a model should predict: one row for each true token.
+
+    A row is a Gaussian around the true token.
 
     Args:
-        tokens: V, number of bins.
-        sigma: Standard deviation in bins.
+        tokens: V, number of tokens.
+        sigma: Standard deviation in bins. 0 means that only the true token has a probability.
     """
     bins = torch.arange(tokens, dtype=torch.float32)
     if sigma <= 0:
@@ -21,10 +23,21 @@ def soft_labels(tokens: int, sigma: float) -> Tensor:
 
 
 def token_loss(logits: Tensor, tokens: Tensor, labels: Tensor) -> Tensor:
-    """Return the mean cross-entropy of logits (B, N, V) with the soft labels of tokens (B, N)."""
+    """Return the mean cross-entropy between predictions and soft labels.
+
+    Args:
+        logits: (B, N, V) predictions.
+        tokens: (B, N) true tokens.
+        labels: (V, V) result of `soft_labels`.
+    """
     return -(labels[tokens] * F.log_softmax(logits.float(), -1)).sum(-1).mean()
 
 
 def position_loss(estimated: Tensor, places: Tensor) -> Tensor:
-    """Return the smooth L1 loss of estimated positions (B, K, 3) in metres, in units of 2 cm."""
+    """Return half the smooth L1 loss of positions (B, K, 3) in metres, computed in units of 2 cm.
+
+    Args:
+        estimated: Estimated positions.
+        places: True positions.
+    """
     return F.smooth_l1_loss(estimated / 0.02, places / 0.02, beta=1.0) * 0.5

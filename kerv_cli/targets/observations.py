@@ -1,4 +1,4 @@
-"""Read demonstrations as observations: for training a compact target in batches, or as any target sees them."""
+"""Read observations from demonstrations: in batches to train a compact target, or one by one for any target."""
 
 from __future__ import annotations
 
@@ -22,23 +22,26 @@ from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.demos.frames import EncodedFrames
 
 BATCH = 64
-"""Observations that a target encodes and decodes together."""
+"""Number of observations that a target encodes and decodes at once."""
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Base of dataclasses with one row per sample: tensors, encoded frames, or None for frames that are not seen."""
+    """Base class of dataclasses whose fields have one row per sample.
+
+    A field is a tensor, or encoded images. It is None if there are no images.
+    """
 
     def __len__(self) -> int:
         return next(len(x) for x in vars(self).values() if x is not None)
 
     def where(self, chosen: Tensor) -> Self:
-        """Return the rows that a mask (n,) or indices select."""
+        """Return the rows that are selected by a boolean mask (n,) or by indices."""
         return type(self)(*(None if x is None else x[chosen] for x in vars(self).values()))
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """Return all rows of `parts`, in order."""
+        """Return the rows of all `parts`, one after the other."""
         return cls(*(_joined([getattr(part, field.name) for part in parts]) for field in fields(cls)))
 
 
@@ -50,16 +53,24 @@ def _joined(column: list[Any]) -> Any:
 
 @dataclass(frozen=True)
 class Observations(Rows):
-    """n observations, in the order of episodes and control steps."""
+    """n observations, ordered by episode and control step.
 
-    frames: EncodedFrames | None  # (n, size, size x views, 3) uint8; None for a state policy
-    proprioception: Tensor  # (n, p) float32
-    states: Tensor  # (n, s) float32, privileged
-    words: Tensor  # (n, L) int64
-    steps: Tensor  # (n,) int64, control steps since the start of the episode
+    Attributes:
+        frames: (n, size, size x views, 3) uint8 images. None for a policy that reads the state.
+        proprioception: (n, p) float32, the robot's own measurements.
+        states: (n, s) float32, the simulator's privileged state.
+        words: (n, L) int64, ids of the instruction's words.
+        steps: (n,) int64, control steps since the start of the episode.
+    """
+
+    frames: EncodedFrames | None
+    proprioception: Tensor
+    states: Tensor
+    words: Tensor
+    steps: Tensor
 
     def inputs(self, indices: Tensor, device: torch.device) -> Inputs:
-        """Return the observations at `indices` (B,) as a batch on `device`."""
+        """Return the observations at indices (B,) as a batch on a device. Their images are decoded."""
         images = None
         if self.frames is not None:
             images = torch.from_numpy(self.frames[indices].pixels()).to(device).permute(0, 3, 1, 2)
@@ -73,17 +84,17 @@ def read_observations(
     words: WordTokenizer,
     chosen: slice | np.ndarray = slice(None),
 ) -> Observations:
-    """Return the observations of an episode from which a compact policy learns.
+    """Return the observations of an episode, to train a compact policy.
 
     Args:
         episode: A stored episode.
-        settings: Shapes of the policy. One that sees gets the steps with a frame, another every step.
+        settings: Shapes of the policy. If it reads images, only control steps with an image count, else every step.
         space: Observation space of the demonstrations.
         words: The policy's vocabulary.
-        chosen: Which of the observations; by default all.
+        chosen: Which of these observations to return, as indices or a slice.
 
     Raises:
-        CheckpointError: Frames of another size than the policy takes.
+        CheckpointError: The images have a different size than the policy takes.
     """
     sees, frames = settings.observation == "vision", None
     steps = steps_of(episode, sees)[chosen]
@@ -98,35 +109,43 @@ def read_observations(
 
 
 def read_chunks(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarray:
-    """Return (n, H, D) float32: the expert's next H = `chunk` clean actions from each of `steps` (n,) on.
+    """Return the expert's actions that follow each of some control steps, without added noise.
 
-    A chunk that begins near the end takes labels that were recorded after the success.
+    A chunk that begins near the end includes actions that were recorded after the success.
+
+    Args:
+        episode: A stored episode.
+        steps: (n,) control steps at which the chunks begin.
+        chunk: H, control steps per chunk.
+
+    Returns:
+        (n, H, D) float32, environment units.
 
     Raises:
-        CheckpointError: Too few of them were recorded.
+        CheckpointError: Too few actions were recorded after the success.
     """
     check_tail(episode, chunk, f"chunks of {chunk}")
     return np.stack([episode.labels[t : t + chunk] for t in steps])
 
 
 def steps_of(episode: DemoEpisode, sees: bool) -> np.ndarray:
-    """Return the control steps (n,) with a recorded observation: for a policy that sees, those with a frame."""
+    """Return the control steps (n,) at which a policy can observe: all, or if it `sees` images those with an image."""
     return episode.frame_steps if sees else np.arange(episode.steps)
 
 
 def observations_of(
     target: Target, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace
 ) -> list[Observation]:
-    """Return the observations at control steps (n,) of a demonstration; all cameras see the recorded frame.
+    """Return the observations of a target at some control steps of a demonstration.
 
     Args:
-        target: Its cameras and, if it has one, its `frame_shape` decide what is read.
+        target: The target. Each of its cameras gets the recorded image.
         episode: The demonstration.
-        steps: Control steps (n,).
+        steps: (n,) control steps.
         space: Observation space of the demonstrations.
 
     Raises:
-        CheckpointError: A step without a frame, or frames of another size.
+        CheckpointError: The target reads images, but a step has none, or they have a different size than it takes.
     """
     pictures: list[dict[str, np.ndarray]] = [{} for _ in steps]
     if target.cameras:
@@ -145,7 +164,16 @@ def observations_of(
 
 
 def prompts_of(target: Target, observations: Iterable[Observation], size: int = BATCH) -> Iterator[Tensor]:
-    """Yield the prompts (B, P, E) of the observations in order, at most `size` of one length together."""
+    """Encode observations as prompts, in order.
+
+    Args:
+        target: The target.
+        observations: The observations.
+        size: Maximum number of observations in a batch.
+
+    Yields:
+        Batches of prompts (B, P, E). All prompts of a batch have the same length.
+    """
     remaining = iter(observations)
     while batch := list(itertools.islice(remaining, size)):
         if isinstance(target, EncodesMany):
@@ -156,10 +184,15 @@ def prompts_of(target: Target, observations: Iterable[Observation], size: int = 
 
 
 def check_tail(episode: DemoEpisode, steps: int, use: str) -> None:
-    """Refuse an episode with fewer than `steps` labels from its last control step on.
+    """Check that a chunk can begin at the last control step of an episode.
+
+    Args:
+        episode: The episode.
+        steps: Number of expert actions that are needed from the last control step on.
+        use: What they are needed for, text for the error message.
 
     Raises:
-        CheckpointError: Too few labels were recorded after the success; the message names their `use`.
+        CheckpointError: Too few actions were recorded after the success.
     """
     tail = len(episode.labels) - episode.steps
     if tail < steps - 1:
@@ -170,10 +203,14 @@ def check_tail(episode: DemoEpisode, steps: int, use: str) -> None:
 
 
 def check_frames(episode: DemoEpisode, size: int) -> None:
-    """Refuse frames that are not views of the policy's size in pixels, side by side.
+    """Check that an episode's images have the size that a policy takes.
+
+    Args:
+        episode: The episode.
+        size: Pixels per side of a camera view. An image may consist of several views side by side.
 
     Raises:
-        CheckpointError: They are not.
+        CheckpointError: The images have a different size.
     """
     height, width = episode.frames.shape[1:3]
     if height != size or width % size:
@@ -184,10 +221,14 @@ def check_frames(episode: DemoEpisode, size: int) -> None:
 
 
 def held_out_every(episodes: int, share: float) -> int:
-    """Return k: every k-th of the episodes is held out, for a share above 0 and at most 0.5.
+    """Return k such that every k-th episode is held out for validation.
+
+    Args:
+        episodes: Number of episodes.
+        share: Share of episodes to hold out, above 0 and at most 0.5.
 
     Raises:
-        CheckpointError: A single episode.
+        CheckpointError: There is only one episode, which cannot be in both parts.
     """
     if episodes < 2:
         raise CheckpointError("one demonstration cannot be both trained on and held out: record at least two")
@@ -198,12 +239,16 @@ S = TypeVar("S", bound=Rows)
 
 
 def split(samples: S, share: float) -> tuple[S, S]:
-    """Return (training, held out) by whole episodes; `samples` has a tensor `episodes`.
+    """Split samples into training and held-out samples. All samples of an episode go to the same part.
 
-    Every k-th episode is held out, so that each task, plain and perturbed, is in both parts.
+    Every k-th episode is held out, so that both parts contain each task, with and without perturbations.
+
+    Args:
+        samples: Samples with a tensor `episodes`, the index of each sample's episode.
+        share: Share of episodes to hold out, above 0 and at most 0.5.
 
     Raises:
-        CheckpointError: A single episode.
+        CheckpointError: There is only one episode, which cannot be in both parts.
     """
     episodes: Tensor = getattr(samples, "episodes")  # noqa: B009
     every = held_out_every(int(episodes.max()) + 1, share)

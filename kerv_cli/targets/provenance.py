@@ -1,4 +1,4 @@
-"""Origin of a number or a file: machine, versions, git commit."""
+"""Describe how a result or a file was made: machine, versions of packages, git commit."""
 
 from __future__ import annotations
 
@@ -17,24 +17,35 @@ _HERE = Path(__file__).resolve().parent
 
 
 def provenance(device: str) -> dict[str, Any]:
-    """Return versions, commit and device, for a checkpoint or a calibration."""
+    """Return versions, commit and device, to be stored in an artifact.
+
+    Args:
+        device: Device of torch, such as `cpu` or `cuda:0`.
+    """
     return {"versions": versions(), "git_commit": git_commit(), "device": device, "device_name": device_name(device)}
 
 
 def provenance_of(command: str, settings: Any, device: str, **figures: Any) -> dict[str, Any]:
-    """Return the command that makes an artifact, its settings and figures, then `provenance`."""
+    """Return the whole provenance of an artifact: command, settings, numbers, versions, commit and device.
+
+    Args:
+        command: Name of the command that makes the artifact.
+        settings: Dataclass of the command's settings.
+        device: Device of torch, such as `cpu` or `cuda:0`.
+        **figures: Numbers to store with it, such as the number of parameters.
+    """
     return {"command": command, "settings": asdict(settings), **figures, **provenance(device)}
 
 
 def stamp(device: str) -> dict[str, str]:
-    """Return host, device, versions and commit for a table's row: flat, every value a string."""
+    """Return host, device, versions and commit as strings, one column of a table each."""
     numbers = {f"{name}_version": number for name, number in versions().items()}
     return {"host": socket.gethostname(), "device_name": device_name(device), **numbers, "git_commit": git_commit()}
 
 
 @functools.cache
 def versions() -> dict[str, str]:
-    """Return the versions of Python and PACKAGES. A package that is not installed is `absent`."""
+    """Return the versions of Python and of each package in PACKAGES, `absent` if it is not installed."""
     return {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}}
 
 
@@ -47,7 +58,7 @@ def _version(package: str) -> str:
 
 @functools.cache
 def device_name(device: str) -> str:
-    """Return the product name of the GPU for a CUDA device, else of the processor."""
+    """Return the model name of the GPU for a CUDA device, else of the CPU."""
     if device.startswith("cuda"):
         import torch
 
@@ -62,9 +73,9 @@ def device_name(device: str) -> str:
 
 @functools.cache
 def git_commit() -> str:
-    """Return the checkout's commit, with `+changes` if tracked files differ. `none` outside a checkout of kerv."""
+    """Return the git commit of kerv, with `+changes` if files were modified. `none` if this is no checkout of kerv."""
     if shutil.which("git") is None or not _git("ls-files", "--error-unmatch", "__init__.py"):
-        return "none"  # an installed copy may lie inside somebody else's repository
+        return "none"  # an installed copy may be inside another project's repository
     changes = _git("status", "--porcelain", "--untracked-files=no", "--", ".")
     return _git("rev-parse", "HEAD") + ("+changes" if changes else "")
 

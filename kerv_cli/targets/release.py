@@ -1,4 +1,4 @@
-"""Installs an archive of a released policy: `kerv build policy` checks it and puts it where policies are looked for."""
+"""Install a released policy from an archive, for `kerv build policy`: download, check, unpack."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from kerv_cli.targets.checkpoint import read_target
 from kerv_cli.targets.folders import RELEASED
 from kerv_cli.targets.settings import BuildPolicySettings
 
-TIMEOUT = 60.0  # seconds without an answer
+TIMEOUT = 60.0  # seconds without an answer after which a download fails
 
 
 def install(settings: BuildPolicySettings) -> Path:
-    """Unpack the archive `settings.source`. Return the policy's folder below `<results>/pretrained`.
+    """Unpack the archive `settings.source` and return the policy's folder in `<results>/pretrained`.
 
-    Weights are checked against their description. The target is checked against the hash that kerv knows, or another
-    policy's archive against the hash in the settings.
+    The weights must have the hash in their description. For kerv's own policies this must be the hash in RELEASED. For
+    any other policy the archive must have the hash `settings.sha256`.
 
     Raises:
-        UsageError: There is no source, no archive, or nothing to check it with.
-        CheckpointError: The archive is another one than was asked for, damaged, or holds no policy.
+        UsageError: The source is missing, `sha256` is missing for a policy that is not kerv's, or the policy exists.
+        CheckpointError: The archive is damaged, has a different hash, or contains no policy.
         KervError: The download failed.
-        StorageError: Writing failed.
+        StorageError: The disk is full or read-only, or permission is missing.
     """
     source = settings.source
     if not source:
@@ -52,7 +52,7 @@ def install(settings: BuildPolicySettings) -> Path:
 
 
 def _archive(source: str, scratch: Path) -> Path:
-    """Return the file of a path, or the download of a URL."""
+    """Return the path of the archive. A URL is downloaded into the folder `scratch`."""
     if not source.startswith(("http://", "https://")):
         path = as_path(source)
         if not path.is_file():
@@ -70,7 +70,16 @@ def _archive(source: str, scratch: Path) -> Path:
 
 
 def _unpacked(archive: Path, content: Path, source: str) -> Path:
-    """Return the one policy's folder in the archive."""
+    """Unpack an archive and return the folder of the policy in it.
+
+    Args:
+        archive: The archive (.tar.gz).
+        content: Folder to unpack to.
+        source: Path or URL of the archive as typed, for the error message.
+
+    Raises:
+        CheckpointError: The archive is damaged, or does not contain exactly one policy.
+    """
     try:
         with tarfile.open(archive) as file:
             file.extractall(content, filter="data")

@@ -1,4 +1,4 @@
-"""Settings of targets that come from elsewhere."""
+"""Settings of `kerv build target` and `kerv build policy`, which install targets that kerv did not train here."""
 
 from __future__ import annotations
 
@@ -11,44 +11,44 @@ from kerv_cli.base.settings import CommandSettings, RunSettings
 
 @dataclass
 class GrowSettings:
-    """The larger trunk of a grown target (docs/methods.md §0.2)."""
+    """Shape of the enlarged trunk of a grown target (docs/methods.md §0.2)."""
 
-    width: int = number(0, 0, 65_536, help="of the layers; 0: nothing grows")
+    width: int = number(0, 0, 65_536, help="width of the layers; 0: the trunk is not enlarged")
     heads: int = number(0, 0, 1024, help="attention heads of a layer")
     feed_forward: int = number(0, 0, 262_144, help="hidden units of a layer")
     layers: int = number(0, 0, 1024, help="decoder layers")
-    drafter: bool = setting(False, "grow the drafter's layers too, to the same shape")
+    drafter: bool = setting(False, "enlarge the drafter's layers too, to the same shape")
 
 
 @dataclass
 class BuildTargetSettings(RunSettings):
-    """Settings of `kerv build target`: a published checkpoint, or a larger copy of a policy, becomes a target."""
+    """Settings of `kerv build target`, which imports a published checkpoint or enlarges a policy."""
 
     groups: ClassVar = {"grow": "none", "runtime": "cpu"}
 
     checkpoint: str = setting("", "folder of a Hugging Face checkpoint")
     family: str = setting("openvla", "kind of target")
-    grow: GrowSettings = setting(GrowSettings, "shape to grow policy.target to: 60m, 150m, 1b, openvla-7b (conf/grow)")
-    base: str = setting("mt10-vision", "the policy that grows")
+    grow: GrowSettings = setting(GrowSettings, "enlarge policy.target to this shape: 60m, 150m, 1b, openvla-7b")
+    base: str = setting("mt10-vision", "the policy that is enlarged")
     name: str = setting("openvla", "folder below <results>/artifacts/target, or a path")
-    statistics: str | None = setting(None, "data set whose actions it emits; null: the only one there is")
+    statistics: str | None = setting(None, "data set whose action statistics it uses; null: the only one in it")
     environment: str | None = setting(
-        None, "environment whose DoFs, control rate and camera it gets; null: OpenVLA's own"
+        None, "environment whose DoFs, control rate and camera it uses; null: OpenVLA's own"
     )
-    control_hz: float = number(5.0, above=0, most=10_000, help="control steps per second, without an environment")
-    camera: str = setting("", "camera whose image it sees; empty: the environment's first, else primary")
+    control_hz: float = number(5.0, above=0, most=10_000, help="control steps per second, if environment= is null")
+    camera: str = setting("", "camera whose image it reads; empty: the environment's first, else primary")
     prompt: str = choice("openvla", "openvla", "openvla_v01", help="text around the instruction")
-    crop: bool = setting(False, "show the central 90 %, for checkpoints fine-tuned with augmented images (LIBERO's)")
+    crop: bool = setting(False, "crop to the central 90 %, for checkpoints trained on augmented images (LIBERO's)")
     libero: bool = setting(
-        False, "before that send it through JPEG and Lanczos, as OpenVLA's evaluation on LIBERO does"
+        False, "first compress the image as JPEG and resize it by Lanczos, as OpenVLA's evaluation on LIBERO does"
     )
-    int8: bool = setting(False, "keep the language model's layers in one byte per weight")
-    prompt_tokens: int = number(64, 1, 65_536, help="longest prompt, without the vision tokens")
+    int8: bool = setting(False, "store the language model's layers with one byte per weight")
+    prompt_tokens: int = number(64, 1, 65_536, help="longest prompt in tokens, without the vision tokens")
 
 
 @dataclass
 class BuildPolicySettings(CommandSettings):
-    """Settings of `kerv build policy`: fetch a released policy that the wheel leaves out."""
+    """Settings of `kerv build policy`, which installs a released policy that is not part of the wheel."""
 
-    source: str = setting("", "archive of the policy's folder (.tar.gz), by URL or path")
+    source: str = setting("", "archive of the policy's folder (.tar.gz), URL or path")
     sha256: str = setting("", "SHA-256 of the archive; not needed for kerv's own policies")
