@@ -19,7 +19,7 @@ from kerv_cli.lab.study import new_name
 
 
 def again_words(run: RunEntry, results: str) -> list[str]:
-    """Return the command-line arguments (without `kerv`) that repeat a run, or resume its repetition."""
+    """Return the command-line arguments (without `kerv`) that repeat a run in a results folder, or resume this."""
     return ["runs", "rerun", run.id, *([] if results == CommandSettings().results else [f"results={results}"])]
 
 

@@ -50,7 +50,7 @@ _EVERY = 10_000
 def connect_foreign(path: Path, **options: Any) -> sqlite3.Connection:
     """Open a SQLite file from somebody else, read-only.
 
-    A query fails after a number of steps that depends on the file's size.
+    To protect against endless queries, a query fails after a number of steps that depends on the file's size.
 
     Args:
         path: The file.
@@ -58,7 +58,7 @@ def connect_foreign(path: Path, **options: Any) -> sqlite3.Connection:
 
     Raises:
         OSError: The file is missing or is not a regular file.
-        ValueError: The file is incomplete, or contains views, which could make any query slow.
+        ValueError: The file is incomplete, or contains views, which could run any query.
     """
     size = regular(path).stat().st_size
     log = path.with_name(f"{path.name}-wal")

@@ -55,7 +55,7 @@ class RealClock:
         self.expected = 0
 
     def delay(self, decode: DecodeRecord, observed: int) -> Delay:
-        """Return the delay of a decode.
+        """Return how long a decode takes in control steps, and how many of its actions are then too old to execute.
 
         Args:
             decode: Record of the decode.
@@ -112,7 +112,7 @@ def check(settings: RolloutSettings, spec: EnvironmentSpec, target: TargetDescri
 
 
 def calibrates(settings: RolloutSettings) -> bool:
-    """Return whether the time of autoregressive decoding must first be measured on this machine."""
+    """Return whether `rollout.ar_ms` needs the time of autoregressive decoding to be measured on this machine."""
     timing = settings.rollout
     return timing.clock == REAL and timing.latency == MEASURED and timing.ar_ms > 0
 

@@ -140,7 +140,7 @@ def _check_expert(settings: RolloutSettings) -> None:
 
 
 def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
-    """Return the decoder for one setting and one task, warmed up.
+    """Return the decoder for one setting (a method with all its options) on one task, warmed up.
 
     Raises:
         UsageError: As in `check`.
@@ -166,7 +166,7 @@ def _method_decoder(settings: RolloutSettings, task: str = "") -> Decoder:
 
 
 def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:
-    """Return the clock for one setting and one task; None if the world waits for decodes."""
+    """Return the clock that tells how long decodes take for the world. None if the world waits for decodes."""
     if settings.rollout.clock == WAITS:
         return None
     target, measured = None, 0.0

@@ -42,7 +42,7 @@ _opened: OrderedDict[tuple[str, CameraSettings, int], World] = OrderedDict()  # 
 
 
 def open_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) -> World:
-    """Return this process's world for a task. It is opened if needed; the most recently used worlds stay open.
+    """Return this process's world (an open environment) for a task. The most recently used worlds stay open.
 
     Args:
         task: Name of the task.
@@ -61,7 +61,7 @@ def open_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) -
 
 
 def new_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) -> World:
-    """Open a further world for a task. The caller must close it."""
+    """Open one more world (environment) for a task. The caller must close it."""
     world = spec_of(task).open_world(task, settings.camera, settings.horizon)
     world.stress = stress
     return world
@@ -74,7 +74,7 @@ def close_worlds() -> None:
 
 
 class Runner:
-    """Runs episodes of one setting on one task. Its decoder is built and warmed up once.
+    """Runs episodes of one setting (a method with all its options) on one task. Its decoder is built only once.
 
     Its episodes may alternate with those of other runners, because decoders share no state.
     """
@@ -218,9 +218,9 @@ def run_batch(settings: RolloutSettings, requests: Iterable[Request[K]]) -> Iter
 
 
 def is_recorded(settings: RolloutSettings, seed: int) -> bool:
-    """Return whether the episode with this seed keeps its images.
+    """Return whether images of the episode with this seed are recorded.
 
-    The first `settings.record` episodes of a task do, or all if it is negative. Episodes of a batch never do.
+    They are for the first `settings.record` episodes of a task, or for all if it is negative. In a batch, never.
     """
     return settings.rollout.batch == 1 and (settings.record < 0 or seed - settings.seed < settings.record)
 
