@@ -208,7 +208,12 @@ class Artifact(Generic[T]):
         return self.described(file)
 
     def described(self, file: Path) -> T:
-        """Read the description in an existing file. The errors are those of `read`."""
+        """Read the description in an existing file.
+
+        Raises:
+            CheckpointError: The description is damaged or of another format. Or the files beside it have other hashes
+                than it names.
+        """
         try:
             description = read_file(self.schema, file)
         except CheckpointError as error:

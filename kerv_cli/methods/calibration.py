@@ -174,7 +174,9 @@ class Calibration:
         return windows[str(window)]
 
     def skip_levels(self, task: str, datastore: str) -> tuple[float, float, float]:
-        """Return the task's `low`, `s_min` and `high`, as in `SkipLevel`. All three are NEVER if the task never skips.
+        """Return (low, s_min, high): the similarity s_min from which the task skips verification, and its bounds.
+
+        Feedback may move s_min between the bounds. All three are NEVER if the task never skips.
 
         Args:
             task: Full name of the task.

@@ -1,8 +1,8 @@
 """Who acts while `kerv demos` records: the scripted expert, or a policy.
 
 If a policy acts, the expert labels the states that it visits (DAgger; Ross, Gordon, Bagnell 2011). The policy may
-decode with any method. For example, `method=scout_unverified` records the states that a drafter's unverified chunks
-lead to, so that the drafter can be trained on them.
+decode with any method. For example, `method=scout_unverified` records the states that a drafter's chunks lead
+to without verification, so that the drafter can be trained on them.
 """
 
 from __future__ import annotations

@@ -103,7 +103,7 @@ def needs(methods: tuple[str, ...], sees: bool, runnable: bool = True) -> tuple[
 
 
 def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
-    """Return the state of an artifact, as in `Step.state`.
+    """Return the state of an artifact: `there`, `missing`, `unfinished`, `of other artifacts` or `step 300 of 4000`.
 
     Args:
         artifacts: The artifacts of the policy.

@@ -55,8 +55,12 @@ def wealth(values: np.ndarray, bound: float, delta: float) -> np.ndarray:
 def p_value(values: np.ndarray, bound: float, delta: float) -> float:
     """Return the p-value of the hypothesis that the mean is at least `bound`; 1 without values.
 
-    It is 1 / (largest wealth so far), so it stays valid if it is checked after each value. The arguments are those of
-    `wealth`.
+    It is 1 / (largest wealth so far), so it stays valid if it is checked after each value.
+
+    Args:
+        values: (n,) in [0, 1], in the order in which they came.
+        bound: The hypothesis is a mean of at least `bound`, in (0, 1).
+        delta: Error probability δ at which the bets aim to reject.
     """
     return float(1 / max(1.0, wealth(values, bound, delta).max(initial=1.0)))
 
@@ -64,7 +68,12 @@ def p_value(values: np.ndarray, bound: float, delta: float) -> float:
 def more_to_decide(values: np.ndarray, bound: float, delta: float) -> float:
     """Estimate how many more values like these the test needs until it rejects the hypothesis.
 
-    The estimate assumes the best constant bet. The arguments are those of `wealth`.
+    The estimate assumes the best constant bet.
+
+    Args:
+        values: (n,) in [0, 1], in the order in which they came.
+        bound: The hypothesis is a mean of at least `bound`, in (0, 1).
+        delta: Error probability δ at which the bets aim to reject.
 
     Returns:
         0 if the test rejects already. Infinity if the values are no evidence against the hypothesis.

@@ -151,7 +151,7 @@ class DrafterProposer(Proposer):
         return self.target.embed(upload([tokens], self.target.device))
 
     def observe(self, following: Tensor, hidden: Tensor, first: int) -> None:
-        """Run the drafter over the target's own hidden states. In the cache, they replace those of the last draft.
+        """Run the drafter over the target's own hidden states. In the cache, the last draft is overwritten.
 
         Args:
             following: (1, T, E) embedding of the token after each position.
@@ -340,7 +340,15 @@ class EagleDrafter(TrainableDrafter):
     ) -> tuple[StatesByLength, StatesByLength]:
         """Decode the demonstrations' observations greedily with the target. The expert's actions are not used.
 
-        The arguments and the result are those of `TrainableDrafter.examples`.
+        Args:
+            target: The loaded target, on the device to train on.
+            dataset: The demonstrations.
+            settings: Settings of the drafter.
+            held_out: Share of the episodes to hold out.
+            progress: Called with the amounts of work done and of all.
+
+        Returns:
+            The training examples, and the held-out examples, which come from other episodes.
 
         Raises:
             CheckpointError: There is only one episode, or an episode is damaged.

@@ -65,7 +65,7 @@ class DraftCache(Cache):
 
 
 class PublicDrafter(nn.Module):
-    """The network of a published drafter. It is called like `EagleNetwork`."""
+    """The network of a published drafter."""
 
     def __init__(self, shape: PublicShape) -> None:
         super().__init__()
@@ -96,9 +96,15 @@ class PublicDrafter(nn.Module):
         cache: DraftCache | None = None,
         seen: np.ndarray | Tensor | None = None,
     ) -> Tensor:
-        """Return the predicted hidden states (B, T, E). The arguments are those of `EagleNetwork.forward`.
+        """Return the predicted hidden states at the next positions, (B, T, E).
 
-        The first call, with an empty cache, must pass the whole prompt.
+        Args:
+            following: (B, T, E) embedding of the token after each position.
+            hidden: (B, T, E) hidden state at each position.
+            positions: (T,) rotary positions.
+            cache: Keys and values of earlier positions. If it is empty, this call must pass the whole prompt. None:
+                there are none.
+            seen: (T, M) bool, which of the last M keys each query sees. None: causal.
         """
         if cache is not None and not cache.length:
             cache.prompt = hidden.shape[1]

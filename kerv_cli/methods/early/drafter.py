@@ -113,7 +113,15 @@ class EarlyNetwork(Packable):
         return self.chosen(self(features.to(self.head.weight.dtype)), radius)
 
     def chosen(self, logits: Tensor, radius: int) -> Tensor:
-        """Choose the tokens of chunks from logits (B, N, V). The result is that of `draft`."""
+        """Choose the tokens of chunks from logits.
+
+        Args:
+            logits: (B, N, V).
+            radius: Acceptance radius, in bins.
+
+        Returns:
+            (B, N + 1) float64: the N tokens, then the estimated probability that all of them are accepted.
+        """
         tokens, odds = choose_with_odds(logits, radius, self.strict)
         return torch.cat([tokens.double(), odds.double()[:, None]], -1)
 
@@ -138,10 +146,15 @@ def choose(logits: Tensor, radius: int, strict: Tensor) -> Tensor:
 
 
 def choose_with_odds(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tensor, Tensor]:
-    """Choose tokens as `choose` does, and estimate the probability that all of them are accepted.
+    """Choose the tokens that are most likely to be accepted, and estimate how likely it is that all are.
 
     The estimate treats tokens as independent, and training on soft labels makes it too low. Use it only to compare
     chunks.
+
+    Args:
+        logits: (B, N, V).
+        radius: Acceptance radius, in bins.
+        strict: (N,) bool, whether the token must equal the target's.
 
     Returns:
         The tokens (B, N), and the estimates (B,).
@@ -194,7 +207,11 @@ class EarlyProposer(ChainProposer):
         return self._drafted[1:]
 
     def _rows(self, chunks: Sequence[Chunk]) -> Tensor:
-        """Draft several chunks with equal acceptance limits. The result (B, N + 1) is that of `EarlyNetwork.draft`."""
+        """Draft several chunks with equal acceptance limits.
+
+        Returns:
+            (B, N + 1) float64: the N tokens, then the estimated probability that all of them are accepted.
+        """
         features = torch.cat([self.target.pooled(chunk.prompt) for chunk in chunks])
         return self.early.draft(features, radius_of(chunks))
 
@@ -248,8 +265,17 @@ class EarlyDrafter(TrainableDrafter):
     ) -> tuple[Decodes, Decodes]:
         """Decode about `settings.samples` observations with the target, spread evenly over all episodes.
 
-        Prompts are pooled right after encoding, so that neither images nor prompts stay in memory. The arguments and
-        the result are those of `TrainableDrafter.examples`.
+        Prompts are pooled right after encoding, so that neither images nor prompts stay in memory.
+
+        Args:
+            target: The loaded target, on the device to train on.
+            dataset: The demonstrations.
+            settings: Settings of the drafter.
+            held_out: Share of the episodes to hold out.
+            progress: Called with the amounts of work done and of all.
+
+        Returns:
+            The training examples, and the held-out examples, which come from other episodes.
 
         Raises:
             CheckpointError: The images have another size than the target takes.

@@ -187,7 +187,17 @@ class ExactIndex:
         self.store = store
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return the k best rows, and rows whose similarity equals the k-th up to rounding. See `Index.candidates`."""
+        """Return the task's k most similar rows, and further rows that equal the k-th up to rounding.
+
+        Args:
+            key: (d,) float32.
+            task: Full name of the task.
+            k: Number of rows wanted.
+            without: Seed of an episode to leave out. None: use all episodes.
+
+        Returns:
+            The rows, in ascending order.
+        """
         shard = self.store.shards[task]
         scores = self.store.vectors[shard] @ key
         if without is not None:
@@ -233,7 +243,14 @@ class QdrantIndex:
                 self.client.upload_collection(self.name, store.vectors[rows], payloads, rows, wait=True)
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return candidate rows. See `Index.candidates`."""
+        """Return rows, in ascending order, that include the task's k rows most similar to a key.
+
+        Args:
+            key: (d,) float32.
+            task: Full name of the task.
+            k: Number of rows wanted.
+            without: Seed of an episode to leave out. None: use all episodes.
+        """
         m, store, shard = self.models, self.store, self.store.shards[task]
         must = [m.FieldCondition(key="task", match=m.MatchValue(value=task))]
         other = [] if without is None else [m.FieldCondition(key="seed", match=m.MatchValue(value=without))]
@@ -322,7 +339,7 @@ class Datastore:
 
     @property
     def content(self) -> str:
-        """Hash of the keys, the chunks and the target. See `Manifest.content`."""
+        """Hash of the keys, the chunks and the target. It stays the same if an equal datastore is built again."""
         return self.manifest.content
 
     def pooled(self, prompt: Tensor, target: ReadableTarget) -> Tensor:

@@ -282,7 +282,14 @@ class GroupRule(DistanceRule):
         return tuple(0 if strict else self.token_limit for strict in self.space.is_strict)
 
     def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
-        """Return the longest accepted path of whole groups. See `accept_by_group` for the arguments."""
+        """Return the longest accepted path of whole groups.
+
+        Args:
+            tree: The draft tree.
+            target_tokens: The target's tokens after the last committed token and after each node.
+            start: Number of committed tokens.
+            r: Not used.
+        """
         limits, bounds = self.limits(r), self.space.bounds
         return accept_by_group(tree, target_tokens, start, limits, group_limit=self.group_limit, bounds=bounds)
 

@@ -148,7 +148,11 @@ class ScoutProposer(EarlyProposer):
 
     @torch.inference_mode()
     def _rows(self, chunks: Sequence[Chunk]) -> Tensor:
-        """Draft several chunks with equal acceptance limits. The result (B, N + 1) is that of `EarlyNetwork.draft`."""
+        """Draft several chunks with equal acceptance limits.
+
+        Returns:
+            (B, N + 1) float64: the N tokens, then the estimated probability that all of them are accepted.
+        """
         seen = [chunk.observation for chunk in chunks if chunk.observation is not None]
         logits = torch.cat([self.scout(self.inputs(observation))[0] for observation in seen])
         return self.early.chosen(logits, radius_of(chunks))
@@ -194,7 +198,15 @@ class ScoutDrafter(EarlyDrafter):
     ) -> tuple[ScoutExamples, ScoutExamples]:
         """Decode about `settings.samples` observations with the target, spread evenly over all episodes.
 
-        The arguments and the result are those of `TrainableDrafter.examples`.
+        Args:
+            target: The loaded target, on the device to train on.
+            dataset: The demonstrations.
+            settings: Settings of the drafter.
+            held_out: Share of the episodes to hold out.
+            progress: Called with the amounts of work done and of all.
+
+        Returns:
+            The training examples, and the held-out examples, which come from other episodes.
 
         Raises:
             CheckpointError: The target has no camera, or the images have another size than the target takes.
