@@ -141,7 +141,7 @@ class Calibration:
 
     @property
     def tasks(self) -> Collection[str]:
-        """Tasks for which K_S was measured."""
+        """Tasks for which the reference level K_S of the variability was measured."""
         return self.variability
 
     def k_s(self, task: str) -> float:
@@ -221,7 +221,7 @@ class CalibrationArtifact(Artifact[Calibration]):
         return path
 
     def check_use(self, description: Calibration, use: Use) -> None:
-        """Refuse a task without K_S, if the method's threshold needs it.
+        """Refuse a task without the reference level K_S, if the method's threshold needs it.
 
         Raises:
             CheckpointError: K_S was not measured for a task.
@@ -231,7 +231,7 @@ class CalibrationArtifact(Artifact[Calibration]):
                 description.k_s(task)
 
     def command_beside(self, kinds: Collection[str]) -> tuple[str, ...]:
-        """Return the command that makes a calibration. Without a drafter among `kinds` it does not measure K_S."""
+        """Return the command that makes a calibration. Without a drafter in `kinds` it leaves K_S out."""
         return self.command if "drafter" in kinds else (*self.command, "decodes=0")
 
     def is_complete(self, description: Calibration, kinds: Collection[str]) -> bool:

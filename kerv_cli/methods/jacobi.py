@@ -45,7 +45,7 @@ class JacobiProposer(ChainProposer):
 
     @classmethod
     def build(cls, settings: JacobiProposerSettings, context: Context) -> JacobiProposer:
-        """Build proposer=jacobi."""
+        """Build the part that the setting `proposer=jacobi` chooses."""
         return cls(settings.depth)
 
     def begin(self, chunk: Chunk) -> None:

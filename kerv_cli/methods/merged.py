@@ -70,7 +70,7 @@ class MergedProposer(ChainProposer):
 
     @classmethod
     def build(cls, settings: MergedProposerSettings, context: Context) -> MergedProposer:
-        """Build proposer=merged."""
+        """Build the part that the setting `proposer=merged` chooses."""
 
         def source(name: str) -> ChainProposer:
             part = find("proposer", name)

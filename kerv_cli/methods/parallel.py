@@ -29,7 +29,7 @@ class ParallelPass(Skip):
 
     @classmethod
     def build(cls, settings: NoSettings, context: Context) -> ParallelPass:
-        """Build skip=parallel."""
+        """Build the part that the setting `skip=parallel` chooses."""
         return cls(context.target)
 
     def take(self, chunk: Chunk) -> bool:

@@ -57,7 +57,7 @@ class SpeedSkip(Skip):
 
     @classmethod
     def build(cls, settings: SpeedSkipSettings, context: Context) -> SpeedSkip:
-        """Build skip=speed."""
+        """Build the part that the setting `skip=speed` chooses."""
         from kerv_cli.methods.kerv.prediction import Ridge
 
         target = context.target

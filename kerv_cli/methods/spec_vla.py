@@ -37,7 +37,7 @@ class RelaxedRule(DistanceRule):
 
     @classmethod
     def build(cls, settings: RelaxedAcceptanceSettings, context: Context) -> RelaxedRule:
-        """Build acceptance=relaxed."""
+        """Build the part that the setting `acceptance=relaxed` chooses."""
         return cls(context.target.actions, settings.strict_dofs)
 
     def limits(self, r: int) -> tuple[int, ...]:
@@ -59,7 +59,7 @@ class FixedThresholdSettings:
 
 
 def fixed(settings: FixedThresholdSettings, context: Context) -> Fixed:
-    """Build threshold=fixed.
+    """Build the part that the setting `threshold=fixed` chooses.
 
     Raises:
         UsageError: The radius is larger than the distance of any two tokens.

@@ -56,7 +56,7 @@ class StreakSkip(Skip):
 
     @classmethod
     def build(cls, settings: StreakSkipSettings, context: Context) -> StreakSkip:
-        """Build skip=streak."""
+        """Build the part that the setting `skip=streak` chooses."""
         draft = context.built["prefill_draft"]
         return cls(settings, getattr(draft, "sources", [draft])[0])  # if the draft is merged, its first source
 
@@ -108,7 +108,7 @@ class AlwaysSkip(Skip):
 
     @classmethod
     def build(cls, settings: NoSettings, context: Context) -> AlwaysSkip:
-        """Build skip=always."""
+        """Build the part that the setting `skip=always` chooses."""
         return cls(context.built["prefill_draft"])
 
     def take(self, chunk: Chunk) -> bool:

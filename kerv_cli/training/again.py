@@ -20,15 +20,21 @@ from kerv_cli.training.target import TargetRun
 
 
 def training_again(run: RunEntry, results: str) -> TrainingRun:
-    """Return the training with the stored settings: an unfinished repetition, or a new one as `NAME-again`.
+    """Return a training that repeats an earlier one with its stored settings.
+
+    If an earlier repetition is unfinished, it is resumed. Otherwise the new training is named `NAME-again`.
+
+    Args:
+        run: The earlier training.
+        results: The results folder.
 
     Raises:
-        CheckpointError: Its description is missing, damaged or of another version.
+        CheckpointError: The description of the earlier training is missing, damaged or of another version.
     """
     path, stored = run.folder / f"{run.kind}.json", description_of(run).get("settings")
     if not isinstance(stored, dict):
         command = "target" if run.kind == "target" else "drafter"
-        raise CheckpointError(f"{path} does not say how it was trained: train anew with 'kerv train {command}'")
+        raise CheckpointError(f"{path} does not say how it was trained: train a new one with 'kerv train {command}'")
     row = unfinished(Database(results), run.kind, again_words(run, results))
     if row is not None:
         name = row.name

@@ -195,7 +195,7 @@ class CalibrationRun:
         return variability
 
     def decoder(self) -> Decoder:
-        """Return the decoder that measures K_S, with the proposer, acceptance and threshold of the settings."""
+        """Return the decoder whose drafts are compared with the target, as the settings choose it."""
         s = self.settings
         method = RolloutSettings(proposer=s.proposer, acceptance=s.acceptance, threshold=s.threshold)
         return Method.of(method).decoder(self.artifacts.target, self.artifacts.load)

@@ -138,7 +138,7 @@ class Certificate:
             raise UsageError(f"skip=certified with runtime.dtype={dtype}: the certificate is of {self.dtype}")
 
     def sentence(self) -> str:
-        """Return what the certificate states, in one sentence."""
+        """Return what the certificate states, as one sentence for the user."""
         chosen = self.certified
         if chosen is None:
             return "nothing is certified: every draft is verified"

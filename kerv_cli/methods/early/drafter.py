@@ -84,7 +84,7 @@ class EarlyNetwork(Packable):
         return Program(self.logits, (1, len(self.mean))) if self.mean.dtype == torch.float32 else None
 
     def standardise(self, features: Tensor) -> None:
-        """Set `mean` and `scale` from the training features (n, F)."""
+        """Set the mean and the scale of the input features, from the training features (n, F)."""
         self.mean.copy_(features.float().mean(0))
         self.scale.copy_(1.0 / features.float().std(0).clamp_min(1e-3))
 
@@ -256,7 +256,7 @@ class EarlyDrafter(TrainableDrafter):
 
     @classmethod
     def proposer(cls, settings: NoSettings, context: Context) -> EarlyProposer:
-        """Build proposer=early."""
+        """Build the part that the setting `proposer=early` chooses."""
         return EarlyProposer(context.artifact(cls.kind), context.target)
 
     @torch.inference_mode()

@@ -303,7 +303,7 @@ class Datastore:
 
     @functools.cached_property
     def index(self) -> Index:
-        """The search that `search` chooses."""
+        """The search for similar keys that the setting `datastore=` chooses, such as exact or Qdrant."""
         kind = self.search.kind if self.search else "exact"
         index: Index = registry.find("datastore", kind, "datastore.kind").built(self, self.search)
         return index
@@ -343,11 +343,19 @@ class Datastore:
         return self.manifest.content
 
     def pooled(self, prompt: Tensor, target: ReadableTarget) -> Tensor:
-        """Pool a prompt (1, P, E) for `key_of`. Return (p,) float32, on the target's device."""
+        """Average the prompt's tokens per segment, to make a search key with `key_of`.
+
+        Args:
+            prompt: (1, P, E) encoded prompt.
+            target: The target that encoded it.
+
+        Returns:
+            (p,) float32 of length 1, on the target's device.
+        """
         return prompt_key(prompt, target, self.manifest.key)[0]
 
     def key_of(self, pooled: np.ndarray) -> np.ndarray:
-        """Return the search key (d,) float32 of a pooled prompt (p,): the prompt itself, projected if keys are."""
+        """Return the search key (d,) float32 of a pooled prompt (p,). A projection, if any, is applied."""
         return pooled if self.projection is None else projected(pooled[None], self.projection)[0]
 
     def query(self, key: np.ndarray, task: str, k: int, without: int | None = None) -> Neighbours:
@@ -407,7 +415,7 @@ def _read_payload(path: Path) -> dict[str, np.ndarray]:
 
 
 class DatastoreArtifact(Artifact[Manifest]):
-    """The kind of artifact `datastore`."""
+    """The kind of artifact `datastore`: a folder with demonstrated chunks, which `Datastore` opens."""
 
     kind = noun = "datastore"
     made, command, again = "built", ("build", "datastore"), AGAIN

@@ -232,7 +232,7 @@ class HybridProposer(Proposer):
 
     @classmethod
     def build(cls, settings: HybridProposerSettings, context: Context) -> HybridProposer:
-        """Build proposer=hybrid."""
+        """Build the part that the setting `proposer=hybrid` chooses."""
         return cls(EagleDrafter.proposer(settings, context), RetrievalProposer.build(settings, context))
 
     def prepare(self, chunk: Chunk) -> None:
@@ -271,7 +271,7 @@ class GroupRule(DistanceRule):
 
     @classmethod
     def build(cls, settings: SequenceAcceptanceSettings, context: Context) -> GroupRule:
-        """Build acceptance=sequence."""
+        """Build the part that the setting `acceptance=sequence` chooses."""
         return cls(context.target.actions, settings.group_limit, settings.token_limit)
 
     def limits(self, r: int) -> tuple[int, ...]:
@@ -310,7 +310,7 @@ class HybridRule(RelaxedRule):
 
 
 def by_proposer(settings: HybridAcceptanceSettings, context: Context) -> HybridRule:
-    """Build acceptance=hybrid."""
+    """Build the part that the setting `acceptance=hybrid` chooses."""
     space = context.target.actions
     by_group = GroupRule(space, settings.group_limit, settings.token_limit)
     return HybridRule(space, settings.strict_dofs, retrieved=by_group)
@@ -359,7 +359,7 @@ class VerifySkip(Skip):
         self.ended.clear()
 
     def finish(self, success: bool) -> None:
-        """End an episode: raise s_min after a failure, lower it after a success."""
+        """End an episode: raise s_min, the similarity needed to skip, after a failure; lower it after a success."""
         span = self.high - self.low
         s_min = self.s_min + span * (-self.settings.down if success else self.settings.up)
         self.s_min = min(self.high, max(self.low, s_min))
@@ -510,7 +510,7 @@ class Random(Seeded):
 
     @classmethod
     def build(cls, settings: RandomBoundarySettings, context: Context) -> Random:
-        """Build boundary=random."""
+        """Build the part that the setting `boundary=random` chooses."""
         return cls(settings.p, settings.seed)
 
     @classmethod
@@ -543,7 +543,7 @@ class Fused(Seeded):
 
     @classmethod
     def build(cls, settings: FusedBoundarySettings, context: Context) -> Fused:
-        """Build boundary=fused."""
+        """Build the part that the setting `boundary=fused` chooses."""
         ranges = context.calibration.ranges(settings.window)
         return cls(ranges, settings.alpha, settings.window, settings.f_star)
 

@@ -167,11 +167,11 @@ class Kinematic:
         self.reset()
 
     def reset(self) -> None:
-        """Begin an episode: set r as if the last decode had K = K_S."""
+        """Begin an episode: set the radius as if the last decode's variability K was the reference level K_S."""
         self.r = self.level(self.k_s)
 
     def level(self, variability: float) -> float:
-        """Return r, not rounded, for a K in normalised action units."""
+        """Return the radius, not rounded, for a variability K in normalised action units."""
         return falling(self.r_min, self.r_max, variability / self.k_s, self.phi)
 
     def radius(self) -> int:
@@ -196,7 +196,10 @@ class Change(Kinematic):
     """
 
     def reset(self) -> None:
-        """Begin an episode: set r as if the last decode had K = K_S. The first change is measured from K_S."""
+        """Begin an episode: set the radius as if the last decode's variability K was the reference level K_S.
+
+        The first change of K is measured from K_S, too.
+        """
         super().reset()
         self.last = self.k_s
 
@@ -221,7 +224,7 @@ class Quoted(Change):
     """
 
     def reset(self) -> None:
-        """Begin an episode with r = r_min."""
+        """Begin an episode with the smallest radius r_min. The first change of K is measured from K_S."""
         self.r, self.last = float(self.r_min), self.k_s
 
     def update(self, variability: float | None) -> None:
@@ -254,7 +257,7 @@ class Schedule:
         self.reset()
 
     def reset(self) -> None:
-        """Begin an episode: t = 0."""
+        """Begin an episode: set the number t of decodes to 0."""
         self.decodes = 0
 
     def radius(self) -> int:

@@ -292,7 +292,7 @@ class Compensation:
 
     @classmethod
     def build(cls, settings: CompensateSettings, context: Context) -> Compensation:
-        """Build rectifier=compensate."""
+        """Build the part that the setting `rectifier=compensate` chooses."""
         name = Hold.name if settings.predictor == DRAFT else settings.predictor
         return cls(settings, load(find_predictor(name).traits["predictor"])(NoSettings(name), context))
 

@@ -189,7 +189,7 @@ class ScoutDrafter(EarlyDrafter):
 
     @classmethod
     def proposer(cls, settings: NoSettings, context: Context) -> ScoutProposer:
-        """Build proposer=scout."""
+        """Build the part that the setting `proposer=scout` chooses."""
         return ScoutProposer(context.artifact(cls.kind), context.target)
 
     @torch.inference_mode()
