@@ -1,1 +1,1 @@
-"""Published OpenVLA checkpoints as targets."""
+"""Load published OpenVLA checkpoints as targets."""

@@ -1,7 +1,8 @@
-"""The `config.json` of a Hugging Face OpenVLA folder, and the statistics beside it, as dataclasses.
+"""Read the configuration and the action statistics of a Hugging Face OpenVLA checkpoint.
 
-A published folder names its vision towers as timm does, and of its language model only what differs from Llama-2 7B.
-The rest is filled in here. A folder of another size gives its towers' shapes itself (`vision_shapes`).
+The `config.json` of a published checkpoint gives only timm's names of its two vision encoders (towers), and of its
+language model only what differs from Llama-2 7B. The rest is filled in here. A checkpoint of a different size must give
+the shapes of its towers in the field `vision_shapes`.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, Group
 
 SHAPES = "vision_shapes"
-"""Field of `config.json` in folders of another size than the published ones: one `Tower` per vision tower."""
+"""Field of `config.json` with the shape of each vision tower. Published checkpoints do not have it."""
 CONFIG, STATISTICS = "config.json", "dataset_statistics.json"
 DOFS = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
 GROUPS = (Group("position", 3), Group("rotation", 3), Group("gripper", 1))
@@ -25,16 +26,16 @@ GROUPS = (Group("position", 3), Group("rotation", 3), Group("gripper", 1))
 
 @dataclass(frozen=True)
 class Tower:
-    """Shape of a vision transformer.
+    """Shape of a vision tower, one of OpenVLA's two vision transformers.
 
     Attributes:
-        width: Channels.
-        depth: Blocks. The last one's output is never used.
-        heads: Attention heads.
-        feed_forward: Hidden channels of a block's perceptron.
-        registers: Learned tokens after the class token.
-        scaled: Whether blocks have layer scales and a class token comes first (DINOv2).
-        image: Pixels per side.
+        width: Number of channels.
+        depth: Number of blocks. The output of the last one is never used.
+        heads: Number of attention heads.
+        feed_forward: Hidden units of a block.
+        registers: Number of learned tokens after the class token.
+        scaled: Whether it is a DINOv2: blocks have layer scales, and the first token is a class token.
+        image: Pixels per side of the image.
         patch: Pixels per side of a patch.
     """
 
@@ -49,12 +50,12 @@ class Tower:
 
     @property
     def patches(self) -> int:
-        """Tokens of an image."""
+        """Number of patches of an image, each of which is a token."""
         return (self.image // self.patch) ** 2
 
     @property
     def prefix(self) -> int:
-        """Tokens before the patches."""
+        """Number of tokens before the patches: class token and registers."""
         return self.registers + self.scaled
 
 
@@ -62,12 +63,12 @@ TOWERS = {
     "vit_large_patch14_reg4_dinov2.lvd142m": Tower(1024, 24, 16, 4096, registers=4, scaled=True),
     "vit_so400m_patch14_siglip_224": Tower(1152, 27, 16, 4304),
 }
-"""The towers of OpenVLA by their timm names: DINOv2 ViT-L/14 with registers, SigLIP So400m/14."""
+"""timm's name -> shape of the towers of OpenVLA: DINOv2 ViT-L/14 with registers, and SigLIP So400m/14."""
 
 
 @dataclass(frozen=True)
 class Language:
-    """Shape of the language model, named as in transformers. The defaults are those of Llama-2 7B."""
+    """Shape of the language model. Fields have their names in transformers, defaults are those of Llama-2 7B."""
 
     vocab_size: int = 32064
     hidden_size: int = 4096
@@ -80,28 +81,28 @@ class Language:
 
     @property
     def key_value_heads(self) -> int:
-        """Heads of keys and values."""
+        """Number of heads of keys and values. Several query heads may share one."""
         return self.num_key_value_heads or self.num_attention_heads
 
     @property
     def channels(self) -> int:
-        """Channels of a head."""
+        """Number of channels of a head."""
         return self.hidden_size // self.num_attention_heads
 
     def cache_sizes(self, batch: int, capacity: int) -> tuple[int, int, int, int, int]:
-        """Return the sizes of a `Cache`: layers, B, heads of keys and values, slots, channels."""
+        """Return the first five arguments of `Cache`: layers, batch, heads of keys and values, capacity, channels."""
         return self.num_hidden_layers, batch, self.key_value_heads, capacity, self.channels
 
 
 @dataclass(frozen=True)
 class Shape:
-    """Everything that determines the tensors of an OpenVLA checkpoint and how its tokens are read.
+    """Shapes of all parts of an OpenVLA checkpoint.
 
     Attributes:
-        towers: The towers of the first and of the second half of the input channels.
-        language: Language model.
-        padding: Rows of the vocabulary after the tokenizer's own.
-        bins: Edges of the action bins.
+        towers: Shapes of the two vision towers, in the order of the input channels.
+        language: Shape of the language model.
+        padding: Number of unused rows at the end of the vocabulary.
+        bins: Number of edges of the action bins.
     """
 
     towers: tuple[Tower, Tower]
@@ -111,20 +112,20 @@ class Shape:
 
     @property
     def vocabulary(self) -> int:
-        """Ids of the tokenizer. The last `bins` of them are the action tokens, highest first."""
+        """Number of the tokenizer's ids. The last `bins` ids are the action tokens, in descending order."""
         return self.language.vocab_size - self.padding
 
     @property
     def patches(self) -> int:
-        """Vision tokens of the prompt."""
+        """Number of vision tokens in the prompt."""
         return self.towers[0].patches
 
 
 def read_shape(folder: Path) -> Shape:
-    """Return the shape that `config.json` describes.
+    """Read the shapes from a checkpoint's `config.json`.
 
     Raises:
-        CheckpointError: There is no such file, or it is not that of an OpenVLA with two vision towers and a Llama.
+        CheckpointError: The file is missing, or does not describe an OpenVLA with two vision towers and a Llama.
     """
     path, value = folder / CONFIG, read_config(folder)
     text = value.get("text_config")
@@ -141,10 +142,10 @@ def read_shape(folder: Path) -> Shape:
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """Return the contents of `config.json`.
+    """Return the content of a checkpoint's `config.json`.
 
     Raises:
-        CheckpointError: There is none, or it is another model's.
+        CheckpointError: The file is missing, or belongs to a different type of model.
     """
     path = folder / CONFIG
     if not path.is_file():
@@ -158,7 +159,14 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Bounds:
-    """The `action` of one data set's statistics: percentiles 1 and 99, and which DoFs are normalised by them."""
+    """Action statistics of a data set, one number per DoF.
+
+    Attributes:
+        q01: 1st percentile of the actions.
+        q99: 99th percentile of the actions.
+        mask: Which DoFs are normalised with the percentiles. Others, such as the gripper, are used as they are. None
+            means all.
+    """
 
     q01: tuple[float, ...]
     q99: tuple[float, ...]
@@ -166,14 +174,21 @@ class Bounds:
 
 
 def read_statistics(folder: Path, name: str | None) -> tuple[str, Bounds]:
-    """Return the name and the action statistics of a data set. Without a name, the only ones there are.
+    """Read the action statistics of a data set from a checkpoint.
 
-    They are in `dataset_statistics.json` of a fine-tuned checkpoint, else in `norm_stats` of `config.json`.
+    They are in `dataset_statistics.json` of a fine-tuned checkpoint, else in the field `norm_stats` of `config.json`.
+
+    Args:
+        folder: Folder of the checkpoint.
+        name: Name of the data set. None: the only one in the checkpoint.
+
+    Returns:
+        The name of the data set and its statistics.
 
     Raises:
-        UsageError: There are several, and no name.
-        UnknownName: There are none of that name.
-        CheckpointError: There are none at all, or they are damaged.
+        UsageError: No name is given, but the checkpoint has statistics of several data sets.
+        UnknownName: The checkpoint has no statistics of this data set.
+        CheckpointError: The checkpoint has no statistics, or they are damaged.
     """
     path = folder / STATISTICS
     statistics = read_json(path) if path.is_file() else read_config(folder).get("norm_stats")
@@ -193,12 +208,13 @@ def action_space(shape: Shape, bounds: Bounds, like: ActionSpace | None, control
 
     Args:
         shape: Shape of the checkpoint.
-        bounds: What -1 and 1 of every DoF mean. A DoF outside the mask, the gripper, keeps its value.
-        like: An environment's space, for names, groups, strict DoFs and control rate. None for OpenVLA's seven DoFs.
-        control_hz: Control steps per second without `like`.
+        bounds: Action statistics. They become `low` and `high` of the space. A DoF outside their mask gets -1 and 1.
+        like: Action space of an environment, from which names, groups, strict DoFs and control rate are copied. None:
+            OpenVLA's seven DoFs.
+        control_hz: Control steps per second if `like` is None.
 
     Raises:
-        CheckpointError: The statistics are of another number of DoFs, or of DoFs that do not move.
+        CheckpointError: The statistics have a different number of DoFs, or the same percentiles for a DoF.
     """
     space = like or ActionSpace(DOFS, GROUPS, DOFS[-1:], control_hz, (-1.0,) * 7, (1.0,) * 7)
     mask = bounds.mask or (True,) * len(bounds.q01)

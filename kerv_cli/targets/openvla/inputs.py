@@ -1,8 +1,8 @@
-"""What OpenVLA reads: frames as the pixels of its two vision towers, and instructions as token ids.
+"""Prepare the inputs of OpenVLA: images for its two vision towers, and instructions as token ids.
 
-The whole frame is resized to the towers' size without keeping its proportions (`resize-naive`, bicubic), scaled to
-[0, 1] and normalised for each tower. A checkpoint that was fine-tuned with augmented images sees the central 90 % of
-the area (`crop`), resized bilinearly: the sides are cut by the square root of that.
+An image is resized to the size of the towers without keeping its proportions (`resize-naive`, bicubic). Then it is
+scaled to [0, 1] and normalised for each tower. For a checkpoint that was fine-tuned on augmented images it is first
+cropped to the central 90 % of its area (`crop`), with bilinear interpolation. Each side is then √0.9 as long.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ RESIZE = "resize-naive"
 
 @dataclass(frozen=True)
 class Normalisation:
-    """Mean and standard deviation of the three channels, in [0, 1]."""
+    """Mean and standard deviation of the three colour channels, for pixels in [0, 1]."""
 
     mean: tuple[float, float, float]
     std: tuple[float, float, float]
@@ -41,7 +41,7 @@ DEFAULTS = (
     Normalisation((0.484375, 0.455078125, 0.40625), (0.228515625, 0.2236328125, 0.224609375)),
     Normalisation((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)),
 )
-"""ImageNet's for DINOv2, as published (rounded to bfloat16), and SigLIP's."""
+"""Published normalisations of the two towers: ImageNet's (rounded to bfloat16) for DINOv2, and SigLIP's."""
 
 
 @dataclass(frozen=True)
@@ -51,10 +51,10 @@ class _Preprocessor:
 
 
 def read_normalisations(folder: Path) -> tuple[Normalisation, Normalisation]:
-    """Return those of `preprocessor_config.json`, or the published ones without such a file.
+    """Read the normalisation for each tower from `preprocessor_config.json`. Without that file return the defaults.
 
     Raises:
-        CheckpointError: The file is damaged, or asks for another way of resizing.
+        CheckpointError: The file is damaged, or requires a different way of resizing images.
     """
     path = folder / PREPROCESSOR
     found = read(_Preprocessor, read_mapping(path) if path.is_file() else {}, str(path), tolerant=True)
@@ -64,9 +64,9 @@ def read_normalisations(folder: Path) -> tuple[Normalisation, Normalisation]:
 
 
 def cropped(image: np.ndarray, size: int) -> np.ndarray:
-    """Return the central CROPPED_AREA of an image (h, w, 3) uint8 as (size, size, 3) uint8.
+    """Crop an image (h, w, 3) uint8 to the central 90 % of its area, and resize it to (size, size, 3) uint8.
 
-    It is sampled bilinearly, with the outermost points on the crop's edges (TensorFlow's crop_and_resize).
+    This equals TensorFlow's crop_and_resize: bilinear interpolation, the outermost pixels are on the crop's edges.
     """
     side = math.sqrt(CROPPED_AREA)
     rows, columns = ((n - 1) * ((1 - side) / 2 + side * np.linspace(0, 1, size)) for n in image.shape[:2])
@@ -76,22 +76,22 @@ def cropped(image: np.ndarray, size: int) -> np.ndarray:
 
 
 def _interpolated(rows: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Interpolate rows (n, …) at fractional `indices` (m,). Return (m, …)."""
+    """Interpolate linearly between rows (n, …) at fractional indices (m,). Return (m, …)."""
     below = np.clip(np.floor(indices).astype(int), 0, len(rows) - 2)
     share = (indices - below).astype(np.float32).reshape(-1, *[1] * (rows.ndim - 1))
     return rows[below] * (1 - share) + rows[below + 1] * share
 
 
 def as_in_libero(image: np.ndarray, size: int) -> np.ndarray:
-    """Prepare an image (h, w, 3) uint8 as OpenVLA's evaluation on LIBERO does before its crop. Return (size, size, 3).
+    """Prepare an image (h, w, 3) uint8 as OpenVLA's evaluation on LIBERO does before it crops. Return (size, size, 3).
 
-    `resize_image` of its libero_utils: JPEG as TensorFlow writes it (quality 95, colour at half resolution), because
-    the training data were, then Lanczos with antialiasing.
+    This equals `resize_image` of its libero_utils. The image is compressed as JPEG as by TensorFlow (quality 95, colour
+    at half resolution), because the training images were, and then resized by Lanczos with antialiasing.
     """
     file = io.BytesIO()
     Image.fromarray(image).save(file, "JPEG", quality=95, subsampling="4:2:0")
     pixels = np.asarray(Image.open(file), dtype=np.float32)
-    # channel by channel as floats: Pillow would cut off the overshoot of whole numbers between its two passes
+    # each channel as floats: with integers Pillow would clip values between its two passes
     channels = (Image.fromarray(pixels[:, :, i]).resize((size, size), Image.Resampling.LANCZOS) for i in range(3))
     return np.stack([np.asarray(one) for one in channels], -1).round().clip(0, 255).astype(np.uint8)
 
@@ -99,14 +99,17 @@ def as_in_libero(image: np.ndarray, size: int) -> np.ndarray:
 def pixels_of(
     image: np.ndarray, shape: Shape, normalisations: Sequence[Normalisation], crop: bool, libero: bool = False
 ) -> Tensor:
-    """Return the pixels (1, 6, s, s) float32: normalised for the first tower, then for the second.
+    """Prepare an image for both vision towers.
 
     Args:
         image: (h, w, 3) uint8.
-        shape: Shape of the checkpoint.
+        shape: Shapes of the checkpoint.
         normalisations: One per tower.
-        crop: Whether to show the central part.
-        libero: Whether to prepare the image by `as_in_libero` before that.
+        crop: Whether to crop the image to its central 90 %.
+        libero: Whether to apply `as_in_libero` first.
+
+    Returns:
+        (1, 6, s, s) float32: three channels normalised for the first tower, then three for the second.
     """
     parts = []
     for tower, normal in zip(shape.towers, normalisations, strict=True):
@@ -133,24 +136,24 @@ PROMPTS = {
         "ASSISTANT:"
     ),
 }
-"""Text around the instruction by version. v0.1 checkpoints were trained with the second."""
+"""Version -> text of the prompt; `{}` is replaced by the instruction. v0.1 checkpoints need the second."""
 
 
 class Prompter:
-    """The prompt of one checkpoint."""
+    """Turns instructions into the token ids of a checkpoint's prompt."""
 
     def __init__(self, folder: Path, shape: Shape, form: str, limit: int) -> None:
         """Read the tokenizer.
 
         Args:
             folder: Folder of the checkpoint.
-            shape: Its shape.
-            form: Key of `PROMPTS`.
-            limit: Most ids of a prompt.
+            shape: Shapes of the checkpoint.
+            form: Version of the prompt, a key of `PROMPTS`.
+            limit: Maximum number of ids in a prompt.
 
         Raises:
-            CheckpointError: There is no tokenizer, or that of another model.
-            KervError: The package tokenizers is missing.
+            CheckpointError: The tokenizer is missing, damaged, or belongs to a different model.
+            KervError: The Python package `tokenizers` is not installed.
         """
         path = folder / TOKENIZER
         self.text, self.limit = PROMPTS[form], limit
@@ -163,10 +166,10 @@ class Prompter:
             )
 
     def ids(self, instruction: str) -> list[int]:
-        """Return the prompt's ids: begin of sequence, the text, the word boundary.
+        """Return the ids of the prompt for an instruction: begin of sequence, the text, a word boundary.
 
         Raises:
-            UsageError: The prompt is longer than `limit`. Cutting it could drop the decisive word.
+            UsageError: The prompt has too many ids. It is not cut, because a decisive word could be lost.
         """
         ids: list[int] = self.tokenizer.encode(self.text.format(instruction.lower())).ids
         if ids[:1] != [self.begin]:

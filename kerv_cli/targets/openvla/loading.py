@@ -1,6 +1,7 @@
-"""Opens the safetensors files of a folder, checks names and shapes against the modules, and fills them.
+"""Load the safetensors files of an OpenVLA checkpoint, after checking the names and shapes of their tensors.
 
-Files stay memory-mapped: on a CPU, in the number format of the file, weights are never copied. Nothing is unpickled.
+The files are memory-mapped. On a CPU the weights are not copied, unless they are converted to another number format.
+Nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -27,17 +28,17 @@ from kerv_cli.targets.openvla.vision import VisionBackbone, projector
 Sizes = tuple[int, ...]
 SINGLE = "model.safetensors"
 PICKLED = (".bin", ".pt", ".pth", ".ckpt")
-LISTED = 3  # names of each kind in a message
+LISTED = 3  # maximum number of tensors of each kind that an error message names
 
 
 @dataclass(frozen=True)
 class Shards:
-    """The safetensors files of a folder.
+    """The safetensors files of a checkpoint.
 
     Attributes:
-        folder: The folder.
-        tensors: Tensor name to file name.
-        shapes: Tensor name to shape, from the files' headers.
+        folder: Folder of the checkpoint.
+        tensors: Name of each tensor -> name of its file.
+        shapes: Name of each tensor -> its shape.
     """
 
     folder: Path
@@ -46,19 +47,19 @@ class Shards:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Names of the files, each once."""
+        """Names of the files, in alphabetical order."""
         return tuple(sorted(set(self.tensors.values())))
 
     def sizes(self) -> dict[str, int]:
-        """Return the bytes of each file."""
+        """Return the size of each file in bytes, by name."""
         return {name: (self.folder / name).stat().st_size for name in self.files}
 
     def hashes(self) -> dict[str, str]:
-        """Return the SHA-256 of each file."""
+        """Return the SHA-256 of each file, by name."""
         return {name: sha256_of(self.folder / name) for name in self.files}
 
     def items(self) -> Iterator[tuple[str, Tensor]]:
-        """Yield every tensor, backed by the file's memory map."""
+        """Yield the name and the content of every tensor. The content is memory-mapped."""
         for file in self.files:
             with _open_tensors(self.folder / file) as handle:
                 for name in handle.keys():  # noqa: SIM118 - not a mapping
@@ -75,10 +76,10 @@ def _open_tensors(path: Path) -> Iterator[Any]:
 
 
 def open_shards(folder: Path) -> Shards:
-    """Return the shards of a folder. Reads their headers only.
+    """Open the safetensors files in a folder. Only their headers are read.
 
     Raises:
-        CheckpointError: There are none, only pickled ones, or one is cut short.
+        CheckpointError: The folder has no such files, or only pickled weights, or a file is damaged.
     """
     files = [path for path in visible(folder) if path.suffix == ".safetensors"]
     if not files:
@@ -98,10 +99,15 @@ def open_shards(folder: Path) -> Shards:
 
 
 def check_layout(shapes: Mapping[str, Sizes], expected: Mapping[str, Sizes], where: Path) -> None:
-    """Compare the names and shapes of a folder with those that its config asks for.
+    """Check that a checkpoint has exactly the expected tensors.
+
+    Args:
+        shapes: Name -> shape of each tensor in the checkpoint.
+        expected: Name -> shape of each expected tensor.
+        where: Folder of the checkpoint, for the error message.
 
     Raises:
-        CheckpointError: Tensors are missing, unknown or of another shape. The message lists the first of each.
+        CheckpointError: Tensors are missing, unknown or have a wrong shape. The message names up to three of each kind.
     """
     both = [name for name in expected if name in shapes and shapes[name] != expected[name]]
     kinds = {
@@ -116,7 +122,7 @@ def check_layout(shapes: Mapping[str, Sizes], expected: Mapping[str, Sizes], whe
 
 
 class OpenVLAModel(nn.Module):
-    """The modules, under the published names."""
+    """All modules of an OpenVLA. They have the names that published checkpoints use."""
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
@@ -126,39 +132,43 @@ class OpenVLAModel(nn.Module):
 
 
 def layout(shape: Shape) -> dict[str, Sizes]:
-    """Return name and shape of every tensor that is read of a checkpoint."""
+    """Return the name and shape of every tensor that is read from a checkpoint of this shape."""
     with torch.device("meta"):
         return sizes_of(OpenVLAModel(shape))
 
 
 def is_unread(name: str, shape: Shape) -> bool:
-    """Return whether a checkpoint's tensor has no effect: a tower's last block, its norm and its pooling head."""
+    """Return whether a tensor has no effect, because it is in a tower's last block, final norm or pooling head."""
     first, second = (tower.depth - 1 for tower in shape.towers)
     parts = rf"(featurizer\.blocks\.{first}|fused_featurizer\.blocks\.{second}|\w+\.norm|\w+\.attn_pool)\."
     return re.match(rf"vision_backbone\.{parts}", name) is not None
 
 
 def sizes_of(module: nn.Module) -> dict[str, Sizes]:
-    """Return name and shape of a module's tensors."""
+    """Return the name and shape of each tensor of a module."""
     return {name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
 
 
 def open_checked(folder: Path, shape: Shape) -> Shards:
-    """Return the shards of a folder if they hold the tensors of this shape; errors as `open_shards`, `check_layout`."""
+    """Open the safetensors files in a folder, and check that they have the tensors of this shape.
+
+    Raises:
+        CheckpointError: Files are missing or damaged, or tensors are missing, unknown or have a wrong shape.
+    """
     shards = open_shards(folder)
     check_layout({n: s for n, s in shards.shapes.items() if not is_unread(n, shape)}, layout(shape), folder)
     return shards
 
 
 def load_model(folder: Path, shape: Shape, device: str, dtype: torch.dtype, int8: bool) -> OpenVLAModel:
-    """Return the model of a folder, frozen; errors as `open_checked`.
+    """Load and freeze the model of a checkpoint; errors as `open_checked`.
 
     Args:
-        folder: The folder.
-        shape: Its shape.
-        device: Device of the weights.
-        dtype: Number format of the weights.
-        int8: Whether the layers of the language model have one byte per weight.
+        folder: Folder of the checkpoint.
+        shape: Shapes of the checkpoint.
+        device: Device to load it to.
+        dtype: Number format to convert the weights to.
+        int8: Whether to convert the layers of the language model to one byte per weight.
     """
     shards = open_checked(folder, shape)
     with torch.device("meta"):
@@ -173,10 +183,13 @@ def load_model(folder: Path, shape: Shape, device: str, dtype: torch.dtype, int8
 
 
 def check_finite(shards: Shards) -> int:
-    """Read every number once. Return how many there are.
+    """Check that all weights are finite. This reads the whole checkpoint.
+
+    Returns:
+        The number of weights.
 
     Raises:
-        CheckpointError: A tensor holds numbers that are not finite.
+        CheckpointError: A tensor contains NaN or infinity.
     """
     count = 0
     for name, tensor in shards.items():
@@ -187,6 +200,11 @@ def check_finite(shards: Shards) -> int:
 
 
 def digest_of(hashes: Mapping[str, str], settings: Mapping[str, Any]) -> str:
-    """Return one SHA-256 for weights in several files and the settings that change what they compute."""
+    """Return one SHA-256 that identifies a model whose weights are in several files.
+
+    Args:
+        hashes: File -> its SHA-256.
+        settings: Settings that change what the model computes.
+    """
     text = json.dumps({"files": dict(sorted(hashes.items())), "settings": dict(settings)}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

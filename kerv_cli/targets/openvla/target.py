@@ -1,8 +1,8 @@
-"""The target of an OpenVLA checkpoint: `ReadableTarget` on published weights (arXiv 2406.09246).
+"""A target with the weights of a published OpenVLA checkpoint (arXiv 2406.09246).
 
-Prompt order: [begin] [vision patches] [text], as its own code inserts the patches after the first token. Action token
-t is id vocabulary - 1 - t. The head's logits are those of these ids alone, so greedy decoding equals the published
-code's wherever its token is an action. (It takes the argmax over all ids and executes any other as the last bin.)
+The prompt is [begin] [vision patches] [text], as in OpenVLA's own code. Action token t has the id vocabulary - 1 - t.
+The head gives logits for the ids of action tokens only. The published code takes the argmax over all ids, and executes
+any other id as the last bin. Greedy decoding gives the same tokens as long as that code decodes action tokens.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ from kerv_cli.targets.settings import BuildTargetSettings
 
 @dataclass(frozen=True)
 class OpenVLASettings:
-    """`settings` of a target.json of family openvla.
+    """The field `settings` in the target.json of an OpenVLA target.
 
     Attributes:
         checkpoint: Folder of the published files.
-        statistics: Data set whose actions it emits.
-        files: File name to bytes.
-        prompt: `openvla` or `openvla_v01`.
-        crop: Whether it sees the central 90 % of an image (for checkpoints fine-tuned with augmented images).
-        libero: Whether an image goes through JPEG and Lanczos, as in OpenVLA's evaluation on LIBERO.
+        statistics: Name of the data set whose action statistics are used.
+        files: Name of each file of weights -> its size in bytes.
+        prompt: Version of the prompt, `openvla` or `openvla_v01`.
+        crop: Whether images are cropped to the central 90 %, for checkpoints fine-tuned on augmented images.
+        libero: Whether images are first compressed as JPEG and resized by Lanczos, as OpenVLA does it for LIBERO.
         int8: Whether the language model's layers have one byte per weight.
-        prompt_tokens: Longest prompt without the patches.
-        image_size: Pixels of a tower.
+        prompt_tokens: Longest prompt in tokens, without the vision patches.
+        image_size: Pixels per side of a tower's image.
         chunk: H, control steps per decode.
     """
 
@@ -64,12 +64,12 @@ class OpenVLASettings:
 
 
 class OpenVLATarget:
-    """The policy in a folder of published files. It reads the image of one camera."""
+    """An OpenVLA policy, which reads the image of one camera. Implements the protocol `ReadableTarget`."""
 
     def __init__(
         self, settings: OpenVLASettings, description: TargetDescription, device: str, dtype: torch.dtype
     ) -> None:
-        """Load the checkpoint, frozen; errors as `build`."""
+        """Load and freeze the checkpoint; arguments and errors as `build`."""
         source = Path(settings.checkpoint)
         self.settings, self.actions, self.cameras = settings, description.actions, tuple(description.cameras)
         self.shape = shape = read_shape(source)
@@ -86,24 +86,24 @@ class OpenVLATarget:
 
     @property
     def segments(self) -> Mapping[str, slice]:
-        """Slice of the prompt by the name of its part. The text ends with the prompt."""
+        """Name of a prompt part -> its slice of the prompt. The instruction ends at the end of the prompt."""
         patches = self.shape.patches
         return {"begin": slice(0, 1), "vision": slice(1, 1 + patches), "instruction": slice(1 + patches, None)}
 
     @property
     def pooled_width(self) -> int:
-        """F of `pooled`."""
+        """F, number of values that `pooled` returns per prompt."""
         return 2 * self.width
 
     def pooled(self, prompt: Tensor) -> Tensor:
-        """Return mean patch and mean word of a prompt (B, P, E) as (B, F)."""
+        """Pool prompts (B, P, E) into vectors (B, F): the mean vision patch, then the mean text token."""
         return torch.cat([prompt[:, self.segments[name]].mean(1) for name in ("vision", "instruction")], -1)
 
     def encode(self, observation: Observation) -> Tensor:
-        """Return the prompt's embeddings (1, P, E).
+        """Encode an observation as a prompt (1, P, E).
 
         Raises:
-            CheckpointError: The camera's image is missing.
+            CheckpointError: The image of the camera is missing.
             UsageError: The instruction is too long.
         """
         camera = self.cameras[0]
@@ -115,7 +115,7 @@ class OpenVLATarget:
         return torch.cat([words[:, :1], patches, words[:, 1:]], 1)
 
     def see(self, pixels: Tensor) -> Tensor:
-        """Map pixels (B, 6, s, s) to vision tokens (B, n, E)."""
+        """Map prepared images (B, 6, s, s) to vision tokens (B, n, E)."""
         return self.model.projector(self.model.vision_backbone(upload(pixels, self.device).to(self.dtype)))
 
     def _words(self, instruction: str) -> Tensor:
@@ -123,36 +123,59 @@ class OpenVLATarget:
         return self.model.language_model.model.embed_tokens(ids)
 
     def embed(self, tokens: Tensor) -> Tensor:
-        """Embed action tokens (B, T) int64 as (B, T, E)."""
+        """Return the embeddings (B, T, E) of action tokens (B, T) int64."""
         return self.model.language_model.model.embed_tokens(self.shape.vocabulary - 1 - tokens)
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
-        """Return an empty cache. `fixed`: every forward has the same shapes, by default on CUDA."""
+        """Return an empty key/value cache.
+
+        Args:
+            batch: Number of sequences.
+            capacity: Maximum number of tokens.
+            fixed: Whether every forward attends to all slots, so that its shapes are fixed. None: only on CUDA.
+        """
         fixed = self.action_rows.is_cuda if fixed is None else fixed
         return Cache(*self.shape.language.cache_sizes(batch, capacity), self.action_rows, fixed)
 
     def forward(
         self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
-        """Return hidden states (B, T, E) of x (B, T, E) at `positions` (T,), after the cached tokens."""
+        """Return the hidden states (B, T, E) of T new tokens that follow the cached ones. The cache grows by T.
+
+        Args:
+            x: (B, T, E) embeddings.
+            positions: (T,) rotary positions.
+            cache: Keys and values of earlier tokens. None: there are none.
+            seen: Which tokens each new one attends to, as in `attention_mask`. None: attention is causal.
+        """
         return self.model.language_model.model(x, positions, cache, seen)
 
     def head(self, hidden: Tensor) -> Tensor:
-        """Return logits over the action tokens (..., V) of hidden states (..., E)."""
+        """Return the logits (..., V) of the action tokens for hidden states (..., E)."""
         return F.linear(hidden, self.action_rows)
 
 
 def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> OpenVLATarget:
-    """Return the target that the target.json in `folder` describes, frozen.
+    """Load and freeze an OpenVLA target.
+
+    Args:
+        folder: Folder of the target, for error messages. The weights are in the checkpoint's own folder.
+        description: The content of its `target.json`.
+        device: Device to load it to.
+        dtype: Number format to convert the weights to.
 
     Raises:
-        CheckpointError: The description is not OpenVLA's, or its checkpoint is missing or does not fit its config.
+        CheckpointError: The description does not belong to an OpenVLA target, or the checkpoint is missing or damaged.
     """
     return OpenVLATarget(read_settings(folder, description), description, device, dtype)
 
 
 def read_settings(folder: Path, description: TargetDescription) -> OpenVLASettings:
-    """Return the description's settings; errors as `build`."""
+    """Return the settings in a target's description.
+
+    Raises:
+        CheckpointError: They are not those of an OpenVLA target, or it has not exactly one camera.
+    """
     path = str(folder / "target.json")
     if len(description.cameras) != 1:
         raise CheckpointError(f"{path} names {len(description.cameras)} cameras: OpenVLA sees one")
@@ -160,10 +183,12 @@ def read_settings(folder: Path, description: TargetDescription) -> OpenVLASettin
 
 
 def check_weights(folder: Path, description: TargetDescription) -> None:
-    """Compare the checkpoint's files with what was imported, by name and size: hashing 15 GB takes too long.
+    """Check that the checkpoint's files still have the names and sizes that they had when the target was built.
+
+    The files are not hashed, because 15 GB would take too long.
 
     Raises:
-        CheckpointError: The folder is gone, or a file is missing, new or of another size.
+        CheckpointError: The folder or a file is missing, or a file is new or has a different size.
     """
     settings = read_settings(folder, description)
     source = Path(settings.checkpoint)
@@ -178,15 +203,15 @@ NO_STATE = ObservationSpace(proprioception=(), state=0, places=(), centre=(0.0, 
 
 
 def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
-    """Write target.json for the checkpoint. Every number of the weights is read once.
+    """Make a target from an OpenVLA checkpoint: check all its weights, and write `target.json`.
 
     Returns:
-        The target's folder, and figures for the user.
+        The target's folder; name -> number for the user, such as the number of parameters.
 
     Raises:
-        UsageError: There is no checkpoint, or several statistics and none chosen.
-        UnknownName: There are no such statistics, or no such environment.
-        CheckpointError: The folder is incomplete, damaged, pickled or another model's.
+        UsageError: No checkpoint is named, or it has statistics of several data sets and none is chosen.
+        UnknownName: The chosen statistics or the environment do not exist.
+        CheckpointError: The checkpoint is incomplete, damaged, pickled, or of a different model.
     """
     if not settings.checkpoint:
         raise UsageError("checkpoint=DIR: name the folder of a Hugging Face OpenVLA checkpoint")
@@ -202,7 +227,7 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
     chosen = {name: getattr(settings, name) for name in ("prompt", "crop", "int8", "libero")}
     target = OpenVLASettings(str(source), statistics, shards.sizes(), **chosen)
     target = replace(target, prompt_tokens=settings.prompt_tokens, image_size=shape.towers[0].image)
-    if not settings.libero:  # hashes of older targets lack it
+    if not settings.libero:  # left out, so that targets from before this setting keep their hashes
         del chosen["libero"]
     origin = {"command": "kerv build target", "settings": asdict(settings), "files": hashes, "parameters": parameters}
     fields = target_fields(

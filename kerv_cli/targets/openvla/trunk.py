@@ -1,6 +1,6 @@
 """The language model of OpenVLA: Llama-2 with tree attention over a key/value cache.
 
-Modules are named as in the published checkpoints, so that weights can stay in the file's memory map.
+Modules have the names that published checkpoints use, so that their weights can be memory-mapped.
 
 Shapes: B batch, T new tokens, S cached tokens, E width, A heads, K heads of keys and values, C channels of a head.
 """
@@ -20,9 +20,15 @@ Rotary = tuple[Tensor, Tensor]
 
 
 def rotation(positions: Tensor, channels: int, theta: float, dtype: torch.dtype) -> Rotary:
-    """Return the rotary embedding of positions (T,), half-split layout, computed in float32.
+    """Return the cosines and sines of the rotary embedding in half-split layout. They are computed in float32.
 
-    The sign of the swapped half is part of the sine.
+    The sines of the first half of the channels are negative, as `attention.rotate` requires.
+
+    Args:
+        positions: (T,) rotary positions.
+        channels: C, channels of a head.
+        theta: Base of the frequencies.
+        dtype: Number format of the result.
     """
     frequencies = theta ** (-torch.arange(0, channels, 2, device=positions.device, dtype=torch.float32) / channels)
     angles = positions[:, None].float() * frequencies
@@ -45,14 +51,14 @@ class LlamaAttention(nn.Module):
     def forward(
         self, x: Tensor, rotary: Rotary, mask: Tensor | None, cache: Tensor | None = None, slots: Slots | None = None
     ) -> Tensor:
-        """Map x (B, T, E) to (B, T, E).
+        """Return the attention's output (B, T, E).
 
         Args:
-            x: Input.
-            rotary: Rotary embedding of the positions.
-            mask: Additive mask. Without mask and cache attention is causal.
-            cache: (2, B, K, capacity, C) of this layer.
-            slots: Slots of the cache to write.
+            x: (B, T, E) input.
+            rotary: Cosines and sines of the tokens' positions.
+            mask: Result of `attention_mask`. None: attention is causal.
+            cache: (2, B, K, capacity, C) keys and values of this layer. None: there are no earlier tokens.
+            slots: Slots of the cache that the new keys and values are written to.
         """
         batch, tokens, width = x.shape
         q = rotate(self.q_proj(x).view(batch, tokens, self.heads, -1).transpose(1, 2), *rotary)
@@ -67,7 +73,7 @@ class LlamaAttention(nn.Module):
 
 
 class LlamaPerceptron(nn.Module):
-    """SwiGLU."""
+    """Feed-forward part of a layer (SwiGLU)."""
 
     def __init__(self, language: Language) -> None:
         super().__init__()
@@ -77,12 +83,17 @@ class LlamaPerceptron(nn.Module):
         self.down_proj = nn.Linear(hidden, width, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map x (B, T, E) to (B, T, E)."""
+        """Return the output (B, T, E) for x (B, T, E)."""
         return self.down_proj(F.silu(self.gate_proj(x)) * self.up_proj(x))
 
 
 class LlamaLayer(nn.Module):
-    """One pre-norm decoder layer. The first layer of a public EAGLE drafter is not `normed` before its attention."""
+    """One pre-norm decoder layer.
+
+    Args:
+        language: Shape of the language model.
+        normed: Whether there is a norm before the attention. The first layer of a public EAGLE drafter has none.
+    """
 
     def __init__(self, language: Language, normed: bool = True) -> None:
         super().__init__()
@@ -95,7 +106,7 @@ class LlamaLayer(nn.Module):
     def forward(
         self, x: Tensor, rotary: Rotary, mask: Tensor | None, cache: Tensor | None = None, slots: Slots | None = None
     ) -> Tensor:
-        """Map x (B, T, E) to (B, T, E); arguments as in `LlamaAttention`."""
+        """Return the layer's output (B, T, E) for x (B, T, E); arguments as `LlamaAttention.forward`."""
         x = x + self.self_attn(self.input_layernorm(x), rotary, mask, cache, slots)
         return x + self.mlp(self.post_attention_layernorm(x))
 
@@ -109,16 +120,16 @@ def run_layers(
     seen: np.ndarray | Tensor | None,
     mask: Tensor | None = None,
 ) -> Tensor:
-    """Return the output of the last layer (B, T, E). The cache grows by T.
+    """Return the output (B, T, E) of the last layer for T new tokens. The cache grows by T.
 
     Args:
-        layers: `LlamaLayer`s.
+        layers: Layers of the class `LlamaLayer`.
         language: Shape of the language model.
-        x: (B, T, E).
-        positions: (T,).
-        cache: Cache of earlier tokens.
-        seen: As in `attention_mask`.
-        mask: Additive mask instead of `seen`.
+        x: (B, T, E) embeddings.
+        positions: (T,) rotary positions.
+        cache: Keys and values of earlier tokens. None: there are none.
+        seen: Which tokens each new one attends to, as in `attention_mask`. None: attention is causal.
+        mask: Additive mask to use instead of `seen`. None: the mask is made from `seen`.
     """
     rotary = rotation(positions, language.channels, language.rope_theta, x.dtype)
     mask = attention_mask(seen, x.shape[1], cache, x) if mask is None else mask
@@ -131,7 +142,7 @@ def run_layers(
 
 
 class LlamaModel(nn.Module):
-    """Token embeddings, layers and the final norm."""
+    """The language model without its head: token embeddings, layers and final norm."""
 
     def __init__(self, language: Language) -> None:
         super().__init__()
@@ -143,12 +154,12 @@ class LlamaModel(nn.Module):
     def forward(
         self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
-        """Return hidden states after the final norm (B, T, E) of x (B, T, E) at `positions` (T,)."""
+        """Return the hidden states (B, T, E) of embeddings x (B, T, E); other arguments as `run_layers`."""
         return self.norm(run_layers(self.layers, self.language, x, positions, cache, seen))
 
 
 class LanguageModel(nn.Module):
-    """The model and its head, which has a row per id."""
+    """The language model with its head, which gives a logit for every id of the vocabulary."""
 
     def __init__(self, language: Language) -> None:
         super().__init__()
@@ -157,32 +168,37 @@ class LanguageModel(nn.Module):
 
 
 class Int8Linear(nn.Module):
-    """A linear layer with one byte per weight and one factor per output: half of bfloat16's memory.
+    """A linear layer whose weights are int8 with a scale per output. It takes half the memory of bfloat16.
 
-    The product is computed in the number format of its input.
+    The matrix multiplication is computed in the number format of the input.
 
     Attributes:
-        weight: (O, I) int8.
-        scale: (O,).
+        weight: (outputs, inputs) int8.
+        scale: (outputs,) factors of the weights.
     """
 
     weight: Tensor
     scale: Tensor
 
     def __init__(self, weight: Tensor, dtype: torch.dtype) -> None:
-        """Round floats (O, I) to 255 levels of each row's largest absolute value."""
+        """Round weights to int8. In each row 127 stands for the largest absolute value.
+
+        Args:
+            weight: (outputs, inputs) floats.
+            dtype: Number format of the scales.
+        """
         super().__init__()
         scale = weight.float().abs().amax(1).clamp_min(1e-12) / 127
         self.register_buffer("weight", (weight.float() / scale[:, None]).round().to(torch.int8))
         self.register_buffer("scale", scale.to(dtype))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map x (…, I) to (…, O)."""
+        """Map inputs (…, inputs) to outputs (…, outputs)."""
         return F.linear(x, self.weight.to(x.dtype)) * self.scale
 
 
 def quantise(module: nn.Module) -> None:
-    """Replace every linear layer below `module` by an `Int8Linear`."""
+    """Replace every linear layer inside a module by an `Int8Linear`."""
     for name, child in module.named_children():
         if isinstance(child, nn.Linear):
             setattr(module, name, Int8Linear(child.weight.data, child.weight.dtype))

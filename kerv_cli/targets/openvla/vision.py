@@ -1,6 +1,6 @@
-"""The vision tower of OpenVLA: DINOv2 ViT-L/14 with registers and SigLIP So400m/14, and the projector after both.
+"""The two vision towers of OpenVLA, DINOv2 ViT-L/14 with registers and SigLIP So400m/14, and the projector after them.
 
-Modules are named as in the published checkpoints. The towers leave out what has no effect: the last block of each
+Modules have the names that published checkpoints use. Weights without effect are left out: the last block of each tower
 (OpenVLA takes the output of the last but one), the norm after it and SigLIP's pooling head.
 
 Shapes: B batch, n patches, W width of a tower, E width of the language model.
@@ -20,7 +20,7 @@ EPSILON = 1e-6  # of every layer norm
 
 
 def named(**layers: nn.Module) -> nn.Sequential:
-    """Return layers in a row, under the names of their weights."""
+    """Return a sequence of layers. The names of the arguments are the names of their weights."""
     return nn.Sequential(OrderedDict(layers))
 
 
@@ -34,7 +34,7 @@ class Attention(nn.Module):
         self.proj = nn.Linear(tower.width, tower.width)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map x (B, n, W) to (B, n, W)."""
+        """Return the attention's output (B, n, W) for x (B, n, W)."""
         batch, tokens, width = x.shape
         q, k, v = self.qkv(x).view(batch, tokens, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
         attended = F.scaled_dot_product_attention(q, k, v)
@@ -49,7 +49,7 @@ class LayerScale(nn.Module):
         self.scale_factor = nn.Parameter(torch.ones(width))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Scale x (B, n, W)."""
+        """Multiply each channel of x (B, n, W) by its factor."""
         return x * self.scale_factor
 
 
@@ -61,19 +61,19 @@ class Block(nn.Module):
         self.norm1 = nn.LayerNorm(tower.width, eps=EPSILON)
         self.attn = Attention(tower)
         self.norm2 = nn.LayerNorm(tower.width, eps=EPSILON)
-        # the exact GELU in both towers: timm's SigLIP differs from transformers' in this
+        # the exact GELU in both towers, as in timm; the SigLIP of transformers approximates it
         width, hidden = tower.width, tower.feed_forward
         self.mlp = named(fc1=nn.Linear(width, hidden), gelu=nn.GELU(), fc2=nn.Linear(hidden, width))
         self.ls1, self.ls2 = (LayerScale(tower.width) if tower.scaled else nn.Identity() for _ in range(2))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map x (B, n, W) to (B, n, W)."""
+        """Return the block's output (B, n, W) for x (B, n, W)."""
         x = x + self.ls1(self.attn(self.norm1(x)))
         return x + self.ls2(self.mlp(self.norm2(x)))
 
 
 class VisionTower(nn.Module):
-    """One tower up to its last but one block."""
+    """One vision tower, without its last block."""
 
     def __init__(self, tower: Tower) -> None:
         super().__init__()
@@ -86,7 +86,10 @@ class VisionTower(nn.Module):
         self.blocks = nn.ModuleList(Block(tower) for _ in range(tower.depth - 1))
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """Map normalised pixels (B, 3, h, w) to patches (B, n, W). Only patches get positions."""
+        """Map normalised images (B, 3, h, w) to patch tokens (B, n, W).
+
+        Position embeddings are added to patches only, not to the class token and the registers.
+        """
         x = self.patch_embed(pixels).flatten(2).transpose(1, 2) + self.pos_embed
         if self.prefix:
             front = torch.cat([self.cls_token, self.reg_token], 1).expand(len(x), -1, -1)
@@ -97,19 +100,19 @@ class VisionTower(nn.Module):
 
 
 class VisionBackbone(nn.Module):
-    """Both towers side by side."""
+    """Both vision towers. Their outputs are concatenated."""
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
         self.featurizer, self.fused_featurizer = (VisionTower(tower) for tower in shape.towers)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """Map pixels (B, 6, h, w), three channels for each tower, to patches (B, n, W + W')."""
+        """Map images (B, 6, h, w), three channels for each tower, to patch tokens (B, n, W + W')."""
         return torch.cat([self.featurizer(pixels[:, :3]), self.fused_featurizer(pixels[:, 3:])], -1)
 
 
 def projector(shape: Shape) -> nn.Sequential:
-    """Return the layers that map patches (B, n, W + W') to embeddings (B, n, E)."""
+    """Return the layers that map patch tokens (B, n, W + W') to vision tokens (B, n, E) of the language model."""
     width, hidden = sum(tower.width for tower in shape.towers), shape.language.hidden_size
     first, second, third = nn.Linear(width, 4 * width), nn.Linear(4 * width, hidden), nn.Linear(hidden, hidden)
     return named(fc1=first, gelu1=nn.GELU(), fc2=second, gelu2=nn.GELU(), fc3=third)
