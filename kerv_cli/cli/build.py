@@ -20,7 +20,6 @@ from kerv_cli.training.settings import BuildDatastoreSettings, BuildDrafterSetti
     BuildTargetSettings,
     keys="grow policy.target target checkpoint name statistics environment camera results",
     examples=(
-        "kerv build target checkpoint=models/openvla-7b name=openvla",
         "kerv build target grow=150m policy.target=mt10-vision name=mt10-150m",
         "kerv build target checkpoint=models/libero name=libero statistics=libero_spatial crop=true",
     ),
