@@ -255,7 +255,7 @@ class ExpertDecoder:
             KervError: `reset` was not called, or the expert did not return D finite numbers.
         """
         if self.expert is None:
-            raise KervError("the expert does not know its task yet: call reset before decode")
+            raise KervError("the expert does not know its task yet: reset it before decoding")
         stopwatch = Stopwatch(torch.device("cpu"))
         action = self.expert(observation)
         seconds = stopwatch.stop()
