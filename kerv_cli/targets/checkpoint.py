@@ -72,7 +72,7 @@ class TargetDescription(Description):
 
     def __post_init__(self) -> None:
         if not isinstance(self.settings.get("chunk"), int):
-            raise ValueError("settings lack chunk, the control steps of a decode")
+            raise ValueError("chunk is missing in the settings: the number of control steps per decode")
 
     @property
     def chunk(self) -> int:

@@ -52,7 +52,7 @@ def grow_stack(stack: LayerStack, shape: GrowSettings, layers: int) -> None:
     """Replace the layers of a stack by larger layers, and more of them, that compute the same function.
 
     Args:
-        stack: A trunk or a drafter.
+        stack: A trunk or a drafter. It is changed in place.
         shape: Width, heads and hidden units of the new layers.
         layers: Number of new layers.
 

@@ -105,7 +105,8 @@ def _tile(rows: int, kind: int, lanes: int) -> Callable[..., None]:
 def _product(kind: int, size: int) -> Callable[..., None]:
     """Return a function that multiplies any number of rows with a whole matrix.
 
-    Its arguments are those of a `_tile`, with the number of panels and of rows. Addresses are those of the first panel.
+    Its arguments are (weights, factors, inputs, panels, x, stride, rows, y, step). `panels` and `rows` are counts. The
+    others are explained in `_tile`; the addresses point to the first panel.
 
     Args:
         kind: Number format of the weights: HALF, INT8 or FLOAT.
