@@ -55,7 +55,7 @@ def _unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
 
 
 def _unraisable_at_the_end(unraisable: "sys.UnraisableHookArgs") -> None:
-    """Hide exceptions of half-built objects that fail to clean up after Ctrl-C. Only a lost Ctrl-C is sent again."""
+    """Hide exceptions of objects that Ctrl-C left half-built. If Ctrl-C itself is hidden so, send it again."""
     if unraisable.exc_type is KeyboardInterrupt:
         _unraisable(unraisable)
 

@@ -23,9 +23,7 @@ def set_up(settings: RuntimeSettings) -> tuple[str, torch.dtype]:
         UsageError: The device does not exist on this machine, or a setting is out of range.
     """
     check_settings(settings, "runtime")
-    device = settings.device
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = settings.device if settings.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
     if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
         raise UsageError(f"runtime.device={device}: known are cpu, cuda, cuda:N, auto")
     if device.startswith("cuda") and not torch.cuda.is_available():

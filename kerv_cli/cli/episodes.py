@@ -25,8 +25,8 @@ SECONDS_PER_EPISODE = 1.0
 def planned_study(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
     """Plan a study: find out which of its episodes must run. Print notes about it to standard error.
 
-    The notes name the overrides that have no effect, the number of episodes and tasks that the policy was not trained
-    on.
+    The notes give the number of episodes, the overrides that have no effect, and the tasks that the policy was not
+    trained on.
 
     Args:
         resolved: The study with all its settings.

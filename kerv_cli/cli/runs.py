@@ -108,12 +108,12 @@ def _entry_row(run: RunEntry) -> dict[str, object]:
 def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Show one run, ID or ID:SETTING: its command, its results, the artifacts it was made from, its folder."""
     from kerv_cli.catalogue.entries import disk_bytes, find_runs, parents, store_of
-    from kerv_cli.report.compare import sides
+    from kerv_cli.report.compare import compared_runs
     from kerv_cli.report.summary import SummaryTable
     from kerv_cli.report.tables import load_study, rows_of
 
     results, (name,) = settings.results, _run_names(names)
-    chosen = sides(results, name)
+    chosen = compared_runs(results, name)
     run = chosen[0].run
     table = load_study(store_of(run)).table if run.has_episodes and run.episodes else None
     if table is not None:

@@ -44,7 +44,7 @@ class Fixed:
         self.r = r
 
     def reset(self) -> None:
-        """Do nothing: r is constant."""
+        """Do nothing: the acceptance radius r is constant."""
 
     def radius(self) -> int:
         """Return the constant radius r, in bins."""

@@ -61,7 +61,7 @@ def is_parallel(target: object) -> bool:
 
 
 def check_parallel(parts: Mapping[str, Part], parallel: bool) -> None:
-    """Check that a parallel target is used with skip=parallel and without drafts, and other targets without it.
+    """Check that a parallel target has skip=parallel and no drafts, and that no other target has skip=parallel.
 
     Args:
         parts: Kind -> part, for all parts of the method.

@@ -25,7 +25,7 @@ _PROVENANCE = ("host", "device_name", "git_commit", "torch_version", "mujoco_ver
 
 
 @dataclass(frozen=True)
-class Side:
+class ComparedRun:
     """One of the two things compared: a setting of a run with episodes, or a training.
 
     Attributes:
@@ -41,7 +41,7 @@ class Side:
     data: StudyData | None = None
 
 
-def sides(results: str, name: str) -> list[Side]:
+def compared_runs(results: str, name: str) -> list[ComparedRun]:
     """Find what a name on the command line stands for.
 
     Args:
@@ -57,14 +57,17 @@ def sides(results: str, name: str) -> list[Side]:
     if not run.has_episodes:
         if label:
             raise UsageError(f"{run.id} is a {run.kind}: it has no setting '{label}'")
-        return [Side(run.id, run)]
+        return [ComparedRun(run.id, run)]
     labels = store_of(run).load().labels
     if label and label not in labels:
         raise UsageError(f"run {run.id} has no setting '{label}': it has {', '.join(labels)}")
-    return [Side(f"{run.id}:{one}" if len(labels) > 1 else run.id, run, one) for one in ([label] if label else labels)]
+    return [
+        ComparedRun(f"{run.id}:{one}" if len(labels) > 1 else run.id, run, one)
+        for one in ([label] if label else labels)
+    ]
 
 
-def pairs_to_compare(results: str, first: str, second: str) -> list[tuple[Side, Side]]:
+def pairs_to_compare(results: str, first: str, second: str) -> list[tuple[ComparedRun, ComparedRun]]:
     """Return which settings of two runs to compare with each other.
 
     Settings with the same label form pairs. If the runs share fewer than two labels, the first run's first setting is
@@ -72,7 +75,7 @@ def pairs_to_compare(results: str, first: str, second: str) -> list[tuple[Side, 
 
     Args:
         results: Results folder.
-        first: Name of the first run, as in `sides`.
+        first: Name of the first run, as in `compared_runs`.
         second: Name of the second run.
 
     Raises:
@@ -80,7 +83,7 @@ def pairs_to_compare(results: str, first: str, second: str) -> list[tuple[Side, 
         UnknownName: There is no such run.
         CheckpointError: A run is damaged.
     """
-    ours, theirs = sides(results, first), sides(results, second)
+    ours, theirs = compared_runs(results, first), compared_runs(results, second)
     if ours[0].run.has_episodes != theirs[0].run.has_episodes:
         raise UsageError(f"{ours[0].run.id} and {theirs[0].run.id} cannot be compared: only one of them has episodes")
     pairs = [(a, b) for a in ours for b in theirs if a.label == b.label]
@@ -91,7 +94,7 @@ def pairs_to_compare(results: str, first: str, second: str) -> list[tuple[Side, 
     return [(replace(a, data=data.get(a.run.id)), replace(b, data=data.get(b.run.id))) for a, b in pairs]
 
 
-def compare(first: Side, second: Side) -> Row:
+def compare(first: ComparedRun, second: ComparedRun) -> Row:
     """Return the differences between two settings or two trainings, as JSON values.
 
     Returns:
@@ -113,7 +116,7 @@ def compare(first: Side, second: Side) -> Row:
     return {"first": first.name, "second": second.name, "settings": settings, "results": results}
 
 
-def _settings_of(side: Side) -> Row:
+def _settings_of(side: ComparedRun) -> Row:
     if side.data is None:
         description = description_of(side.run)
         settings: Row = dict(description.get("settings", {}))

@@ -29,7 +29,7 @@ BATCH = 64
 class Rows:
     """Base class of dataclasses whose fields have one row per sample.
 
-    A field is a tensor, or encoded images. It is None if there are no images.
+    A field is a tensor or encoded images. The field of the images is None if the samples have none.
     """
 
     def __len__(self) -> int:

@@ -305,7 +305,7 @@ def continued_target(settings: TargetSettings, init: CompactTarget, camera: str)
     """Make a target that starts from the weights, action statistics and words of another target.
 
     Only the query embeddings of a parallel target are newly initialised. The encoder of an added view is a copy of the
-    first view's, and weights of zero keep the estimated positions independent of the added view at first.
+    first view's. The weights from an added view to the estimated object positions start at zero.
 
     Args:
         settings: Shapes of the new target.

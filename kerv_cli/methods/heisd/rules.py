@@ -515,7 +515,7 @@ class Random(Seeded):
 
     @classmethod
     def always(cls, settings: NoSettings, context: Context) -> Random:
-        """Build boundary=always_retrieval or always_drafter."""
+        """Build the boundary that always chooses one side: boundary=always_retrieval or boundary=always_drafter."""
         return cls(float(settings.kind == "always_retrieval"))
 
     def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
