@@ -20,7 +20,8 @@ OPSET = 17
 class PackedVision:
     """A vision encoder, exported to ONNX.
 
-    An ONNX session cannot be copied, so copies and pickles hold None in its place. It uses as many threads as torch has at the time of the export.
+    An ONNX session cannot be copied, so copies and pickles hold None in its place. It uses as many threads as torch has
+    at the time of the export.
     """
 
     def __init__(self, encoder: nn.Module, size: int) -> None:
