@@ -395,7 +395,7 @@ def test_an_import_is_a_target_like_any_other(checkpoint: Path, tmp_path: Path) 
         ({"dataset_statistics.json": {"tiny": {"action": {"q01": ["x"]}}}}, [], "damaged"),
         ({}, ["statistics=bridge"], "unknown statistics 'bridge'"),
         ({}, ["environment=metaworld"], "are of 7 DoFs, the action space has 4"),
-        ({}, ["family=compact"], "openvla is imported"),
+        ({}, ["family=compact"], "others are trained"),
         ({}, ["prompt_tokens=3"], "at most 3 are taken"),
         ({"preprocessor_config.json": {"image_resize_strategy": "letterbox"}}, [], "letterbox"),
     ],

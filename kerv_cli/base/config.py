@@ -91,7 +91,7 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
     places = {key: place for key, place in places.items() if key not in typed}
     key = ""
     try:
-        nodes = copy.deepcopy(_composed(tuple(choices.items()), schema, conf_dir()))  # type: ignore[arg-type]
+        nodes = copy.deepcopy(_composed((*choices.items(),), schema, conf_dir(), (*parts("artifact"),)))  # type: ignore[arg-type]
         for key, value in values:
             if value == "" and key in typed and OmegaConf.select(nodes, key):
                 raise UsageError(f"{key}= is empty: write a value, or leave it out")
@@ -205,13 +205,14 @@ def _parsed(override: str) -> Any:
 
 
 @functools.lru_cache(maxsize=256)
-def _composed(choices: tuple[tuple[str, str], ...], schema: type, conf: Path) -> Any:
+def _composed(choices: tuple[tuple[str, str], ...], schema: type, conf: Path, artifacts: tuple[str, ...]) -> Any:
     """Return the settings that Hydra composes for these choices. This takes 0.1 s, so the result is cached.
 
     Args:
         choices: (group, name) pairs, such as ("method", "kerv"). Later ones override earlier ones.
         schema: Dataclass of the settings.
         conf: Folder of the configuration files.
+        artifacts: Registered kinds of artifacts, which the settings of a policy can name.
 
     Raises:
         UnknownName: A group has no such name.
