@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -177,11 +176,11 @@ def grow(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
     recipe = Recipe(**asdict(settings.grow), base=str(base), sha256=description.sha256)
     target = build_compact(base, description, "cpu", torch.float32)
     grow_stack(target.trunk, recipe, recipe.layers)
-    others: Mapping[str, Any] = {at.name: getattr(description, at.name) for at in fields(description)}
     digest = hashlib.sha256(json.dumps(asdict(recipe) | {"base": ""}, sort_keys=True).encode()).hexdigest()
     written = checkpoint.target_fields(
         "grown", {**description.settings, "grown": asdict(recipe)}, description.environment, description.actions,
-        description.observation, cameras=description.cameras, words=description.words, provenance=others["provenance"],
+        description.observation, cameras=description.cameras, words=description.words,
+        provenance=description.provenance,
     )  # fmt: skip
     folder = artifact(settings.results, "target", settings.name)
     write_json(folder / "target.json", {"format": checkpoint.FORMAT, "kind": "target", "sha256": digest, **written})
