@@ -87,16 +87,6 @@ def test_without_enough_history_the_target_decodes_on() -> None:
     assert chunk.closed is None
 
 
-@pytest.mark.parametrize(("known", "closed"), [(5, [False, False, True]), (9, [False, True, True]), (13, [True] * 3)])
-def test_a_chunk_is_not_closed_where_too_much_would_be_dropped(known: int, closed: list[bool]) -> None:
-    found = []
-    for most in (0, 1, 2):
-        chunk = chunk_with(PAST)
-        chunk.tokens = [100] * known
-        found.append(compensation(max_dropped=most).close(chunk))
-    assert found == closed
-
-
 def test_the_filter_rests_after_a_compensation() -> None:
     resting = compensation(rest=2)
     closed = []
@@ -125,6 +115,35 @@ class Known(Proposer):
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
         return Draft.of(self.drafted)
+
+
+@pytest.mark.parametrize("use_target_token", [True, False])
+@pytest.mark.parametrize("wrong", range(N))
+def test_a_filled_step_drops_nothing(wrong: int, use_target_token: bool) -> None:
+    """The target's greedy tokens, given those that were filled; predicted values are executed without rounding."""
+    prompt = prompt_of(3)
+    truth = plain_greedy(TARGET, prompt)
+    drafted = [(t + 100) % 255 if i == wrong else t for i, t in enumerate(truth)]
+    first = wrong + use_target_token
+    filled = range(first, (wrong // D + 1) * D)
+    rectifier = compensation(use_target_token=use_target_token, drop=False, min_verified=0, rest=4)
+    decoder = Decoder(TARGET, Parts(prefill_draft=Known(drafted), rectifier=rectifier))
+    decoder.situation = Situation("t", PAST)
+    chunk = decoder.decode_prompt(prompt)
+    if use_target_token and first % D == 0:  # a whole step would follow without a single token of the target
+        filled = range(first, min(N, first + D))
+    assert tuple(chunk.filled) == tuple(filled)
+    assert chunk.closed is None
+    assert len(chunk.tokens) == N
+    assert chunk.tokens[:first] == truth[:first]
+    known = chunk.tokens[: first + len(filled)]
+    rest = plain_greedy(TARGET, torch.cat([prompt, TARGET.embed(torch.tensor([known]))], 1))
+    assert chunk.tokens == [*known, *rest][:N]
+    step = first // D
+    last = SPACE.values_of(np.array(chunk.tokens[step * D - D : step * D])) if step else PAST.values()[-1]
+    executed = SPACE.normalise(chunk.actions()).flatten()
+    assert executed[list(filled)] == pytest.approx([last[index % D] for index in filled], abs=1e-6)
+    assert decoder.parts.rectifier.resting == (5 if filled else 0)  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("use_target_token", [True, False])

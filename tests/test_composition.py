@@ -39,16 +39,16 @@ AR: dict[str, Any] = {
 }
 PRESETS: dict[str, dict[str, Any]] = {
     # what differs from AR, spelled out, in the presets whose tokens tests/golden does not hold
-    "naive_sd": {"proposer": DrafterProposerSettings(depth=5, top_k=1, nodes=5)},
+    "naive_sd": {"proposer": DrafterProposerSettings(depth=5)},
     "jacobi": {"proposer": JacobiProposerSettings(depth=0)},
-    "kerv_paper": {
-        "proposer": DrafterProposerSettings(depth=5, top_k=8, nodes=50),
+    "kerv": {
+        "proposer": DrafterProposerSettings(shape="tree", depth=5, top_k=8, nodes=50),
         "acceptance": RelaxedAcceptanceSettings(strict_dofs=False),
-        "threshold": KinematicThresholdSettings(r_min=5, r_max=15, phi=2.0, k_s=None),
-        "rectifier": CompensateSettings("compensate", "kalman", 1, False, 1, 4, -1),
+        "threshold": KinematicThresholdSettings("quoted", r_min=5, r_max=15, phi=2.0, k_s=None),
+        "rectifier": CompensateSettings(predictor="kalman", use_target_token=False, drop=False, min_verified=0, rest=4),
     },
-    "heisd_paper": {
-        "proposer": HybridProposerSettings(depth=5, top_k=8, nodes=50, neighbours=5),
+    "heisd": {
+        "proposer": HybridProposerSettings(shape="tree", depth=5, top_k=8, nodes=50, neighbours=5),
         "acceptance": HybridAcceptanceSettings(strict_dofs=False, group_limit=30, token_limit=15),
         "boundary": FusedBoundarySettings(alpha=0.5, window=15, f_star=0.5),
         "skip": SimilaritySkipSettings(s_min=None, max_skips=2, up=0.0, down=0.0),

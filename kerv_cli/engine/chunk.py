@@ -133,7 +133,7 @@ class Chunk:
     """The N tokens of one decode, filled step by step.
 
     Parts of a method may read it. They change it only through its methods. The cache holds the prompt and all committed
-    tokens except the last.
+    tokens except `uncached`, which is the last one unless a rectifier has filled several.
     """
 
     encoding: Tensor | Callable[[], Tensor]  # the prompt, or a function that encodes it
@@ -154,6 +154,7 @@ class Chunk:
     similarity: float | None = None  # cosine of the best match in the datastore, if it was searched
     reason: str | None = None  # as in `DecodeRecord`
     closed: np.ndarray | None = None  # (steps, D) normalised actions, if a rectifier ended the chunk
+    filled: dict[int, float] = field(default_factory=dict)  # index -> normalised value that a rectifier predicted
     _differences: list[float] = field(default_factory=list)  # |draft − target| of compared tokens, normalised units
 
     @property
@@ -179,6 +180,11 @@ class Chunk:
         return self.prompt.shape[1]
 
     @property
+    def uncached(self) -> list[int]:
+        """Committed tokens that the target has not read yet. Empty before the prefill."""
+        return self.tokens[self.cache.length - self.prompt_length :] if self.tokens else []
+
+    @property
     def remaining(self) -> int:
         """Number of tokens still to be decoded. 0 if a prediction (a rectifier) ended the chunk early."""
         return 0 if self.closed is not None else self.size - len(self.tokens)
@@ -186,7 +192,7 @@ class Chunk:
     @property
     def compensated(self) -> int:
         """Number of action values that a rectifier predicted instead of the target."""
-        return 0 if self.closed is None else max(0, self.closed.size - len(self.tokens))
+        return len(self.filled) if self.closed is None else max(0, self.closed.size - len(self.tokens))
 
     @property
     def variability(self) -> float | None:
@@ -278,16 +284,38 @@ class Chunk:
             with_target_token: Whether the target's token at the rejected position stays committed.
         """
         if not with_target_token:
-            del self.tokens[-1]
-            self.rounds[-1] = replace(self.rounds[-1], committed=self.rounds[-1].accepted)  # without the bonus
+            self._remove_bonus()
         del self.tokens[values.size :]
         self.closed = values
 
+    def fill(self, values: np.ndarray, with_target_token: bool) -> None:
+        """Commit predicted values up to the end of a control step. The chunk goes on behind it.
+
+        The values are executed as they are. The target reads their nearest tokens.
+
+        Args:
+            values: Normalised actions (steps, D): those of the committed tokens, then predicted ones.
+            with_target_token: Whether the target's token at the rejected position stays committed.
+        """
+        if not with_target_token:
+            self._remove_bonus()
+        start = len(self.tokens)
+        self.filled |= dict(enumerate(values.flatten()[start:].tolist(), start))
+        self.tokens += self.space.bins_of(values).flatten()[start:].tolist()
+
+    def _remove_bonus(self) -> None:
+        del self.tokens[-1]
+        self.rounds[-1] = replace(self.rounds[-1], committed=self.rounds[-1].accepted)
+
     def actions(self) -> np.ndarray:
         """Return the actions (steps, D) of the complete chunk, float32, environment units."""
-        if self.closed is None:
-            return actions_of(self.space, self.tokens)
-        return self.space.unnormalise(self.closed).astype(np.float32)
+        values = self.closed
+        if values is None:
+            if not self.filled:
+                return actions_of(self.space, self.tokens)
+            values = self.space.values_of(np.array(self.tokens))
+            values[list(self.filled)] = list(self.filled.values())
+        return self.space.unnormalise(values.reshape(-1, self.dofs)).astype(np.float32)
 
     def record(self, actions: np.ndarray, seconds: float, phases: dict[str, float]) -> DecodeRecord:
         """Return the record of the complete chunk. The arguments are attributes of `DecodeRecord`."""
@@ -303,6 +331,7 @@ class Chunk:
             seconds=seconds,
             phases=phases,
             compensated=self.compensated,
+            filled=tuple(self.filled),
             variability=self.variability,
             skipped="skip" in modes,
             similarity=self.similarity,

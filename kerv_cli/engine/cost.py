@@ -167,8 +167,8 @@ def work_of(
         phases: Recorded seconds of each of `READ_PHASES`, (decodes,).
         looked_up: Whether the decode searched the datastore, (decodes,) bool.
         size: Number of tokens N in a chunk.
-        drafter: The drafter's settings `depth` and `top_k`. None if unknown: then a draft of many nodes counts as a
-            tree.
+        drafter: The drafter's depth, and whether it drafts a tree. None if unknown: then a draft of many nodes
+            counts as a tree.
     """
     decodes, decode = len(counts), np.repeat(np.arange(len(counts)), counts)
     mode, proposer, start = rounds["mode"], rounds["proposer"], rounds["start"]
@@ -177,8 +177,8 @@ def work_of(
     has_drafter = np.bincount(decode, drafts, decodes) > 0
     nodes = np.where(mode == PARALLEL, size, rounds["tree_size"])
     accepted = np.where(mode == PARALLEL, 0, rounds["accepted"])
-    depth, top_k = drafter or (_LEVELS, 0)
-    trees = drafts & ((nodes >= _WIDE) if drafter is None else top_k > 1)
+    depth, is_tree = drafter or (_LEVELS, False)
+    trees = drafts & ((nodes >= _WIDE) if drafter is None else is_tree)
     forward, prefill = mode != "skip", start == 0
     feeds = forward & has_drafter[decode] & (np.diff(decode, append=decodes) == 0)  # not after the last round
 

@@ -191,7 +191,7 @@ class Decoder(EpisodeState):
         if skip is not None:
             skip.verified(chunk)
         stopwatch.lap("accept")
-        self.rectify(chunk, stopwatch)
+        chunk.hidden = self.rectify(chunk, chunk.hidden, stopwatch)
         if proposer is not None and chunk.remaining > 1:
             proposer.begin(chunk)
             stopwatch.lap("propose")
@@ -205,7 +205,7 @@ class Decoder(EpisodeState):
         accepted = self.accept(chunk, verified, proposer)
         hidden = self.commit(chunk, verified, accepted, proposer)
         stopwatch.lap("accept")
-        self.rectify(chunk, stopwatch)
+        hidden = self.rectify(chunk, hidden, stopwatch)
         if proposer is not None and chunk.remaining > 1:
             proposer.committed(chunk, first, hidden, verified.target_tokens)
             stopwatch.lap("propose")
@@ -253,11 +253,12 @@ class Decoder(EpisodeState):
     def verify(self, chunk: Chunk, draft: Draft) -> Verified:
         """Run the target over the draft, preceded by the tokens that are not in its cache yet.
 
-        In the first round these are the prompt, later the last committed token.
+        In the first round these are the prompt, later the last committed token or those that a rectifier has filled.
         """
         target, cache = self.target, chunk.cache
         if chunk.tokens:
-            before, x = 1, target.embed(draft.tokens_after(chunk.tokens[-1], target.device)[None])
+            uncached = chunk.uncached
+            before, x = len(uncached), target.embed(draft.tokens_after(uncached, target.device)[None])
         else:
             before, x = chunk.prompt_length, chunk.prompt
             if len(draft):
@@ -333,12 +334,22 @@ class Decoder(EpisodeState):
         cache.compact(end, end + kept)
         return torch.cat([hidden[:, :before], hidden[:, before + kept]], 1)
 
-    def rectify(self, chunk: Chunk, stopwatch: Stopwatch) -> None:
-        """After a rejection, let the rectifier end the chunk if it can predict the missing actions."""
+    def rectify(self, chunk: Chunk, hidden: Tensor, stopwatch: Stopwatch) -> Tensor:
+        """After a rejection, let the rectifier predict the missing values of the control step.
+
+        If several values were filled and the chunk goes on, one forward reads their tokens and gives the next token.
+
+        Returns:
+            `hidden`, the target's hidden states of this round, followed by those of that forward.
+        """
         last, rectifier = chunk.rounds[-1], self.parts.rectifier
         if rectifier is None or last.accepted == len(last.drafted):
-            return
+            return hidden
         # a full chunk whose last token is the target's is complete, unless the rectifier may not use that token
         if chunk.remaining or not rectifier.uses_target_token:
             rectifier.close(chunk)
         stopwatch.lap("rectify")
+        if chunk.remaining and len(chunk.uncached) > 1:
+            hidden = torch.cat([hidden, self.commit(chunk, self.verify(chunk, EMPTY), Accepted((), None), None)], 1)
+            stopwatch.lap("verify")
+        return hidden

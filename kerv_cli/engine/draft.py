@@ -82,11 +82,11 @@ class Draft:
         """Return the tokens (n,) as a tensor on `device`."""
         return upload(self.tokens, device) if self.tokens.device == HOST else self.tokens
 
-    def tokens_after(self, token: int, device: torch.device) -> Tensor:
-        """Return `token`, the last committed one, and then the draft's tokens: (1 + n,) int64 on `device`."""
+    def tokens_after(self, committed: list[int], device: torch.device) -> Tensor:
+        """Return k committed tokens and then the draft's n tokens: (k + n,) int64 on `device`."""
         if self.tokens.device == HOST:
-            return upload(np.concatenate([[token], self.tokens.numpy()]), device)
-        return torch.cat([torch.full_like(self.tokens[:1], token), self.tokens])
+            return upload(np.concatenate([committed, self.tokens.numpy()]), device)
+        return torch.cat([upload(committed, device), self.tokens])
 
     @cached_property
     def ancestors(self) -> np.ndarray | Tensor | None:

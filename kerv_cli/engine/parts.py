@@ -68,10 +68,13 @@ class Rectifier(Protocol):
         """Note that a decode has ended."""
 
     def close(self, chunk: Chunk) -> bool:
-        """End the chunk with predicted actions after a rejection, if the missing values can be predicted.
+        """Fill the rejected control step with predicted values, if they can be predicted.
+
+        The rectifier calls `Chunk.close`, which drops the later steps, or `Chunk.fill`, after which the target decodes
+        them.
 
         Returns:
-            Whether the chunk ended. If not, the target decodes on.
+            Whether it did either. If not, the target decodes on after its own token.
         """
 
 

@@ -81,6 +81,7 @@ class DecodeRecord:
     seconds: float  # inference time (docs/methods.md §7), device synchronised at both ends; NaN: not timed
     phases: dict[str, float]  # seconds by phase, keys from PHASES
     compensated: int = 0  # tokens filled by a prediction instead of the target
+    filled: tuple[int, ...] = ()  # their indices; empty: the last executed tokens, if the rest of the chunk was dropped
     size: int = 0  # N; 0: as many as `tokens`
     skipped: bool = False  # executed without verification
     variability: float | None = None  # K of this decode (§3.2), normalised action units

@@ -23,7 +23,7 @@ from kerv_cli.base.registry import METHOD_KINDS, PART_GROUPS, part_of
 from kerv_cli.episodes.settings import CONSTANT, PROFILE, WAITS, RolloutSettings, TimingSettings, settings_from
 from kerv_cli.methods.settings import EXPERT
 
-ENGINE = 1
+ENGINE = 2
 """Version of the tokens that the code gives. Increase it with every change that alters tokens or actions.
 tests/test_golden.py checks this."""
 

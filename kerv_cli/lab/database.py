@@ -137,8 +137,8 @@ METRICS = _table(
 
 
 def now() -> str:
-    """Return the current time in UTC, ISO 8601 with seconds."""
-    return datetime.now(UTC).isoformat(timespec="seconds")
+    """Return the current time in UTC, ISO 8601 with milliseconds."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
 class Database:

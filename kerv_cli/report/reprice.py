@@ -162,7 +162,7 @@ def _work_of_label(data: StudyData, label: str, store: StudyStore) -> _LabelWork
     phases = {phase: np.nan_to_num(table[f"seconds.{phase}"].to_numpy()) for phase in READ_PHASES}
     looked_up = ~np.isnan(table["similarity"].to_numpy(zero_copy_only=False).astype(float))
     proposer = setting.settings.get("proposer", {})
-    drafter = (int(proposer["depth"]), int(proposer["top_k"])) if "top_k" in proposer else None
+    drafter = (int(proposer["depth"]), proposer.get("shape") == "tree") if "shape" in proposer else None
     work = work_of(columns, counts, phases, looked_up, size, drafter)
     return _LabelWork(work, table["episode"].to_numpy(), size)
 

@@ -324,10 +324,9 @@ class EagleDrafter(TrainableDrafter):
 
     @classmethod
     def proposer(cls, settings: Any, context: Context) -> DrafterProposer:
-        """Build proposer=drafter, or the drafter of proposer=hybrid. Both settings have depth, top_k and nodes."""
-        return DrafterProposer(
-            context.artifact(cls.kind), context.target, settings.depth, settings.top_k, settings.nodes
-        )
+        """Build proposer=drafter, or the drafter of proposer=hybrid. Both settings have shape, depth, top_k, nodes."""
+        top_k, nodes = (settings.top_k, settings.nodes) if settings.shape == "tree" else (1, settings.depth)
+        return DrafterProposer(context.artifact(cls.kind), context.target, settings.depth, top_k, nodes)
 
     @torch.inference_mode()
     def examples(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, number
+from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, choice, number
 from kerv_cli.base.registry import DRAFTING, PREFILL, STATES, add
 
 MANIFEST = "manifest.json"
@@ -64,8 +64,9 @@ class HybridProposerSettings:
     """
 
     kind: str = "hybrid"
+    shape: str = choice("chain", "chain", "tree", help="the drafter's drafts")
     depth: int = number(15, 1, MOST_TOKENS)  # drafter: maximum number of tokens on a path
-    top_k: int = number(1, 1, MOST_TOKENS)  # drafter: nodes expanded per depth; 1: a chain
+    top_k: int = number(8, 1, MOST_TOKENS)  # drafter's tree: nodes expanded per depth
     nodes: int = number(24, 1, MOST_TOKENS)  # maximum number of nodes of either tree
     neighbours: int = number(3, 1, MOST_TOKENS)  # retrieval: number of stored chunks in the tree
 

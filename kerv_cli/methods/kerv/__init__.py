@@ -58,15 +58,15 @@ def find_predictor(name: str) -> Part:
 
 @dataclass
 class CompensateSettings:
-    """KERV: after a rejection, predict the rest of that control step, and drop the later steps of the chunk."""
+    """KERV: after a rejection, predict the rest of that control step."""
 
     kind: str = "compensate"
     predictor: str = "hold"  # hold, linear, kalman, damped; or draft: the rejected draft's remaining tokens (ours)
     steps: int = number(1, 1, MOST_TOKENS)  # control steps that a prediction may fill (paper: predict length PL)
     use_target_token: bool = True  # true: keep the target's token at the rejected position (ours); false: predict it
+    drop: bool = True  # true: end the chunk after the filled steps (ours); false: decode on, drop nothing (paper)
     min_verified: int = number(1, 0, MOST_TOKENS)  # fill a control step only if it has this many committed DoFs
     rest: int = number(0, 0, MOST_DECODES)  # after a compensation, number of decodes without one (KERV: 4)
-    max_dropped: int = number(-1, -1, MOST_TOKENS)  # decode on if more control steps would be dropped; -1: never (KERV)
 
     def check_together(self, prefix: str) -> None:
         """Refuse an unknown predictor, and `predictor=draft` without the target's token before the draft's tokens.

@@ -275,11 +275,12 @@ class PredictionProposer(ChainProposer):
 
 
 class Compensation:
-    """KERV: after a rejection, keeps the accepted tokens, predicts the rest of that control step and ends the chunk.
+    """KERV: after a rejection, keeps the accepted tokens and predicts the rest of that control step.
 
     The settings change this:
 
     - `use_target_token` (ours) also keeps the target's token at the rejected position, which is already computed.
+    - `drop` (ours) ends the chunk after the predicted steps. Without it, the target decodes the later steps.
     - `steps` (the paper's predict length PL) lets the prediction fill further control steps.
     - `predictor=draft` (ours) fills with the rejected draft's remaining tokens first. The draft knows the observation,
       and a predictor does not.
@@ -310,19 +311,19 @@ class Compensation:
         self.resting = max(0, self.resting - 1)
 
     def close(self, chunk: Chunk) -> bool:
-        """End the chunk after a rejection, if the missing actions can be predicted.
+        """Fill the rejected control step, if its missing values can be predicted.
 
         Returns:
-            Whether the chunk was ended. If not, the target decodes on.
+            Whether it was filled. If not, the target decodes on after its own token.
         """
         if self.resting:
             return False
         tokens = chunk.tokens if self.settings.use_target_token else chunk.tokens[:-1]
         drafted = chunk.rejection.draft if self.settings.predictor == DRAFT else ()
         values = assemble(tokens, chunk, self.predictor, self.settings, drafted)
-        if values is None or 0 <= self.settings.max_dropped < chunk.steps - len(values):
+        if values is None or (not self.settings.drop and values.size <= len(tokens)):
             return False
-        chunk.close(values, self.settings.use_target_token)
+        (chunk.close if self.settings.drop else chunk.fill)(values, self.settings.use_target_token)
         # + 1, because `next_decode` also counts the decode that compensated
         self.resting = self.settings.rest + 1
         return True
@@ -351,7 +352,7 @@ def assemble(
     """
     dofs, horizon = chunk.dofs, chunk.steps
     whole, part = divmod(len(tokens), dofs)
-    filled = 1 if whole == 0 or (part and part >= settings.min_verified) else 0
+    filled = 1 if whole == 0 or part >= max(settings.min_verified, settings.drop) else 0
     steps = min(horizon, whole + max(filled, settings.steps - 1 + filled))
     values = chunk.space.values_of(np.array([*tokens, *drafted][: steps * dofs], dtype=np.int64))
     flat = np.full(steps * dofs, np.nan)

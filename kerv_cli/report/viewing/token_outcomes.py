@@ -98,7 +98,7 @@ def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome
     executed = len(decode.actions) * dofs
     outcomes = [TokenOutcome(_unjudged(decode))] * size
     judged = [pair for one_round in decode.rounds for pair in _judged(one_round)]
-    filled = range(max(0, executed - decode.compensated), executed)  # predictions fill the last executed tokens
+    filled = decode.filled or range(max(0, executed - decode.compensated), executed)
     for index, outcome in [*judged, *((index, TokenOutcome("compensated")) for index in filled)]:
         if outcomes[index].kind != "rejected":
             outcomes[index] = outcome
