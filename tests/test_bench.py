@@ -73,7 +73,7 @@ def test_a_skipped_decode_has_no_forward() -> None:
 
 def test_a_tree_has_the_levels_of_its_settings_and_of_the_chunk() -> None:
     rounds = (PREFILL, ("verify", 1, 50, 4, "drafter"), ("verify", 13, 50, 1, "drafter"))
-    assert work(*rounds, drafter=(5, 8)).calls["tree"].rows.tolist() == [5, 2]
+    assert work(*rounds, drafter=(5, True)).calls["tree"].rows.tolist() == [5, 2]
 
 
 def test_bytes_and_operations_of_a_forward() -> None:
@@ -151,8 +151,8 @@ def test_the_cost_model_adds_the_forwards_up() -> None:
 def test_ceilings_are_those_of_the_definition() -> None:
     found = {c.method: c for c in ceilings(profile(), 16)}
     assert found["one_pass"].free == pytest.approx(20 / 5.15)
-    assert found["spec_vla"].free == pytest.approx(20 / (5 + 1.14))
-    assert found["spec_vla"].drafted == pytest.approx(20 / (5 + 1.14 + 1.3))
+    assert found["spec_vla_tuned"].free == pytest.approx(20 / (5 + 1.14))
+    assert found["spec_vla_tuned"].drafted == pytest.approx(20 / (5 + 1.14 + 1.3))
     assert found["naive_sd"].how == "3 × 5 drafted"
     assert found["naive_sd"].drafted < found["naive_sd"].free
     assert found["parallel"].free == pytest.approx(20 / 5.16)

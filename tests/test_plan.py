@@ -274,7 +274,7 @@ def test_reasons_name_what_changed(database: Database, monkeypatch: pytest.Monke
     assert reason(idle) == ""
     monkeypatch.setattr(identity.work_of, "__defaults__", (4,))
     monkeypatch.setattr("kerv_cli.lab.plan.ENGINE", 4)
-    assert reason(same) == "engine 1 → 4"
+    assert reason(same) == f"engine {ENGINE} → 4"
 
 
 def test_what_depends_on_the_order_of_episodes_is_reused_whole(database: Database) -> None:
