@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pandas as pd
 import pytest
@@ -251,7 +252,7 @@ def test_plain_lines_of_progress_say_the_time_left(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     clock = iter([0.0, 30.0, 45.0])
-    monkeypatch.setattr("kerv_cli.cli.common.time.monotonic", lambda: next(clock))
+    monkeypatch.setattr("kerv_cli.cli.common.time", SimpleNamespace(monotonic=lambda: next(clock)))
     with progress_bar("training") as advance:
         for done in (41, 42, 51, 56, 61, 101):  # resumed at 40 of 101
             advance(done, 101, "loss 1")

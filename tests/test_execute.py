@@ -21,7 +21,6 @@ from typing import Any
 import pytest
 import sqlalchemy as sa
 from conftest import python, raising
-from rich.console import Console
 from studies_synthetic import (
     count_calls,
     episode,
@@ -39,7 +38,8 @@ from studies_synthetic import (
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import KervError, StorageError, UsageError
 from kerv_cli.base.settings import RuntimeSettings
-from kerv_cli.cli.progress import ProgressDisplay
+from kerv_cli.cli.common import progress_bar
+from kerv_cli.cli.work import event_printer
 from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, WANTED, Database
@@ -304,29 +304,30 @@ def test_estimates_say_what_they_rest_on(database: Database) -> None:
     assert source == "measured on 8 stored episodes"
 
 
-def test_progress_without_a_terminal_is_plain_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_without_a_terminal_is_plain_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     swept(tmp_path, threshold_study(["reach-v3"], episodes=1))
-    written = io.StringIO()
-    with ProgressDisplay(Console(file=written, width=60)) as display:
+    with progress_bar("episodes") as show:
         bad = raising(ValueError("[bold] is not markup"), "naive_sd")
-        swept(tmp_path, STUDY, bad, on_event=display)
-    lines = written.getvalue().splitlines()
-    assert lines[0] == "4 episodes there already"
+        swept(tmp_path, STUDY, bad, on_event=event_printer(show))
+    written = capsys.readouterr().err
+    lines = written.splitlines()
+    assert lines[:2] == ["episodes …", "4 episodes there already"]
     assert any(line.startswith("naive_sd on reach-v3: failed: ValueError: [bold] is not markup") for line in lines)
-    assert re.fullmatch(r"12/12 .* on reach-v3, seed 100003: (success|failure), \d\.\d s", lines[-1])
-    assert "\x1b" not in written.getvalue()
-    monkeypatch.setattr("kerv_cli.cli.progress.LOG_SECONDS", -1.0)
-    with ProgressDisplay(Console(file=written, width=60)) as display:
-        swept(tmp_path, TWO, on_event=display)
-    assert re.search(r"^\d+/19 episodes, about \d+ s left; push-v3 100000-100003: 4 settings in turn$",
-                     written.getvalue(), re.M)  # fmt: skip
+    assert re.fullmatch(r"12/12 .* on reach-v3, seed 100003: (success|failure), \d\.\d s", lines[-2])
+    assert re.fullmatch(r"episodes 12/12, reach-v3 100001-100003: 4 settings in turn", lines[-1])
+    assert any(re.match(r"episodes \d+/12, about \d+ s left, ", line) for line in lines)
+    assert "\x1b" not in written
 
 
-def test_progress_on_a_terminal_is_a_bar_that_goes_away(tmp_path: Path) -> None:
+def test_progress_on_a_terminal_is_a_bar_that_goes_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     written = io.StringIO()
-    with ProgressDisplay(Console(file=written, width=100, force_terminal=True)) as display:
-        swept(tmp_path, STUDY, on_event=display)
-    assert "16/16 episodes" in written.getvalue()
+    monkeypatch.setattr(written, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(sys, "stderr", written)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    with progress_bar("episodes") as show:
+        swept(tmp_path, STUDY, on_event=event_printer(show))
+    assert "16/16" in written.getvalue()
     assert written.getvalue().count("\x1b[?25h") == 1  # the cursor is shown again
 
 

@@ -34,7 +34,7 @@ ANSWERS = [
     ("rollout --task=reach", "settings have no dashes: task=reach"),
     ("rollout --method kerv", "settings have no dashes: method=VALUE"),
     ("rollout --paln", "No such option: --paln (Possible options: --plan)"),
-    ("view --to", "Option '--to' requires an argument"),
+    ("runs export --to", "Option '--to' requires an argument"),
     # lists, empty values
     ("rollout reach", "'reach' is not an override: write key=value"),
     ("rollout task=reach, push", "write a list without spaces, task=[reach,push]"),

@@ -12,14 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 from examples.insertion import SPEC as INSERTION
-from PIL import Image
 from rerun.chunk import RrdReader
 from rerun_synthetic import DOFS, decode_of, episode, prefill, read_recording, skipped_decode, verify
 
 from kerv_cli.base.errors import KervError, StorageError, UsageError
 from kerv_cli.engine.record import EpisodeRecord, Round
 from kerv_cli.report.viewing import save_recording, viewer
-from kerv_cli.report.viewing.film import save_film
 from kerv_cli.report.viewing.token_outcomes import chunk_size, outcomes_of, readable
 from kerv_cli.report.viewing.viewer import MOST_OPENED, find_recordings, open_recording, read_chunks
 
@@ -137,21 +135,6 @@ def test_a_damaged_recording_gets_one_line(share: float, tmp_path: Path) -> None
         read_chunks(path)
     assert "\n" not in str(caught.value)
     assert "record the episode again" in str(caught.value)
-
-
-@pytest.mark.parametrize("ending", ["gif", "mp4"])
-def test_a_film_shows_the_camera_and_below_it_the_tokens(tmp_path: Path, ending: str) -> None:
-    place = save_film(saved(episode("drafter", frames=64), tmp_path), tmp_path / f"film.{ending}")
-    content = place.read_bytes()
-    assert content[:3] == b"GIF" if ending == "gif" else content[4:8] == b"ftyp"
-    if ending == "gif":
-        with Image.open(place) as film:
-            assert getattr(film, "n_frames") > 1  # noqa: B009
-            strip = film.convert("RGB").crop((0, film.width, *film.size))
-        colours = {colour for _, colour in strip.getcolors(1 << 20) or ()}
-        assert len(colours) > 3
-    with pytest.raises(UsageError, match=r"\.gif or \.mp4"):
-        save_film(place, tmp_path / "film.avi")
 
 
 def test_every_place_of_a_chunk_has_its_outcome() -> None:

@@ -194,7 +194,7 @@ def test_results_that_cannot_be_written_are_refused_at_once(tmp_path: Path) -> N
 
 
 def test_a_task_that_the_policy_never_saw_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from kerv_cli.cli.episodes import planned_rollout
+    from kerv_cli.cli.work import planned_rollout
     from kerv_cli.episodes.resolve import resolve_rollout
 
     words = ["method=ar,spec_vla", "task=coffee-button,reach", f"results={tmp_path}"]

@@ -10,7 +10,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.places import artifact
 from kerv_cli.base.registry import find, load, parts
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan, print_figures, print_plan, progress_bar
+from kerv_cli.cli.common import AsJson, ShowPlan, end_with_plan, print_figures, progress_bar
 from kerv_cli.targets.settings import BuildPolicySettings, BuildTargetSettings
 from kerv_cli.training.settings import BuildDatastoreSettings, BuildDrafterSettings
 
@@ -97,7 +97,7 @@ def datastore(settings: BuildDatastoreSettings, plan: ShowPlan = False, as_json:
 
     run = DatastoreBuild(settings)
     if plan:
-        print_plan(run.plan(), as_json)
+        end_with_plan(run.plan(), as_json)
     with (
         making(settings.results, "datastore", run.folder) as made,
         progress_bar("encoding demonstrations", made) as advance,

@@ -8,7 +8,16 @@ import typer
 
 from kerv_cli.base.config import compose
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan, print_json, print_plan, print_table, progress_bar, settings_yaml
+from kerv_cli.cli.common import (
+    AsJson,
+    ShowPlan,
+    end_with_json,
+    end_with_plan,
+    print_rows,
+    print_table,
+    progress_bar,
+    settings_yaml,
+)
 from kerv_cli.episodes.settings import SweepSettings
 from kerv_cli.training.settings import CalibrateSettings, CalibrateSuccessSettings
 
@@ -25,7 +34,7 @@ def calibrate(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
 
     run = CalibrationRun(settings)
     if plan:
-        print_plan(run.plan())
+        end_with_plan(run.plan())
     from kerv_cli.lab.runs import making
 
     with making(settings.results, "calibration", run.path.parent) as record:
@@ -57,7 +66,7 @@ def success(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_
 
     Existing episodes are reused. Choose the number of episodes before you look at any result.
     """
-    from kerv_cli.cli.episodes import planned_study, print_settings, print_study_plan, run_study
+    from kerv_cli.cli.work import planned_study, print_settings, print_study_plan, run_study
     from kerv_cli.episodes.resolve import resolve
     from kerv_cli.lab.runs import making
     from kerv_cli.report.certificate import candidate_rows, certify, folder_of, write
@@ -86,8 +95,7 @@ def success(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_
         path = write(folder, certificate)
     rows = candidate_rows(certificate)
     if as_json:
-        print_json({"certificate": path, "sentence": certificate.sentence(), "candidates": rows})
-        return
+        end_with_json({"certificate": path, "sentence": certificate.sentence(), "candidates": rows})
     title = f"not more than {settings.margin:g} points below AR? tested in this order, each at {settings.delta:g}"
-    print_table(tuple(rows[0]), [tuple(row.values()) for row in rows], title)
+    print_rows(rows, title)
     typer.echo(f"{certificate.sentence()}\n{path}")

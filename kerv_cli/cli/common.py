@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import fields, is_dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
@@ -30,9 +30,15 @@ ShowPlan = Annotated[bool, typer.Option("--plan", help="Print what would be done
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output, nothing else.")]
 
 
-def print_json(value: object) -> None:
-    """Print a value as indented JSON. NaN and infinity, which JSON cannot express, become null."""
+def end_with_json(value: object, code: int = 0) -> NoReturn:
+    """Print a value as indented JSON and end the command. NaN and infinity, which JSON cannot express, become null.
+
+    Args:
+        value: The value to print.
+        code: Exit code of the command.
+    """
     typer.echo(json.dumps(_plain(value), indent=2, ensure_ascii=False))
+    raise typer.Exit(code)
 
 
 def _plain(value: object) -> object:
@@ -80,7 +86,7 @@ def print_notes(idle: Mapping[str, str]) -> None:
         typer.echo(f"note: {override} has no effect: {reason}", err=True)
 
 
-def print_plan(text: str, as_json: bool = False) -> None:
+def end_with_plan(text: str, as_json: bool = False) -> NoReturn:
     """Print what the command would do, and end it. For the option --plan.
 
     Args:
@@ -88,9 +94,8 @@ def print_plan(text: str, as_json: bool = False) -> None:
         as_json: Print it as JSON.
     """
     if as_json:
-        print_json({"plan": text})
-    else:
-        typer.echo(text)
+        end_with_json({"plan": text})
+    typer.echo(text)
     raise typer.Exit(0)
 
 
@@ -176,7 +181,9 @@ def at_work(what: str) -> Iterator[None]:
 
 @contextmanager
 def progress_bar(title: str, record: Run | None = None) -> Iterator[Callable[..., None]]:
-    """Show a progress bar while the block runs.
+    """Show a progress bar while the block runs. Lines that are printed meanwhile appear above it.
+
+    Without a terminal, print at most 10 lines of progress instead, or 50 for a total of 2000 or more.
 
     Args:
         title: Text before the bar.
@@ -185,50 +192,34 @@ def progress_bar(title: str, record: Run | None = None) -> Iterator[Callable[...
     Yields:
         `advance(done, total, text="")`. Call it to move the bar and to change the text after it.
     """
-    with _shown(title) as show:
-
-        def advance(done: int, total: int, text: str = "") -> None:
-            if record is not None:
-                record.beat(done, total)
-            show(done, total, text)
-
-        yield advance
-
-
-@contextmanager
-def _shown(title: str) -> Iterator[Callable[..., None]]:
-    """Show a progress bar on a terminal. Elsewhere print at most 10 lines of progress, 50 for a total of 2000 or more.
-
-    Yields:
-        `advance(done, total, text="")` as in `progress_bar`.
-    """
-    if not sys.stderr.isatty():
-        typer.echo(f"{title} …", err=True)
-        yield _plain_lines(title)
-        return
     from rich import progress as bars
 
-    timed = (bars.BarColumn(), bars.MofNCompleteColumn(), bars.TimeElapsedColumn(), bars.TimeRemainingColumn())
-    texts = (bars.TextColumn(f"{{task.{name}}}") for name in ("description", "fields[text]"))
-    with bars.Progress(next(texts), *timed, next(texts), console=console(stderr=True)) as bar:
-        task = bar.add_task(title, total=None, text="")
-        yield lambda done, total, text="": bar.update(task, completed=done, total=total, text=text)
-
-
-def _plain_lines(title: str) -> Callable[..., None]:
-    latest, first, began = -1, 0, 0.0  # first: where the count begins, above 0 for resumed work
+    on_terminal = sys.stderr.isatty()
+    known, latest, first, began = -1, -1, 0, 0.0  # first: where the count begins, above 0 for resumed work
 
     def advance(done: int, total: int, text: str = "") -> None:
-        nonlocal latest, first, began
-        if latest < 0:
-            first, began = done, time.monotonic()
+        nonlocal known, latest, first, began
+        if record is not None:
+            record.beat(done, total)
+        if on_terminal:
+            bar.update(task, completed=done, total=total, text=text)
+            return
+        if total != known:
+            known, latest, first, began = total, -1, done, time.monotonic()
         part = (50 if total >= 2000 else 10) * done // max(1, total)
         if part > latest:
             latest = part
             rest = left(time.monotonic() - began, done - first, total - first) if first < done < total else ""
             typer.echo(", ".join(filter(None, (f"{title} {done}/{total}", rest, text))), err=True)
 
-    return advance
+    timed = (bars.BarColumn(), bars.MofNCompleteColumn(), bars.TimeElapsedColumn(), bars.TimeRemainingColumn())
+    name, text = (bars.TextColumn(f"{{task.{one}}}", markup=False) for one in ("description", "fields[text]"))
+    shown: Any = {"console": console(stderr=True), "transient": True, "disable": not on_terminal}
+    with bars.Progress(name, *timed, text, **shown) as bar:
+        task = bar.add_task(title, total=None, text="")
+        if not on_terminal:
+            typer.echo(f"{title} …", err=True)
+        yield advance
 
 
 def console(stderr: bool = False) -> Console:
@@ -257,6 +248,12 @@ def print_table(columns: Iterable[str], rows: Iterable[Iterable[object]], title:
     console().print(table)
 
 
+def print_rows(rows: Sequence[Mapping[str, object]], title: str | None = None) -> None:
+    """Print a table of rows with the same keys, which are the columns. None is shown as a dash."""
+    cells = (("–" if value is None else value for value in row.values()) for row in rows)
+    print_table(rows[0], cells, title)
+
+
 def print_figures(what: str, figures: Mapping[str, float], folder: object, as_json: bool = False) -> None:
     """Print named numbers with four digits each, and a folder.
 
@@ -267,8 +264,7 @@ def print_figures(what: str, figures: Mapping[str, float], folder: object, as_js
         as_json: Print numbers and folder as JSON.
     """
     if as_json:
-        print_json({"folder": folder, **figures})
-        return
+        end_with_json({"folder": folder, **figures})
     rows = ((name, f"{value:.4g}" if isinstance(value, float) else value) for name, value in figures.items())
     print_table((what, ""), rows)
     typer.echo(str(folder))

@@ -11,7 +11,7 @@ from kerv_cli.base.limits import choice, setting
 from kerv_cli.base.places import artifact, results_dir
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import ShowPlan, print_figures, print_plan, print_table, progress_bar
+from kerv_cli.cli.common import ShowPlan, end_with_plan, print_figures, print_table, progress_bar
 from kerv_cli.training.settings import DEMOS, DemosSettings
 from kerv_cli.worlds.settings import DemosImportSettings
 
@@ -45,7 +45,7 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
     folder = artifact(settings.results, "demos", settings.name or name_of(settings.task))
     if plan:
         what = f"{count(len(config.tasks), 'task')} x {count(settings.episodes, 'episode')}"
-        print_plan(f"{what} -> {folder}")
+        end_with_plan(f"{what} -> {folder}")
     try:
         with making(settings.results, "demos", folder) as made, progress_bar("demonstrations", made) as advance:
             manifest = record(config, folder, advance, actor)

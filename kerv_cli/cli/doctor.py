@@ -12,7 +12,7 @@ from kerv_cli.base.leftovers import left_over, remove
 from kerv_cli.base.places import results_dir
 from kerv_cli.bench.doctor import DoctorSettings, check_environment_of, check_machine, check_policy
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, print_json, print_table
+from kerv_cli.cli.common import AsJson, end_with_json, print_table
 
 Repair = Annotated[bool, typer.Option("--repair", help="Remove temporary files that killed commands left behind.")]
 
@@ -38,12 +38,11 @@ def doctor(settings: DoctorSettings, repair: Repair = False, as_json: AsJson = F
         findings = [*check_policy(settings), *check_environment_of(settings)]
     else:
         findings = check_machine(settings)
+    failed = not all(finding.ok for finding in findings)
     if as_json:
-        print_json([asdict(finding) for finding in findings])
-    else:
-        print_table(("check", "", "finding"), ((f.what, "ok" if f.ok else "FAILS", f.says) for f in findings))
-    if not all(finding.ok for finding in findings):
-        raise typer.Exit(1)
+        end_with_json([asdict(finding) for finding in findings], code=int(failed))
+    print_table(("check", "", "finding"), ((f.what, "ok" if f.ok else "FAILS", f.says) for f in findings))
+    raise typer.Exit(int(failed))
 
 
 def _repair(settings: DoctorSettings) -> None:

@@ -11,7 +11,7 @@ from kerv_cli.base.limits import number, setting
 from kerv_cli.base.places import results_dir
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, print_json, print_table
+from kerv_cli.cli.common import AsJson, end_with_json, print_table
 
 
 @dataclass
@@ -47,7 +47,7 @@ Choose = Annotated[
 )
 def report(settings: ReportSettings, publish: Publish = False, choose: Choose = False, as_json: AsJson = False) -> None:
     """Write CSV tables (per task and aggregated), plots and an HTML page about the studies."""
-    from kerv_cli.cli.episodes import print_study, print_verdict
+    from kerv_cli.cli.work import print_study, print_verdict
     from kerv_cli.episodes.resolve import study_name
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.report import report as write_report
@@ -63,8 +63,7 @@ def report(settings: ReportSettings, publish: Publish = False, choose: Choose = 
     if as_json:
         tables = {name: rows_of(table) for name, table in output.tables.items()}
         priced = {} if output.priced is None else {"priced": rows_of(output.priced)}
-        print_json({"files": output.files, "studies": tables, **priced})
-        return
+        end_with_json({"files": output.files, "studies": tables, **priced})
     for name, table in output.tables.items():
         print_study(table, StudyStore(results, name))
     if output.priced is not None:
@@ -95,4 +94,4 @@ def _print_choice(settings: ReportSettings, as_json: bool) -> None:
             for choice in groups[1:]:
                 typer.echo(f"  {short_sentence(choice)}")
     if as_json:
-        print_json(answers)
+        end_with_json(answers)

@@ -13,13 +13,13 @@ from kerv_cli.cli.common import (
     AsJson,
     ShowPlan,
     console,
-    print_json,
+    end_with_json,
     print_notes,
     print_table,
     results_word,
     settings_yaml,
 )
-from kerv_cli.cli.episodes import planned_rollout, run_study
+from kerv_cli.cli.work import planned_rollout, run_study
 from kerv_cli.episodes.settings import RolloutSettings
 
 if TYPE_CHECKING:
@@ -57,9 +57,10 @@ def rollout(
         names = ", ".join(f"{label}{stress_text(asdict(settings))}" for label, settings in resolved.settings.items())
         total, tasks = len(planned.study.episodes), resolved.tasks
         if as_json:
-            print_json({"settings": list(resolved.settings), "tasks": tasks, "episodes": total, "seconds": 3 * total})
-        else:
-            typer.echo(f"{names}: {count(len(tasks), 'task')}, {count(total, 'episode')}, {about(3 * total)}")
+            end_with_json(
+                {"settings": list(resolved.settings), "tasks": tasks, "episodes": total, "seconds": 3 * total}
+            )
+        typer.echo(f"{names}: {count(len(tasks), 'task')}, {count(total, 'episode')}, {about(3 * total)}")
         return
     run_study(resolved, planned)
     _print_rollout(planned.store, as_json, results_word(overrides))
@@ -73,9 +74,8 @@ def _print_rollout(store: StudyStore, as_json: bool, where: str) -> None:
     data = load_study(store)
     whole, per_task = rows_of(data.table, MICRO), rows_of(data.per_task)
     if as_json:
-        print_json({"run": store.name, "folder": store.root, "settings": whole, "tasks": per_task,
+        end_with_json({"run": store.name, "folder": store.root, "settings": whole, "tasks": per_task,
                     "recordings": store.recordings})  # fmt: skip
-        return
     if len(data.study.labels) > 1:
         console().print(SummaryTable(data.table))
     else:

@@ -14,7 +14,16 @@ from kerv_cli.base.limits import setting
 from kerv_cli.base.places import as_path, results_dir
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan, console, print_json, print_table, results_word
+from kerv_cli.cli.common import (
+    AsJson,
+    ShowPlan,
+    console,
+    end_with_json,
+    end_with_plan,
+    print_rows,
+    print_table,
+    results_word,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -77,8 +86,7 @@ def list_(settings: CommandSettings, names: list[str], as_json: AsJson = False) 
             raise UsageError(f"'{word}' is no filter: write kind=, method=, task=, state= or since=")
     runs = matching(find_runs(settings.results), dict(word.split("=", 1) for word in names))
     if as_json:
-        print_json([_entry_row(run) for run in runs])
-        return
+        end_with_json([_entry_row(run) for run in runs])
     if not runs:
         typer.echo(f"no runs in {settings.results}" + (" that agree" if names else ""))
         return
@@ -121,8 +129,7 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
     size, origin = disk_bytes(run.folder), parents(run, find_runs(results))
     if as_json:
         rows = [] if table is None else rows_of(table)
-        print_json({**_entry_row(run), "made_from": origin, "bytes": size, "settings": rows})
-        return
+        end_with_json({**_entry_row(run), "made_from": origin, "bytes": size, "settings": rows})
     line = shlex.join(["kerv", *run.command]) if run.command else "unknown"
     lines = {"run": run.id, "kind": run.kind, "state": run.state, "started": run.started, "folder": run.folder}
     parts = {"made from": ", ".join(f"{kind} {name}" for kind, name in origin.items())} if origin else {}
@@ -143,31 +150,23 @@ def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False
     runs = _run_names(names, 2, 2, "two runs, ID or ID:SETTING")
     comparisons = [comparing.compare(a, b) for a, b in comparing.pairs_to_compare(settings.results, *runs)]
     if as_json:
-        print_json(comparisons)
-        return
+        end_with_json(comparisons)
     for comparison in comparisons:
         typer.echo(f"\n{comparison['first']}  →  {comparison['second']}")
-        _print_differences(comparison["settings"])
-        _print_results(comparison["results"])
+        if comparison["settings"]:
+            print_rows(comparison["settings"])
+        else:
+            typer.echo("no difference in settings, weights, machine or versions")
+        print_rows([_result_cells(row) for row in comparison["results"]])
 
 
-def _print_differences(rows: list[Row]) -> None:
-    if not rows:
-        typer.echo("no difference in settings, weights, machine or versions")
-        return
-    cells = (("–" if value is None else value for value in row.values()) for row in rows)
-    print_table(("setting", "first", "second"), cells)
-
-
-def _print_results(results: list[Row]) -> None:
+def _result_cells(row: Row) -> dict[str, str]:
+    """Return the cells of one measure in the comparison of two runs."""
     from kerv_cli.report.tables import is_number
 
-    rows = []
-    for row in results:
-        interval = f"{row['low']:.3g} to {row['high']:.3g}" if is_number(row.get("low")) else ""
-        numbers = (f"{row[name]:.4g}" for name in ("first", "second", "change"))
-        rows.append((row["measure"], *numbers, interval, row.get("what", "")))
-    print_table(("measure", "first", "second", "change", "95 % interval", ""), rows)
+    interval = f"{row['low']:.3g} to {row['high']:.3g}" if is_number(row.get("low")) else ""
+    numbers = {name: f"{row[name]:.4g}" for name in ("first", "second", "change")}
+    return {"measure": row["measure"], **numbers, "95 % interval": interval, "": row.get("what", "")}
 
 
 @_command_on_runs("rerun", "kerv runs rerun last", "kerv runs rerun main --plan")
@@ -181,7 +180,7 @@ def rerun(
     run = find_run(results, name)
     if run.is_training:
         from kerv_cli.catalogue.again import again_words
-        from kerv_cli.cli.training import run_training
+        from kerv_cli.cli.work import run_training
         from kerv_cli.training.again import training_again
 
         command = again_words(run, results)
@@ -195,22 +194,20 @@ def rerun(
         raise UsageError(f"{run.id} was imported: run vla-eval again, then 'kerv runs import'")
     from kerv_cli.base.durations import count
     from kerv_cli.catalogue.again import plan_of
-    from kerv_cli.cli.episodes import run_planned
+    from kerv_cli.cli.work import run_planned
     from kerv_cli.report.compare import same_tokens
 
     planned = plan_of(run, results)
     name = planned.store.name
     if plan:
-        typer.echo(f"{run.id} again as {name}: {count(len(planned.to_run), 'episode')}")
-        return
+        end_with_plan(f"{run.id} again as {name}: {count(len(planned.to_run), 'episode')}", as_json)
     failed = run_planned(planned).failed
     if failed:
         raise KervError(failed[0].reason)
     entry = find_run(results, name, exact=True)
     same, shared = same_tokens(run, entry)
     if as_json:
-        print_json({"run": entry.id, "folder": entry.folder, "episodes": shared, "same_tokens": same})
-        return
+        end_with_json({"run": entry.id, "folder": entry.folder, "episodes": shared, "same_tokens": same})
     typer.echo(f"{entry.id}: the same tokens in {same} of {shared} episodes of {run.id}")
     typer.echo(f"both side by side: kerv runs compare {run.id} {entry.id}{results_word(overrides)}")
 
@@ -250,8 +247,7 @@ def export(
     folder = folder or results_dir(settings.results) / "exports" / to
     written = hand_over(find_run(settings.results, name), to, folder)
     if as_json:
-        print_json({"folder": folder, "written": written})
-        return
+        end_with_json({"folder": folder, "written": written})
     for name in written:
         typer.echo(name)
     typer.echo(f"{len(written)} {'file' if to in FILES else 'run'}{'s' * (len(written) != 1)} in {folder}")
@@ -285,8 +281,7 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
             raise UsageError("import results folders and evaluations one after the other")
         imported = import_results(Database(results), folders, settings.name)
         if as_json:
-            print_json({"studies": imported.names, "notes": imported.notes})
-            return
+            end_with_json({"studies": imported.names, "notes": imported.notes})
         for line in [*imported.notes, f"imported {', '.join(imported.names) or 'nothing'}: kerv runs list"]:
             typer.echo(line)
         return
@@ -294,8 +289,7 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
     name, notes = import_evaluations(results, paths, settings.name, settings.labels, settings.baseline, words)
     table = load_study(StudyStore(results, name)).table
     if as_json:
-        print_json({"study": name, "notes": notes, "settings": rows_of(table)})
-        return
+        end_with_json({"study": name, "notes": notes, "settings": rows_of(table)})
     for line in notes:
         typer.echo(line)
     console().print(SummaryTable(table))

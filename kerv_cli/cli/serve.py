@@ -9,7 +9,7 @@ import time
 import typer
 
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import ShowPlan, print_plan
+from kerv_cli.cli.common import ShowPlan, end_with_plan
 from kerv_cli.serve.settings import ServeSettings
 
 
@@ -27,7 +27,7 @@ def serve(settings: ServeSettings, plan: ShowPlan = False) -> None:
 
     server = PolicyServer(Policy(settings), settings, _log)
     if plan:
-        print_plan(f"{settings.policy.target} with {settings.method} on ws://{settings.host}:{settings.port}")
+        end_with_plan(f"{settings.policy.target} with {settings.method} on ws://{settings.host}:{settings.port}")
     with server.listening(settings.host, settings.port) as listening:
         port = listening.socket.getsockname()[1]
         _log(f"{settings.policy.target} with {settings.method} listens on ws://{settings.host}:{port}")

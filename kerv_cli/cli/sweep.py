@@ -10,8 +10,8 @@ from kerv_cli.base.config import compose, expand, groups, split
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UsageError
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan, at_work, print_json, print_table
-from kerv_cli.cli.episodes import planned_study, print_settings, print_study, print_study_plan, print_verdict, run_study
+from kerv_cli.cli.common import AsJson, ShowPlan, at_work, end_with_json, print_rows
+from kerv_cli.cli.work import planned_study, print_settings, print_study, print_study_plan, print_verdict, run_study
 from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 
 if TYPE_CHECKING:
@@ -49,10 +49,7 @@ def sweep(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_js
     if plan:
         print_study_plan(planned, as_json)
         return
-    outcome = run_study(resolved, planned)
-    _print_outcome(outcome, resolved, planned, as_json)
-    if outcome.failed:
-        raise typer.Exit(1)
+    _print_outcome(run_study(resolved, planned), resolved, planned, as_json)
 
 
 def _list_studies(as_json: bool) -> None:
@@ -64,42 +61,42 @@ def _list_studies(as_json: bool) -> None:
         study = compose("sweep", [f"study={name}"], SweepSettings).study
         common = compose("rollout", split(study.common), RolloutSettings)
         settings, tasks = sum(len(expand(split(text))) for text in study.settings.values()), len(tasks_of(common))
-        rows.append((name, settings, tasks, common.episodes, settings * tasks * common.episodes, study.title))
-    columns = ("study", "settings", "tasks", "episodes", "in all", "")
+        counts = {"settings": settings, "tasks": tasks, "episodes": common.episodes}
+        rows.append({"study": name, **counts, "in all": settings * tasks * common.episodes, "title": study.title})
     if as_json:
-        print_json([dict(zip((*columns[:5], "title"), row, strict=True)) for row in rows])
-        return
-    print_table(columns, rows, "episodes: per task; in all: settings x tasks x episodes")
+        end_with_json(rows)
+    print_rows(rows, "episodes: per task; in all: settings x tasks x episodes")
     typer.echo("run one, e.g.: kerv sweep study=demo; what it would do: --plan")
 
 
 def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, planned: Plan, as_json: bool) -> None:
+    """Print the results of a sweep and end the command, with exit code 1 if episodes failed."""
     from kerv_cli.report.tables import load_study, rows_of
 
     store, there = planned.store, [*outcome.done, *outcome.reused]
     data = load_study(store, there) if there else None
     failed = [one for failure in outcome.failed for one in failure.episodes]
     counts = {"run": len(outcome.done), "reused": len(outcome.reused), "failed": len(failed)}
-    if as_json:
-        rows = [] if data is None else rows_of(data.table)
-        print_json({"study": store.name, "folder": store.root, "episodes": counts, "settings": rows,
-                    "recordings": store.recordings})  # fmt: skip
-    else:
-        if data is not None:
-            print_study(data.table, store)
-        minutes = outcome.seconds / 60
-        if outcome.done and minutes:
-            rate = len(outcome.done) / minutes
-            typer.echo(f"{count(len(outcome.done), 'episode')} in {minutes:.1f} min: {rate:.0f} per minute")
-        typer.echo(", ".join(f"{number} {what}" for what, number in counts.items()))
-        if data is not None and not outcome.failed:
-            with at_work("writing the page"):
-                from kerv_cli.report.report import write_study
-
-                # the study in the database may have more tasks, from earlier sweeps
-                is_whole = store.counts()[1] == len(data.study.episodes)
-                write_study(store, data if is_whole else load_study(store), resolved.sweep.loss)
-            print_verdict(data.table, store, resolved.sweep.loss)
     for failure in outcome.failed:
         one = failure.episodes[0]
         typer.echo(f"kerv: {one.setting.label} on {one.task}: {failure.reason}", err=True)
+    if as_json:
+        rows = [] if data is None else rows_of(data.table)
+        content = {"study": store.name, "folder": store.root, "episodes": counts, "settings": rows}
+        end_with_json({**content, "recordings": store.recordings}, code=int(bool(failed)))
+    if data is not None:
+        print_study(data.table, store)
+    minutes = outcome.seconds / 60
+    if outcome.done and minutes:
+        rate = len(outcome.done) / minutes
+        typer.echo(f"{count(len(outcome.done), 'episode')} in {minutes:.1f} min: {rate:.0f} per minute")
+    typer.echo(", ".join(f"{number} {what}" for what, number in counts.items()))
+    if data is not None and not failed:
+        with at_work("writing the page"):
+            from kerv_cli.report.report import write_study
+
+            # the study in the database may have more tasks, from earlier sweeps
+            is_whole = store.counts()[1] == len(data.study.episodes)
+            write_study(store, data if is_whole else load_study(store), resolved.sweep.loss)
+        print_verdict(data.table, store, resolved.sweep.loss)
+    raise typer.Exit(int(bool(failed)))

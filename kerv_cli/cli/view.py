@@ -3,40 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
-from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.errors import UnknownName
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
-
-To = Annotated[Path | None, typer.Option("--to", help="Write a film of one recording: FILE.mp4 or FILE.gif.")]
 
 
 @command(
     "view",
     CommandSettings,
     keys="results",
-    examples=("kerv view last", "kerv view --to episode.gif NAME.rrd"),
+    examples=("kerv view last", "kerv view NAME.rrd"),
     names="NAME: runs (id, a unique part of it, or last), recordings (.rrd) or folders of them, and results=DIR.",
     writes=False,
 )
-def view(settings: CommandSettings, names: list[str], to: To = None) -> None:
+def view(settings: CommandSettings, names: list[str]) -> None:
     """Open recordings in the Rerun viewer; without a display, print the command that opens them."""
     from kerv_cli.report.viewing.viewer import find_recordings, open_recording
 
     paths = [_place(settings.results, name) for name in names] or [Path(settings.results)]
-    recordings = find_recordings(paths)
-    if to is not None:
-        from kerv_cli.report.viewing.film import save_film
-
-        if names and len(recordings) > 1:
-            needed = f"one recording is needed, of {len(recordings)} name one, e.g. {recordings[0]}"
-            raise UsageError(f"--to {to}: {needed}")
-        typer.echo(str(save_film(recordings[0], to)))
-        return
-    typer.echo(open_recording(recordings))
+    typer.echo(open_recording(find_recordings(paths)))
 
 
 def _place(results: str, name: str) -> Path:

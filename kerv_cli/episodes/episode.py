@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections import deque
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,9 +15,6 @@ from kerv_cli.engine.record import DecodeRecord, Delay, EpisodeRecord
 from kerv_cli.episodes.clock import RealClock
 from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import World
-
-OnStep = Callable[[int], object]
-"""Function that is called after each control step with the number of steps executed. Its time is not measured."""
 
 
 class Follower(Protocol):
@@ -62,8 +59,8 @@ class _Execution:
     Before the first chunk the robot stands still.
     """
 
-    def __init__(self, world: World, follower: Follower, camera: CameraSettings | None, on_step: OnStep | None) -> None:
-        self.world, self.follower, self.camera, self.on_step = world, follower, camera, on_step
+    def __init__(self, world: World, follower: Follower, camera: CameraSettings | None) -> None:
+        self.world, self.follower, self.camera = world, follower, camera
         self.chunk: deque[np.ndarray] = deque()
         self.last = world.spec.standstill(world.gripper)
         self.actions: list[np.ndarray] = []  # (D,) float32, within the limits
@@ -91,8 +88,6 @@ class _Execution:
         self.actions.append(np.clip(self.last, space.low, space.high).astype(np.float32))
         self._collect()
         self.follower.observe(self.actions[-1], self.path[-1])
-        if self.on_step is not None:
-            self.on_step(len(self.actions))
 
     def until(self, rest: int) -> None:
         """Execute the chunk until only `rest` of its actions are left, or the episode ends."""
@@ -121,7 +116,6 @@ def run_episode(
     seed: int,
     camera: CameraSettings | None = None,
     clock: RealClock | None = None,
-    on_step: OnStep | None = None,
 ) -> EpisodeRecord:
     """Run one episode until the task is solved or the horizon is reached, and return its record.
 
@@ -133,9 +127,8 @@ def run_episode(
         seed: Seed of the initial state.
         camera: View to record, one image per control step; None to record no images.
         clock: Latency of decodes, if the world goes on meanwhile (docs/methods.md §8); None if the world waits.
-        on_step: Called after each control step, e.g. to show progress.
     """
-    steps = episode(world, decoder, seed, camera, clock, on_step)
+    steps = episode(world, decoder, seed, camera, clock)
     decode: Any = None
     while True:
         try:
@@ -152,7 +145,6 @@ def episode(
     seed: int,
     camera: CameraSettings | None = None,
     clock: RealClock | None = None,
-    on_step: OnStep | None = None,
 ) -> Generator[Observation, DecodeRecord, EpisodeRecord]:
     """Run one episode like `run_episode`, but let the caller decode.
 
@@ -162,7 +154,7 @@ def episode(
     began = time.perf_counter()
     world.reset(seed)
     follower.reset(world.task, seed, world.end_effector)
-    execution = _Execution(world, follower, camera, on_step)
+    execution = _Execution(world, follower, camera)
     decodes: list[DecodeRecord] = []
     decode_steps: list[int] = []
     if clock is not None:

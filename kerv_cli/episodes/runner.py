@@ -20,7 +20,7 @@ from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.chunk import EpisodeState
 from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
-from kerv_cli.episodes.episode import OnStep, episode, run_episode
+from kerv_cli.episodes.episode import episode, run_episode
 from kerv_cli.episodes.policy import batch_decoder_for, clock_for, decoder_for
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.parallel import native_decoder
@@ -86,16 +86,15 @@ class Runner:
         self.clock = clock_for(settings, task)
         self._recording = dataclasses.replace(settings.world.camera, size=settings.record_size, supersample=1)
 
-    def episode(self, seed: int, recorded: bool = False, on_step: OnStep | None = None) -> EpisodeRecord:
+    def episode(self, seed: int, recorded: bool = False) -> EpisodeRecord:
         """Run one episode, and return its record.
 
         Args:
             seed: Seed of the initial state.
             recorded: Whether the record keeps images.
-            on_step: Called after each control step.
         """
         world = open_world(self.task, self.settings.world, self.stress)  # another runner may have closed it since
-        return run_episode(world, self.decoder, seed, self._recording if recorded else None, self.clock, on_step)
+        return run_episode(world, self.decoder, seed, self._recording if recorded else None, self.clock)
 
 
 @dataclass(frozen=True)

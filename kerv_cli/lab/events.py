@@ -30,13 +30,6 @@ class BlockStarted:
 
 
 @dataclass(frozen=True)
-class BlockEnded:
-    """A block (episodes that one process runs) has ended."""
-
-    block: Block
-
-
-@dataclass(frozen=True)
 class BlockWaits:
     """Another sweep is running the same block of episodes. `execute` checks again later."""
 
@@ -101,5 +94,5 @@ class Outcome:
         self.seconds += other.seconds
 
 
-Event = Started | BlockStarted | BlockEnded | BlockWaits | EpisodeEnd | SettingFailed
+Event = Started | BlockStarted | BlockWaits | EpisodeEnd | SettingFailed
 OnEvent = Callable[[Event], None]

@@ -414,7 +414,6 @@ class _Sweep:
             for one in attempt.block.episodes:
                 self._fail(attempt, one, failure_of(error))
         self._release(attempt)
-        self.on_event(events.BlockEnded(attempt.block))
         if lost:
             self.waiting.append(Block(tuple(lost)))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import re
 import secrets
 from collections.abc import Callable, Iterator, Sequence
@@ -35,34 +34,28 @@ Its arguments are the stored study, the episodes so far, the labels of the setti
 number of this analysis (from 1), and the largest possible number of analyses.
 """
 
-OnEpisodeStep = Callable[[Setting, str, int, int], None]
-"""Function that is called after each control step with the setting, task, seed and number of steps executed."""
-
 Save = Callable[[EpisodeRecord, Path, str], object]
 """Function that writes an episode to a .rrd file. The last argument is the setting's label."""
 
 
 @dataclass(frozen=True)
 class EpisodeRunner:
-    """Builds the decoder of a setting and runs its episodes. Picklable if `on_step` is None.
+    """Builds the decoder of a setting and runs its episodes. Picklable.
 
     Attributes:
         rollouts: Folder for recordings, one .rrd file per recorded episode.
         save: Writes a recording.
-        on_step: Called after each control step, to show progress.
     """
 
     rollouts: Path
     save: Save
-    on_step: OnEpisodeStep | None = None
 
     def __call__(self, setting: Setting, task: str) -> Callable[[int], EpisodeRecord]:
         """Build the setting's decoder for a task. Return a function that runs the episode with a given seed."""
         runner = Runner(settings_from(setting.on(task)), task)
 
         def run_episode(seed: int) -> EpisodeRecord:
-            on_step = functools.partial(self.on_step, setting, task, seed) if self.on_step is not None else None
-            record = runner.episode(seed, is_recorded(runner.settings, seed), on_step)
+            record = runner.episode(seed, is_recorded(runner.settings, seed))
             if record.frames:
                 label = setting.label.replace(" ", "_").replace("=", "")
                 path = self.rollouts / f"{label}-{record.task}-{seed}-{setting.work[:6]}.rrd"
@@ -80,8 +73,6 @@ class EpisodeRunner:
         settings = settings_from(setting.on(episodes[0].task))
         requests = [Request(one, one.task, one.seed) for one in episodes]
         for request, result in run_batch(settings, requests):
-            if self.on_step is not None:
-                self.on_step(setting, request.task, request.seed, settings.world.horizon)
             yield request.key, result
 
 
@@ -167,7 +158,6 @@ def run(
     on_event: OnEvent = lambda event: None,
     *,
     save: Save = lambda *_: None,
-    on_step: OnEpisodeStep | None = None,
     analysis: InterimAnalysis | None = None,
 ) -> Outcome:
     """Run the missing episodes of a plan. Each is saved in the database as soon as it ends.
@@ -176,7 +166,6 @@ def run(
         planned: The plan.
         on_event: Called with each event, to show progress.
         save: Writes recordings. By default nothing is recorded.
-        on_step: Called after each control step. Used only with a single local worker.
         analysis: Called after each block of seeds; decides which settings continue. By default all do.
 
     Raises:
@@ -184,15 +173,14 @@ def run(
         KervError: An episode of a rollout failed.
         StorageError: The disk is full or not writable.
     """
-    store, single = planned.store, planned.runtime.executor == "local" and planned.runtime.workers == 1
-    is_rollout = planned.study.kind == ROLLOUT
+    store, is_rollout = planned.store, planned.study.kind == ROLLOUT
 
     def forward(event: Event) -> None:
         if isinstance(event, SettingFailed) and is_rollout:
             raise event.error or KervError(event.reason)
         on_event(event)
 
-    runner = EpisodeRunner(store.rollouts, save, on_step if single else None)
+    runner = EpisodeRunner(store.rollouts, save)
     with Run(store.database, planned.study.kind, store.name, planned.command, alone=is_rollout) as record:
         try:
             if analysis is not None:

@@ -9,7 +9,7 @@ import typer
 from kerv_cli.base.limits import choice, number
 from kerv_cli.base.registry import add
 from kerv_cli.base.settings import TaskSettings
-from kerv_cli.cli.common import AsJson, print_json
+from kerv_cli.cli.common import AsJson, end_with_json
 from kerv_cli.worlds.settings import EVALUATION_SEED
 
 
@@ -28,8 +28,7 @@ def seeds(settings: SeedsSettings, as_json: AsJson = False) -> None:
     first = EVALUATION_SEED if settings.use == "evaluation" else 0
     numbers = {task: list(range(first, first + settings.episodes)) for task in resolve_tasks(settings.task)}
     if as_json:
-        print_json(numbers)
-        return
+        end_with_json(numbers)
     for task, one in numbers.items():
         typer.echo(f"{task}: {one[0]} to {one[-1]}")
 

@@ -1,22 +1,38 @@
-"""Helpers of the commands that run episodes: plan a study, estimate its duration, run it, print the results."""
+"""Run studies and trainings for the commands: plan them, show their progress, print the results."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import typer
 
 from kerv_cli.base.durations import about, count
-from kerv_cli.cli.common import at_work, console, print_json, print_notes, print_table, settings_yaml
+from kerv_cli.cli.common import (
+    at_work,
+    console,
+    end_with_json,
+    end_with_plan,
+    print_figures,
+    print_notes,
+    print_rows,
+    progress_bar,
+    settings_yaml,
+)
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from pandas import DataFrame
 
     from kerv_cli.episodes.resolve import ResolvedStudy
-    from kerv_cli.lab.events import Outcome
+    from kerv_cli.lab.events import Event, Outcome
+    from kerv_cli.lab.runs import Run
     from kerv_cli.lab.store import Plan, StudyStore
     from kerv_cli.lab.study import InterimAnalysis
+    from kerv_cli.training.run import TrainingRun
 
 SECONDS_PER_EPISODE = 1.0
 """Guess that is used before anything was measured. MT10 takes 0.5 to 1.5 s per episode on one core."""
@@ -39,46 +55,34 @@ def planned_study(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
     from kerv_cli.episodes.resolve import idle_overrides
 
     print_notes(idle_overrides(resolved))
-    _announce(resolved)
-    with at_work("loading the policy"):
-        from kerv_cli.lab.study import plan
-
-        planned = plan(resolved, command)
-    _warn_of_unseen(resolved)
-    return planned
+    return _planned(resolved, command, is_rollout=False)
 
 
 def planned_rollout(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
     """Plan a rollout as `planned_study` plans a study. If it continues an interrupted rollout, print that."""
-    _announce(resolved)
-    with at_work("loading the policy"):
-        from kerv_cli.lab.study import plan_rollout
-
-        planned = plan_rollout(resolved, command)
-    _warn_of_unseen(resolved)
+    planned = _planned(resolved, command, is_rollout=True)
     if planned.existing:
         there, wanted = len(planned.existing), len(planned.study.episodes)
         typer.echo(f"resuming {planned.store.name}: {there} of {wanted} episodes are there", err=True)
     return planned
 
 
-def _announce(resolved: ResolvedStudy) -> None:
-    """Print the number of episodes, before torch and the simulator load."""
+def _planned(resolved: ResolvedStudy, command: Sequence[str], is_rollout: bool) -> Plan:
     settings, tasks = resolved.settings, resolved.tasks
     what = next(iter(settings)) if len(settings) == 1 else f"{len(settings)} settings"
     whose = _few(list(dict.fromkeys(setting.policy.target for setting in settings.values())), "targets")
     number = len(settings) * len(tasks) * resolved.first.episodes * resolved.study.repeats
+    # printed before torch and the simulator load
     typer.echo(f"{what} of {whose} on {_few(tasks, 'tasks')}: {count(number, 'episode')}", err=True)
+    with at_work("loading the policy"):
+        from kerv_cli.episodes.policy import unseen_tasks
+        from kerv_cli.lab.study import plan, plan_rollout
 
-
-def _warn_of_unseen(resolved: ResolvedStudy) -> None:
-    """Print a warning with the tasks that a policy was not trained on."""
-    from kerv_cli.episodes.policy import unseen_tasks
-
-    settings = resolved.settings.values()
-    for target, names in dict.fromkeys((s.policy.target, tuple(unseen_tasks(s, resolved.tasks))) for s in settings):
+        planned = (plan_rollout if is_rollout else plan)(resolved, command)
+    for target, names in dict.fromkeys((s.policy.target, tuple(unseen_tasks(s, tasks))) for s in settings.values()):
         if names:
             typer.echo(f"kerv: warning: policy {target} was never trained on {', '.join(names)}", err=True)
+    return planned
 
 
 def _few(names: Sequence[str], what: str) -> str:
@@ -105,10 +109,9 @@ def print_study_plan(planned: Plan, as_json: bool) -> None:
     rows, store, to_run, reused = plan_rows(planned), planned.store, planned.to_run, planned.existing
     seconds, source = estimate(planned, SECONDS_PER_EPISODE)
     if as_json:
-        print_json({"study": store.name, "folder": store.root, "settings": rows, "to run": len(to_run),
-                    "reused": len(reused), "seconds": seconds, "source": source})  # fmt: skip
-        return
-    print_table(rows[0], (row.values() for row in rows), f"study {store.name}, episodes")
+        end_with_json({"study": store.name, "folder": store.root, "settings": rows, "to run": len(to_run),
+                       "reused": len(reused), "seconds": seconds, "source": source})  # fmt: skip
+    print_rows(rows, f"study {store.name}, episodes")
     typer.echo(f"{count(len(to_run), 'episode')} to run, {len(reused)} reused, {about(seconds, source)}")
 
 
@@ -140,12 +143,53 @@ def run_planned(planned: Plan, analysis: InterimAnalysis | None = None) -> Outco
         planned: The plan.
         analysis: Decides during the study whether it can end early. None: all episodes run.
     """
-    from kerv_cli.cli.progress import ProgressDisplay
     from kerv_cli.lab.study import run
     from kerv_cli.report.viewing import save_recording
 
-    with ProgressDisplay(console(stderr=True)) as display:
-        return run(planned, display, save=save_recording, on_step=display.on_step, analysis=analysis)
+    with progress_bar("episodes") as show:
+        return run(planned, event_printer(show), save=save_recording, analysis=analysis)
+
+
+def event_printer(show: Callable[[int, int, str], None]) -> Callable[[Event], None]:
+    """Return a function that prints a line about each event of a running study and moves its progress bar.
+
+    Without a terminal, runs of more than 100 episodes get no line per episode.
+
+    Args:
+        show: Moves the bar, see `progress_bar`.
+    """
+    from kerv_cli.lab.events import BlockStarted, BlockWaits, SettingFailed, Started
+
+    total = ended = 0
+    title = "preparing"
+
+    def on_event(event: Event) -> None:
+        nonlocal total, ended, title
+        line = ""
+        if isinstance(event, Started):
+            total, ended = event.to_run, 0
+            line = f"{count(event.reused, 'episode')} there already" if event.reused else ""
+        elif isinstance(event, BlockStarted):
+            title = event.block.title
+        elif isinstance(event, BlockWaits):
+            line = f"{event.block.name}: another sweep computes it"
+        elif isinstance(event, SettingFailed):
+            ended += len(event.episodes)
+            one = event.episodes[0]
+            line = f"{one.setting.label} on {one.task}: failed: {event.reason}"
+        else:
+            ended += 1
+            one, result = event.episode, "run by another sweep"
+            if not event.elsewhere:
+                result = f"{'success' if event.success else 'failure'}, {event.seconds:.1f} s"
+            if event.elsewhere or total <= 100 or sys.stderr.isatty():
+                line = f"{ended}/{total} {one.setting.label} on {one.task}, seed {one.seed}: {result}"
+        if line:
+            typer.echo(line, err=True)
+        if total:
+            show(ended, total, title)
+
+    return on_event
 
 
 def print_study(table: DataFrame, store: StudyStore) -> None:
@@ -189,3 +233,61 @@ def print_verdict(table: DataFrame, store: StudyStore, loss: float) -> None:
     recordings = store.recordings
     mend = "" if store.kind == "import" else "; the same sweep with record=1 rerun=all does that"
     typer.echo(f"watch: {f'kerv view {recordings[0]}' if recordings else f'nothing is recorded{mend}'}")
+
+
+def run_training(
+    run: TrainingRun, plan: bool, as_json: bool, loading: str, training: str, command: Sequence[str] = ()
+) -> None:
+    """Run a training and show its progress, or print the plan.
+
+    Args:
+        run: The training.
+        plan: Print what would be trained, and end the command.
+        as_json: Print the result as JSON.
+        loading: Title of the progress bar while data are read.
+        training: Title of the progress bar during training.
+        command: Command-line arguments after `kerv` that resume this training. Empty: those that were typed.
+
+    Raises:
+        UsageError: Another process is training the same artifact.
+    """
+    if plan:
+        end_with_plan(run.plan(), as_json)
+    from kerv_cli.lab.runs import making
+
+    with making(run.settings.results, run.artifact_kind, run.folder, command) as record:
+        metrics, plot = _train(run, record, loading, training)
+    if as_json:
+        end_with_json({"folder": run.folder, "best": metrics, "curves": plot})
+    print_figures("best checkpoint", metrics, run.folder)
+    typer.echo(f"curves in {run.folder / 'log.csv'} and {plot}")
+
+
+def _train(run: TrainingRun, record: Run, loading: str, training: str) -> tuple[dict[str, float], Path]:
+    from kerv_cli.training.loop import without_subnormals
+    from kerv_cli.training.trackers import tracked
+
+    with without_subnormals(), progress_bar(loading, record) as advance:
+        run.load(advance)
+    started = False
+    settings = run.settings
+
+    def on_step(step: int, now: dict[str, float]) -> None:
+        nonlocal started
+        if not started and step > 1:
+            typer.echo(f"resuming at step {step - 1}", err=True)
+        started = True
+        log(step, now)
+        line = " ".join(f"{name} {value:.4g}" for name, value in list(now.items())[:6] if name != "step")
+        advance(step, settings.train.steps, line)
+
+    name = f"{run.kind}/{run.folder.name}"
+    with (
+        without_subnormals(),
+        tracked(settings.log, name, run.folder, settings.train.steps, asdict(settings)) as log,
+        progress_bar(training, record) as advance,
+    ):
+        metrics = run.train(on_step)
+    from kerv_cli.report.plots import save_curves
+
+    return metrics, save_curves(run.folder)
