@@ -32,7 +32,8 @@ ARCHIVE = Path(__file__).parent / "fixtures" / "results-0.1.0.tar.xz"
 STUDY = """
 name: four-methods
 common: policy.target=few task=[reach-v3,drawer-close-v3] episodes=3 world.horizon=12 record=0
-settings: {ar: method=ar, spec_vla: method=spec_vla, heisd: method=heisd, one_pass_streak: method=one_pass_streak}
+settings:
+  {ar: method=ar, spec_vla: method=spec_vla_tuned, heisd: method=heisd_tuned, one_pass_streak: method=one_pass_streak}
 """
 
 
@@ -65,7 +66,7 @@ def test_every_run_of_0_1_0_is_listed_shown_and_compared(older: Path) -> None:
     kinds = ["calibration", "datastore", "demos", "drafter", "early", "rollout", "rollout", "sweep", "target"]
     assert sorted(run["kind"] for run in runs.values()) == kinds
     assert runs["four-methods"]["command"] == ["kerv", "sweep", "study=four.yaml", "results=results"]
-    assert runs["four-methods"]["started"] == "2026-11-23T01:31:05"
+    assert runs["four-methods"]["started"] == "2026-11-23T01:31:05.826"
     made = answer("runs", "show", "four-methods", results)["made_from"]
     assert made == {kind: f"{kind}/few" for kind in ("calibration", "datastore", "drafter", "early", "target")}
     (found,) = answer("runs", "compare", "four-methods:ar", "four-methods:heisd", results)
@@ -75,12 +76,19 @@ def test_every_run_of_0_1_0_is_listed_shown_and_compared(older: Path) -> None:
 def test_it_is_reported_as_it_was(older: Path) -> None:
     """Columns have the values of then, but for what is inferred from them: intervals of ratios and averages."""
     before = pd.read_csv(older / "results/report/tables/four-methods.csv")
+    renamed = {name: f"{name}_tuned" for name in ("spec_vla", "heisd")}
+    before["method"] = before["method"].replace(renamed)
     data = load_study(StudyStore(older / "results", "four-methods"))
     assert set(data.episodes["git_commit"].str[:7]) == {"1e4a685"}
     now = data.table.loc[:, lambda table: [name in before for name in table]].convert_dtypes().astype(object)
     text = pd.read_csv(pd.io.common.StringIO(now.to_csv(index=False, float_format="%.6g")))
     ratios, macro = ("speedup", "episode_speedup", "AL"), before["averaging"] == MACRO
-    inferred = {"pairs_to_settle", *(f"{name}_{end}" for name in ratios for end in ("low", "high"))}
+    inferred = {
+        "pairs_to_settle",
+        "proposer.top_k",
+        "proposer.nodes",  # of a chain, these have no meaning now
+        *(f"{name}_{end}" for name in ratios for end in ("low", "high")),
+    }
     of_macro = {"difference", "difference_low", "difference_high", "non_inferior"}
     for rows, anew in ((~macro, inferred), (macro, inferred | of_macro)):
         columns = [name for name in text if name not in anew]

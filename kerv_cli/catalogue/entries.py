@@ -104,7 +104,7 @@ def find_runs(results: str | Path) -> list[RunEntry]:
             place = database.results / "pretrained" if kind == POLICY else folder / kind
             entry = entry or RunEntry(f"{kind}/{name}", kind, place / name, "", "", (kind,))
             state = f"{row.status}, {row.done} of {row.total}" if row.total else row.status
-            entry = replace(entry, started=row.started, state=state)
+            entry = replace(entry, started=row.started[:23], state=state)
         if entry is not None:
             made[entry.id] = replace(entry, command=row.command)
     return sorted([*runs, *made.values()], key=lambda run: (run.started, run.id), reverse=True)
@@ -209,7 +209,7 @@ def _studies(database: Database, rows: Mapping[tuple[str, str], RunRow]) -> list
                 id=study.name,
                 kind=study.kind,
                 folder=StudyStore(database, study.name, study.kind).root,
-                started=started,
+                started=started[:23],
                 state=state,
                 methods=tuple(dict.fromkeys(one.method for one in compared)),
                 tasks=tuple(one.task for one in mine),
@@ -260,7 +260,7 @@ def state_of(folder: Path, kind: str) -> str:
 
 def _artifact(folder: Path, kind: str) -> RunEntry:
     changed = [path.stat().st_mtime for path in visible(folder) if path.is_file()]
-    started = datetime.fromtimestamp(max(changed, default=0.0), UTC).isoformat(timespec="milliseconds")
+    started = datetime.fromtimestamp(max(changed, default=0.0), UTC).isoformat(timespec="milliseconds")[:23]
     run = RunEntry(f"{kind}/{folder.name}", kind, folder, started, "damaged")
     try:
         value = _described(folder, kind)

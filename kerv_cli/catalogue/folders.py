@@ -31,6 +31,9 @@ from kerv_cli.worlds.demos.parquet import foreign_table
 
 _FOLDERS = {"studies": SWEEP, "rollouts": ROLLOUT}
 _ROW = (*EPISODE_SCHEMA.names, "order", "started", "worker_pid")
+_RENAMED = {name: f"{name}_tuned" for name in ("spec_vla", "kerv", "heisd")} | {
+    f"{name}_paper": name for name in ("spec_vla", "kerv", "heisd")
+}
 _NOT_OF_BLOCK = {"state", "episodes", "successes", "seconds", "wall_seconds", "timed", "started", "files", "sha256",
                  "run", "pid", "code"}  # fmt: skip
 _DAMAGE = (OSError, ValueError, KeyError, TypeError, AttributeError, pa.ArrowException, KervError)
@@ -144,12 +147,17 @@ def completed(stored: Mapping[str, Any]) -> dict[str, Any]:
     """Convert stored settings to the current format, without the task.
 
     Missing settings get their defaults. Settings that no longer exist are removed. Settings of a part that is not
-    installed stay as they are.
+    installed stay as they are. Our presets have been renamed since 0.1.0, and a draft's shape was its `top_k`.
     """
+    stored = {**stored, "method": _RENAMED.get(str(stored.get("method")), stored.get("method"))}
     plain = dataclasses.asdict(read(RolloutSettings, with_artifacts(stored), "a stored setting", tolerant=True))
     for group in SETTINGS_GROUPS:
         value = stored.get(group)
         if isinstance(value, Mapping):
+            if value.get("top_k", 1) > 1:
+                value = {**value, "shape": "tree"}
+            elif value.get("kind") == "drafter":
+                value = {key: one for key, one in value.items() if key not in ("top_k", "nodes")}
             plain[group] = dict(value)
             with contextlib.suppress(UnknownName):
                 schema = part_of(group, value["kind"]).settings

@@ -23,7 +23,7 @@ from kerv_cli.base.registry import METHOD_KINDS, PART_GROUPS, part_of
 from kerv_cli.episodes.settings import CONSTANT, PROFILE, WAITS, RolloutSettings, TimingSettings, settings_from
 from kerv_cli.methods.settings import EXPERT
 
-ENGINE = 2
+ENGINE = 1
 """Version of the tokens that the code gives. Increase it with every change that alters tokens or actions.
 tests/test_golden.py checks this."""
 
@@ -190,6 +190,9 @@ def idle_keys(settings: RolloutSettings) -> dict[str, str]:
         idle["rectifier"] = f"skip={skip.name} verifies nothing, so nothing is rejected"
     elif not acceptance.traits.get("reads_threshold", True):
         idle["threshold"] = f"acceptance={acceptance.name} has no threshold"
+    if getattr(method["proposer"], "shape", "") == "chain":
+        shared = hasattr(method["proposer"], "neighbours")  # whose tree `nodes` limits, too
+        idle |= dict.fromkeys(("proposer.top_k", *(() if shared else ("proposer.nodes",))), "a chain is a single path")
     needed = {need for kind, part in parts.items() for need in part.needs(method[kind])}
     artifacts = registry.parts("artifact")
     if not any(artifacts[kind].traits.get("names_more") for kind in needed):
