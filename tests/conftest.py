@@ -1,7 +1,5 @@
 """Small real policies for the tests: untrained weights on disk, made by the code that makes trained ones."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import os

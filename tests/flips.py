@@ -1,7 +1,5 @@
 """How often one verification picks other tokens than single forwards: ties that the number format flips."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Loads what tests need in a special way: programs of scripts/, artifacts for a target."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from pathlib import Path

@@ -5,8 +5,6 @@
 The references share nothing with the package but the weights: a plain decoder in numpy, and one in C where there is a
 compiler, as one would write them down. They also have to give the same tokens. Decodes take turns."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Made-up episodes for the Rerun tests: every kind of round, without a simulator or a model."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

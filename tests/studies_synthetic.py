@@ -1,7 +1,5 @@
 """Records that look like those of real episodes, made up from a seed; no world, no model."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import signal

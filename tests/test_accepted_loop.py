@@ -4,8 +4,6 @@ The oracle knows no cache, no mask and no tree forward: it walks down the drafte
 at a time, and decides by the definitions of docs/methods.md §2.1.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

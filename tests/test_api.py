@@ -1,7 +1,5 @@
 """kerv as a library: the same runs as the commands', errors as exceptions, and the notebook of the docs."""
 
-from __future__ import annotations
-
 import ast
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """A policy's files: found, checked, and each loaded and hashed once per process, however many settings share them."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Episodes whose decodes are computed together: tokens as one by one, no times, and no speedups made of them."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

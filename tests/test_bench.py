@@ -1,7 +1,5 @@
 """`kerv bench`: what is counted, what is measured, what is refused."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tests of means by betting: how often they err, and what they show."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """The packed weights of a bfloat16 trunk compute the trunk, up to bfloat16's rounding; and decode what it decodes."""
 
-from __future__ import annotations
-
 import copy
 
 import numpy as np

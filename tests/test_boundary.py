@@ -1,7 +1,5 @@
 """The trajectory metric on paths whose curvature is known, and the boundary that is built on it."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """Calibration: windows, fits and errors on data made to order; K by hand; the file and its refusals; the command."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import json

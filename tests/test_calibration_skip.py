@@ -1,7 +1,5 @@
 """The boundary's ranges and the skip levels: by hand, from a datastore made to order, kept, refused and printed."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import asdict, replace
 from pathlib import Path

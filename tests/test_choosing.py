@@ -1,7 +1,5 @@
 """Which setting to take, and when a sweep has measured enough."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """The command line as a user meets it: its output, its exit code; in a process of its own where that matters."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

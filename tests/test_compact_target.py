@@ -1,7 +1,5 @@
 """The compact target reads its spaces: Meta-World's features as ever, other environments' as well; its checkpoints."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

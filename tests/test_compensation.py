@@ -1,7 +1,5 @@
 """Accepted prefix + prediction (docs/methods.md §3.1) for every rejection position, and what the loop does with it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a method is composed of: every preset's parts, what each needs, and one line for what does not fit."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Every config composes into its dataclass; wrong overrides get one helpful line."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, fields, is_dataclass
 from itertools import chain
 from typing import Any

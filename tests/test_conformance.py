@@ -1,7 +1,5 @@
 """`kerv doctor target=… environment=…`: good ones pass, and each way of breaking the protocol is found."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Drafts from a part of what the target knows: from demonstrations of some of the tasks to a study's plan."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

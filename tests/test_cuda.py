@@ -1,7 +1,5 @@
 """On a CUDA device: captured graphs compute what eager forwards do, and strict methods decode AR's tokens."""
 
-from __future__ import annotations
-
 import warnings
 
 import pytest

@@ -1,7 +1,5 @@
 """Balanced batches, datasets that add up, and DAgger."""
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The tables of a results folder: whole or unchanged, whoever dies, whoever else writes, whatever the file holds."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import resource

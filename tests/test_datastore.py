@@ -1,7 +1,5 @@
 """The datastore: search against brute force, what an entry holds, what is refused, and the tree of the neighbours."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """The property that guards the engine: strict speculative decoding yields AR's tokens, token for token, in float32."""
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 """Every command in README.md, docs/ and on the results page runs: with --cfg where it has it, which composes and checks
 all of its settings and computes nothing."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path

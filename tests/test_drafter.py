@@ -1,7 +1,5 @@
 """The drafter's dynamic tree against a drafter that walks every path alone: positions, masks, states, ranking."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from test_decoding_lossless import random_prompt, random_target

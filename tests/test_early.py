@@ -1,7 +1,5 @@
 """The early drafter: what it reads, what it is trained on, and that it only serves the target it imitates."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

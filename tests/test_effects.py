@@ -1,7 +1,5 @@
 """What a method does not read is said in one line."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 
 import pytest

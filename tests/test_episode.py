@@ -1,7 +1,5 @@
 """Real episodes on real Meta-World: closed loop, pairing, what is timed and what is drawn."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

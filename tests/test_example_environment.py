@@ -1,7 +1,5 @@
 """An environment in one file of its own: run and drawn like those that kerv ships."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

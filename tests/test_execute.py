@@ -1,7 +1,5 @@
 """Running a study: resume, isolation of failures, processes that are killed, sweeps at once, executors."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import importlib

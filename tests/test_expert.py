@@ -1,7 +1,5 @@
 """The scripted expert in the policy's place: closed loop on real Meta-World, and every reader of its records."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Every kind of part is in the table of docs/extending.md, and each of its examples runs by the command given there."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import sys

@@ -1,7 +1,5 @@
 """Frames that stay encoded in their files: the same pixels, whatever is chosen of them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,8 +1,6 @@
 """The shipped policy decodes what it has always decoded: tokens, forwards and successes of study=main, closed loop; and
 `ENGINE`, by which stored results are reused, changes with them and never without."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from types import ModuleType

@@ -1,7 +1,5 @@
 """A grown target decodes the tokens of its policy, and takes the policy's artifacts."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Runs from elsewhere: a results folder of 0.1.0, another kerv.db, lerobot's results; what is handed on, and limits."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import shutil

@@ -1,7 +1,5 @@
 """The example with a simulator: seven DoFs, tasks that need rotation, from demonstrations to a recording."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from examples.insertion import SPEC

@@ -1,7 +1,5 @@
 """Kinematic prediction: precomputed weights against weighted least squares, closed forms, held DoFs, the history."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Success at a latency that the world feels, from a made-up study: every setting beside AR at the same latency."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

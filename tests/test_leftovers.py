@@ -1,7 +1,5 @@
 """What dead processes leave is known by its name, listed and removed; what belongs to the living stays."""
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess

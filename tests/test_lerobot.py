@@ -1,7 +1,5 @@
 """LeRobot datasets of version 3: written, read back, with images and with videos; what was read can be trained on."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

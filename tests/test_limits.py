@@ -1,7 +1,5 @@
 """Every setting has a range, and what lies outside it is refused when it is composed."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from dataclasses import Field, fields, is_dataclass

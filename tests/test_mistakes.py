@@ -1,7 +1,5 @@
 """Bad input gets one line that says what is wrong, where, and what to type."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The OpenVLA target on tiny random checkpoints: equal to transformers' own models, lossless, strict about files."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import json

@@ -1,7 +1,5 @@
 """Files and demonstrations that were made for other actions: every command refuses them in one line."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

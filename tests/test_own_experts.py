@@ -1,7 +1,5 @@
 """Experts of our own on real Meta-World, beside those that they replace."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Iterator
 

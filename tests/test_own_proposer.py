@@ -1,7 +1,5 @@
 """A proposer with weights that is not kerv's: two files under examples/, and everything that kerv's own can do."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import shutil

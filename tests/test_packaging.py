@@ -1,7 +1,5 @@
 """What a stranger gets: the wheel's contents, and the set-up scripts run against stand-ins for Python, apt and sudo."""
 
-from __future__ import annotations
-
 import email
 import os
 import shutil

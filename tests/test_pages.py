@@ -1,7 +1,5 @@
 """The figures on the committed pages are those of the committed tables."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

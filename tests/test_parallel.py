@@ -1,7 +1,5 @@
 """A target that decodes all tokens of a chunk at once (docs/methods.md §6)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A plan is what a study wants minus what the database has, with a reason for the rest."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import shutil

@@ -1,7 +1,5 @@
 """No process of a command outlives it, however it ends."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

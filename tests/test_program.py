@@ -1,7 +1,5 @@
 """The packed weights of a frozen CPU policy compute what its modules do; training and other devices never meet them."""
 
-from __future__ import annotations
-
 import copy
 import os
 import pickle

@@ -1,7 +1,5 @@
 """Every proposer, in-prefill draft and boundary is lossless under strict acceptance; HeiSD's choice and skip."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

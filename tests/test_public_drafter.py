@@ -1,7 +1,5 @@
 """Drafters of the public EAGLE and Spec-VLA layout: what they compute, and their conventions."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, replace
 from pathlib import Path

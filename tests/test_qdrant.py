@@ -1,7 +1,5 @@
 """Qdrant finds the neighbours of exact search; tried with the client's local mode."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """A world that goes on while the policy decodes: what is executed meanwhile, for how long, and what compensates it."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import json

@@ -1,7 +1,5 @@
 """The registry: names, collisions, plugins, and that everything it names is there."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

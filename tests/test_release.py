@@ -1,7 +1,5 @@
 """`kerv build policy`: the archive of a policy, checked and put where policies are looked for."""
 
-from __future__ import annotations
-
 import gc
 import http.server
 import json

@@ -1,7 +1,5 @@
 """Speeds on other machines, per episode and per control step."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

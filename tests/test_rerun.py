@@ -1,7 +1,5 @@
 """Recordings read back from disk: entities, timelines, values, layout, and what a failure leaves behind."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The scout and the certificate of success: drafts without the target's encoder, and what a certificate covers."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The `sequence` rule against docs/methods.md §2.1 read aloud, and the kinematic groups that it judges by."""
 
-from __future__ import annotations
-
 from itertools import groupby
 
 import pytest

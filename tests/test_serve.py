@@ -1,7 +1,5 @@
 """`kerv serve`: the protocol spoken by a minimal client of our own, bad clients, and the same actions as in process."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,8 +1,6 @@
 """The pages as a site: links lead somewhere, every page is listed, the reference has every command. mkdocs itself is
 not needed: `make docs` runs it."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

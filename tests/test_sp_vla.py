@@ -1,7 +1,5 @@
 """method=sp_vla (docs/methods.md §6.1): the regression, and when it takes the target's place."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Action spaces: round trips of tokens, both ends, groups, statistics, and what may be used together."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Rows of everything that was begun, curves of trainings, and which database holds them."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

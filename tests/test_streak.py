@@ -1,7 +1,5 @@
 """skip=streak (docs/methods.md §4.5): when a draft is executed unverified, from the target's agreement alone."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

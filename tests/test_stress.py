@@ -1,7 +1,5 @@
 """Stress: what each kind changes of a world and what it leaves alone, seeds, levels, refusals, the command line."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The report of a study of stress: what a stressed setting is compared with, the figure, the sentence."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

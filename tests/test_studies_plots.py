@@ -1,7 +1,5 @@
 """Figures of studies whose axis is text, nothing or a number on some rows only."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What `kerv report --publish` writes, and what it refuses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Intervals and tests against closed forms, slower references and simulated coverage."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tables against numbers worked out by hand; files that come out the same every time."""
 
-from __future__ import annotations
-
 import io
 import json
 import math

@@ -1,7 +1,5 @@
 """Thresholds against their closed forms."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

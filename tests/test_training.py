@@ -1,7 +1,5 @@
 """Training: a run that is killed and started again ends where the uninterrupted one does; losses are what they say."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

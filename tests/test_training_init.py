@@ -1,7 +1,5 @@
 """train.init: a run that begins with another target's weights, at another chunk length."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 from pathlib import Path

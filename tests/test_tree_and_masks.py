@@ -1,7 +1,5 @@
 """Trees, ancestor masks against an independent reference, acceptance against its definition, cache commit."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """What is executed unverified, what lies inside the clock, and K against the chunk's length."""
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

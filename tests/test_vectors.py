@@ -1,7 +1,5 @@
 """What seeds draw and worlds do is the same on every CPU: lengths, a recording, stress under another kernel."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import os

@@ -1,7 +1,5 @@
 """Frames of several views: their names, what a world draws, recordings, the policy that sees them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """vla-eval in both directions: kerv serves its benchmarks, Meta-World is one of them, and recordings become studies."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

@@ -1,7 +1,5 @@
 """A round waits for the device once: counted on a pretended device, for every family of proposers."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 
