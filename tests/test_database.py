@@ -1,5 +1,6 @@
 """The tables of a results folder: whole or unchanged, whoever dies, whoever else writes, whatever the file holds."""
 
+import contextlib
 import dataclasses
 import os
 import resource
@@ -15,6 +16,7 @@ from studies_synthetic import episode, settings_of, still_episode, study_of, swe
 from typer.testing import CliRunner
 
 from kerv_cli.base.errors import CheckpointError, KervError, StorageError, UsageError
+from kerv_cli.catalogue.folders import import_results
 from kerv_cli.cli.app import app
 from kerv_cli.engine.record import PHASES, EpisodeRecord
 from kerv_cli.episodes.rows import decodes_table, episode_row
@@ -24,6 +26,7 @@ from kerv_cli.lab.execute import RunEpisode
 from kerv_cli.lab.plan import Setting
 from kerv_cli.lab.runs import Run, run_rows
 from kerv_cli.lab.store import StudyStore, studies
+from kerv_cli.report.tables import load_study
 
 STUDY = threshold_study(["reach-v3"])
 
@@ -159,6 +162,20 @@ def test_older_tables_are_migrated_in_one_transaction(database: Database, monkey
         assert [store.name for store in studies(Database(database.results))] == ["b"]
     with database.reading() as connection:
         assert connection.exec_driver_sql("SELECT colour FROM studies").all() == [(None,)]
+
+
+def test_a_measure_that_an_older_kerv_did_not_store_is_missing_until_it_is_measured(tmp_path: Path) -> None:
+    swept(tmp_path / "old", STUDY)
+    with contextlib.closing(sqlite3.connect(tmp_path / "old" / FILE)) as file:
+        file.execute("ALTER TABLE episodes DROP COLUMN closest_approach")
+    store = StudyStore(tmp_path / "old", "threshold")
+    assert load_study(store).table["near_contact_failure"].isna().all()
+    new = Database(tmp_path / "new")
+    import_results(new, [tmp_path / "old"])
+    assert StudyStore(new, "threshold").frame()["closest_approach"].isna().all()
+    swept(tmp_path / "old", study_of({"ar": settings_of("ar")}, ["push-v3"], "later"))
+    assert StudyStore(tmp_path / "old", "later").frame()["closest_approach"].notna().all()
+    assert store.frame()["closest_approach"].isna().all()
 
 
 def test_newer_tables_are_refused(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:

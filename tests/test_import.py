@@ -90,7 +90,7 @@ def test_it_is_reported_as_it_was(older: Path) -> None:
     of_macro = {"difference", "difference_low", "difference_high", "non_inferior"}
     for rows, anew in ((~macro, inferred), (macro, inferred | of_macro)):
         columns = [name for name in text if name not in anew]
-        assert {*CSV_COLUMNS} - {*columns} <= {*anew, "steps_to_success"}
+        assert {*CSV_COLUMNS} - {*columns} <= {*anew, "steps_to_success", "near_contact_failure"}
         pd.testing.assert_frame_equal(text.loc[rows, columns], before.loc[rows, columns])
 
 

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from kerv_cli.base.errors import KervError, RenderingUnavailable, UnknownName, UsageError
+from kerv_cli.episodes.episode import run_episode
+from kerv_cli.episodes.policy import ExpertDecoder
 from kerv_cli.worlds.metaworld.spec import SPEC
 from kerv_cli.worlds.mujoco_world import box_average, choose_backend, find_backend
 from kerv_cli.worlds.settings import CameraSettings
@@ -64,6 +66,13 @@ def test_reset_and_step_report_what_happened(world):
     assert moved.instruction == world.instruction == "slide the window closed"
     assert moved.proprioception.tolist() == moved.state[:4].tolist() == [*world.end_effector, world.gripper]
     assert moved.state[18:36].tolist() == start.state[:18].tolist()
+
+
+def test_an_expert_that_grips_the_object_comes_within_two_centimetres_of_it():
+    with SPEC.open_world("push-v3") as world:
+        assert run_episode(world, ExpertDecoder(), 0).closest_approach < 0.02
+    with SPEC.open_world("reach-v3") as world:  # it leaves the object where it is
+        assert run_episode(world, ExpertDecoder(), 0).closest_approach > 0.1
 
 
 @pytest.mark.bits

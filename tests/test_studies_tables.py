@@ -63,8 +63,15 @@ EPISODES: dict[tuple[str, str], list[tuple[bool, list[DecodeRecord]]]] = {
 }
 
 
+DISTANCES = (0.01, 0.015, 0.03)  # metres between hand and object at the closest, by episode
+
+
 def by_hand(setting: Setting, task: str) -> RunEpisode:
-    return lambda seed: still_episode(task, seed, *EPISODES[task, setting.label][seed - 100_000])
+    def run(seed: int) -> EpisodeRecord:
+        record = still_episode(task, seed, *EPISODES[task, setting.label][seed - 100_000])
+        return replace(record, closest_approach=DISTANCES[seed - 100_000])
+
+    return run
 
 
 def two_settings(episodes: int = 4, **about: Any) -> Study:
@@ -127,6 +134,13 @@ def test_one_task_by_hand(data: StudyData) -> None:
     assert {name: row[name] for name in expected} == pytest.approx(expected)
     found = speedup(np.array([0.5, 0.3]), np.array([0.25, 0.05]), ["reach", "reach"])
     assert (row["speedup_low"], row["speedup_high"]) == pytest.approx((found.low, found.high))
+
+
+def test_failures_near_the_object_are_a_share_of_the_failures(data: StudyData) -> None:
+    shares = {(row["task"], row["label"]): row["near_contact_failure"] for _, row in data.per_task.iterrows()}
+    assert shares["push-v3", "kerv"] == 0.5  # it failed at 0.015 m and at 0.03 m
+    assert shares["push-v3", "ar"] == 0.0
+    assert math.isnan(shares["reach-v3", "kerv"])  # nothing failed
 
 
 def test_the_baseline_has_no_verifications_and_a_speedup_of_one(data: StudyData) -> None:

@@ -30,6 +30,7 @@ from kerv_cli.lab.database import (
     STUDIES,
     WANTED,
     Database,
+    measures_in,
     newer,
 )
 from kerv_cli.lab.plan import Episode, Setting, Study
@@ -37,7 +38,8 @@ from kerv_cli.lab.store import ImportedEpisode, StudyStore, stored_study
 from kerv_cli.worlds.demos.parquet import foreign_table
 
 _DAMAGE = (sa.exc.SQLAlchemyError, sqlite3.Error, pa.ArrowException, OSError, ValueError, KeyError, TypeError)
-_ROW = (*(column.name for column in MEASURES), "order", "started", "worker_pid")
+_FURTHER = ("order", "started", "worker_pid")
+_ROW = (*(column.name for column in MEASURES), *_FURTHER)
 
 MOST_STEPS = 20_000_000
 """Limit on steps of SQLite's virtual machine per connection, about a second. STEPS_PER_BYTE is added."""
@@ -141,8 +143,10 @@ def episodes_in(connection: sa.Connection, settings: dict[int, Setting]) -> Iter
         ValueError: The decodes of an episode are damaged or too large.
     """
     of_block = BLOCKS.c.id.label("block"), BLOCKS.c.about, BLOCKS.c.run, BLOCKS.c.seeds, BLOCKS.c.code
+    stored = [*measures_in(connection), *(EPISODES.c[name] for name in _FURTHER)]
+    measures = (column.label(f"row.{name}") for name, column in zip(_ROW, stored, strict=True))
     query = (
-        sa.select(WANTED, *(EPISODES.c[name].label(f"row.{name}") for name in _ROW), *of_block, DECODES.c.parquet)
+        sa.select(WANTED, *measures, *of_block, DECODES.c.parquet)
         .select_from(WANTED.join(EPISODES).join(BLOCKS).join(DECODES, DECODES.c.episode_id == EPISODES.c.id))
         .where(WANTED.c.setting_id.in_(settings))
         .order_by(WANTED.c.position)

@@ -66,6 +66,7 @@ class _Execution:
         self.actions: list[np.ndarray] = []  # (D,) float32, within the limits
         self.path: list[np.ndarray] = []
         self.gripper: list[float] = []
+        self.distances: list[float] = []  # between hand and object, after each step
         self.frames: dict[int, np.ndarray] = {}
         self.places: dict[str, list[np.ndarray]] = {}
         self._collect()
@@ -87,6 +88,7 @@ class _Execution:
         space = self.world.spec.actions
         self.actions.append(np.clip(self.last, space.low, space.high).astype(np.float32))
         self._collect()
+        self.distances.append(self.world.object_distance)
         self.follower.observe(self.actions[-1], self.path[-1])
 
     def until(self, rest: int) -> None:
@@ -183,6 +185,7 @@ def episode(
         path=np.stack(execution.path).astype(np.float32),
         gripper=np.asarray(execution.gripper, dtype=np.float32),
         initial_state=world.initial_state,
+        closest_approach=min(execution.distances),
         frames=execution.frames,
         places={name: np.asarray(path, dtype=np.float32) for name, path in execution.places.items()},
         wall_seconds=time.perf_counter() - began,

@@ -76,6 +76,7 @@ _EPISODE: Fields = {
     # of these: steps on the previous chunk, steps on the last action, and actions that were too old to execute
     **{f"{name}_steps": (INT, _summed(_delay(name))) for name in ("carried", "held", "dropped")},
     **_attributes("path_length", "jerk", kind=FLOAT),  # of the end effector: metres; m/s³
+    **_attributes("closest_approach", kind=FLOAT),  # least distance of fingertips to object, metres
     **_attributes("wall_seconds", kind=FLOAT),
     "initial_state": (pa.list_(FLOAT), lambda episode: np.asarray(episode.initial_state, np.float64).ravel().tolist()),
 }

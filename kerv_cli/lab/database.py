@@ -23,7 +23,10 @@ from kerv_cli.lab.command import STORE
 
 FILE = "kerv.db"
 SCHEMA = 1
-"""Version of the tables. Increase it whenever they change, and add the SQL statements to MIGRATIONS."""
+"""Version of the tables. Increase it whenever they change, and add the SQL statements to MIGRATIONS.
+
+A new column in MEASURES needs neither: it is added at the next write, and until then it reads as null.
+"""
 MIGRATIONS: dict[int, Sequence[str]] = {}
 """Version -> SQL statements that turn its tables into those of the next version."""
 LOCK_SECONDS = 60
@@ -93,7 +96,8 @@ _INTEGERS = (
 )  # fmt: skip
 _NUMBERS = (
     "seconds", "seconds.vision", "seconds.prefill", "seconds.propose", "seconds.verify", "seconds.accept",
-    "seconds.rectify", "seconds.other", "deviation_sum", "delay_seconds", "path_length", "jerk", "wall_seconds",
+    "seconds.rectify", "seconds.other", "deviation_sum", "delay_seconds", "path_length", "jerk", "closest_approach",
+    "wall_seconds",
 )  # fmt: skip
 MEASURES: tuple[sa.Column[Any], ...] = (
     sa.Column("success", sa.Boolean),
@@ -169,6 +173,7 @@ class Database:
         self.shown = str(self.file or parsed.render_as_string())
         self._url = parsed if self.file else parsed.set(drivername="postgresql+psycopg")
         self._engine: sa.Engine | None = None
+        self._is_complete = False  # whether the table of episodes is known to have all columns
 
     @property
     def exists(self) -> bool:
@@ -200,7 +205,10 @@ class Database:
         with self._errors():
             engine = self._opened(create=True).execution_options(kerv_writes=True)
             with engine.begin() as connection:
+                if not self._is_complete:
+                    _add_measures(connection)
                 yield connection
+            self._is_complete = True
 
     def _opened(self, create: bool = False) -> sa.Engine:
         if self._engine is None:
@@ -303,6 +311,21 @@ def _migrated(connection: sa.Connection) -> int:
             connection.execute(sa.text(statement))
     connection.execute(sa.update(ABOUT).where(ABOUT.c.key == "schema_version").values(value=str(max(version, SCHEMA))))
     return max(version, SCHEMA)
+
+
+def measures_in(connection: sa.Connection) -> list[sa.ColumnElement[Any]]:
+    """Return the columns of MEASURES. Those that an older kerv did not store are null in every row."""
+    stored = {column["name"] for column in sa.inspect(connection).get_columns(EPISODES.name)}
+    return [EPISODES.c[one.name] if one.name in stored else sa.null().label(one.name) for one in MEASURES]
+
+
+def _add_measures(connection: sa.Connection) -> None:
+    """Add the columns of MEASURES that an older kerv did not store. It can still read and write the table."""
+    quote = connection.dialect.identifier_preparer.quote
+    for column, found in zip(MEASURES, measures_in(connection), strict=True):
+        if not isinstance(found, sa.Column):
+            kind = column.type.compile(connection.dialect)
+            connection.execute(sa.text(f"ALTER TABLE {EPISODES.name} ADD COLUMN {quote(column.name)} {kind}"))
 
 
 def newer(name: str | Path, version: int) -> CheckpointError:

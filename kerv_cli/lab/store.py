@@ -13,7 +13,19 @@ import sqlalchemy as sa
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import check_label, check_name
 from kerv_cli.base.settings import RuntimeSettings
-from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, MEASURES, RUNS, SETTINGS, STUDIES, WANTED, Database, now
+from kerv_cli.lab.database import (
+    BLOCKS,
+    DECODES,
+    EPISODES,
+    MEASURES,
+    RUNS,
+    SETTINGS,
+    STUDIES,
+    WANTED,
+    Database,
+    measures_in,
+    now,
+)
 from kerv_cli.lab.plan import NEVER, Block, Episode, Key, Setting, StoredEpisode, Study, blocks_of, split
 from kerv_cli.lab.runs import Run, run_rows
 
@@ -210,18 +222,17 @@ class StudyStore:
         import pandas as pd
 
         keys = ("label", "task", "seed", "repeat")
-        measures = [EPISODES.c[column.name] for column in MEASURES]
         circumstances = [EPISODES.c[name] for name in ("block", "order", "started", "decode_seconds")]
-        query = (
-            sa.select(
-                SETTINGS.c.label, WANTED.c.task, WANTED.c.seed, WANTED.c.repeat, EPISODES.c.id.label("episode"),
-                *measures, *circumstances, BLOCKS.c.run, BLOCKS.c.code, BLOCKS.c.about,
-            )
-            .select_from(WANTED.join(EPISODES).join(BLOCKS).join(SETTINGS).join(STUDIES))
-            .where(STUDIES.c.name == self.name)
-            .order_by(WANTED.c.position)
-        )  # fmt: skip
         with self.database.reading() as connection:
+            query = (
+                sa.select(
+                    SETTINGS.c.label, WANTED.c.task, WANTED.c.seed, WANTED.c.repeat, EPISODES.c.id.label("episode"),
+                    *measures_in(connection), *circumstances, BLOCKS.c.run, BLOCKS.c.code, BLOCKS.c.about,
+                )
+                .select_from(WANTED.join(EPISODES).join(BLOCKS).join(SETTINGS).join(STUDIES))
+                .where(STUDIES.c.name == self.name)
+                .order_by(WANTED.c.position)
+            )  # fmt: skip
             frame = pd.DataFrame(connection.execute(query).mappings().all())
         if frame.empty:
             return frame

@@ -19,6 +19,8 @@ Row = dict[str, Any]
 
 MICRO = "micro over tasks"
 MACRO = "macro over difficulty groups"
+NEAR = 0.02
+"""Distance between hand and object, in metres, below which a failed episode counts as a near-contact failure."""
 MARGIN = 0.03
 """Loss of success, as a share of episodes, below which a setting counts as non-inferior to the baseline."""
 
@@ -205,6 +207,8 @@ def _means(episodes: pd.DataFrame) -> dict[str, float]:
     solved = episodes[episodes["success"].astype(bool)]
     values["steps_to_success"] = float(solved["steps"].mean())
     values["path_m"] = float(solved["path_length"].astype(float).mean())
+    distances = episodes.loc[~episodes["success"].astype(bool), "closest_approach"].astype(float).dropna()
+    values["near_contact_failure"] = float((distances < NEAR).mean())
     return values | {name: float(part.built(episodes)) for name, part in registered_columns().items()}
 
 

@@ -118,6 +118,7 @@ def _columns() -> dict[str, TextOf]:
         "decodes compensated": shares("compensation_rate"),
         "decodes retrieved": shares("retrieval_share"),
         "deviation from AR": numbers("deviation"),
+        "failures near the object": shares("near_contact_failure"),
         **{name.replace("_", " "): numbers(name) for name in registered_columns()},
         "lost / won": lost_won,
     }

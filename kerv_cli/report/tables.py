@@ -27,7 +27,7 @@ CSV_COLUMNS = (
     "time_per_episode_ms", "latency_p50_ms", "latency_p95_ms", "latency_worst_ms", "AL", "forwards_per_step",
     "skip_rate", "unverified_share", "compensation_rate", "retrieval_share", "deviation", "pairs", "only_baseline",
     "only_method", "mcnemar_p", "difference", "difference_low", "difference_high", "non_inferior", "pairs_to_settle",
-    "steps", "decodes", "steps_to_success",
+    "steps", "decodes", "steps_to_success", "near_contact_failure",
 )  # fmt: skip
 """Columns of a study's CSV files. The remaining values are in tables/<study>.json (`further_of`)."""
 

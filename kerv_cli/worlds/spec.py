@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -304,6 +305,20 @@ class World(ABC):
     def end_effector(self) -> NDArray[np.float64]:
         """Position (3,) of the end effector in metres: the first three numbers of the proprioception."""
         return self.observation.proprioception[:3].copy()
+
+    @property
+    def grip_point(self) -> NDArray[np.float64]:
+        """Position (3,) where the hand grips, in metres. The end effector's, unless a subclass knows the fingertips."""
+        return self.end_effector
+
+    @property
+    def object_distance(self) -> float:
+        """Distance between `grip_point` and the place `object`, in metres. NaN if the task has no such place."""
+        for place in self.spec.observation.places:
+            if place.name == "object":
+                position = self.observation.state[place.first : place.first + 3]
+                return float(np.linalg.norm(self.grip_point - position))
+        return math.nan
 
     @property
     def gripper(self) -> float:

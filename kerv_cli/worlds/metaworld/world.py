@@ -60,6 +60,11 @@ class MetaWorld(MujocoWorld):
         self.observation  # noqa: B018 - raises before the first reset
         return np.array(self._env._last_rand_vec, dtype=np.float64)
 
+    @property
+    def grip_point(self) -> NDArray[np.float64]:
+        """Position (3,) between the fingertips, in metres. The end effector's is 4.5 cm above it."""
+        return np.array(self._env.tcp_center, dtype=np.float64)
+
     def _start(self, seed: int) -> NDArray[np.float64]:
         placement = _placements(self.task, seed // _TASKS_PER_BENCHMARK)[seed % _TASKS_PER_BENCHMARK]
         if self._env is None:
