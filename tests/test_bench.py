@@ -12,11 +12,10 @@ from typer.testing import CliRunner
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.bench import phases as measuring
-from kerv_cli.bench.ceilings import ceilings
 from kerv_cli.bench.machine import Machine
 from kerv_cli.bench.model import layer_weights, open_model
 from kerv_cli.bench.phases import Laps, Phase, costs_of, decoders
-from kerv_cli.bench.profile import profile_of, projected, shares
+from kerv_cli.bench.results import ceilings, profile_of, projected, shares
 from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.cli.app import app
 from kerv_cli.engine.cost import READ_PHASES, Profile, Work, prices, read_profile, work_of

@@ -47,7 +47,7 @@ from kerv_cli.training.calibration import (
 )
 from kerv_cli.training.settings import CalibrateSettings
 from kerv_cli.worlds.demos.dataset import FORMAT, DemoDataset, dataset_hash, episode_path
-from kerv_cli.worlds.demos.episode_file import DemoEpisode, save_episode
+from kerv_cli.worlds.demos.files import DemoEpisode, save_episode
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 TASKS = ("reach-v3", "drawer-close-v3")

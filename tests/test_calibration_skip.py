@@ -25,7 +25,7 @@ from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.training.calibration import LEAST, CalibrationRun, Matches, lowest_level, match, skip_section, task_levels
 from kerv_cli.training.datastore import DatastoreBuild
 from kerv_cli.training.settings import BuildDatastoreSettings, CalibrateSettings
-from kerv_cli.worlds.demos.episode_file import DemoEpisode
+from kerv_cli.worlds.demos.files import DemoEpisode
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 SPACE = SPEC.actions

@@ -27,7 +27,7 @@ from kerv_cli.targets.checkpoint import TargetDescription, load_target
 from kerv_cli.training import datastore as datastore_build
 from kerv_cli.training.datastore import DatastoreBuild
 from kerv_cli.training.settings import BuildDatastoreSettings
-from kerv_cli.worlds.demos.episode_file import DemoEpisode
+from kerv_cli.worlds.demos.files import DemoEpisode
 from kerv_cli.worlds.metaworld.spec import SPEC
 from kerv_cli.worlds.settings import EVALUATION_SEED
 

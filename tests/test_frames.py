@@ -9,8 +9,7 @@ import torch
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.observations import Observations, read_observations
-from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode, save_episode
-from kerv_cli.worlds.demos.frames import EncodedFrames
+from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames, load_episode, save_episode
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 SIZE = 96

@@ -23,8 +23,7 @@ from kerv_cli.worlds.demos.dataset import register_recorded
 from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD
 from kerv_cli.worlds.mujoco_world import MujocoWorld
 from kerv_cli.worlds.settings import CameraSettings, StressSettings
-from kerv_cli.worlds.stress.scene import CameraJitter, Objects, objects, scenery_of
-from kerv_cli.worlds.stress.sensor import Sensor
+from kerv_cli.worlds.stress.kinds import CameraJitter, Objects, Sensor, objects, scenery_of
 
 TESTS = Path(__file__).parent
 SEED, STEPS, SIZE = 50_006, 24, 48

@@ -30,7 +30,7 @@ from kerv_cli.training import imitation
 from kerv_cli.training.imitation import Imitation, lit, vocabulary, waypoints
 from kerv_cli.training.loop import Loop, Metrics, digest, read_state, schedule, write_state
 from kerv_cli.training.settings import TrainSettings
-from kerv_cli.worlds.demos.episode_file import DemoEpisode
+from kerv_cli.worlds.demos.files import DemoEpisode
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.metaworld.spec import SPEC
 from kerv_cli.worlds.settings import CameraSettings

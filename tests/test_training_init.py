@@ -19,7 +19,7 @@ from kerv_cli.training.drafter import DrafterRun
 from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
 from kerv_cli.training.target import TargetRun
 from kerv_cli.worlds.demos.dataset import DemoDataset, DemoEntry
-from kerv_cli.worlds.demos.episode_file import DemoEpisode
+from kerv_cli.worlds.demos.files import DemoEpisode
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation

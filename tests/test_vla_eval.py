@@ -41,8 +41,7 @@ from websockets.sync.client import connect
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import Observation
-from kerv_cli.catalogue.evaluations import labelled, read_evaluations
-from kerv_cli.catalogue.served import read_served
+from kerv_cli.catalogue.evaluations import labelled, read_evaluations, read_served
 from kerv_cli.cli.app import app
 from kerv_cli.episodes.runner import Runner
 from kerv_cli.episodes.settings import RolloutSettings

@@ -22,11 +22,11 @@ from typing import Any
 import pyarrow as pa
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
-from kerv_cli.base.files import read_mapping, visible
-from kerv_cli.catalogue.served import path_of, read_served
+from kerv_cli.base.files import atomic_path, read_mapping, visible
 from kerv_cli.catalogue.stored import connect_foreign
+from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.episodes.identity import ENGINE, OBSERVATION, flat
-from kerv_cli.episodes.rows import DECODE_SCHEMA, EPISODE_SCHEMA, INT
+from kerv_cli.episodes.rows import DECODE_SCHEMA, EPISODE_SCHEMA, INT, decodes_table, episode_row
 from kerv_cli.episodes.settings import RolloutSettings, settings_from
 from kerv_cli.lab.plan import Episode, Setting, Study
 from kerv_cli.lab.store import IMPORT, ImportedEpisode, StudyStore
@@ -394,3 +394,58 @@ def _imported(results: Path, episode: Episode, one: Evaluation, recorded: Record
         "imported": {"source": one.source.name, "evaluation": one.id, "config": one.config},
     }
     return ImportedEpisode(episode, row, decodes, f"{one.id} {episode.setting.label}", about)
+
+
+SERVED = "served"
+_KEY = b"kerv"
+_NAME = re.compile(r"\w[\w.-]{0,199}")
+
+
+def path_of(results: Path, evaluation: str, episode: str) -> Path | None:
+    """Return the file of a served episode. None if a name cannot be used as a file name."""
+    if not _NAME.fullmatch(evaluation) or not _NAME.fullmatch(episode):
+        return None
+    return results / SERVED / evaluation / f"{episode}.arrow"
+
+
+def write_served(path: Path, record: EpisodeRecord, started: str, by: Mapping[str, Any]) -> None:
+    """Write one episode.
+
+    Args:
+        path: The file.
+        record: The episode. If the end effector's path is unknown, `record.path` has the shape (0, 3).
+        started: Time at which the episode began (ISO 8601).
+        by: Facts about the server (`Policy.facts`).
+
+    Raises:
+        StorageError: The disk is full or not writable.
+    """
+    row = episode_row(record) | {"task": record.task, "seed": record.seed, "started": started}
+    if not len(record.path):
+        row |= {"path_length": None, "jerk": None}
+    facts = json.dumps({"episode": row, "by": by})
+    table = decodes_table(record).replace_schema_metadata({_KEY: facts})
+    options = pa.ipc.IpcWriteOptions(compression="zstd")
+    with atomic_path(path) as temporary, pa.ipc.new_file(str(temporary), table.schema, options=options) as file:
+        file.write_table(table)
+
+
+def read_served(path: Path) -> tuple[dict[str, Any], pa.Table] | None:
+    """Read one episode.
+
+    Returns:
+        The episode's columns, and the table of its decodes. None if the file does not exist.
+
+    Raises:
+        CheckpointError: The file is damaged.
+    """
+    try:
+        with pa.ipc.open_file(str(path)) as file:
+            table = file.read_all()
+        facts = json.loads((table.schema.metadata or {})[_KEY])
+        table = table.replace_schema_metadata(None)
+        return facts["episode"], table.select(DECODE_SCHEMA.names).cast(DECODE_SCHEMA)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
+        raise CheckpointError(f"{path} is damaged ({' '.join(str(error).split())[:80]}): move it aside") from error

@@ -27,7 +27,7 @@ from kerv_cli.lab.database import FILE, Database
 from kerv_cli.lab.plan import Episode, Setting, Study, plain_settings
 from kerv_cli.lab.store import ROLLOUT, SWEEP, ImportedEpisode, StudyStore
 from kerv_cli.methods.settings import with_artifacts
-from kerv_cli.worlds.demos.parquet import foreign_table
+from kerv_cli.worlds.demos.files import foreign_table
 
 _FOLDERS = {"studies": SWEEP, "rollouts": ROLLOUT}
 _ROW = (*EPISODE_SCHEMA.names, "order", "started", "worker_pid")

@@ -35,7 +35,7 @@ from kerv_cli.lab.database import (
 )
 from kerv_cli.lab.plan import Episode, Setting, Study
 from kerv_cli.lab.store import ImportedEpisode, StudyStore, stored_study
-from kerv_cli.worlds.demos.parquet import foreign_table
+from kerv_cli.worlds.demos.files import foreign_table
 
 _DAMAGE = (sa.exc.SQLAlchemyError, sqlite3.Error, pa.ArrowException, OSError, ValueError, KeyError, TypeError)
 _FURTHER = ("order", "started", "worker_pid")

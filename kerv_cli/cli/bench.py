@@ -29,8 +29,7 @@ def bench(settings: BenchSettings, as_json: AsJson = False) -> None:
     """
     from kerv_cli.bench.machine import measure_machine
     from kerv_cli.bench.model import open_model
-    from kerv_cli.bench.run import card_of, run, write
-    from kerv_cli.bench.tables import PHASE_COLUMNS, card_rows, ceiling_rows, phase_rows
+    from kerv_cli.bench.results import PHASE_COLUMNS, card_of, card_rows, ceiling_rows, phase_rows, run, write
 
     model = open_model(settings)
     machine = measure_machine(model.target.device, model.dtype)

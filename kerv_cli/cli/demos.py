@@ -66,7 +66,7 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
 def export_demos(settings: DemosExportSettings) -> None:
     """Write demonstrations as a LeRobot dataset."""
     from kerv_cli.worlds.demos.dataset import DemoDataset
-    from kerv_cli.worlds.demos.lerobot.export import export
+    from kerv_cli.worlds.demos.lerobot import export
 
     dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
     folder = (
@@ -90,7 +90,7 @@ def export_demos(settings: DemosExportSettings) -> None:
 def import_demos(settings: DemosImportSettings) -> None:
     """Read a LeRobot dataset as demonstrations."""
     from kerv_cli.lab.runs import making
-    from kerv_cli.worlds.demos.lerobot.reading import import_lerobot
+    from kerv_cli.worlds.demos.lerobot import import_lerobot
 
     if not settings.source:
         raise UsageError("source=DIR: name the folder of a LeRobot dataset")

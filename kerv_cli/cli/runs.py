@@ -179,7 +179,7 @@ def rerun(
     results, (name,) = settings.results, _run_names(names)
     run = find_run(results, name)
     if run.is_training:
-        from kerv_cli.catalogue.again import again_words
+        from kerv_cli.catalogue.entries import again_words
         from kerv_cli.cli.work import run_training
         from kerv_cli.training.again import training_again
 
@@ -193,7 +193,7 @@ def rerun(
     if run.kind == "import":
         raise UsageError(f"{run.id} was imported: run vla-eval again, then 'kerv runs import'")
     from kerv_cli.base.durations import count
-    from kerv_cli.catalogue.again import plan_of
+    from kerv_cli.catalogue.entries import plan_of
     from kerv_cli.cli.work import run_planned
     from kerv_cli.report.compare import same_tokens
 

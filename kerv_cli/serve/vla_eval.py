@@ -21,7 +21,7 @@ import numpy as np
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.places import results_dir
 from kerv_cli.base.spaces import Observation
-from kerv_cli.catalogue.served import path_of, write_served
+from kerv_cli.catalogue.evaluations import path_of, write_served
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
 from kerv_cli.serve.interface import (
     LARGEST,

@@ -18,8 +18,7 @@ from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.worlds import instruction_of
-from kerv_cli.worlds.demos.episode_file import DemoEpisode
-from kerv_cli.worlds.demos.frames import EncodedFrames
+from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames
 
 BATCH = 64
 """Number of observations that a target encodes and decodes at once."""

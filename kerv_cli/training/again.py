@@ -8,8 +8,7 @@ import itertools
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.manifests import read
 from kerv_cli.base.settings import read_settings
-from kerv_cli.catalogue.again import again_words
-from kerv_cli.catalogue.entries import RunEntry, description_of
+from kerv_cli.catalogue.entries import RunEntry, again_words, description_of
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import unfinished
 from kerv_cli.methods.settings import with_artifacts

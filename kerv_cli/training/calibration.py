@@ -47,7 +47,7 @@ from kerv_cli.training.demonstrations import check_tasks, demos_for
 from kerv_cli.training.settings import CalibrateSettings
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
-from kerv_cli.worlds.demos.episode_file import DemoEpisode
+from kerv_cli.worlds.demos.files import DemoEpisode
 
 PRESAMPLED = 6
 """Number of episodes per task over which the decodes that measure K_S are spread."""

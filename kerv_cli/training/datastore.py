@@ -36,7 +36,7 @@ from kerv_cli.training.demonstrations import demos_for
 from kerv_cli.training.settings import BuildDatastoreSettings
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import OnProgress
-from kerv_cli.worlds.demos.episode_file import DemoEpisode
+from kerv_cli.worlds.demos.files import DemoEpisode
 
 BATCH = 128
 """Maximum number of observations that are encoded together."""

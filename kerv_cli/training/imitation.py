@@ -32,7 +32,7 @@ from kerv_cli.training.loop import Metrics
 from kerv_cli.training.settings import TrainSettings
 from kerv_cli.worlds import specs
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
-from kerv_cli.worlds.demos.episode_file import DemoEpisode
+from kerv_cli.worlds.demos.files import DemoEpisode
 
 WITHIN = 9
 """Validation reports the share of tokens at most this many bins from the label: Spec-VLA's acceptance radius."""

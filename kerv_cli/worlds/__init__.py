@@ -113,13 +113,13 @@ def settled(world: W, spec: EnvironmentSpec) -> W:
 
 add("environment", "metaworld", "kerv_cli.worlds.metaworld.spec:SPEC", names="kerv_cli.worlds.metaworld.tasks:NAMES")
 for _name, _class, _needed in (
-    ("push", "actions:Push", ("actions", "position")),
-    ("actuation", "actions:Actuation", ("actions",)),
-    ("sensor", "sensor:Sensor", ("images",)),
-    ("light", "scene:Light", ("model",)),
-    ("colour", "scene:Colour", ("model",)),
-    ("camera", "scene:CameraJitter", ("model",)),
-    ("object", "scene:Objects", ("model", "range")),
+    ("push", "kinds:Push", ("actions", "position")),
+    ("actuation", "kinds:Actuation", ("actions",)),
+    ("sensor", "kinds:Sensor", ("images",)),
+    ("light", "kinds:Light", ("model",)),
+    ("colour", "kinds:Colour", ("model",)),
+    ("camera", "kinds:CameraJitter", ("model",)),
+    ("object", "kinds:Objects", ("model", "range")),
 ):
     add("stress", _name, f"kerv_cli.worlds.stress.{_class}", needed=_needed)
 add("stress", "none", needed=())

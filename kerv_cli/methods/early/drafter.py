@@ -32,7 +32,7 @@ from kerv_cli.targets.compact.program import Program
 from kerv_cli.targets.losses import soft_labels, token_loss
 from kerv_cli.targets.observations import Rows, observations_of, prompts_of, split, steps_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
-from kerv_cli.worlds.demos.episode_file import DemoEpisode
+from kerv_cli.worlds.demos.files import DemoEpisode
 
 SURE = 0.05
 """The early drafter is sure of a chunk if it estimates at least this probability that all tokens are accepted.

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import read_mapping, sha256_of
@@ -15,10 +15,12 @@ from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import add
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.worlds import stands_for_tasks
-from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode
-from kerv_cli.worlds.demos.frames import EncodedFrames
+from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames, load_episode
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.task import Task
+
+if TYPE_CHECKING:
+    pass
 
 OnProgress = Callable[[int, int], object]
 """Reports progress: called with (done, total) after every episode or batch."""

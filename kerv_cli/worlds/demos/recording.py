@@ -33,7 +33,7 @@ from kerv_cli.base.processes import begin_worker, check_workers
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.demos.dataset import FORMAT, DemoManifest, EpisodeEntry, OnProgress, episode_path, totals
-from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode, save_episode
+from kerv_cli.worlds.demos.files import DemoEpisode, load_episode, save_episode
 from kerv_cli.worlds.mujoco_world import choose_backend
 from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import EnvironmentSpec, World

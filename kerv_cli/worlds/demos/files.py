@@ -1,0 +1,283 @@
+"""Files of demonstrations: episodes (safetensors with lossless PNG images, docs/formats.md), and Parquet of others."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import struct
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from PIL import Image
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.files import regular, write_bytes
+
+FORMAT = "1"
+"""Version of the episode files' format."""
+_ARRAYS = {
+    "frame_steps": "frame_steps",
+    "states": "states",
+    "labels": "labels",
+    "executed": "executed",
+    "initial_state": "rand_vec",  # its name in Meta-World
+}
+"""Attribute of an episode -> name of its tensor in the file."""
+
+
+@dataclass(frozen=True)
+class DemoEpisode:
+    """A demonstration of T control steps.
+
+    It ends with the first success. If an actor moved the robot, it may end without success.
+
+    Attributes:
+        task: Full name of the task.
+        seed: Seed of the episode.
+        perturbed: Whether noise was added to the executed actions, or an actor moved the robot instead of the expert.
+        steps: T.
+        frames: (n, size, size x views, 3) uint8, the recorded images.
+        frame_steps: (n,) int64. Image i was drawn before the action of control step `frame_steps[i]`.
+        states: (T, s) float32, privileged state before each action. It begins with the proprioception.
+        labels: (T + tail, D) float32, the expert's actions, clipped and without noise. The last `tail` actions come
+            after the episode's end.
+        executed: (T, D) float32, the actions that moved the robot.
+        initial_state: (k,) float64, the world's `initial_state`, such as the placement of object and goal.
+    """
+
+    task: str
+    seed: int
+    perturbed: bool
+    steps: int
+    frames: NDArray[np.uint8] | EncodedFrames
+    frame_steps: NDArray[np.int64]
+    states: NDArray[np.float32]
+    labels: NDArray[np.float32]
+    executed: NDArray[np.float32]
+    initial_state: NDArray[np.float64]
+
+    @property
+    def end_effector(self) -> NDArray[np.float32]:
+        """Position of the end effector before each action, (T, 3) float32, in metres."""
+        return self.states[:, :3]
+
+
+def save_episode(path: Path, episode: DemoEpisode) -> None:
+    """Write an episode to a file, atomically.
+
+    The PNG files of all images are stored end to end in one tensor. Another tensor holds their n + 1 offsets.
+
+    Raises:
+        StorageError: Writing failed.
+    """
+    pictures = [encode_png(frame) for frame in episode.frames]
+    tensors = {
+        "png": np.frombuffer(b"".join(pictures), dtype=np.uint8),
+        "png_offsets": np.cumsum([0, *map(len, pictures)], dtype=np.int64),
+        **{name: getattr(episode, attribute) for attribute, name in _ARRAYS.items()},
+    }
+    height, width = episode.frames.shape[1:3]
+    metadata = {
+        "format": FORMAT,
+        "task": episode.task,
+        "seed": str(episode.seed),
+        "perturbed": str(episode.perturbed).lower(),
+        "steps": str(episode.steps),
+        "frame_size": str(height),
+        # no width for square frames: older files have none, and equal episodes must have equal bytes
+        **({"frame_width": str(width)} if width != height else {}),
+    }
+    # Not safetensors' save_file: on a full disk it raises its own type of error.
+    write_bytes(path, _with_sorted_metadata(save(tensors, metadata=metadata)))
+
+
+def _with_sorted_metadata(data: bytes) -> bytes:
+    """Sort the keys of the metadata in a safetensors file, given and returned as bytes.
+
+    safetensors writes the keys in random order. Without sorting, two recordings of the same episode would have
+    different hashes.
+    """
+    header, start = header_of(data)
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)  # arrays start at a multiple of eight
+    return LENGTH.pack(len(text)) + text + data[start:]
+
+
+def load_episode(path: Path) -> DemoEpisode:
+    """Read an episode from a file.
+
+    Raises:
+        CheckpointError: The file is missing, damaged or of another format.
+    """
+    try:
+        with safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            if metadata.get("format") != FORMAT:
+                raise CheckpointError(f"{path} is not a demonstration episode of format {FORMAT}")
+            arrays = {attribute: file.get_tensor(name) for attribute, name in _ARRAYS.items()}
+            offsets = file.get_tensor("png_offsets")
+        steps, seed = int(metadata["steps"]), int(metadata["seed"])
+        frames = EncodedFrames.of_file(path, offsets, int(metadata["frame_size"]), int(metadata.get("frame_width", 0)))
+        perturbed = metadata["perturbed"] == "true"
+        return DemoEpisode(metadata["task"], seed, perturbed, steps, frames, **arrays)
+    except (OSError, SafetensorError, KeyError, ValueError) as error:
+        raise CheckpointError(f"{path} is missing or damaged: {error}") from error
+
+
+LENGTH = struct.Struct("<Q")  # a safetensors file begins with the length of its header
+
+
+class EncodedFrames:
+    """Images (n, size, width, 3) uint8 that are decoded when they are used.
+
+    Attributes:
+        files: Files that contain the PNG files.
+        spans: (n, 3) int64. For each image: index into `files`, position of the PNG's first byte, position after its
+            last.
+        size: Height in pixels.
+        width: Width in pixels. Parts of a PNG further to the right are cut off.
+    """
+
+    def __init__(self, files: Sequence[Path], spans: NDArray[np.int64], size: int, width: int) -> None:
+        self.files, self.spans, self.size, self.width = files, spans, size, width
+
+    @classmethod
+    def of_file(cls, path: Path, offsets: NDArray[np.int64], size: int, width: int = 0) -> EncodedFrames:
+        """Return the images of an episode's file without decoding them.
+
+        Args:
+            path: The file.
+            offsets: (n + 1,) positions of the PNG files in the tensor `png`.
+            size: Height in pixels.
+            width: Width in pixels. 0: the images are square.
+        """
+        with path.open("rb") as file:
+            length = file.read(LENGTH.size)
+            header, begin = header_of(length + file.read(LENGTH.unpack(length)[0]))
+        positions = offsets + begin + header["png"]["data_offsets"][0]
+        spans = np.stack([np.zeros(len(offsets) - 1, np.int64), positions[:-1], positions[1:]], axis=1)
+        return cls([path], spans, size, width or size)
+
+    @classmethod
+    def joined(cls, parts: Sequence[EncodedFrames]) -> EncodedFrames:
+        """Return the images of all parts, in order. All parts must have the same size."""
+        firsts = np.cumsum([0, *(len(part.files) for part in parts[:-1])])
+        spans = np.concatenate(
+            [part.spans + np.array([first, 0, 0]) for part, first in zip(parts, firsts, strict=True)]
+        )
+        return cls([file for part in parts for file in part.files], spans, parts[0].size, parts[0].width)
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Shape of the decoded images, (n, size, width, 3)."""
+        return len(self), self.size, self.width, 3
+
+    def __len__(self) -> int:
+        return len(self.spans)
+
+    def __iter__(self) -> Iterator[NDArray[np.uint8]]:
+        return (self[i] for i in range(len(self)))
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return self.pixels().astype(dtype or np.uint8, copy=False)
+
+    def __getitem__(self, chosen: Any) -> Any:
+        """Select images.
+
+        An integer returns one decoded image (size, width, 3). A slice, mask or indices return the selected images as
+        `EncodedFrames`, not decoded.
+        """
+        if isinstance(chosen, int | np.integer):
+            return self._decode(int(chosen))
+        rows = chosen if isinstance(chosen, slice) else np.asarray(chosen)
+        return EncodedFrames(self.files, self.spans[rows], self.size, self.width)
+
+    def left(self, width: int) -> EncodedFrames:
+        """Return the same images, cut off at the right to a smaller `width`, so that only the first views remain."""
+        return EncodedFrames(self.files, self.spans, self.size, width)
+
+    def pixels(self) -> NDArray[np.uint8]:
+        """Decode all images (n, size, width, 3), on several threads if the process has several CPU cores."""
+        if not len(self):
+            return np.zeros(self.shape, np.uint8)
+        threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        if threads == 1 or len(self) < 16:
+            return np.stack(list(self))
+        with ThreadPoolExecutor(min(threads, 8)) as pool:
+            return np.stack(list(pool.map(self._decode, range(len(self)))))
+
+    def _decode(self, i: int) -> NDArray[np.uint8]:
+        """Return the decoded image number i."""
+        file_index, start, end = self.spans[i].tolist()
+        with self.files[file_index].open("rb") as file:
+            file.seek(start)
+            data = file.read(end - start)
+        with Image.open(io.BytesIO(data)) as image:
+            return np.array(image)[:, : self.width]  # a copy, because torch warns if memory is read-only
+
+
+def header_of(data: bytes) -> tuple[dict[str, Any], int]:
+    """Return the header of a safetensors file, and the position at which its arrays begin.
+
+    Args:
+        data: Bytes of the file. The header suffices.
+    """
+    begin = LENGTH.size + LENGTH.unpack(data[: LENGTH.size])[0]
+    return json.loads(data[LENGTH.size : begin]), begin
+
+
+def encode_png(frame: NDArray[np.uint8]) -> bytes:
+    """Return an image (height, width, 3) uint8 as a PNG file."""
+    buffer = io.BytesIO()
+    Image.fromarray(frame).save(buffer, format="PNG", compress_level=6)
+    return buffer.getvalue()
+
+
+MOST_EXPANDED = 2**30
+"""Largest size of a table in memory, in bytes."""
+_BATCH = 1024  # rows
+
+
+def foreign_table(source: Path | bytes, where: tuple[str, Any] | None = None) -> pa.Table:
+    """Read a table from a Parquet file, part by part.
+
+    Args:
+        source: The file's path or its bytes.
+        where: (column, value). Read only the rows that have this value in this column. None: all rows.
+
+    Raises:
+        OSError: The file is missing or is no Parquet file.
+        ValueError: The file is damaged, or takes more than MOST_EXPANDED bytes in memory.
+    """
+    batches, total = [], 0
+    with pq.ParquetFile(io.BytesIO(source) if isinstance(source, bytes) else regular(source)) as file:
+        groups = [n for n in range(file.num_row_groups) if not where or _may_hold(file.metadata.row_group(n), *where)]
+        # not pyarrow's dataset scanner, which would expand whole row groups before the total can be checked
+        for batch in file.iter_batches(_BATCH, groups, use_threads=False):
+            batches.append(batch.filter(pc.equal(batch[where[0]], where[1])) if where else batch)
+            total += batches[-1].nbytes
+            if total > MOST_EXPANDED:
+                name = "a table" if isinstance(source, bytes) else str(source)
+                raise ValueError(f"{name} expands to more than {MOST_EXPANDED // 2**20} MiB in memory: split it")
+        return pa.Table.from_batches(batches, file.schema_arrow)
+
+
+def _may_hold(group: pq.RowGroupMetaData, column: str, value: Any) -> bool:
+    """Return whether a part of a file (row group) can contain the value in a column, according to its statistics."""
+    for number in range(group.num_columns):
+        chunk = group.column(number)
+        if chunk.path_in_schema == column and chunk.statistics is not None and chunk.statistics.has_min_max:
+            return bool(chunk.statistics.min <= value <= chunk.statistics.max)
+    return True
