@@ -51,7 +51,7 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def registered_environments() -> Iterator[None]:
+def registered_environments():
     """A module begins with these environments, and what it registers is gone when it ends.
 
     Opening a dataset of a recording, or importing an example, registers an environment for the process, and which
@@ -88,7 +88,7 @@ def write_policy(results: Path, name: str, observation: str, seed: int = 0) -> N
 
 
 @pytest.fixture(scope="session")
-def policies(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def policies(tmp_path_factory):
     """A results folder with the policies `nano-state` and `nano-vision`. Read only: copy it to change it."""
     results = tmp_path_factory.mktemp("policies")
     write_policy(results, "nano-state", "state")
@@ -97,7 +97,7 @@ def policies(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def few_validations(monkeypatch: pytest.MonkeyPatch) -> None:
+def few_validations(monkeypatch):
     """A drafter in training is validated on 4 observations, not on 60 of which each is decoded twice."""
     from kerv_cli.methods.eagle import drafter
 
@@ -119,8 +119,8 @@ def raising(error: BaseException, label: str = "", seeds: Sequence[int] = ()) ->
     """Episodes of which those of a label and these seeds raise; of all labels or seeds if none is given."""
     from studies_synthetic import episode
 
-    def prepare(setting: Any, task: str) -> Any:
-        def run(seed: int) -> Any:
+    def prepare(setting, task):
+        def run(seed):
             if setting.label == (label or setting.label) and seed in (seeds or (seed,)):
                 raise error
             return episode(setting, task, seed)
@@ -131,7 +131,7 @@ def raising(error: BaseException, label: str = "", seeds: Sequence[int] = ()) ->
 
 
 @pytest.fixture(scope="session")
-def postgresql() -> Iterator[str]:
+def postgresql():
     """URL of a PostgreSQL server for this session, without the name of a database."""
     programs = sorted(Path("/usr/lib/postgresql").glob("*/bin"))
     if not programs:
@@ -144,7 +144,7 @@ def postgresql() -> Iterator[str]:
         port = free.getsockname()[1]
         free.close()
 
-        def run(program: str, *words: str) -> None:
+        def run(program, *words):
             command = [programs[-1] / program, "-D", f"{folder}/data", *words]
             subprocess.run(command, check=True, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, **user)
 
@@ -158,7 +158,7 @@ def postgresql() -> Iterator[str]:
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
-def database(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Database]:
+def database(request, tmp_path, monkeypatch):
     """The empty database of the results folder `tmp_path`: in its file, or on a server."""
     monkeypatch.delenv(STORE, raising=False)
     if request.param == "sqlite":

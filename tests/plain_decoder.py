@@ -124,11 +124,11 @@ def main(name: str, repeats: int, folder: Path) -> bool:
         cached = decoder.cache.buffer[:, :, 0, :, :length].numpy()
         plain.begin(cached[:, 0], cached[:, 1], chunk.size)
 
-        def compiled(first: int = first, count: int = count, length: int = length) -> list[int]:
+        def compiled(first=first, count=count, length=length):
             decoder.cache.length = length
             return target.continue_greedily(first, count, decoder.cache)
 
-        def numpy(first: int = first, count: int = count) -> list[int]:
+        def numpy(first=first, count=count):
             tokens = [first]
             for _ in range(count):
                 tokens.append(plain(tokens[-1]))

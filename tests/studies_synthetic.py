@@ -175,7 +175,7 @@ def count_calls() -> tuple[Prepare, list[str]]:
     """episodes_of, and the list of the labels that it was called for."""
     calls: list[str] = []
 
-    def counted(setting: Setting, task: str) -> RunEpisode:
+    def counted(setting, task):
         calls.append(setting.label)
         return episodes_of(setting, task)
 
@@ -193,7 +193,7 @@ def misbehave(setting: Setting, task: str) -> RunEpisode:
     """Kills its process in its second episode, raises, or reports its process's thread number as wall seconds,
     depending on r."""
 
-    def run(seed: int) -> EpisodeRecord:
+    def run(seed):
         r = setting.settings["threshold"]["r"]
         if r == 1 and seed > setting.settings["seed"]:
             os.kill(os.getpid(), signal.SIGKILL)
@@ -208,7 +208,7 @@ def misbehave(setting: Setting, task: str) -> RunEpisode:
 def unhurried(setting: Setting, task: str) -> RunEpisode:
     """A tenth of a second for each episode."""
 
-    def run(seed: int) -> EpisodeRecord:
+    def run(seed):
         time.sleep(0.1)
         return episode(setting, task, seed)
 
@@ -218,7 +218,7 @@ def unhurried(setting: Setting, task: str) -> RunEpisode:
 def slow_elsewhere(setting: Setting, task: str) -> RunEpisode:
     """The first task at once, every other in a minute."""
 
-    def run(seed: int) -> EpisodeRecord:
+    def run(seed):
         time.sleep(0.0 if task == "reach-v3" else 60.0)
         return episode(setting, task, seed)
 

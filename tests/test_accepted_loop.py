@@ -132,7 +132,7 @@ def assert_same(
     greedy, space = Greedy(target, prompt), target.actions
     size = target.chunk * space.dofs
 
-    def made(name: str, offset: int) -> NearTrees:
+    def made(name, offset):
         return NearTrees(greedy, name, seed + offset, nodes, spread=4, switching=kind == "hybrid" and not offset)
 
     before, after = (made("retrieval" if seed % 2 else "early", 1) if inside else None), made("drafter", 0)
@@ -172,9 +172,7 @@ cases = {
 @settings(max_examples=60, deadline=None)
 @given(space=st.sampled_from([SEVEN, SPEC.actions]), **cases)
 @pytest.mark.parametrize("kind", ["relaxed", "sequence", "hybrid"])
-def test_the_loop_accepts_by_definition(
-    kind: str, space: ActionSpace, seed: int, chunk: int, r: int, strict_dofs: bool, inside: bool, nodes: int
-) -> None:
+def test_the_loop_accepts_by_definition(kind, space, seed, chunk, r, strict_dofs, inside, nodes):
     target = MockTarget(space, chunk, seed=seed)
     prompt = target.encode(Observation(np.array([0.1 * seed]), np.zeros(0), "go there"))
     assert_same(target, prompt, kind, r, strict_dofs, seed, inside, nodes)
@@ -184,15 +182,13 @@ def test_the_loop_accepts_by_definition(
 @settings(max_examples=10, deadline=None)
 @given(**{**cases, "chunk": st.sampled_from([1, 2])})
 @pytest.mark.parametrize("kind", ["relaxed", "sequence", "hybrid"])
-def test_the_loop_accepts_by_definition_on_a_transformer(
-    kind: str, seed: int, chunk: int, r: int, strict_dofs: bool, inside: bool, nodes: int
-) -> None:
+def test_the_loop_accepts_by_definition_on_a_transformer(kind, seed, chunk, r, strict_dofs, inside, nodes):
     target = random_target(seed, 2, 2, chunk)
     assert_same(target, random_prompt(target, seed), kind, r, strict_dofs, seed, inside, nodes)
 
 
 @pytest.mark.parametrize("kind", ["relaxed", "sequence", "hybrid"])
-def test_the_trees_hold_tokens_that_only_a_limit_accepts(kind: str) -> None:
+def test_the_trees_hold_tokens_that_only_a_limit_accepts(kind):
     """Otherwise the comparison would prove no more than that of strict decoding."""
     total = 0
     for seed in range(8):

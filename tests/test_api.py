@@ -18,7 +18,7 @@ SHORT: dict[str, Any] = {"task": "reach", "episodes": 1, "record": 0, "world": {
 
 
 @pytest.fixture(scope="module")
-def mine(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def mine(policies, tmp_path_factory):
     """Settings of a short episode of an untrained policy, in a results folder of this module."""
     target = policies / "artifacts" / "target" / "nano-state"
     results = tmp_path_factory.mktemp("library") / "results"
@@ -26,18 +26,18 @@ def mine(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
 
 
 @pytest.fixture(scope="module")
-def run(mine: dict[str, Any]) -> kerv.Study:
+def run(mine):
     return kerv.rollout("seed=100003", method="ar", **mine)
 
 
 @pytest.fixture(scope="module")
-def study(mine: dict[str, Any]) -> kerv.Study:
+def study(mine):
     path = mine["results"].parent / "both.yaml"
     path.write_text("settings: {ar: method=ar, hold: method=spec_vla proposer=hold}\n", encoding="utf-8")
     return kerv.sweep(path, **mine)
 
 
-def test_the_import_loads_nothing_and_names_what_the_stub_names() -> None:
+def test_the_import_loads_nothing_and_names_what_the_stub_names():
     code = "import sys, kerv_cli; print(sorted({'torch', 'numpy', 'pandas', 'mujoco', 'typer'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
     stub = ast.parse((ROOT / "kerv_cli/__init__.pyi").read_text(encoding="utf-8"))
@@ -47,14 +47,14 @@ def test_the_import_loads_nothing_and_names_what_the_stub_names() -> None:
         _ = kerv.rolout  # type: ignore[attr-defined]
 
 
-def test_settings_are_written_as_they_are_typed() -> None:
+def test_settings_are_written_as_they_are_typed():
     words = as_overrides(
         "a=1", task=["reach", "push"], threshold={"r": 5}, world={"camera": {"size": 48}}, on=True, x=None
     )
     assert words == ["a=1", "task=[reach,push]", "threshold.r=5", "world.camera.size=48", "on=true", "x=null"]
 
 
-def test_a_rollout_gives_its_episodes_and_is_the_commands_own(run: kerv.Study, mine: dict[str, Any]) -> None:
+def test_a_rollout_gives_its_episodes_and_is_the_commands_own(run, mine):
     (episode,) = run.episodes()
     assert (episode["task"], episode["seed"], episode["label"]) == ("reach-v3", 100003, "ar")
     assert episode["steps"] == 6
@@ -64,12 +64,12 @@ def test_a_rollout_gives_its_episodes_and_is_the_commands_own(run: kerv.Study, m
     assert command[:3] == ("rollout", "seed=100003", "method=ar")
 
 
-def test_a_grid_has_a_setting_per_value(mine: dict[str, Any]) -> None:
+def test_a_grid_has_a_setting_per_value(mine):
     both = kerv.rollout(grid=True, method="ar,jacobi", **mine)
     assert list(both.to_pandas()["label"]) == ["ar", "jacobi"]
 
 
-def test_a_study_is_run_once_reported_and_loaded(study: kerv.Study, mine: dict[str, Any]) -> None:
+def test_a_study_is_run_once_reported_and_loaded(study, mine):
     table = study.to_pandas()
     assert list(table["label"]) == ["ar", "hold"]
     assert table["episodes"].tolist() == [1, 1]
@@ -81,14 +81,14 @@ def test_a_study_is_run_once_reported_and_loaded(study: kerv.Study, mine: dict[s
     assert {"both.csv", "both_per_task.csv", "report.html"} <= files
 
 
-def test_runs_are_listed_and_narrowed(run: kerv.Study, study: kerv.Study, mine: dict[str, Any]) -> None:
+def test_runs_are_listed_and_narrowed(run, study, mine):
     there = kerv.runs(mine["results"])
     assert {run.name, study.name} <= set(there["id"])
     assert list(kerv.runs(mine["results"], kind="sweep")["id"]) == ["both"]
     assert kerv.runs(mine["results"] / "none").empty
 
 
-def test_a_policy_answers_observations(mine: dict[str, Any]) -> None:
+def test_a_policy_answers_observations(mine):
     policy = kerv.load_policy(str(mine["policy"]["target"]), method="ar", results=mine["results"])
     seen = {"observation/state": np.linspace(-0.1, 0.2, 39), "prompt": "reach the goal"}
     actions = policy.act(seen)
@@ -110,14 +110,14 @@ def test_a_policy_answers_observations(mine: dict[str, Any]) -> None:
         (lambda mine: kerv.load_policy("absent", results=mine["results"]), "no target 'absent'"),
     ],
 )
-def test_a_wrong_request_is_an_exception_of_one_line(call: Any, says: str, mine: dict[str, Any]) -> None:
+def test_a_wrong_request_is_an_exception_of_one_line(call, says, mine):
     with pytest.raises(kerv.KervError) as error:
         call(mine)
     assert says in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_what_a_study_or_a_policy_cannot_do_is_said(run: kerv.Study, mine: dict[str, Any]) -> None:
+def test_what_a_study_or_a_policy_cannot_do_is_said(run, mine):
     with pytest.raises(kerv.KervError, match="unknown table 'rows'"):
         run.to_pandas("rows")
     with pytest.raises(kerv.KervError, match="is a rollout"):
@@ -127,8 +127,8 @@ def test_what_a_study_or_a_policy_cannot_do_is_said(run: kerv.Study, mine: dict[
         policy.act({"prompt": "reach the goal"})
 
 
-def test_episodes_that_fail_are_an_exception(mine: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    def failing(*_: Any) -> None:
+def test_episodes_that_fail_are_an_exception(mine, monkeypatch):
+    def failing(*_):
         raise RuntimeError("the world broke")
 
     monkeypatch.setattr("kerv_cli.episodes.runner.Runner.episode", failing)
@@ -136,7 +136,7 @@ def test_episodes_that_fail_are_an_exception(mine: dict[str, Any], monkeypatch: 
         kerv.sweep(mine["results"].parent / "both.yaml", "seed=100050", **mine)
 
 
-def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_notebook_runs(tmp_path, monkeypatch):
     cells = json.loads((ROOT / "docs/notebook.ipynb").read_text(encoding="utf-8"))["cells"]
     sources = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
     assert sum(len(source.splitlines()) for source in sources) <= 25

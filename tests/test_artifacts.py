@@ -42,7 +42,7 @@ STUDY = (
 
 
 @pytest.fixture(scope="module")
-def whole(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole(policies, tmp_path_factory):
     """`nano-state` with everything that belongs to it."""
     results = tmp_path_factory.mktemp("artifacts") / "results"
     shutil.copytree(policies, results)
@@ -56,7 +56,7 @@ def whole(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def results(whole: Path, tmp_path: Path) -> Path:
+def results(whole, tmp_path):
     """A copy: other paths, so nothing of it is loaded yet."""
     return Path(shutil.copytree(whole, tmp_path / "results"))
 
@@ -69,14 +69,14 @@ def settings_of(results: Path, overrides: str) -> RolloutSettings:
 def counted(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, counts: Counter[str], key: Any) -> None:
     real = getattr(owner, name)
 
-    def counting(*arguments: Any, **options: Any) -> Any:
+    def counting(*arguments, **options):
         counts[key(*arguments, **options)] += 1
         return real(*arguments, **options)
 
     monkeypatch.setattr(owner, name, counting)
 
 
-def test_a_study_loads_and_hashes_everything_once(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_study_loads_and_hashes_everything_once(results, monkeypatch):
     loaded: Counter[str] = Counter()
     hashed: Counter[str] = Counter()
     counted(monkeypatch, checkpoint, "load_target", loaded, lambda folder, *rest: f"target {folder}")
@@ -99,7 +99,7 @@ def test_a_study_loads_and_hashes_everything_once(results: Path, monkeypatch: py
     assert len({id(decoder) for decoder in decoders}) == len(decoders)  # the state of an episode is a decoder's own
 
 
-def test_only_what_is_needed_is_read(results: Path) -> None:
+def test_only_what_is_needed_is_read(results):
     for kind in ("drafter", "datastore", "calibration"):
         shutil.rmtree(results / "artifacts" / kind)
     check(settings_of(results, "method=ar"))
@@ -115,7 +115,7 @@ def test_only_what_is_needed_is_read(results: Path) -> None:
         assert "\n" not in str(refused.value)
 
 
-def test_a_changed_file_is_another_artifact(results: Path) -> None:
+def test_a_changed_file_is_another_artifact(results):
     asked = settings_of(results, "method=spec_vla proposer=retrieval")
     files = Artifacts(asked.results, asked.policy)
     before, store = check(asked), files.load("datastore")
@@ -129,7 +129,7 @@ def test_a_changed_file_is_another_artifact(results: Path) -> None:
     assert len(again.vectors) < len(store.vectors)
 
 
-def test_an_artifact_can_be_named(results: Path) -> None:
+def test_an_artifact_can_be_named(results):
     shutil.move(results / "artifacts/drafter/nano-state", results / "artifacts/drafter/better")
     files = Artifacts(str(results), PolicySettings(target="nano-state", artifacts={"drafter": "better"}))
     assert files.path("drafter") == results / "artifacts/drafter/better"
@@ -140,7 +140,7 @@ def test_an_artifact_can_be_named(results: Path) -> None:
         files.check(["draftr"])
 
 
-def test_names_of_artifacts_in_stored_settings_of_0_1_0_are_kept() -> None:
+def test_names_of_artifacts_in_stored_settings_of_0_1_0_are_kept():
     older = {"kind": "model", "target": "mine", "drafter": "a", "early": None, "others": {"follow": "b"}}
     policy = {"kind": "model", "target": "mine", "artifacts": {"drafter": "a", "follow": "b"}}
     assert with_artifacts({"policy": older, "seed": 1}) == {"policy": policy, "seed": 1}
@@ -148,7 +148,7 @@ def test_names_of_artifacts_in_stored_settings_of_0_1_0_are_kept() -> None:
 
 
 @pytest.fixture(scope="module")
-def complete(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def complete(whole, tmp_path_factory):
     """As `whole`, with an early drafter."""
     results = Path(shutil.copytree(whole, tmp_path_factory.mktemp("complete") / "results"))
     target, described = checkpoint.load_target(results / "artifacts/target/nano-state")
@@ -172,7 +172,7 @@ MESSAGE = rf"was \w+ for [a-z ]+ {OTHER[:12]}, not for [0-9a-f]{{12}}: (run|buil
 
 
 @pytest.mark.parametrize("kind", FILES)
-def test_what_was_made_for_another_target_is_refused(complete: Path, tmp_path: Path, kind: str) -> None:
+def test_what_was_made_for_another_target_is_refused(complete, tmp_path, kind):
     results = Path(shutil.copytree(complete, tmp_path / "results"))
     files = Artifacts(str(results), PolicySettings(target="nano-state"))
     assert set(files.check(FILES)) == {"target", *FILES}
@@ -185,9 +185,7 @@ def test_what_was_made_for_another_target_is_refused(complete: Path, tmp_path: P
     assert "\n" not in str(refused.value)
 
 
-def test_what_was_made_from_another_artifact_is_refused_beside_this_one(
-    complete: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_was_made_from_another_artifact_is_refused_beside_this_one(complete, monkeypatch):
     files = Artifacts(str(complete), PolicySettings(target="nano-state"))
     monkeypatch.setattr(EarlyDrafter, "sources", lambda self, description: {"datastore": OTHER})
     with pytest.raises(CheckpointError, match=MESSAGE) as refused:

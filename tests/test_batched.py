@@ -7,7 +7,6 @@ import re
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -87,7 +86,7 @@ def same(alone: Sequence[Any], together: Sequence[Any]) -> None:
 @pytest.mark.bits
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("batch", [1, 2, 7])
-def test_autoregressive_tokens_of_a_batch_are_those_of_its_rows(packed: bool, batch: int) -> None:
+def test_autoregressive_tokens_of_a_batch_are_those_of_its_rows(packed, batch):
     policy = target()
     if packed:
         policy.requires_grad_(False)
@@ -100,7 +99,7 @@ def test_autoregressive_tokens_of_a_batch_are_those_of_its_rows(packed: bool, ba
 
 @pytest.mark.bits
 @pytest.mark.parametrize("parallel", [False, True])
-def test_a_smaller_batch_after_a_larger_one(parallel: bool) -> None:
+def test_a_smaller_batch_after_a_larger_one(parallel):
     policy = target(f"target.parallel={str(parallel).lower()}")
     decoder = Decoder(policy, Parts(skip=ParallelPass(policy))) if parallel else Decoder(policy, chunk=1)
     for count in (5, 1, 2):
@@ -109,7 +108,7 @@ def test_a_smaller_batch_after_a_larger_one(parallel: bool) -> None:
 
 @pytest.mark.bits
 @pytest.mark.parametrize(("radius", "history"), [(0, 0), (9, 1), (9, 30)])
-def test_early_drafts_of_a_batch_follow_each_episodes_own_history(radius: int, history: int) -> None:
+def test_early_drafts_of_a_batch_follow_each_episodes_own_history(radius, history):
     policy = target()
     torch.manual_seed(3)
     drafter = EarlyDrafter().network(EarlySettings(layers=1, width=32), policy).eval()
@@ -123,7 +122,7 @@ def test_early_drafts_of_a_batch_follow_each_episodes_own_history(radius: int, h
 
 
 @pytest.mark.bits
-def test_prompts_of_different_lengths_are_decoded_apart() -> None:
+def test_prompts_of_different_lengths_are_decoded_apart():
     policy = MockTarget()
     seen = [Observation(np.array([0.1 * i]), np.zeros(0), "on " * (i % 3)) for i in range(6)]
     assert len({policy.encode(one).shape[1] for one in seen}) == 3
@@ -166,7 +165,7 @@ class Stub:
 
 
 @pytest.fixture
-def stubs() -> type[Stub]:
+def stubs():
     Stub.opened, Stub.closed = [], []
     return Stub
 
@@ -179,7 +178,7 @@ class Forwards(BatchDecoder):
         return super().decode(episodes, observations)
 
 
-def test_the_next_episode_begins_where_one_ends_and_every_world_is_closed(stubs: type[Stub]) -> None:
+def test_the_next_episode_begins_where_one_ends_and_every_world_is_closed(stubs):
     decoder = Forwards(Decoder(target(), chunk=1))
     decoder.sizes = []
     requests = [Request((task, seed), task, seed) for task in ("a", "b", "c") for seed in range(1, 7)]
@@ -198,7 +197,7 @@ def test_the_next_episode_begins_where_one_ends_and_every_world_is_closed(stubs:
     assert len(stubs.opened) <= 3 + 3
 
 
-def test_a_world_that_fails_ends_its_own_episode(stubs: type[Stub]) -> None:
+def test_a_world_that_fails_ends_its_own_episode(stubs):
     requests = [Request(seed, "a", seed) for seed in (10, 11, 12, 13, 15)]
     decoder = BatchDecoder(Decoder(target(), chunk=1))
     ended = {request.key: result for request, result in run_together(decoder, requests, 2, stubs)}
@@ -207,7 +206,7 @@ def test_a_world_that_fails_ends_its_own_episode(stubs: type[Stub]) -> None:
     assert sorted(stubs.opened) == sorted(stubs.closed)
 
 
-def test_stopping_early_closes_the_worlds(stubs: type[Stub]) -> None:
+def test_stopping_early_closes_the_worlds(stubs):
     running = run_together(BatchDecoder(Decoder(target(), chunk=1)), [Request(0, "a", 1), Request(1, "b", 6)], 2, stubs)
     next(running)
     running.close()
@@ -219,7 +218,7 @@ def test_stopping_early_closes_the_worlds(stubs: type[Stub]) -> None:
 
 @pytest.mark.bits
 @pytest.mark.parametrize("policy", ["nano-state", "nano-vision"])
-def test_a_batch_of_real_episodes_is_what_they_are_one_by_one(policies: Path, policy: str) -> None:
+def test_a_batch_of_real_episodes_is_what_they_are_one_by_one(policies, policy):
     words = [f"policy.target={policy}", "deviation_every=2"]
     tasks, seeds = ("drawer-open-v3", "reach-v3"), range(100_000, 100_002)
     alone = {
@@ -245,13 +244,13 @@ def test_a_batch_of_real_episodes_is_what_they_are_one_by_one(policies: Path, po
     "words",
     [["method=spec_vla"], ["method=early_unverified", "threshold=schedule"], ["policy=expert"], ["rollout.clock=real"]],
 )
-def test_what_cannot_be_batched_is_refused(policies: Path, words: list[str]) -> None:
+def test_what_cannot_be_batched_is_refused(policies, words):
     target = [] if words == ["policy=expert"] else ["policy.target=nano-state"]
     with pytest.raises(UsageError, match=words[-1]):
         policies_of.check(settings(policies, *target, "rollout.batch=8", *words))
 
 
-def test_a_threshold_that_nothing_reads_may_be_batched(policies: Path) -> None:
+def test_a_threshold_that_nothing_reads_may_be_batched(policies):
     policies_of.check(settings(policies, "policy.target=nano-state", "rollout.batch=8", "threshold=schedule"))
 
 
@@ -298,7 +297,7 @@ def ar_study(*tasks: str, episodes: int = 7, batch: int = 4) -> Study:
     )
 
 
-def test_a_batch_is_another_setting_and_has_no_times(tmp_path: Path) -> None:
+def test_a_batch_is_another_setting_and_has_no_times(tmp_path):
     assert ar_study().settings[0].work != threshold_study(TASKS, episodes=7).settings[0].work
     prepared = Prepared()
     swept(tmp_path, ar_study("reach-v3"), prepared)
@@ -312,7 +311,7 @@ def test_a_batch_is_another_setting_and_has_no_times(tmp_path: Path) -> None:
     assert (episodes["forwards"] > 0).all()
 
 
-def test_blocks_of_a_batch_hold_many_tasks_and_share_out_over_workers() -> None:
+def test_blocks_of_a_batch_hold_many_tasks_and_share_out_over_workers():
     wanted, timed = ar_study().episodes, threshold_study(TASKS, episodes=7).episodes
     (block,) = blocks_of(wanted, 5)
     assert {one.task for one in block.episodes} == set(TASKS)
@@ -325,7 +324,7 @@ def test_blocks_of_a_batch_hold_many_tasks_and_share_out_over_workers() -> None:
     assert all(len({one.setting.settings["rollout"]["batch"] for one in block.episodes}) == 1 for block in mixed)
 
 
-def test_a_failure_in_a_batch_is_of_its_setting_and_what_ran_is_kept(tmp_path: Path) -> None:
+def test_a_failure_in_a_batch_is_of_its_setting_and_what_ran_is_kept(tmp_path):
     _, outcome = swept(tmp_path, ar_study(), Prepared(broken="all"))
     assert [(failure.reason, len(failure.episodes)) for failure in outcome.failed] == [("no such policy", 7)] * 3
     _, outcome = swept(tmp_path, ar_study(), Prepared(broken="push-v3"))
@@ -337,7 +336,7 @@ def test_a_failure_in_a_batch_is_of_its_setting_and_what_ran_is_kept(tmp_path: P
 
 
 @pytest.mark.parametrize("which", ["baseline", "method", "both"])
-def test_no_speedup_is_made_of_what_was_not_timed(tmp_path: Path, which: str) -> None:
+def test_no_speedup_is_made_of_what_was_not_timed(tmp_path, which):
     study = threshold_study(TASKS)
     labels = [one for one in study.labels if which == "both" or (which == "baseline") == (one == "ar")]
     store, _ = swept(tmp_path, batched(study, labels), Prepared())
@@ -356,7 +355,7 @@ def test_no_speedup_is_made_of_what_was_not_timed(tmp_path: Path, which: str) ->
     assert study_figures(table, "threshold.r", "threshold")
 
 
-def test_decodes_without_host_times_have_no_price(tmp_path: Path) -> None:
+def test_decodes_without_host_times_have_no_price(tmp_path):
     store, _ = swept(tmp_path, ar_study(), Prepared())
     with pytest.raises(UsageError, match="setting 'ar' ran 4 episodes at a time, without times"):
         repriced_table(load_study(store), store, [NamedProfile("there", Profile(31, {}))])
@@ -365,16 +364,14 @@ def test_decodes_without_host_times_have_no_price(tmp_path: Path) -> None:
 # --- the command
 
 
-def test_a_rollout_in_batches_prints_success_and_goes_on_where_it_was(
-    policies: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_rollout_in_batches_prints_success_and_goes_on_where_it_was(policies, tmp_path, monkeypatch):
     results = tmp_path / "results"
     shutil.copytree(policies / "artifacts", results / "artifacts")
     words = ["policy=state", "policy.target=nano-state", "task=reach-v3,push-v3", "world.horizon=8"]
     command = ["rollout", "method=ar", "episodes=3", "rollout.batch=4", *words, f"results={results}"]
     original = EpisodeRunner.together
 
-    def interrupted(self: EpisodeRunner, wanted: Sequence[Any]) -> Iterator[Any]:
+    def interrupted(self, wanted):
         yield from itertools.islice(original(self, wanted), 2)
         raise KeyboardInterrupt
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,7 +34,7 @@ def work(*rounds: Played, looked_up: bool = False, drafter: tuple[int, int] | No
     return work_of(columns, np.array([len(rounds)]), times, np.array([looked_up]), 16, drafter)
 
 
-def test_a_recorded_decode_becomes_its_forwards() -> None:
+def test_a_recorded_decode_becomes_its_forwards():
     found = work(PREFILL, ("verify", 1, 14, 3, "drafter"), ("decode", 5, 0, 0, "none"))
     rows = {kind: calls.rows.tolist() for kind, calls in found.calls.items()}
     assert rows == {"encode": [1], "prefill": [0], "verify": [15, 1], "feed": [0, 4], "draft": [14]}
@@ -44,7 +43,7 @@ def test_a_recorded_decode_becomes_its_forwards() -> None:
     assert found.needs == ["encode", "prefill", "verify", "feed", "draft"]
 
 
-def test_early_and_retrieved_drafts_have_costs_and_others_take_what_was_recorded() -> None:
+def test_early_and_retrieved_drafts_have_costs_and_others_take_what_was_recorded():
     jacobi = work(PREFILL, ("verify", 1, 12, 12, "jacobi"))
     assert jacobi.propose.tolist() == [0.5]
     assert jacobi.needs == ["encode", "prefill", "verify"]
@@ -54,12 +53,12 @@ def test_early_and_retrieved_drafts_have_costs_and_others_take_what_was_recorded
     assert beside.needs == ["encode", "prefill", "verify", "feed", "draft", "early", "retrieval"]
 
 
-def test_a_parallel_decode_is_one_forward_over_prompt_and_chunk() -> None:
+def test_a_parallel_decode_is_one_forward_over_prompt_and_chunk():
     found = work(("parallel", 0, 0, 0, "none"))
     assert (found.calls["prefill"].rows.tolist(), found.needs) == ([16], ["encode", "prefill"])
 
 
-def test_a_skipped_decode_has_no_forward() -> None:
+def test_a_skipped_decode_has_no_forward():
     found = work(("skip", 0, 0, 16, "early"))
     assert found.needs == ["encode", "early"]
     blind = work(("skip", 0, 0, 16, "scout"), vision=0.0)  # the target never encoded
@@ -68,12 +67,12 @@ def test_a_skipped_decode_has_no_forward() -> None:
     assert prices(blind, profile).tolist() + prices(found, profile).tolist() == [0.875, 9.875]
 
 
-def test_a_tree_has_the_levels_of_its_settings_and_of_the_chunk() -> None:
+def test_a_tree_has_the_levels_of_its_settings_and_of_the_chunk():
     rounds = (PREFILL, ("verify", 1, 50, 4, "drafter"), ("verify", 13, 50, 1, "drafter"))
     assert work(*rounds, drafter=(5, True)).calls["tree"].rows.tolist() == [5, 2]
 
 
-def test_bytes_and_operations_of_a_forward() -> None:
+def test_bytes_and_operations_of_a_forward():
     model = open_model(NANO)
     s, sizes = model.target.settings, model.sizes
     weights = s.layers * (4 * s.width**2 + 3 * s.width * s.feed_forward) + s.width * 255
@@ -89,7 +88,7 @@ def test_bytes_and_operations_of_a_forward() -> None:
 
 @pytest.mark.bits
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
-def test_a_verification_and_single_tokens_agree(dtype: str) -> None:
+def test_a_verification_and_single_tokens_agree(dtype):
     differ, compared = flipped(open_model(dataclasses.replace(NANO, dtype=dtype)), 2)
     assert compared == 32
     assert differ == 0 if dtype == "float32" else differ <= 3
@@ -97,7 +96,7 @@ def test_a_verification_and_single_tokens_agree(dtype: str) -> None:
 
 @torch.inference_mode()
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
-def test_decodes_of_all_sizes_show_what_each_part_costs(dtype: str) -> None:
+def test_decodes_of_all_sizes_show_what_each_part_costs(dtype):
     """The forwards' rows are counted at the trunk, the costs' at the laps."""
     model, rows = open_model(dataclasses.replace(NANO, dtype=dtype)), list[int]()
     shown = set[tuple[str, int]]()
@@ -123,7 +122,7 @@ def test_decodes_of_all_sizes_show_what_each_part_costs(dtype: str) -> None:
 def profile() -> Profile:
     """A prefill of 31 costs four tokens, as the shipped policy's does; every drafted row a hundredth."""
 
-    def phase(kind: str, rows: int, seconds: float) -> Phase:
+    def phase(kind, rows, seconds):
         return Phase(kind, rows, seconds, seconds, seconds, 1e6, 1e6, seconds / 2)
 
     found = [phase("encode", 1, 1.0), *(phase("verify", n, 1 + 0.01 * (n - 1)) for n in (1, 2, 16))]
@@ -132,7 +131,7 @@ def profile() -> Profile:
     return profile_of(found, 16)
 
 
-def test_the_cost_model_adds_the_forwards_up() -> None:
+def test_the_cost_model_adds_the_forwards_up():
     known = profile()
     assert known.decode(16) == pytest.approx(20.0)
     assert known.seconds("verify", 9) == pytest.approx(1.08)
@@ -145,7 +144,7 @@ def test_the_cost_model_adds_the_forwards_up() -> None:
     assert prices(skipped, early) == pytest.approx([1 + 0.7 + 0.375])
 
 
-def test_ceilings_are_those_of_the_definition() -> None:
+def test_ceilings_are_those_of_the_definition():
     found = {c.method: c for c in ceilings(profile(), 16)}
     assert found["one_pass"].free == pytest.approx(20 / 5.15)
     assert found["spec_vla_tuned"].free == pytest.approx(20 / (5 + 1.14))
@@ -156,7 +155,7 @@ def test_ceilings_are_those_of_the_definition() -> None:
     assert not {"ar", "expert", "early_unverified"} & set(found)
 
 
-def test_a_projection_keeps_the_shares_of_the_floor() -> None:
+def test_a_projection_keeps_the_shares_of_the_floor():
     here, there = Machine(1e10, 1e12), Machine(1e12, 1e14)
     token = Phase("verify", 1, 0.02, 0.02, 0.02, 1e8, 1e6, 0.01)
     prefill = Phase("prefill", 31, 0.05, 0.05, 0.05, 1e8, 4e10, 0.04)
@@ -170,7 +169,7 @@ def test_a_projection_keeps_the_shares_of_the_floor() -> None:
 
 
 @pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+def quick(monkeypatch):
     """Small buffers, and no shipped policy beside the measured one."""
     monkeypatch.setattr("kerv_cli.bench.machine._BUFFER", 2**20)
     monkeypatch.setattr("kerv_cli.bench.machine._WIDTH", 256)
@@ -185,7 +184,7 @@ def kerv(*words: str) -> str:
 
 
 @pytest.mark.usefixtures("quick")
-def test_the_command_ends_with_one_document(tmp_path: Path) -> None:
+def test_the_command_ends_with_one_document(tmp_path):
     words = ("target=nano", "dtype=float32", "repeats=3", "tokens=[7]", "projected=vla-150m", f"results={tmp_path}")
     told = kerv(*words, "--json")
     document = json.loads(told.splitlines()[-1])
@@ -211,9 +210,7 @@ def test_the_command_ends_with_one_document(tmp_path: Path) -> None:
         (["projections.mine=[1]"], "GB/s and TFLOP/s"),
     ],
 )
-def test_what_cannot_be_measured_is_refused(
-    words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_measured_is_refused(words, message, tmp_path, monkeypatch):
     monkeypatch.setattr("kerv_cli.bench.model.free_memory", lambda device: 8e9)
     done = CliRunner().invoke(app, ["bench", *words, f"results={tmp_path}"])
     assert done.exit_code == 2
@@ -224,7 +221,7 @@ def test_what_cannot_be_measured_is_refused(
 @pytest.mark.parametrize(
     "content", ["{}", '{"profile": {"prompt": 1, "tokens": 1, "phases": {"verify": {"rows": 1}}}}']
 )
-def test_a_file_without_a_profile_is_refused(content: str, tmp_path: Path) -> None:
+def test_a_file_without_a_profile_is_refused(content, tmp_path):
     path = tmp_path / "other.json"
     path.write_text(content)
     with pytest.raises(CheckpointError, match="no latency profile"):

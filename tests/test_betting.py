@@ -1,7 +1,6 @@
 """Tests of means by betting: how often they err, and what they show."""
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -15,12 +14,12 @@ def lost_and_won(random: np.random.Generator, pairs: int, lost: float, won: floa
 
 
 @pytest.mark.parametrize("groups", [1, 10])
-def test_a_bet_against_a_true_hypothesis_errs_no_oftener_than_it_says(groups: int) -> None:
+def test_a_bet_against_a_true_hypothesis_errs_no_oftener_than_it_says(groups):
     """Means at the bound: skewed ones, two-point ones, those of tasks that differ in random order, and of pairs."""
     random, bound = np.random.default_rng(0), 0.1
     hard = np.repeat(np.linspace(0, 2 * bound, groups) if groups > 1 else [bound], 200 // groups)
 
-    def share(draw: Callable[[], np.ndarray], at: float = bound) -> float:
+    def share(draw, at=bound):
         return float(np.mean([p_value(draw(), at, 0.1) <= 0.1 for _ in range(400)]))
 
     most = 0.1 + 3 * math.sqrt(0.09 / 400)
@@ -30,20 +29,20 @@ def test_a_bet_against_a_true_hypothesis_errs_no_oftener_than_it_says(groups: in
         assert share(lambda lost=lost, won=won: lost_and_won(random, 210, lost, won), 0.525) <= most  # type: ignore[misc]
 
 
-def test_bets_show_that_pairs_that_seldom_differ_lose_less_than_five_points() -> None:
+def test_bets_show_that_pairs_that_seldom_differ_lose_less_than_five_points():
     random = np.random.default_rng(1)
     shown = [p_value(lost_and_won(random, 210, 0.01, 0.01), 0.525, 0.1) <= 0.1 for _ in range(300)]
     assert np.mean(shown) >= 0.95
 
 
-def test_bets_know_nothing_of_the_values_to_come() -> None:
+def test_bets_know_nothing_of_the_values_to_come():
     values = np.random.default_rng(2).random(30)
     changed = np.concatenate([values[:20], 1 - values[20:]])
     assert wealth(values, 0.5, 0.1)[:20] == pytest.approx(wealth(changed, 0.5, 0.1)[:20])
     assert p_value(np.zeros(0), 0.5, 0.1) == 1.0
 
 
-def test_how_many_values_more_would_decide() -> None:
+def test_how_many_values_more_would_decide():
     """Pairs that agree: each multiplies the wealth by as much, so that the number is exact up to the first bets."""
     short = np.full(60, 0.5)
     more = more_to_decide(short, 0.525, 0.1)

@@ -18,7 +18,7 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def trunks() -> tuple[Trunk, Trunk]:
+def trunks():
     """The exact trunk of bfloat16 weights, in float32, and the packed one."""
     torch.manual_seed(3)
     trunk = Trunk(128, 3, 4, 320).eval().requires_grad_(False)
@@ -48,7 +48,7 @@ def run(trunk: Trunk, x: torch.Tensor, tree: Draft) -> list[torch.Tensor]:
     return hidden
 
 
-def test_the_packed_trunk_is_the_trunk(trunks: tuple[Trunk, Trunk]) -> None:
+def test_the_packed_trunk_is_the_trunk(trunks):
     tree = Draft.of(range(6), [-1, -1, 0, 1, 3, 2])
     x = torch.randn(1, 32, 128)
     with torch.inference_mode():
@@ -57,7 +57,7 @@ def test_the_packed_trunk_is_the_trunk(trunks: tuple[Trunk, Trunk]) -> None:
             assert (packed.float() - exact).abs().mean() < 0.02 * exact.abs().mean()
 
 
-def test_without_a_cache_one_token_sees_itself_alone(trunks: tuple[Trunk, Trunk]) -> None:
+def test_without_a_cache_one_token_sees_itself_alone(trunks):
     exact, packed = trunks
     x = torch.randn(1, 1, 128).bfloat16()
     with torch.inference_mode():
@@ -65,7 +65,7 @@ def test_without_a_cache_one_token_sees_itself_alone(trunks: tuple[Trunk, Trunk]
         assert (told - exact(x.float(), torch.tensor([7]))).abs().mean() < 0.02 * told.abs().mean()
 
 
-def test_one_verification_and_single_tokens_agree_but_for_ties(trunks: tuple[Trunk, Trunk]) -> None:
+def test_one_verification_and_single_tokens_agree_but_for_ties(trunks):
     """Where their argmax differs, the two best logits lie within bfloat16's rounding: no other cause is allowed."""
     packed, head = trunks[1], torch.randn(50, 128)
     x, differ = torch.randn(1, 36, 128).bfloat16(), 0
@@ -84,7 +84,7 @@ def test_one_verification_and_single_tokens_agree_but_for_ties(trunks: tuple[Tru
     assert differ <= 2
 
 
-def test_training_and_unfreezing_drop_the_packed_weights(trunks: tuple[Trunk, Trunk]) -> None:
+def test_training_and_unfreezing_drop_the_packed_weights(trunks):
     packed = copy.deepcopy(trunks[1])
     assert packed.packed is None  # copies have none: oneDNN's layouts cannot be copied
     pack(packed)

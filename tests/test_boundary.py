@@ -30,7 +30,7 @@ def boundary_of(kind: str, **values: Any) -> Boundary:
     check_settings(chosen, "boundary")
     calibration = SimpleNamespace(ranges={10: RANGES, WINDOW: RANGES}.__getitem__)
 
-    def artifact(kind: str) -> Any:
+    def artifact(kind):
         assert kind in part.needs(chosen)
         return calibration
 
@@ -59,14 +59,14 @@ def line(rng: np.random.Generator, length: float, n: int = WINDOW) -> np.ndarray
 
 @settings(deadline=None)
 @given(seeds, st.floats(0.005, 5.0), st.floats(0.2, 2 * np.pi), st.integers(3, 30))
-def test_the_radius_is_exact_on_arcs(seed: int, radius: float, angle: float, n: int) -> None:
+def test_the_radius_is_exact_on_arcs(seed, radius, angle, n):
     points = arc(np.random.default_rng(seed), radius, radius * angle * (n - 1) / n, n)
     assert radius_of_curvature(points) == pytest.approx(radius, rel=1e-6)
 
 
 @settings(deadline=None)
 @given(seeds, st.floats(0.01, 0.5), st.integers(3, 30))
-def test_a_line_has_no_finite_radius(seed: int, length: float, n: int) -> None:
+def test_a_line_has_no_finite_radius(seed, length, n):
     points = line(np.random.default_rng(seed), length, n)
     assert radius_of_curvature(points) == math.inf
     assert radius_of_curvature(points.astype(np.float32)) > 1e3 * length  # float32 positions bend a line by 0.1 µm
@@ -82,11 +82,11 @@ def test_a_line_has_no_finite_radius(seed: int, length: float, n: int) -> None:
         np.array([[0, 0, 0], [0.1, 0, 0], [0, 0, 0], [0.1, 0, 0]]),  # to and fro
     ],
 )
-def test_where_there_is_no_circle_the_radius_is_infinite(points: np.ndarray) -> None:
+def test_where_there_is_no_circle_the_radius_is_infinite(points):
     assert radius_of_curvature(points) == math.inf
 
 
-def test_ranges_are_the_minimum_and_the_95th_percentile_of_finite_values() -> None:
+def test_ranges_are_the_minimum_and_the_95th_percentile_of_finite_values():
     rng = np.random.default_rng(1)
     paths = [np.cumsum(rng.normal(size=(40, 3)) * 0.01, 0) for _ in range(5)]
     paths += [line(rng, 0.2, 60), np.zeros((2, 3))]  # infinite radii, and too short to count
@@ -100,14 +100,14 @@ def test_ranges_are_the_minimum_and_the_95th_percentile_of_finite_values() -> No
     assert (ranges.length_low, ranges.length_high) == (min(lengths), pytest.approx(np.percentile(lengths, 95)))
 
 
-def test_demonstrations_without_a_curved_path_have_no_ranges() -> None:
+def test_demonstrations_without_a_curved_path_have_no_ranges():
     with pytest.raises(CheckpointError):
         BoundaryRanges.fit([line(np.random.default_rng(0), 0.2), np.zeros((9, 3))], WINDOW)
     with pytest.raises(CheckpointError):
         BoundaryRanges(0.1, 0.1, 0.0, 1.0)
 
 
-def test_normalisation_is_linear_and_clipped() -> None:
+def test_normalisation_is_linear_and_clipped():
     assert RANGES.normalise(0.01, STILL) == (0.0, pytest.approx(STILL / 0.15))
     assert RANGES.normalise(0.505, 0.075) == (pytest.approx(0.5), pytest.approx(0.5))
     assert RANGES.normalise(7.0, 9.0) == (1.0, 1.0)
@@ -115,7 +115,7 @@ def test_normalisation_is_linear_and_clipped() -> None:
     assert RANGES.fused(0.505, 0.15, 0.25) == pytest.approx(0.25 * 0.5 + 0.75)
 
 
-def test_an_infinite_radius_is_a_straight_reach_unless_the_hand_stands_still() -> None:
+def test_an_infinite_radius_is_a_straight_reach_unless_the_hand_stands_still():
     assert RANGES.normalise(math.inf, 0.15) == (1.0, 1.0)
     assert RANGES.normalise(math.inf, 0.0) == (0.0, 0.0)
     boundary = boundary_of("fused")
@@ -123,7 +123,7 @@ def test_an_infinite_radius_is_a_straight_reach_unless_the_hand_stands_still() -
     assert still == Choice("drafter", 0.0)
 
 
-def test_fused_sends_straight_reaches_to_retrieval_and_bends_to_the_drafter() -> None:
+def test_fused_sends_straight_reaches_to_retrieval_and_bends_to_the_drafter():
     rng = np.random.default_rng(3)
     boundary = boundary_of("fused")
     reach, bend = boundary.choose(line(rng, 0.14), rng), boundary.choose(arc(rng, 0.02, 0.05), rng)
@@ -135,7 +135,7 @@ def test_fused_sends_straight_reaches_to_retrieval_and_bends_to_the_drafter() ->
     assert exact.choose(line(np.random.default_rng(3), 0.14), rng).mode == "retrieval"  # F ≥ F*
 
 
-def test_only_the_newest_positions_count() -> None:
+def test_only_the_newest_positions_count():
     rng = np.random.default_rng(4)
     boundary = boundary_of("fused", window=10)
     newest = arc(rng, 0.05, 0.1, 10)
@@ -145,23 +145,23 @@ def test_only_the_newest_positions_count() -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, 2])
-def test_fewer_than_three_positions_go_to_the_drafter(n: int) -> None:
+def test_fewer_than_three_positions_go_to_the_drafter(n):
     boundary = boundary_of("fused", f_star=0.0)
     path = np.arange(3.0 * n).reshape(n, 3)
     assert boundary.choose(path, np.random.default_rng(0)) == Choice("drafter", None)
 
 
 @pytest.mark.parametrize("mode", ["retrieval", "drafter"])
-def test_the_fixed_kinds_never_change_their_mind(mode: str) -> None:
+def test_the_fixed_kinds_never_change_their_mind(mode):
     boundary = boundary_of(f"always_{mode}")
     for n in (0, 2, 20):
         assert boundary.choose(np.zeros((n, 3)), np.random.default_rng(n)).mode == mode
 
 
-def test_random_keeps_its_share_and_repeats_itself() -> None:
+def test_random_keeps_its_share_and_repeats_itself():
     boundary, other = (boundary_of("random", p=0.3, seed=seed) for seed in (5, 6))
 
-    def modes(task: str, seed: int, boundary: Boundary = boundary) -> list[str]:
+    def modes(task, seed, boundary=boundary):
         rng = boundary.numbers(task, seed)
         return [boundary.choose(np.zeros((0, 3)), rng).mode for _ in range(2000)]
 

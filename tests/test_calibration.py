@@ -99,7 +99,7 @@ def write_dataset(
 
 
 @pytest.fixture(scope="module")
-def results(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(policies, tmp_path_factory):
     """The small policies and a dataset of two tasks."""
     folder = tmp_path_factory.mktemp("calibration") / "results"
     shutil.copytree(policies, folder)
@@ -119,7 +119,7 @@ def settings(results: Path, *overrides: str, target: str = "nano-state") -> Cali
     return compose("calibrate", [*words, f"results={results}", *overrides], CalibrateSettings)
 
 
-def test_windows_hold_the_normalised_labels_before_and_after_each_moment() -> None:
+def test_windows_hold_the_normalised_labels_before_and_after_each_moment():
     episode = made_up_episode("reach-v3", 0)
     past, future = episode_windows(episode, SPACE, 10, 4)
     assert past.shape == (STEPS - 10, 10, 4)
@@ -138,7 +138,7 @@ def test_windows_hold_the_normalised_labels_before_and_after_each_moment() -> No
 
 
 @pytest.mark.parametrize("ratio", [0.01, 1.0])
-def test_the_fit_finds_the_noise_that_made_the_data(ratio: float) -> None:
+def test_the_fit_finds_the_noise_that_made_the_data(ratio):
     """A random walk of the velocity, observed with noise: the true ratio predicts best."""
     random = np.random.default_rng(0)
     acceleration = random.normal(0, np.sqrt(ratio), (4000, 12))
@@ -159,7 +159,7 @@ def line_windows(slope: float) -> Windows:
     return Windows(both[:, :10], both[:, 10:], np.array([0, 1, 0, 1]), held, TASKS, {}, [])
 
 
-def test_errors_of_hold_and_linear_have_closed_forms() -> None:
+def test_errors_of_hold_and_linear_have_closed_forms():
     noise = {kind: Noise(*3 * [(1.0,) * 4]) for kind in PREDICTORS}
     errors = prediction_errors(line_windows(0.02), noise, SPACE)
     assert set(errors) == set(PREDICTORS)
@@ -169,7 +169,7 @@ def test_errors_of_hold_and_linear_have_closed_forms() -> None:
         np.testing.assert_allclose(errors[kind][TASKS[1]]["gripper"], 0.01 * np.arange(1, 5), atol=1e-12)
 
 
-def test_both_kinds_of_episodes_are_held_out(results: Path) -> None:
+def test_both_kinds_of_episodes_are_held_out(results):
     dataset = DemoDataset.open(results / "artifacts/demos/few")
     chosen = choose_episodes(dataset, TASKS, 0, 0.3)
     assert len(chosen) == 12
@@ -180,11 +180,11 @@ def test_both_kinds_of_episodes_are_held_out(results: Path) -> None:
         choose_episodes(dataset, ("push-v3",), 0, 0.3)
 
 
-def test_variability_is_the_mean_difference_of_the_judged_tokens() -> None:
+def test_variability_is_the_mean_difference_of_the_judged_tokens():
     """K by hand, in normalised action units; what is not judged does not count, nor does a strict DoF."""
     chunk = Chunk(torch.zeros(1, 1, 8), 4, SPACE, None, Situation("t", ActionHistory(4)))  # type: ignore[arg-type]
 
-    def play(start: int, drafted: tuple[int, ...], target_tokens: tuple[int, ...]) -> float | None:
+    def play(start, drafted, target_tokens):
         played = Round("verify", "x", start, drafted, target_tokens, 0, 1, len(drafted), ())
         chunk.commit(played, [0])
         return None if chunk.variability is None else chunk.variability / BIN
@@ -195,13 +195,13 @@ def test_variability_is_the_mean_difference_of_the_judged_tokens() -> None:
     assert play(1, (0, 0, 254, 7), (0, 4, 0, 0)) == pytest.approx((5 + 0 + 4 + 7) / 6)
 
 
-def test_the_reference_level_is_the_median_and_can_divide() -> None:
+def test_the_reference_level_is_the_median_and_can_divide():
     assert distribution([0.1, 5.0, 0.3], BIN).k_s == 0.3
     assert distribution([0.0, 0.0], BIN).k_s == BIN == pytest.approx(SPACE.centres[1] - SPACE.centres[0])
 
 
 @pytest.mark.parametrize("target", ["nano-state", "nano-vision"])
-def test_a_run_writes_what_the_next_session_reads(results: Path, target: str) -> None:
+def test_a_run_writes_what_the_next_session_reads(results, target):
     run = CalibrationRun(settings(results, target=target))
     assert "8 demonstrations of 2 tasks, tested on 4; 4 decodes per task with drafter drafts" in run.plan()
     made = run.run(quiet)
@@ -221,7 +221,7 @@ def test_a_run_writes_what_the_next_session_reads(results: Path, target: str) ->
         np.testing.assert_allclose(predictor.predict(np.full((10, 4), 0.25), 4), 0.25)
 
 
-def test_a_task_without_a_reference_level_is_named() -> None:
+def test_a_task_without_a_reference_level_is_named():
     with pytest.raises(CheckpointError, match="no reference level K_S for push-v3, only for reach-v3"):
         calibration({"reach-v3": 0.7}).k_s("push-v3")
 
@@ -258,9 +258,7 @@ def description(**changes: Any) -> TargetDescription:
         (lambda v: v["target"].update(chunk=8), "was made for chunks of 8 steps, not of 4"),
     ],
 )
-def test_what_does_not_fit_is_refused_in_one_line(
-    change: Callable[[dict[str, Any]], Any], says: str, tmp_path: Path
-) -> None:
+def test_what_does_not_fit_is_refused_in_one_line(change, says, tmp_path):
     path = tmp_path / "calibration.json"
     write_json(path, dataclasses.asdict(calibration({"reach-v3": 0.7})))
     assert CalibrationArtifact().checked(path, description()) == calibration({"reach-v3": 0.7})
@@ -284,13 +282,13 @@ def test_what_does_not_fit_is_refused_in_one_line(
         ("policy.target=absent", UsageError, "no target 'absent'"),
     ],
 )
-def test_wrong_requests_get_one_line(results: Path, override: str, kind: type[KervError], says: str) -> None:
+def test_wrong_requests_get_one_line(results, override, kind, says):
     with pytest.raises(kind, match=says) as caught:
         CalibrationRun(settings(results, override)).run(quiet)
     assert "\n" not in str(caught.value)
 
 
-def test_the_command_prints_what_it_found(results: Path) -> None:
+def test_the_command_prints_what_it_found(results):
     words = ["calibrate", "task=reach,drawer-close", "demos=few", "held_out=0.4", "policy.target=nano-state"]
     done = CliRunner().invoke(app, [*words, f"results={results}", "decodes=0", "name=without"])
     assert done.exit_code == 0, done.output

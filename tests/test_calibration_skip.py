@@ -44,7 +44,7 @@ def recognisable_episode(task: str, seed: int) -> DemoEpisode:
 
 
 @pytest.fixture(scope="module")
-def results(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(policies, tmp_path_factory):
     """The small policies, a dataset of two tasks and a datastore of the state policy."""
     folder = tmp_path_factory.mktemp("skipping") / "results"
     shutil.copytree(policies, folder)
@@ -57,7 +57,7 @@ def results(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def copy(results: Path, tmp_path: Path) -> Path:
+def copy(results, tmp_path):
     return Path(shutil.copytree(results, tmp_path / "results"))
 
 
@@ -87,7 +87,7 @@ def store_of(similar: np.ndarray, tokens: np.ndarray, seeds: np.ndarray, space: 
 
 @hypothesis_settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 60), st.sampled_from([0.5, 0.7, 0.9, 0.97]), st.integers(1, 25))
-def test_the_lowest_level_is_the_definitions(seed: int, n: int, confidence: float, least: int) -> None:
+def test_the_lowest_level_is_the_definitions(seed, n, confidence, least):
     """Against every level tried one by one; few distinct similarities, so that ties are many."""
     rng = np.random.default_rng(seed)
     similarity = (rng.integers(0, 12, n) / 16).astype(np.float32)
@@ -100,7 +100,7 @@ def test_the_lowest_level_is_the_definitions(seed: int, n: int, confidence: floa
 
 @hypothesis_settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.5, 0.6, 0.8, 0.9, 0.95, 0.99]), st.floats(0.05, 1.0))
-def test_the_bounds_hold_the_level(seed: int, confidence: float, share: float) -> None:
+def test_the_bounds_hold_the_level(seed, confidence, share):
     rng = np.random.default_rng(seed)
     similarity = rng.random(80).astype(np.float32)
     matches = Matches(similarity, 0.2 * (rng.random(80) > share), rng.random(80) > 0.97)
@@ -116,7 +116,7 @@ def test_the_bounds_hold_the_level(seed: int, confidence: float, share: float) -
         assert (row.low, row.high, row.share, row.error) == (NEVER, NEVER, 0.0, None)
 
 
-def test_the_bounds_are_the_levels_of_twice_and_a_third_of_the_wrong_chunks() -> None:
+def test_the_bounds_are_the_levels_of_twice_and_a_third_of_the_wrong_chunks():
     """1000 entries, the more similar the better: the k-th hundred from the top has 5·k wrong ones, spread."""
     wrong = np.concatenate([5 * k * np.arange(100) % 100 < 5 * k for k in range(10)])
     similarity = np.linspace(1, 0, 1000).astype(np.float32)
@@ -128,7 +128,7 @@ def test_the_bounds_are_the_levels_of_twice_and_a_third_of_the_wrong_chunks() ->
     assert shares["low"] == pytest.approx(0.8, abs=0.003)
 
 
-def test_an_entry_is_compared_with_the_best_of_another_episode() -> None:
+def test_an_entry_is_compared_with_the_best_of_another_episode():
     """Seeds 0 and 1: the nearest of entry 0 is its own episode's entry 1, and must be passed over."""
     angles, seeds = np.array([0.0, 0.01, 0.5, 0.6]), np.array([0, 0, 1, 1])
     own = np.full((4, 8), 100)
@@ -145,7 +145,7 @@ def test_an_entry_is_compared_with_the_best_of_another_episode() -> None:
     assert match(store_of(angles, seven, seeds, SEVEN), "a").strict.tolist() == [False, False, False, True]
 
 
-def test_a_single_episode_or_too_few_good_entries_never_skip() -> None:
+def test_a_single_episode_or_too_few_good_entries_never_skip():
     tokens = np.full((40, 8), 100)
     lonely = task_levels(match(store_of(np.linspace(0, 1, 40), tokens, np.zeros(40, int)), "a"), 0.1, 0.9)
     assert (lonely.s_min, lonely.entries) == (NEVER, 0)
@@ -157,7 +157,7 @@ def test_a_single_episode_or_too_few_good_entries_never_skip() -> None:
     assert task_levels(match(store_of(np.linspace(0, 1, 40), tokens, seeds), "a"), 0.1, 0.9).s_min == NEVER
 
 
-def test_tasks_that_the_datastore_does_not_hold_are_left_out() -> None:
+def test_tasks_that_the_datastore_does_not_hold_are_left_out():
     store = store_of(np.linspace(0, 1, 40), np.full((40, 8), 100), np.arange(40) % 2)
     seen: list[int] = []
     section = skip_section(store, ["b", "a"], 0.1, 0.9, lambda done, total: seen.append(done))
@@ -167,7 +167,7 @@ def test_tasks_that_the_datastore_does_not_hold_are_left_out() -> None:
     assert skip_section(store, ["b"], 0.1, 0.9, silent) is None
 
 
-def test_the_ranges_are_those_of_the_training_episodes(copy: Path) -> None:
+def test_the_ranges_are_those_of_the_training_episodes(copy):
     run, made = calibrated(copy, "boundary_windows=[7,15]")
     training = [run.dataset.load(i).end_effector for i, held_out in run.chosen.items() if not held_out]
     everything = [run.dataset.load(i).end_effector for i in run.chosen]
@@ -180,7 +180,7 @@ def test_the_ranges_are_those_of_the_training_episodes(copy: Path) -> None:
         replace(made, boundary=None).ranges(7)
 
 
-def test_the_skip_levels_belong_to_one_datastore(copy: Path) -> None:
+def test_the_skip_levels_belong_to_one_datastore(copy):
     run, made = calibrated(copy, "epsilon=1.9", "confidence=0.5")
     folder = copy / "artifacts/datastore/nano-state"
     assert made.skip is not None
@@ -198,7 +198,7 @@ def test_the_skip_levels_belong_to_one_datastore(copy: Path) -> None:
         replace(made, skip=None).skip_levels("reach-v3", store.content)
 
 
-def test_what_cannot_be_computed_now_is_kept(copy: Path) -> None:
+def test_what_cannot_be_computed_now_is_kept(copy):
     levels = {name: Variability(0.25, 3, 0.1, 0.3, 0.4) for name in TASKS}
     _, first = calibrated(copy, levels=levels)
     assert "kept" not in first.provenance
@@ -216,7 +216,7 @@ def test_what_cannot_be_computed_now_is_kept(copy: Path) -> None:
     assert list(fourth.provenance["kept"]) == ["skip"]
 
 
-def test_nothing_is_kept_of_another_target_or_a_damaged_file(copy: Path) -> None:
+def test_nothing_is_kept_of_another_target_or_a_damaged_file(copy):
     run, made = calibrated(copy, levels={"reach-v3": Variability(0.25, 3, 0.1, 0.3, 0.4)})
     write_json(run.path, asdict(replace(made, target=replace(made.target, sha256="f" * 64))))
     run, made = calibrated(copy)
@@ -226,7 +226,7 @@ def test_nothing_is_kept_of_another_target_or_a_damaged_file(copy: Path) -> None
     assert calibrated(copy)[1].variability == {}
 
 
-def test_the_command_prints_ranges_and_levels(copy: Path) -> None:
+def test_the_command_prints_ranges_and_levels(copy):
     done = CliRunner().invoke(app, ["calibrate", *words(copy, "epsilon=1.9", "confidence=0.5")])
     assert done.exit_code == 0, done.output
     for word in ("s_min", "would be skipped", "error ≤ 1.9", "144"):

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -43,7 +42,7 @@ def row(
 
 
 @pytest.fixture
-def table() -> pd.DataFrame:
+def table():
     rows = [
         row("ar", 1.0, PairedCounts(190, 0, 0, 10), 4),
         row("slow", 0.8, PairedCounts(150, 40, 0, 10), 3),
@@ -55,7 +54,7 @@ def table() -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def test_the_fastest_setting_before_the_first_that_fails_is_chosen(table: pd.DataFrame) -> None:
+def test_the_fastest_setting_before_the_first_that_fails_is_chosen(table):
     """`slow` fails and is no answer; `unverified` would pass, but comes after `r=20`, which does not."""
     assert [r["label"] for r in safest_first(rows_of(table))] == ["r=3", "r=9", "r=20", "unverified"]
     whole, reach = choices(table, table.assign(task="reach"), 4.0)
@@ -68,7 +67,7 @@ def test_the_fastest_setting_before_the_first_that_fails_is_chosen(table: pd.Dat
     assert short_sentence(reach) == "reach: r=9"
 
 
-def test_a_setting_is_called_faster_only_if_its_interval_is_above_one(table: pd.DataFrame) -> None:
+def test_a_setting_is_called_faster_only_if_its_interval_is_above_one(table):
     wide = table[table["label"].isin(["ar", "r=9"])].assign(episode_speedup_low=0.9)
     (found,) = choices(wide, table.iloc[:0], 4.0)
     assert (found.chosen, found.is_shown) == ("r=9", False)
@@ -77,7 +76,7 @@ def test_a_setting_is_called_faster_only_if_its_interval_is_above_one(table: pd.
     assert choices(with_narrow, table.iloc[:0], 4.0)[0].chosen == "r=3"
 
 
-def test_nothing_is_recommended_where_the_baseline_does_not_solve_the_tasks() -> None:
+def test_nothing_is_recommended_where_the_baseline_does_not_solve_the_tasks():
     rows = [row("ar", 1.0, PairedCounts(30, 0, 0, 170), 4), row("r=9", 2.0, PairedCounts(30, 0, 0, 170))]
     whole, reach = choices(pd.DataFrame(rows), pd.DataFrame(rows).assign(task="reach"), 4.0)
     assert (whole.chosen, whole.candidate, whole.is_shown) == ("", "", False)
@@ -85,7 +84,7 @@ def test_nothing_is_recommended_where_the_baseline_does_not_solve_the_tasks() ->
     assert "does not solve" in short_sentence(reach)
 
 
-def test_what_is_not_shown_yet_says_how_many_pairs_more_would_do(table: pd.DataFrame) -> None:
+def test_what_is_not_shown_yet_says_how_many_pairs_more_would_do(table):
     """Of r = 9, the fastest that may be non-inferior: nothing after r = 20 is, which loses more than the bound."""
     found = choices(table, table.iloc[:0], 2.0)[0]
     assert (found.chosen, found.candidate) == ("", "r=9")
@@ -99,7 +98,7 @@ def test_what_is_not_shown_yet_says_how_many_pairs_more_would_do(table: pd.DataF
     assert sentence(worse, 2.0, "ar").endswith("more pairs would not show one either")
 
 
-def test_untimed_settings_are_chosen_by_the_order_of_the_tests(table: pd.DataFrame) -> None:
+def test_untimed_settings_are_chosen_by_the_order_of_the_tests(table):
     untimed = table[~table["label"].isin(["r=20", "slow"])].assign(
         episode_speedup=math.nan, episode_speedup_low=math.nan
     )
@@ -108,7 +107,7 @@ def test_untimed_settings_are_chosen_by_the_order_of_the_tests(table: pd.DataFra
     assert sentence(found, 4.0, "ar").endswith("; its speed was not measured")
 
 
-def test_ten_settings_at_the_bound_are_seldom_chosen() -> None:
+def test_ten_settings_at_the_bound_are_seldom_chosen():
     """Ten settings that lose exactly the bound, a tenth of the pairs discordant; each tested by itself, one looks safe
     in a fifth of the studies."""
     random, chosen, studies = np.random.default_rng(0), 0, 300
@@ -120,7 +119,7 @@ def test_ten_settings_at_the_bound_are_seldom_chosen() -> None:
     assert chosen / studies <= 0.05
 
 
-def test_the_pareto_front_keeps_ties_and_drops_what_is_beaten_in_both() -> None:
+def test_the_pareto_front_keeps_ties_and_drops_what_is_beaten_in_both():
     rows = [
         {"label": name, "baseline": "ar", "episode_speedup": speed, "success": success}
         for name, speed, success in (("ar", 1.0, 0.9), ("a", 2.0, 0.9), ("b", 2.0, 0.8), ("c", 3.0, 0.5))
@@ -129,7 +128,7 @@ def test_the_pareto_front_keeps_ties_and_drops_what_is_beaten_in_both() -> None:
 
 
 @pytest.mark.parametrize("looks", [2, 4, 10])
-def test_the_boundary_misjudges_one_time_in_twenty_over_all_looks(looks: int) -> None:
+def test_the_boundary_misjudges_one_time_in_twenty_over_all_looks(looks):
     steps = np.random.default_rng(0).normal(size=(200_000, looks))
     z = steps.cumsum(axis=1) / np.sqrt(np.arange(1, looks + 1))
     from scipy.stats import norm
@@ -138,18 +137,18 @@ def test_the_boundary_misjudges_one_time_in_twenty_over_all_looks(looks: int) ->
     assert (np.abs(z) > bound).any(axis=1).mean() == pytest.approx(0.05, abs=0.003)
 
 
-def test_more_looks_than_are_tabled_are_refused() -> None:
+def test_more_looks_than_are_tabled_are_refused():
     with pytest.raises(UsageError):
         confidence_of_a_look(21)
 
 
-def test_a_setting_is_open_until_its_interval_leaves_the_bound() -> None:
+def test_a_setting_is_open_until_its_interval_leaves_the_bound():
     assert decision_of("a", PairedCounts(5, 0, 0, 0), 0.03, 1, 4).verdict == OPEN
     assert decision_of("a", PairedCounts(950, 5, 5, 40), 0.03, 1, 4).verdict == SMALLER
     assert decision_of("a", PairedCounts(500, 400, 0, 100), 0.03, 1, 4).verdict == LARGER
 
 
-def test_verdicts_come_from_the_stored_pairs_and_are_stored(tmp_path: Path) -> None:
+def test_verdicts_come_from_the_stored_pairs_and_are_stored(tmp_path):
     settings = {"ar": settings_of("ar", episodes=4), "spec_vla": settings_of("spec_vla", 9, 4)}
     study = study_of(settings, ["reach-v3"], block=2)
     store, _ = swept(tmp_path, study)

@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 from kerv_cli.base.config import groups
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.registry import NoSettings, Part, parts
+from kerv_cli.base.registry import NoSettings, parts
 from kerv_cli.cli.app import app
 from kerv_cli.cli.common import one_line_errors, progress_bar
 
@@ -47,7 +47,7 @@ def one_line(run: subprocess.CompletedProcess[str], code: int) -> str:
     return lines[0]
 
 
-def test_help_lists_the_commands_without_importing_anything_heavy() -> None:
+def test_help_lists_the_commands_without_importing_anything_heavy():
     heavy = "{'torch', 'mujoco', 'hydra', 'pandas', 'rerun'}"
     code = f"import sys, kerv_cli.cli.app; print(sorted({heavy} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
@@ -58,8 +58,8 @@ def test_help_lists_the_commands_without_importing_anything_heavy() -> None:
 
 
 @pytest.mark.parametrize("words", [[], ["train"]])
-def test_help_is_fast(words: list[str]) -> None:
-    def seconds(command: list[str]) -> float:
+def test_help_is_fast(words):
+    def seconds(command):
         """Of the processor."""
         began = os.times()
         subprocess.run(command, capture_output=True, check=True)
@@ -72,7 +72,7 @@ def test_help_is_fast(words: list[str]) -> None:
     assert min(seconds(asked) for _ in range(5)) < max(0.5, 6 * typer)
 
 
-def test_what_is_missing_or_damaged_gets_one_line_and_exit_code_1(policies: Path, tmp_path: Path) -> None:
+def test_what_is_missing_or_damaged_gets_one_line_and_exit_code_1(policies, tmp_path):
     results = tmp_path / "results"
     shutil.copytree(policies, results)
     common = ["task=reach-v3", *FAST, f"results={results}"]
@@ -86,7 +86,7 @@ def test_what_is_missing_or_damaged_gets_one_line_and_exit_code_1(policies: Path
     assert "demonstrations" in one_line(kerv("train", "target", "name=new", f"results={results}"), 1)
 
 
-def test_no_graphics_gets_the_command_that_brings_them(policies: Path, tmp_path: Path) -> None:
+def test_no_graphics_gets_the_command_that_brings_them(policies, tmp_path):
     results = tmp_path / "results"
     shutil.copytree(policies, results)
     run = process(
@@ -101,7 +101,7 @@ def test_no_graphics_gets_the_command_that_brings_them(policies: Path, tmp_path:
     assert "MUJOCO_GL" in one_line(run, 1) or "apt-get install" in one_line(run, 1)
 
 
-def test_rollout_prints_figures_and_writes_a_recording(policies: Path, tmp_path: Path) -> None:
+def test_rollout_prints_figures_and_writes_a_recording(policies, tmp_path):
     results = tmp_path / "results"
     shutil.copytree(policies, results)
     run = kerv(
@@ -115,7 +115,7 @@ def test_rollout_prints_figures_and_writes_a_recording(policies: Path, tmp_path:
     assert recording.stat().st_size > 10_000
 
 
-def test_sweep_resumes_and_report_writes_tables(policies: Path, tmp_path: Path) -> None:
+def test_sweep_resumes_and_report_writes_tables(policies, tmp_path):
     results = tmp_path / "results"
     shutil.copytree(policies, results)
     study = tmp_path / "small.yaml"
@@ -148,14 +148,14 @@ def test_sweep_resumes_and_report_writes_tables(policies: Path, tmp_path: Path) 
     assert list((results / "report/plots").glob("small*.png"))
 
 
-def test_the_settings_of_a_certificate_stand_in_front_of_its_studys() -> None:
+def test_the_settings_of_a_certificate_stand_in_front_of_its_studys():
     shown = kerv("calibrate", "success", "margin=3", "delta=0.2", "--cfg").stdout
     lines = shown.partition("---\n")[0].splitlines()
     assert [line.split("  #")[0] for line in lines] == ["margin: 3.0", "delta: 0.2"]
 
 
-def test_typer_completes_keys_and_names() -> None:
-    def completed(*words: str, shell: str = "zsh") -> str:
+def test_typer_completes_keys_and_names():
+    def completed(*words, shell="zsh"):
         line = " ".join(("kerv", *words))
         asked = {"COMP_WORDS": line, "COMP_CWORD": str(len(words)), "_TYPER_COMPLETE_ARGS": line}
         environment = {**os.environ, **asked, "_KERV_COMPLETE": f"complete_{shell}"}
@@ -173,7 +173,7 @@ COMMANDS = [part for part in parts("command").values() if part.build.startswith(
 
 
 @pytest.mark.parametrize("part", COMMANDS, ids=lambda part: part.name)
-def test_the_help_of_a_command_shows_its_settings_and_two_examples_that_compose(part: Part) -> None:
+def test_the_help_of_a_command_shows_its_settings_and_two_examples_that_compose(part):
     shown = kerv(*part.name.split(), "--help")
     assert shown.returncode == 0, shown.stderr
     keys = part.traits["keys"].split()
@@ -187,13 +187,13 @@ def test_the_help_of_a_command_shows_its_settings_and_two_examples_that_compose(
         assert composed.returncode == 0, composed.stderr
 
 
-def test_the_help_shows_the_defaults_that_hold() -> None:
+def test_the_help_shows_the_defaults_that_hold():
     shown = kerv("train", "drafter", "--help").stdout
     assert "  train.steps=4000 " in shown  # of conf/train/drafter.yaml
     assert "  runtime.device=auto " in shown
 
 
-def test_a_sweep_without_a_study_lists_the_studies_with_their_sizes(tmp_path: Path) -> None:
+def test_a_sweep_without_a_study_lists_the_studies_with_their_sizes(tmp_path):
     shown = kerv("sweep", f"results={tmp_path}")
     assert shown.returncode == 0, shown.stderr
     assert re.search(r"\bdemo +│ 12 +│ 3 +│ 5 +│ 180 +│ The three papers", shown.stdout)
@@ -203,11 +203,11 @@ def test_a_sweep_without_a_study_lists_the_studies_with_their_sizes(tmp_path: Pa
     assert listed["stress"]["settings"] == 145
 
 
-def test_a_command_from_a_plugin_is_one_like_any_other(tmp_path: Path) -> None:
+def test_a_command_from_a_plugin_is_one_like_any_other(tmp_path):
     """docs/extending.md: tests/examples/own_command.py."""
     path = os.pathsep.join([str(Path(__file__).parent / "examples"), os.environ.get("PYTHONPATH", "")])
 
-    def run(*words: str, **env: str) -> subprocess.CompletedProcess[str]:
+    def run(*words, **env):
         return process(*words, PYTHONPATH=path, KERV_PLUGINS="own_command", **env)
 
     assert "  seeds      Print the seeds of a task's episodes\n" in run("--help").stdout
@@ -222,7 +222,7 @@ def test_a_command_from_a_plugin_is_one_like_any_other(tmp_path: Path) -> None:
     assert one_line(run("seeds", "uses=x"), 2).startswith("kerv: unknown key 'uses': did you mean use")
 
 
-def test_doctor_repair_removes_what_a_killed_command_left(tmp_path: Path) -> None:
+def test_doctor_repair_removes_what_a_killed_command_left(tmp_path):
     from test_leftovers import of_process
 
     child = subprocess.Popen([sys.executable, "-c", ""])
@@ -237,7 +237,7 @@ def test_doctor_repair_removes_what_a_killed_command_left(tmp_path: Path) -> Non
     assert kerv("doctor", "--repair", f"results={tmp_path}").stdout.startswith("0 left over files")
 
 
-def test_what_has_no_effect_is_said_in_one_line(policies: Path) -> None:
+def test_what_has_no_effect_is_said_in_one_line(policies):
     words = ["policy=state", "policy.target=nano-state", f"results={policies}", "task=reach", *FAST]
     run = kerv("rollout", "--plan", "method=ar", "acceptance=relaxed", *words)
     assert run.returncode == 0
@@ -246,9 +246,7 @@ def test_what_has_no_effect_is_said_in_one_line(policies: Path) -> None:
     assert announcement == "ar acceptance=relaxed of nano-state on reach-v3: 2 episodes"
 
 
-def test_plain_lines_of_progress_say_the_time_left(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_plain_lines_of_progress_say_the_time_left(monkeypatch, capsys):
     clock = iter([0.0, 30.0, 45.0])
     monkeypatch.setattr("kerv_cli.cli.common.time", SimpleNamespace(monotonic=lambda: next(clock)))
     with progress_bar("training") as advance:
@@ -260,7 +258,7 @@ def test_plain_lines_of_progress_say_the_time_left(
     ]  # fmt: skip
 
 
-def test_a_plan_names_every_target_that_it_measures(policies: Path) -> None:
+def test_a_plan_names_every_target_that_it_measures(policies):
     words = ["policy=state", "policy.target=nano-state,mt10-state", f"results={policies}", "task=reach", *FAST]
     run = kerv("rollout", "--plan", "-m", "method=ar", *words)
     assert run.returncode == 0, run.stderr
@@ -269,9 +267,7 @@ def test_a_plan_names_every_target_that_it_measures(policies: Path) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("late", [False, True])
-def test_an_interrupted_command_says_so_in_one_line(
-    number: signal.Signals, late: bool, policies: Path, tmp_path: Path
-) -> None:
+def test_an_interrupted_command_says_so_in_one_line(number, late, policies, tmp_path):
     words = ["rollout", "task=reach", "episodes=50", "policy.target=nano-vision", f"results={tmp_path}/results"]
     shutil.copytree(policies, tmp_path / "results")
     # as early as there is a process of ours: the line says that it is
@@ -293,12 +289,10 @@ def test_an_interrupted_command_says_so_in_one_line(
     assert re.fullmatch("(ar of .*\n)?kerv: interrupted.*\n", errors), errors
 
 
-def test_an_interrupt_that_a_library_made_another_error_of_is_an_interrupt(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupt_that_a_library_made_another_error_of_is_an_interrupt(capsys, monkeypatch):
     monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)  # which an interrupt changes
 
-    def compose() -> None:
+    def compose():
         try:
             try:
                 raise KeyboardInterrupt
@@ -313,7 +307,7 @@ def test_an_interrupt_that_a_library_made_another_error_of_is_an_interrupt(
     assert capsys.readouterr().err == "kerv: interrupted\n"
 
 
-def test_the_question_of_runs_rm_ends_in_one_line(policies: Path) -> None:
+def test_the_question_of_runs_rm_ends_in_one_line(policies):
     run = kerv("runs", "rm", "target/nano-state", f"results={policies}")  # nobody answers
     assert run.returncode == 130
     assert run.stderr.splitlines()[-1] == "kerv: nothing is removed; --yes asks no question"

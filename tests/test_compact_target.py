@@ -42,7 +42,7 @@ def relative(vector: torch.Tensor) -> list[torch.Tensor]:
     return [vector / 0.1, torch.tanh(vector / 0.02)]
 
 
-def test_metaworlds_columns_are_what_the_shipped_weights_were_trained_on() -> None:
+def test_metaworlds_columns_are_what_the_shipped_weights_were_trained_on():
     states = torch.randn(5, 39, generator=torch.Generator().manual_seed(0)) * 0.2
     hand, gripper, thing, second, goal = (states[:, a:b] for a, b in ((0, 3), (3, 4), (4, 7), (11, 14), (36, 39)))
     centre = torch.tensor([0.0, 0.7, 0.15])
@@ -58,7 +58,7 @@ def test_metaworlds_columns_are_what_the_shipped_weights_were_trained_on() -> No
 
 
 @given(felt=st.integers(3, 9), places=st.integers(1, 5), seed=st.integers(0, 1000))
-def test_features_of_any_space_depend_on_every_number(felt: int, places: int, seed: int) -> None:
+def test_features_of_any_space_depend_on_every_number(felt, places, seed):
     space = ObservationSpace(
         tuple(f"p{i}" for i in range(felt)), 3 * places, tuple(Place(f"o{i}", 3 * i) for i in range(places)), (0, 0, 0)
     )
@@ -77,14 +77,14 @@ def test_features_of_any_space_depend_on_every_number(felt: int, places: int, se
 # checkpoints
 
 
-def test_the_policy_of_the_plain_protocol_sees_two_views() -> None:
+def test_the_policy_of_the_plain_protocol_sees_two_views():
     target, _ = load_target(shipped_dir() / "mt50-plain" / "target")
     assert target.cameras == ("corner4+gripperPOV:75",)
     assert target.observation == SPEC.observation
 
 
 @pytest.mark.parametrize("name", ["mt10-vision", "mt10-state"])
-def test_the_shipped_targets_load_with_metaworlds_spaces(name: str) -> None:
+def test_the_shipped_targets_load_with_metaworlds_spaces(name):
     target, description = load_target(shipped_dir() / name / "target")
     assert isinstance(target, CompactTarget)
     assert (description.family, description.environment) == ("compact", SPEC.name)
@@ -120,23 +120,23 @@ def damaged(folder: Path, **changes: object) -> Path:
         ({"format": 9}, "written by another version"),
     ],
 )
-def test_a_damaged_description_is_one_line(tmp_path: Path, changes: dict[str, object], says: str) -> None:
+def test_a_damaged_description_is_one_line(tmp_path, changes, says):
     with pytest.raises(CheckpointError, match=says) as caught:
         load_target(damaged(tmp_path, **changes))
     assert "\n" not in str(caught.value)
 
 
-def test_a_field_of_a_newer_kerv_is_no_damage(tmp_path: Path) -> None:
+def test_a_field_of_a_newer_kerv_is_no_damage(tmp_path):
     target, description = load_target(damaged(tmp_path, surplus=1))
     assert (target.chunk, description.family) == (description.chunk, "compact")
 
 
-def test_an_unknown_family_names_the_known_ones(tmp_path: Path) -> None:
+def test_an_unknown_family_names_the_known_ones(tmp_path):
     with pytest.raises(UnknownName, match="compact"):
         load_target(damaged(tmp_path, family="compct"))
 
 
-def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+def test_weights_that_are_not_finite_are_refused(tmp_path):
     target = nano()
     target.head.weight.data[0, 0] = torch.nan
     save_target(tmp_path, target, "insertion", {})
@@ -144,7 +144,7 @@ def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
         load_target(tmp_path)
 
 
-def test_an_observation_of_another_environment_is_refused() -> None:
+def test_an_observation_of_another_environment_is_refused():
     target, seeing = nano(), nano(observation="vision")
     with pytest.raises(CheckpointError, match="8 numbers of proprioception and 14 of state, the environment gives 4"):
         target.encode(Observation(np.zeros(4), np.zeros(39), "insert"))
@@ -153,7 +153,7 @@ def test_an_observation_of_another_environment_is_refused() -> None:
 
 
 @pytest.mark.parametrize("tokens", [1, 3, 16, 17, 33])
-def test_a_padded_bucket_computes_its_tokens(tokens: int) -> None:
+def test_a_padded_bucket_computes_its_tokens(tokens):
     """What a captured graph would run, call by call: the rows behind the tokens change nothing."""
     torch.manual_seed(0)
     trunk = Trunk(32, 2, 2, 48).eval()
@@ -171,5 +171,5 @@ def test_a_padded_bucket_computes_its_tokens(tokens: int) -> None:
     assert torch.allclose(in_buckets, uncached, atol=1e-5)
 
 
-def test_buckets_hold_their_tokens() -> None:
+def test_buckets_hold_their_tokens():
     assert [bucket(n) for n in (1, 2, 3, 5, 16, 17, 281)] == [1, 2, 4, 8, 16, 32, 288]

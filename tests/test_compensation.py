@@ -46,7 +46,7 @@ def chunk_with(history: ActionHistory) -> Chunk:
 
 @pytest.mark.parametrize("known", range(N + 1))
 @pytest.mark.parametrize("min_verified", [0, 1, 2, 3])
-def test_assembly_for_every_position(known: int, min_verified: int) -> None:
+def test_assembly_for_every_position(known, min_verified):
     """Transcribed from the definition: step by step, DoF by DoF, with `hold` as the prediction."""
     tokens = [10 * i for i in range(known)]
     settings = CompensateSettings(min_verified=min_verified)
@@ -65,7 +65,7 @@ def test_assembly_for_every_position(known: int, min_verified: int) -> None:
     assert np.isfinite(actions).all()
 
 
-def test_further_steps_are_predicted_from_the_accepted_prefix() -> None:
+def test_further_steps_are_predicted_from_the_accepted_prefix():
     settings = CompensateSettings(steps=3)
     tokens = [127, 127, 127, 254, 150]
     actions = assemble(tokens, chunk_with(PAST), Linear(SPACE.is_strict, minimum=2), settings)
@@ -78,14 +78,14 @@ def test_further_steps_are_predicted_from_the_accepted_prefix() -> None:
     assert actions[1:, 3] == pytest.approx(first[3])
 
 
-def test_without_enough_history_the_target_decodes_on() -> None:
+def test_without_enough_history_the_target_decodes_on():
     chunk = chunk_with(history_of())
     chunk.tokens = [1, 2]
     assert not compensation().close(chunk)
     assert chunk.closed is None
 
 
-def test_the_filter_rests_after_a_compensation() -> None:
+def test_the_filter_rests_after_a_compensation():
     resting = compensation(rest=2)
     closed = []
     for _ in range(7):
@@ -117,7 +117,7 @@ class Known(Proposer):
 
 @pytest.mark.parametrize("use_target_token", [True, False])
 @pytest.mark.parametrize("wrong", range(N))
-def test_a_filled_step_drops_nothing(wrong: int, use_target_token: bool) -> None:
+def test_a_filled_step_drops_nothing(wrong, use_target_token):
     """The target's greedy tokens, given those that were filled; predicted values are executed without rounding."""
     prompt = prompt_of(3)
     truth = plain_greedy(TARGET, prompt)
@@ -146,7 +146,7 @@ def test_a_filled_step_drops_nothing(wrong: int, use_target_token: bool) -> None
 
 @pytest.mark.parametrize("use_target_token", [True, False])
 @pytest.mark.parametrize("wrong", range(N))
-def test_one_forward_whatever_is_rejected(wrong: int, use_target_token: bool) -> None:
+def test_one_forward_whatever_is_rejected(wrong, use_target_token):
     """An in-prefill draft whose token `wrong` is off: one forward, the target's tokens up to it, the rest predicted."""
     prompt = prompt_of(3)
     truth = plain_greedy(TARGET, prompt)
@@ -169,7 +169,7 @@ def test_one_forward_whatever_is_rejected(wrong: int, use_target_token: bool) ->
 
 
 @pytest.mark.parametrize("wrong", range(N - 1))
-def test_what_the_rejected_draft_had_goes_before_the_prediction(wrong: int) -> None:
+def test_what_the_rejected_draft_had_goes_before_the_prediction(wrong):
     """predictor=draft: behind the target's token come the draft's own values; the gripper is held."""
     prompt = prompt_of(3)
     truth = plain_greedy(TARGET, prompt)
@@ -189,7 +189,7 @@ def test_what_the_rejected_draft_had_goes_before_the_prediction(wrong: int) -> N
 
 
 @pytest.mark.parametrize("wrong", range(2 * D - 1))
-def test_without_a_gripper_to_hold_the_drafts_is_taken(wrong: int) -> None:
+def test_without_a_gripper_to_hold_the_drafts_is_taken(wrong):
     """predictor=draft at an episode's first decode: one forward all the same."""
     prompt = prompt_of(3)
     truth = plain_greedy(TARGET, prompt)

@@ -65,7 +65,7 @@ def checked(overrides: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_preset_is_the_parts_that_its_name_promises(method: str) -> None:
+def test_a_preset_is_the_parts_that_its_name_promises(method):
     asked = composed(f"method={method}")
     assert asked.method == method
     if method in PRESETS:
@@ -75,7 +75,7 @@ def test_a_preset_is_the_parts_that_its_name_promises(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_settings_survive_a_file(method: str) -> None:
+def test_settings_survive_a_file(method):
     asked = composed(f"method={method}", "threshold=change", "policy.artifacts={own: mine}")
     plain = dataclasses.asdict(asked)
     assert settings_from(plain) == asked
@@ -105,14 +105,14 @@ def test_settings_survive_a_file(method: str) -> None:
         ("method=spec_vla proposer.depth=0", "proposer.depth=0"),
     ],
 )
-def test_what_does_not_belong_together_is_refused(overrides: str, says: str) -> None:
+def test_what_does_not_belong_together_is_refused(overrides, says):
     with pytest.raises(KervError) as refused:
         checked(overrides)
     assert says in str(refused.value)
     assert "\n" not in str(refused.value)
 
 
-def test_only_what_needs_no_states_can_be_chosen_before_the_prefill() -> None:
+def test_only_what_needs_no_states_can_be_chosen_before_the_prefill():
     before = groups()["prefill_draft"]
     assert {"none", "early", "hold", "kalman", "retrieval", "merged"} <= set(before)
     assert not {"drafter", "hybrid", "jacobi"} & set(before)
@@ -136,7 +136,7 @@ def test_only_what_needs_no_states_can_be_chosen_before_the_prefill() -> None:
         ("seed=99999 episodes=2", "seed 100000 is for evaluation"),
     ],
 )
-def test_a_rollout_that_cannot_be_is_refused_before_a_policy_is_read(overrides: str, says: str) -> None:
+def test_a_rollout_that_cannot_be_is_refused_before_a_policy_is_read(overrides, says):
     with pytest.raises(UsageError) as refused:
         check_rollout(composed("task=reach", *overrides.split()))
     assert says in str(refused.value)
@@ -165,6 +165,6 @@ def test_a_rollout_that_cannot_be_is_refused_before_a_policy_is_read(overrides: 
         ("method=sp_vla", ()),
     ],
 )
-def test_a_method_needs_what_its_parts_read_and_nothing_else(overrides: str, wanted: tuple[str, ...]) -> None:
+def test_a_method_needs_what_its_parts_read_and_nothing_else(overrides, wanted):
     assert set(Method.of(composed(*overrides.split())).needs) == set(wanted)
     assert len(Method.of(composed(*overrides.split())).needs) == len(wanted)

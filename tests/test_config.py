@@ -2,7 +2,6 @@
 
 from dataclasses import asdict, fields, is_dataclass
 from itertools import chain
-from typing import Any
 
 import pytest
 import yaml
@@ -21,7 +20,7 @@ SCHEMAS = {name.replace(" ", "_"): part.settings for name, part in parts("comman
 HOMES = {"target": "train_target", "grow": "build_target", "drafter": "train_drafter", "study": "sweep"}
 
 
-def test_every_command_composes_and_shows_what_every_setting_is() -> None:
+def test_every_command_composes_and_shows_what_every_setting_is():
     for command, schema in SCHEMAS.items():
         settings = compose(command, [], schema)
         shown = settings_yaml(settings)
@@ -29,10 +28,10 @@ def test_every_command_composes_and_shows_what_every_setting_is() -> None:
         assert yaml.safe_load(shown) == asdict(settings)  # the descriptions are comments
 
 
-def test_every_setting_has_a_description() -> None:
+def test_every_setting_has_a_description():
     undescribed: list[str] = []
 
-    def look(value: Any, prefix: str) -> None:
+    def look(value, prefix):
         for at in fields(value):
             undescribed.extend([f"{prefix}.{at.name}"] if at.name != "kind" and not description(at) else [])
             if is_dataclass(at.default_factory):  # the settings of a part are the part's
@@ -48,14 +47,14 @@ PARTS = {group: groups()[group] for group in PART_GROUPS}
 
 
 @pytest.mark.parametrize("choice", list(chain(*([(g, n) for n in names] for g, names in WHOLE.items()))))
-def test_every_config_composes(choice: tuple[str, str]) -> None:
+def test_every_config_composes(choice):
     group, name = choice
     command = HOMES.get(name if group == "train" else group, "train_target" if group == "train" else "rollout")
     compose(command, [f"{group}={name}"], SCHEMAS[command])
 
 
 @pytest.mark.parametrize("row", range(max(map(len, PARTS.values()))))
-def test_every_config_of_a_part_composes(row: int) -> None:
+def test_every_config_of_a_part_composes(row):
     """One of every group at a time."""
     names = {group: names[row % len(names)] for group, names in PARTS.items()}
     settings = compose("rollout", [f"{group}={name}" for group, name in names.items()], RolloutSettings)
@@ -67,7 +66,7 @@ def test_every_config_of_a_part_composes(row: int) -> None:
         assert name in parts(part.kind) or (conf_dir() / group / f"{name}.yaml").is_file()
 
 
-def test_grids_expand_in_hydras_grammar() -> None:
+def test_grids_expand_in_hydras_grammar():
     assert expand(["method=ar,spec_vla", "threshold.r=0,9"]) == [
         ["method=ar", "threshold.r=0"],
         ["method=ar", "threshold.r=9"],
@@ -79,12 +78,12 @@ def test_grids_expand_in_hydras_grammar() -> None:
     assert swept_keys(["method=ar", "threshold.r=0,9"]) == ["threshold.r"]
 
 
-def test_a_study_refuses_what_it_sets_itself() -> None:
+def test_a_study_refuses_what_it_sets_itself():
     with pytest.raises(UsageError, match=r"sets threshold\.r itself"):
         resolve(["study=threshold", "threshold.r=3"])
 
 
-def test_a_study_composes_each_choice_of_parts_once() -> None:
+def test_a_study_composes_each_choice_of_parts_once():
     """145 settings take 1 s; each composition of Hydra takes 0.05 s."""
     before = _composed.cache_info().misses
     assert len(resolve(["study=stress"]).settings) == 145

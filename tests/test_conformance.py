@@ -2,7 +2,6 @@
 
 import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,14 +28,14 @@ def failures(found: list[Finding]) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("target", [OwnPolicy(), MockTarget(chunk=1)], ids=["own_policy", "own_target"])
-def test_the_examples_keep_the_protocol(target: Any) -> None:
+def test_the_examples_keep_the_protocol(target):
     found = check_target(target, SEEN)
     assert failures(found) == {}
     assert len(found) == 12
 
 
 @pytest.mark.bits
-def test_the_example_without_a_cache_is_decoded_losslessly() -> None:
+def test_the_example_without_a_cache_is_decoded_losslessly():
     target = OwnPolicy()
     prompt = target.encode(SEEN)
     truth = plain_greedy(target, prompt)
@@ -54,10 +53,10 @@ class Forgetful(Remembered):
 def broken(name: str) -> OwnPolicy:
     target: Any = OwnPolicy()
 
-    def right(x: Any, positions: Any, cache: Any = None, seen: Any = None) -> torch.Tensor:
+    def right(x, positions, cache=None, seen=None):
         return OwnPolicy.forward(target, x, positions, cache, seen)
 
-    def everything(x: Any) -> np.ndarray:
+    def everything(x):
         return np.ones((x.shape[1],) * 2, dtype=bool)
 
     wrong: dict[str, dict[str, Any]] = {
@@ -94,11 +93,11 @@ def broken(name: str) -> OwnPolicy:
         ("members", "members"),
     ],
 )
-def test_every_way_of_breaking_it_is_found(name: str, what: str) -> None:
+def test_every_way_of_breaking_it_is_found(name, what):
     assert what in failures(check_target(broken(name), SEEN))
 
 
-def test_doctor_checks_a_policy_on_disk(policies: Path) -> None:
+def test_doctor_checks_a_policy_on_disk(policies):
     for name, code, says in (("nano-state", 0, "tree attention"), ("nothing", 2, "no target 'nothing'")):
         run = CliRunner().invoke(app, ["doctor", f"target={name}", f"results={policies}"])
         assert run.exit_code == code, run.output
@@ -108,7 +107,7 @@ def test_doctor_checks_a_policy_on_disk(policies: Path) -> None:
 # --- environments
 
 
-def test_insertion_keeps_the_protocol() -> None:
+def test_insertion_keeps_the_protocol():
     found = check_environment(INSERTION, 100_000)
     assert failures(found) == {}
     assert len(found) == 5
@@ -140,7 +139,7 @@ class Greedy(InsertionWorld):
     ("world", "what"),
     [(Noisy, "same seed, same episode"), (Blank, "frames"), (Greedy, "another seed, another start")],
 )
-def test_a_broken_environment_is_found(monkeypatch: pytest.MonkeyPatch, world: type[InsertionWorld], what: str) -> None:
+def test_a_broken_environment_is_found(monkeypatch, world, what):
     monkeypatch.setattr(sys.modules[__name__], "Chosen", world, raising=False)
     spec = replace(INSERTION, world_class=f"{__name__}:Chosen", expert_class="")
     assert what in failures(check_environment(spec, 100_000))

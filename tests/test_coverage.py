@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-from pathlib import Path
 
 import pytest
 from test_calibration import write_dataset
@@ -22,21 +21,19 @@ from kerv_cli.worlds import resolve_tasks
         ("policy.artifacts.certificate=m method=one_pass_certified", "calibrate success policy.target=mt10-vision"),
     ],
 )
-def test_a_missing_artifact_with_a_name_is_answered_with_the_command_that_makes_it(
-    words: str, command: str, tmp_path: Path
-) -> None:
+def test_a_missing_artifact_with_a_name_is_answered_with_the_command_that_makes_it(words, command, tmp_path):
     run = CliRunner().invoke(app, ["rollout", *words.split(), f"results={tmp_path / 'results'}"])
     assert run.exit_code == 1
     assert f"kerv {command} {words.split()[0]}" in run.stderr
 
 
 @pytest.mark.usefixtures("few_validations")
-def test_drafts_of_seven_tasks_are_made_as_the_note_of_their_study_says(policies: Path, tmp_path: Path) -> None:
+def test_drafts_of_seven_tasks_are_made_as_the_note_of_their_study_says(policies, tmp_path):
     results = tmp_path / "results"
     shutil.copytree(policies, results)
     write_dataset(results / "artifacts/demos/mt10", names=resolve_tasks(["MT10"]))
 
-    def kerv(*words: str) -> str:
+    def kerv(*words):
         result = CliRunner().invoke(app, [*words, f"results={results}"])
         assert result.exit_code == 0, result.output
         return str(result.output)

@@ -18,7 +18,7 @@ from kerv_cli.targets.compact.trunk import Trunk
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 
 
-def test_a_captured_graph_computes_what_eager_forwards_do() -> None:
+def test_a_captured_graph_computes_what_eager_forwards_do():
     torch.manual_seed(0)
     trunk = Trunk(64, 3, 4, 160).cuda().eval()
     x, outputs = torch.randn(1, 40, 64, device="cuda"), []
@@ -34,7 +34,7 @@ def test_a_captured_graph_computes_what_eager_forwards_do() -> None:
     assert torch.allclose(*outputs, atol=1e-4)
 
 
-def test_strict_methods_decode_the_baselines_tokens() -> None:
+def test_strict_methods_decode_the_baselines_tokens():
     model = open_model(BenchSettings(model="nano", dtype="float32", runtime=RuntimeSettings(device="cuda")))
     autoregressive = Decoder(model.target).decode(model.observation)
     assert sum(autoregressive.phases.values()) == pytest.approx(autoregressive.seconds, rel=0.2)
@@ -42,7 +42,7 @@ def test_strict_methods_decode_the_baselines_tokens() -> None:
         assert Decoder(model.target, Parts(proposer=proposer)).decode(model.observation).tokens == autoregressive.tokens
 
 
-def test_a_round_waits_once() -> None:
+def test_a_round_waits_once():
     model = open_model(BenchSettings(model="nano", dtype="float32", runtime=RuntimeSettings(device="cuda")))
     for proposer in (None, JacobiProposer(), *(DrafterProposer(model.drafter, model.target, 5, k, 9) for k in (1, 3))):
         decoder = Decoder(model.target, Parts(proposer=proposer))
@@ -56,7 +56,7 @@ def test_a_round_waits_once() -> None:
         assert len(waits) <= record.forwards
 
 
-def test_ties_in_bfloat16_are_few() -> None:
+def test_ties_in_bfloat16_are_few():
     model = open_model(BenchSettings(model="nano", dtype="bfloat16", runtime=RuntimeSettings(device="cuda")))
     differ, compared = flipped(model, 4)
     assert differ <= compared // 4

@@ -1,7 +1,6 @@
 """Balanced batches, datasets that add up, and DAgger."""
 
 from contextlib import nullcontext
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,7 +29,7 @@ SHORT = CameraSettings()
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(tmp_path_factory):
     """Two small datasets of real demonstrations: `few` of one task, `more` of another."""
     folder = tmp_path_factory.mktemp("datasets")
     for name, task in (("few", "drawer-close-v3"), ("more", "reach-v3")):
@@ -38,11 +37,11 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_balanced_tasks_are_drawn_alike() -> None:
+def test_balanced_tasks_are_drawn_alike():
     tasks = torch.tensor([0] * 900 + [1] * 100)
     generator = torch.Generator().manual_seed(0)
 
-    def share(balance: float) -> float:
+    def share(balance):
         weights = task_weights(tasks, balance)
         drawn = draw_samples(1000, 20_000, generator, None if weights is None else weights.cumsum(0))
         return float(tasks[drawn].double().mean())
@@ -52,7 +51,7 @@ def test_balanced_tasks_are_drawn_alike() -> None:
     assert share(0.5) == pytest.approx(0.25, abs=0.02)  # 1 : 3, the root of 1 : 9
 
 
-def test_datasets_add_up(results: Path) -> None:
+def test_datasets_add_up(results):
     few, more, both = (open_demos(str(results), name) for name in ("few", "more", "few+more"))
     assert [e.path for e in both.episodes] == [e.path for e in (*few.episodes, *more.episodes)]
     assert set(both.manifest.tasks) == {"drawer-close-v3", "reach-v3"}
@@ -60,7 +59,7 @@ def test_datasets_add_up(results: Path) -> None:
     assert both.load(5).task == "reach-v3"
 
 
-def test_datasets_of_other_cameras_do_not_add_up(results: Path, tmp_path: Path) -> None:
+def test_datasets_of_other_cameras_do_not_add_up(results, tmp_path):
     other = DemoConfig(("reach-v3",), 1, camera=CameraSettings(size=48), frame_stride=50, workers=1)
     record(other, tmp_path / "other")
     with pytest.raises(CheckpointError, match="another camera"):
@@ -72,7 +71,7 @@ def acts_of(target: str, spec: EnvironmentSpec, world: WorldSettings | None = No
 
 
 @pytest.mark.bits
-def test_a_target_acts_and_the_expert_labels(tmp_path: Path) -> None:
+def test_a_target_acts_and_the_expert_labels(tmp_path):
     acts = acts_of("mt10-state", SPEC)
     tasks, share = ("reach-v3",), 0.5
     config = DemoConfig(tasks, 2, camera=SHORT, frame_stride=20, workers=1, horizon=60, expert_share=share)
@@ -95,7 +94,7 @@ def test_a_target_acts_and_the_expert_labels(tmp_path: Path) -> None:
     world.close()
 
 
-def test_a_policy_acts_by_its_method(tmp_path: Path) -> None:
+def test_a_policy_acts_by_its_method(tmp_path):
     words = ("policy=vision", "method=early_unverified", "task=reach", f"name={tmp_path / 'visited'}", "episodes=1")
     short = ("world.horizon=12", "expert_share=0", "frame_stride=4", "runtime.workers=1")
     done = CliRunner().invoke(app, ["demos", *words, *short])
@@ -111,7 +110,7 @@ def test_a_policy_acts_by_its_method(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("method", ["ar", "early_unverified"])
-def test_the_chunk_counts_and_is_executed(method: str) -> None:
+def test_the_chunk_counts_and_is_executed(method):
     words = ["policy=vision", f"method={method}"]
     whole, two = (PolicyActs.of(compose("demos", [*words, f"chunk={n}"], DemosSettings), SPEC) for n in (0, 2))
     assert whole.sha256 != two.sha256
@@ -129,8 +128,6 @@ def test_the_chunk_counts_and_is_executed(method: str) -> None:
         ("mt10-state", spec_of("insert-peg"), CameraSettings(), "target 'mt10-state'"),
     ],
 )
-def test_only_further_views_may_differ_from_what_the_target_was_trained_on(
-    target: str, spec: EnvironmentSpec, camera: CameraSettings, says: str
-) -> None:
+def test_only_further_views_may_differ_from_what_the_target_was_trained_on(target, spec, camera, says):
     with pytest.raises((UsageError, CheckpointError), match=says) if says else nullcontext():
         assert acts_of(target, spec, WorldSettings(camera=camera)).sha256

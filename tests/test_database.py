@@ -7,7 +7,6 @@ import resource
 import signal
 import sqlite3
 import time
-from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
@@ -18,12 +17,10 @@ from typer.testing import CliRunner
 from kerv_cli.base.errors import CheckpointError, KervError, StorageError, UsageError
 from kerv_cli.catalogue.folders import import_results
 from kerv_cli.cli.app import app
-from kerv_cli.engine.record import PHASES, EpisodeRecord
+from kerv_cli.engine.record import PHASES
 from kerv_cli.episodes.rows import decodes_table, episode_row
 from kerv_cli.lab import database as module
 from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, FILE, RUNS, STUDIES, Database
-from kerv_cli.lab.execute import RunEpisode
-from kerv_cli.lab.plan import Setting
 from kerv_cli.lab.runs import Run, run_rows
 from kerv_cli.lab.store import StudyStore, studies
 from kerv_cli.report.tables import load_study
@@ -56,13 +53,13 @@ def told(error: pytest.ExceptionInfo[KervError]) -> str:
     return message
 
 
-def test_reading_creates_nothing(database: Database, tmp_path: Path) -> None:
+def test_reading_creates_nothing(database, tmp_path):
     assert studies(database) == run_rows(database) == []
     assert StudyStore(tmp_path, "threshold").counts() == (0, 0)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_episode_comes_back_as_it_was(database: Database) -> None:
+def test_an_episode_comes_back_as_it_was(database):
     setting = STUDY.settings[-1]
     records = {seed: episode(setting, "reach-v3", seed) for seed in range(100_000, 100_004)}
     decodes = records[100_000].decodes
@@ -80,7 +77,7 @@ def test_an_episode_comes_back_as_it_was(database: Database) -> None:
     assert store.load().settings[0].settings == study_of({"ar": settings_of("ar")}, ["reach-v3"]).settings[0].settings
 
 
-def test_episode_rows_sum_their_decodes() -> None:
+def test_episode_rows_sum_their_decodes():
     record = episode(STUDY.settings[-1], "reach-v3", 100_000)
     row = episode_row(record)
     assert sum(row[f"seconds.{phase}"] for phase in PHASES) == pytest.approx(row["seconds"])
@@ -89,8 +86,8 @@ def test_episode_rows_sum_their_decodes() -> None:
     assert row["committed"] > row["accepted"]
 
 
-def test_what_is_no_number_is_stored_as_unknown(database: Database) -> None:
-    def run(seed: int) -> EpisodeRecord:
+def test_what_is_no_number_is_stored_as_unknown(database):
+    def run(seed):
         deviates = dataclasses.replace(episode(STUDY.settings[0], "reach-v3", seed).decodes[0], deviation=float("nan"))
         return still_episode("reach-v3", seed, False, [deviates])
 
@@ -99,7 +96,7 @@ def test_what_is_no_number_is_stored_as_unknown(database: Database) -> None:
     assert store.frame()["deviation_sum"].isna().all()
 
 
-def test_a_failed_transaction_leaves_nothing(database: Database) -> None:
+def test_a_failed_transaction_leaves_nothing(database):
     begun(database, "a")
     with pytest.raises(RuntimeError), database.writing() as connection:  # noqa: PT012
         connection.execute(sa.delete(STUDIES))
@@ -123,7 +120,7 @@ if all(others):
 """
 
 
-def test_first_commands_at_once_create_one_set_of_tables(database: Database, tmp_path: Path) -> None:
+def test_first_commands_at_once_create_one_set_of_tables(database, tmp_path):
     with python(BEGUN + WRITERS, tmp_path) as process:
         assert process.wait(60) == 0
     assert count(database, STUDIES) == 100
@@ -136,7 +133,7 @@ with database.writing() as connection:
 """
 
 
-def test_a_kill_in_a_transaction_leaves_nothing(database: Database, tmp_path: Path) -> None:
+def test_a_kill_in_a_transaction_leaves_nothing(database, tmp_path):
     begun(database, "a")
     with python(BEGUN + KILLED, tmp_path) as process:
         assert process.wait(60) == -signal.SIGKILL
@@ -149,7 +146,7 @@ def as_version(monkeypatch: pytest.MonkeyPatch, version: int, *statements: str) 
     monkeypatch.setattr(module, "MIGRATIONS", {version - 1: statements})
 
 
-def test_older_tables_are_migrated_in_one_transaction(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_older_tables_are_migrated_in_one_transaction(database, monkeypatch):
     begun(database, "a")
     rename = "UPDATE studies SET name = 'b'"
     as_version(monkeypatch, 2, "ALTER TABLE studies ADD COLUMN colour TEXT", rename, "SELECT * FROM nowhere")
@@ -164,7 +161,7 @@ def test_older_tables_are_migrated_in_one_transaction(database: Database, monkey
         assert connection.exec_driver_sql("SELECT colour FROM studies").all() == [(None,)]
 
 
-def test_a_measure_that_an_older_kerv_did_not_store_is_missing_until_it_is_measured(tmp_path: Path) -> None:
+def test_a_measure_that_an_older_kerv_did_not_store_is_missing_until_it_is_measured(tmp_path):
     swept(tmp_path / "old", STUDY)
     with contextlib.closing(sqlite3.connect(tmp_path / "old" / FILE)) as file:
         file.execute("ALTER TABLE episodes DROP COLUMN closest_approach")
@@ -178,7 +175,7 @@ def test_a_measure_that_an_older_kerv_did_not_store_is_missing_until_it_is_measu
     assert store.frame()["closest_approach"].isna().all()
 
 
-def test_newer_tables_are_refused(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_newer_tables_are_refused(database, monkeypatch):
     begun(database, "a")
     as_version(monkeypatch, 0)
     with pytest.raises(CheckpointError, match="newer kerv") as error:
@@ -189,7 +186,7 @@ def test_newer_tables_are_refused(database: Database, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("harm", ["no database", "cut", "changed", "empty", "a folder"])
-def test_a_damaged_file_is_one_line(tmp_path: Path, harm: str) -> None:
+def test_a_damaged_file_is_one_line(tmp_path, harm):
     swept(tmp_path, STUDY)
     path = tmp_path / FILE
     content = path.read_bytes()
@@ -215,7 +212,7 @@ def test_a_damaged_file_is_one_line(tmp_path: Path, harm: str) -> None:
     assert "Traceback" not in result.output
 
 
-def test_a_folder_that_cannot_be_written_to_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_cannot_be_written_to_can_be_read(tmp_path, monkeypatch):
     swept(tmp_path, STUDY)
     before = set(tmp_path.iterdir())
     monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)
@@ -226,7 +223,7 @@ def test_a_folder_that_cannot_be_written_to_can_be_read(tmp_path: Path, monkeypa
     assert told(error)
 
 
-def test_a_locked_file_says_what_else_to_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_locked_file_says_what_else_to_use(tmp_path, monkeypatch):
     begun(Database(tmp_path), "a")
     monkeypatch.setattr(module, "LOCK_SECONDS", 0)
     other = sqlite3.connect(tmp_path / FILE)
@@ -238,13 +235,13 @@ def test_a_locked_file_says_what_else_to_use(tmp_path: Path, monkeypatch: pytest
     other.close()
 
 
-def test_a_full_disk_keeps_what_was_committed(tmp_path: Path) -> None:
+def test_a_full_disk_keeps_what_was_committed(tmp_path):
     """A limit on the size of files stands for the disk."""
     study = threshold_study(["reach-v3", "push-v3"], episodes=5)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
 
-    def filling(setting: Setting, task: str) -> RunEpisode:
-        def run(seed: int) -> EpisodeRecord:
+    def filling(setting, task):
+        def run(seed):
             if seed == 100_002:
                 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
             return episode(setting, task, seed)
@@ -264,7 +261,7 @@ def test_a_full_disk_keeps_what_was_committed(tmp_path: Path) -> None:
     assert store.counts() == (40, 40)
 
 
-def test_a_study_that_is_not_there_names_what_to_run(database: Database, tmp_path: Path) -> None:
+def test_a_study_that_is_not_there_names_what_to_run(database, tmp_path):
     with pytest.raises(UsageError, match=r"no study 'threshold'.*run `kerv sweep study=threshold`") as error:
         StudyStore(tmp_path, "threshold").load()
     assert told(error)
@@ -273,7 +270,7 @@ def test_a_study_that_is_not_there_names_what_to_run(database: Database, tmp_pat
             StudyStore(tmp_path, name)
 
 
-def test_a_removed_study_leaves_nothing_but_what_others_want(database: Database) -> None:
+def test_a_removed_study_leaves_nothing_but_what_others_want(database):
     store, _ = swept(database.results, STUDY)
     other, _ = swept(database.results, threshold_study(["reach-v3"], radii=(3,), name="other"))
     store.remove()
@@ -284,10 +281,10 @@ def test_a_removed_study_leaves_nothing_but_what_others_want(database: Database)
     assert [count(database, table) for table in (EPISODES, DECODES, BLOCKS, STUDIES)] == [0] * 4
 
 
-def test_a_run_has_a_row_from_its_first_second_to_its_end(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_has_a_row_from_its_first_second_to_its_end(database, monkeypatch):
     monkeypatch.setattr("kerv_cli.lab.runs.BEAT_SECONDS", 0.05)
 
-    def row() -> tuple[str, int, int, str]:
+    def row():
         (row,) = run_rows(database, "target", "mine")
         assert row.command == ("train", "target")
         return row.status, row.done, row.total, row.message

@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from test_calibration import write_dataset
 from typer.testing import CliRunner
 
 from kerv_cli.base.errors import CheckpointError, StorageError, UnknownName, UsageError
-from kerv_cli.base.spaces import ActionSpace, Observation
+from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.methods.heisd.datastore import Datastore, Manifest, Shard, check_seeds, prompt_key
@@ -64,14 +64,14 @@ def write_demos(
 ) -> None:
     """A recorded dataset of both tasks."""
 
-    def made(task: str, seed: int) -> DemoEpisode:
+    def made(task, seed):
         return make(task, seed, lengths[seed], tail, size)
 
     write_dataset(folder, make=made, names=TASKS[::-1], seeds=lengths)
 
 
 @pytest.fixture(scope="module")
-def results(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(policies, tmp_path_factory):
     """Policies, demonstrations and a datastore of each policy."""
     results = tmp_path_factory.mktemp("datastore") / "results"
     shutil.copytree(policies, results)
@@ -82,7 +82,7 @@ def results(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def copy(results: Path, tmp_path: Path) -> Path:
+def copy(results, tmp_path):
     """A copy that a test may change."""
     return Path(shutil.copytree(results, tmp_path / "results"))
 
@@ -120,7 +120,7 @@ def store_of(vectors: np.ndarray, shards: dict[str, slice], seeds: np.ndarray | 
 @pytest.mark.bits
 @settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(0, 20), st.integers(1, 12), st.integers(1, 4))
-def test_the_search_is_brute_force_with_ties_in_stored_order(seed: int, n: int, before: int, k: int, span: int) -> None:
+def test_the_search_is_brute_force_with_ties_in_stored_order(seed, n, before, k, span):
     """Small whole numbers, so that scores are exact and ties are many."""
     rng = np.random.default_rng(seed)
     vectors = rng.integers(-span, span + 1, (before + n, 3)).astype(np.float32)
@@ -147,7 +147,7 @@ def test_the_search_is_brute_force_with_ties_in_stored_order(seed: int, n: int, 
     k=st.integers(1, 9),
     noise=st.sampled_from([0.0, 1e-7, 1e-3, 0.1]),
 )
-def test_the_search_is_exact_near_a_subspace(seed: int, size: tuple[int, int], rank: int, k: int, noise: float) -> None:
+def test_the_search_is_exact_near_a_subspace(seed, size, rank, k, noise):
     """Keys near a subspace, as an encoder's are; with noise rows differ in the rest, too."""
     rng, (rows, width) = np.random.default_rng(seed), size
     vectors = rng.normal(size=(rows, rank)) @ rng.normal(size=(rank, width)) + noise * rng.normal(size=size)
@@ -168,7 +168,7 @@ def entries(store: Datastore) -> list[tuple[str, int, int]]:
 
 
 @pytest.mark.parametrize(("name", "stride"), [("nano-state", 1), ("nano-vision", 2)])
-def test_every_observed_step_is_one_entry_by_task_seed_and_step(results: Path, name: str, stride: int) -> None:
+def test_every_observed_step_is_one_entry_by_task_seed_and_step(results, name, stride):
     store, _, _ = opened(results, name)
     expected = [(task, s, t) for task in TASKS for s, steps in LENGTHS.items() for t in range(0, steps, stride)]
     assert entries(store) == sorted(expected) == expected
@@ -176,7 +176,7 @@ def test_every_observed_step_is_one_entry_by_task_seed_and_step(results: Path, n
     assert np.linalg.norm(store.vectors, axis=1) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_a_chunk_is_what_follows_in_its_own_episode(results: Path) -> None:
+def test_a_chunk_is_what_follows_in_its_own_episode(results):
     """The last entries' chunks run into the labels recorded beyond the success, never into the next episode."""
     store, target, _ = opened(results)
     for row, (task, seed, step) in enumerate(entries(store)):
@@ -185,7 +185,7 @@ def test_a_chunk_is_what_follows_in_its_own_episode(results: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["nano-state", "nano-vision"])
-def test_an_entry_is_found_by_its_own_observation(results: Path, name: str) -> None:
+def test_an_entry_is_found_by_its_own_observation(results, name):
     store, target, _ = opened(results, name)
     shown, instruction = episode("reach-v3", 1, LENGTHS[1]), SPEC.task("reach").instruction
     with torch.inference_mode():
@@ -199,7 +199,7 @@ def test_an_entry_is_found_by_its_own_observation(results: Path, name: str) -> N
             assert (neighbours.chunks.shape, neighbours.chunks.dtype) == ((3, 16), np.int64)
 
 
-def test_the_key_pools_the_named_parts_of_the_prompt(results: Path) -> None:
+def test_the_key_pools_the_named_parts_of_the_prompt(results):
     _, target, _ = opened(results, "nano-vision")
     prompt = torch.randn(2, target.max_prompt, target.width)
     vision, scene, hand = prompt[:, :4].mean(1), prompt[:, 14:16].mean(1), prompt[:, 16]
@@ -215,14 +215,14 @@ def test_the_key_pools_the_named_parts_of_the_prompt(results: Path) -> None:
         prompt_key(prompt, state, ["vision"])
 
 
-def test_the_first_episodes_and_tasks_can_be_asked_for(copy: Path) -> None:
+def test_the_first_episodes_and_tasks_can_be_asked_for(copy):
     store = DatastoreBuild(asked(copy, task=["reach"], episodes=2, name="small", key=["proprioception"])).build()
     assert set(entries(store)) == {("reach-v3", s, t) for s in (0, 1) for t in range(LENGTHS[s])}
     assert store.manifest.tasks == {"reach-v3": Shard((0, 15), (0, 1))}
 
 
 @pytest.mark.parametrize(("name", "frames"), [("nano-state", 1), ("nano-vision", 2)])
-def test_a_thinned_datastore_of_half_the_bytes_holds_every_so_many_entry(copy: Path, name: str, frames: int) -> None:
+def test_a_thinned_datastore_of_half_the_bytes_holds_every_so_many_entry(copy, name, frames):
     whole, _, description = opened(copy, name)
     DatastoreBuild(asked(copy, name, stride=3, half=True)).build()
     thin = Datastore.open(folder_of(copy, name), description)
@@ -235,7 +235,7 @@ def test_a_thinned_datastore_of_half_the_bytes_holds_every_so_many_entry(copy: P
     assert np.load(folder_of(copy, name) / "vectors.npy").dtype == np.float16
 
 
-def test_projected_keys_find_nearly_always_the_same_neighbour_in_a_smaller_file(copy: Path) -> None:
+def test_projected_keys_find_nearly_always_the_same_neighbour_in_a_smaller_file(copy):
     write_demos(copy / "artifacts/demos/few", LENGTHS, make=smooth)
     DatastoreBuild(asked(copy)).build()
     whole, target, _ = opened(copy)
@@ -264,7 +264,7 @@ def test_projected_keys_find_nearly_always_the_same_neighbour_in_a_smaller_file(
     assert neighbours.similarity[0] == pytest.approx(1.0, abs=1e-5)
 
 
-def test_training_and_evaluation_seeds_are_proved_disjoint(results: Path, tmp_path: Path) -> None:
+def test_training_and_evaluation_seeds_are_proved_disjoint(results, tmp_path):
     last = SPEC.seeds.training.stop - 1
     check_seeds({"reach-v3": [0, last]}, "here")
     with pytest.raises(CheckpointError, match="here holds seed 50000 of reach-v3"):  # of selection
@@ -312,9 +312,7 @@ def cut(path: Path) -> None:
         (lambda f: shutil.rmtree(f), "no datastore in"),
     ],
 )
-def test_a_datastore_that_is_damaged_or_not_of_this_target_is_refused(
-    copy: Path, harm: Callable[[Path], None], says: str
-) -> None:
+def test_a_datastore_that_is_damaged_or_not_of_this_target_is_refused(copy, harm, says):
     harm(folder_of(copy))
     with pytest.raises(CheckpointError) as caught:
         opened(copy)
@@ -330,15 +328,13 @@ def test_a_datastore_that_is_damaged_or_not_of_this_target_is_refused(
         ({"task": ["push"]}, CheckpointError, "hold no episode of push-v3"),
     ],
 )
-def test_what_cannot_be_built_is_refused_at_once(
-    results: Path, changes: dict[str, Any], error: type[Exception], says: str
-) -> None:
+def test_what_cannot_be_built_is_refused_at_once(results, changes, error, says):
     with pytest.raises(error) as caught:
         DatastoreBuild(asked(results, **changes))
     assert says in str(caught.value)
 
 
-def test_demonstrations_that_do_not_fit_the_target_are_refused(copy: Path) -> None:
+def test_demonstrations_that_do_not_fit_the_target_are_refused(copy):
     write_demos(copy / "artifacts/demos/few", LENGTHS, tail=2)
     with pytest.raises(CheckpointError, match="2 labels after an episode's end, chunks of 4 need 3"):
         DatastoreBuild(asked(copy)).build()
@@ -348,7 +344,7 @@ def test_demonstrations_that_do_not_fit_the_target_are_refused(copy: Path) -> No
     assert opened(copy)[0].manifest.rows == 52  # what was there still is
 
 
-def test_only_a_datastore_is_ever_replaced(copy: Path) -> None:
+def test_only_a_datastore_is_ever_replaced(copy):
     other = copy / "artifacts/datastore/other"
     other.mkdir()
     assert DatastoreBuild(asked(copy, name="other")).folder == other
@@ -362,7 +358,7 @@ def test_only_a_datastore_is_ever_replaced(copy: Path) -> None:
 def refusing(real: Callable[..., Any]) -> Callable[..., Any]:
     """Does its work, then finds the disk full."""
 
-    def failing(*arguments: Any, **options: Any) -> Any:
+    def failing(*arguments, **options):
         real(*arguments, **options)
         raise OSError(28, "No space left on device")
 
@@ -371,9 +367,7 @@ def refusing(real: Callable[..., Any]) -> Callable[..., Any]:
 
 @pytest.mark.parametrize("stage", ["_write", "write_json", "sha256_of"])
 @pytest.mark.parametrize("before", [True, False])
-def test_a_build_that_fails_leaves_what_was_there(
-    copy: Path, monkeypatch: pytest.MonkeyPatch, stage: str, before: bool
-) -> None:
+def test_a_build_that_fails_leaves_what_was_there(copy, monkeypatch, stage, before):
     if not before:
         shutil.rmtree(folder_of(copy))
     parent = folder_of(copy).parent
@@ -388,7 +382,7 @@ def test_a_build_that_fails_leaves_what_was_there(
 
 
 @pytest.mark.bits
-def test_a_rebuild_replaces_the_whole_datastore_and_is_the_same(copy: Path) -> None:
+def test_a_rebuild_replaces_the_whole_datastore_and_is_the_same(copy):
     first = {p.name: p.read_bytes() for p in folder_of(copy).iterdir()}
     DatastoreBuild(asked(copy, episodes=1)).build()
     assert opened(copy)[0].manifest.rows == 2 * LENGTHS[0]
@@ -398,7 +392,7 @@ def test_a_rebuild_replaces_the_whole_datastore_and_is_the_same(copy: Path) -> N
     assert again["payload.parquet"] == first["payload.parquet"]
 
 
-def test_the_command_builds_and_reports(copy: Path) -> None:
+def test_the_command_builds_and_reports(copy):
     words = ["build", "datastore", "policy.target=nano-state", "demos=few", "task=reach,drawer-close"]
     words.append(f"results={copy}")
     run = CliRunner().invoke(app, [*words, "--plan"])
@@ -421,12 +415,10 @@ def ranked_paths(
     search. The i-th neighbour weighs 1 / i; a path leaves the neighbours it has followed with probability `cross`."""
     weights = [1.0 / (1 + i) for i in range(len(chunks))]
 
-    def share(some: set[int], all_: set[int]) -> float:
+    def share(some, all_):
         return sum(weights[i] for i in some) / sum(weights[i] for i in all_)
 
-    def below(
-        level: int, path: tuple[int, ...], odds: float, gave: set[int], followed: set[int]
-    ) -> Iterator[tuple[float, tuple[int, ...]]]:
+    def below(level, path, odds, gave, followed):
         if level == len(cuts):
             return
         first, last, strict = cuts[level]
@@ -454,9 +446,7 @@ def ranked_paths(
     st.sampled_from([0.0, 0.1, 0.5, 1.0]),
     st.floats(0, 1),
 )
-def test_a_limited_tree_holds_the_most_probable_groups(
-    seed: int, space: ActionSpace, k: int, span: int, start: int, depth: int, cross: float, where: float
-) -> None:
+def test_a_limited_tree_holds_the_most_probable_groups(seed, space, k, span, start, depth, cross, where):
     """Room for exactly the m most probable groups: the tree is these, where the next one is less probable."""
     chunks = np.random.default_rng(seed).integers(0, span, (k, 3 * space.dofs))
     paths = ranked_paths(chunks, list(space.segments(start, min(chunks.shape[1], start + depth))), cross)
@@ -472,7 +462,7 @@ def test_a_limited_tree_holds_the_most_probable_groups(
     assert set(leaves(smaller)) <= {path for _, path in paths}
 
 
-def test_of_equally_probable_groups_the_better_neighbours_comes_first() -> None:
+def test_of_equally_probable_groups_the_better_neighbours_comes_first():
     """The grippers 8 of neighbours 3 and 6 and 9 of neighbour 2 weigh 1/3 + 1/6 = 1/2; only the best neighbour, who
     went another way, gave the 8 before."""
     grippers = [8, 9, 8, 8, 8, 8]

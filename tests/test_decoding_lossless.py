@@ -1,7 +1,6 @@
 """The property that guards the engine: strict speculative decoding yields AR's tokens, token for token, in float32."""
 
 import functools
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -125,9 +124,7 @@ def assert_adds_up(chunk: Chunk) -> None:
     nodes=st.integers(0, 24),
     fixed=st.booleans(),
 )
-def test_strict_decoding_of_random_trees_equals_ar(
-    seed: int, layers: int, heads: int, chunk: int, nodes: int, fixed: bool
-) -> None:
+def test_strict_decoding_of_random_trees_equals_ar(seed, layers, heads, chunk, nodes, fixed):
     target = random_target(seed, layers, heads, chunk, fixed)
     prompt = random_prompt(target, seed)
     truth = plain_greedy(target, prompt)
@@ -146,9 +143,7 @@ def test_strict_decoding_of_random_trees_equals_ar(
     layers=st.integers(1, 2),
     fixed=st.booleans(),
 )
-def test_strict_decoding_with_a_drafter_equals_ar(
-    seed: int, chunk: int, depth: int, top_k: int, nodes: int, layers: int, fixed: bool
-) -> None:
+def test_strict_decoding_with_a_drafter_equals_ar(seed, chunk, depth, top_k, nodes, layers, fixed):
     target = random_target(seed, 2, 2, chunk, fixed)
     drafter = EagleDrafter().network(DrafterSettings(layers=layers), target).eval().requires_grad_(False)
     if fixed:
@@ -162,7 +157,7 @@ def test_strict_decoding_with_a_drafter_equals_ar(
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10_000), chunk=st.sampled_from([1, 4, 8]))
-def test_the_fixed_point_of_jacobi_decoding_is_ar(seed: int, chunk: int) -> None:
+def test_the_fixed_point_of_jacobi_decoding_is_ar(seed, chunk):
     target = random_target(seed, 2, 2, chunk)
     prompt = random_prompt(target, seed)
     result = decode(target, JacobiProposer(), prompt)
@@ -172,7 +167,7 @@ def test_the_fixed_point_of_jacobi_decoding_is_ar(seed: int, chunk: int) -> None
 
 
 @pytest.mark.parametrize("chunk", [1, 4, 8])
-def test_ar_takes_exactly_n_forwards(chunk: int) -> None:
+def test_ar_takes_exactly_n_forwards(chunk):
     target = random_target(3, 2, 2, chunk)
     prompt = random_prompt(target, 5)
     result = Decoder(target).decode_prompt(prompt)
@@ -181,15 +176,13 @@ def test_ar_takes_exactly_n_forwards(chunk: int) -> None:
 
 
 @pytest.mark.parametrize(("where", "most", "committed"), [("proposer", 5, [1, 6, 6, 3]), ("prefill_draft", 16, [16])])
-def test_a_perfect_draft_commits_depth_plus_bonus_and_never_overshoots(
-    where: str, most: int, committed: list[int]
-) -> None:
+def test_a_perfect_draft_commits_depth_plus_bonus_and_never_overshoots(where, most, committed):
     target = random_target(11, 2, 2, 4)
     prompt = random_prompt(target, 11)
     truth = plain_greedy(target, prompt)
 
     class Perfect(RandomTrees):
-        def propose(self, chunk: Chunk, depth: int) -> Draft:
+        def propose(self, chunk, depth):
             return Draft.of(self.truth[len(chunk.tokens) :][: min(most, depth)])
 
     result = Decoder(target, Parts(**{where: Perfect(truth, 0, 16)})).decode_prompt(prompt)  # type: ignore[arg-type]
@@ -207,9 +200,7 @@ def test_a_perfect_draft_commits_depth_plus_bonus_and_never_overshoots(
     drafting=st.booleans(),
     fixed=st.booleans(),
 )
-def test_drafts_verified_inside_the_prefill_are_lossless(
-    seed: int, heads: int, chunk: int, nodes: int, drafting: bool, fixed: bool
-) -> None:
+def test_drafts_verified_inside_the_prefill_are_lossless(seed, heads, chunk, nodes, drafting, fixed):
     """docs/methods.md §5: random trees in the prefill, then plain decoding or the drafter, still yield AR's tokens."""
     target = random_target(seed, 2, heads, chunk, fixed)
     prompt = random_prompt(target, seed)
@@ -224,7 +215,7 @@ def test_drafts_verified_inside_the_prefill_are_lossless(
     assert_adds_up(result)
 
 
-def test_a_drafter_drafts_the_same_tree_from_a_cache_of_fixed_shapes() -> None:
+def test_a_drafter_drafts_the_same_tree_from_a_cache_of_fixed_shapes():
     target = random_target(2, 2, 2, 4)
     drafter = EagleDrafter().network(DrafterSettings(), target).eval().requires_grad_(False)
     prompt = random_prompt(target, 2)
@@ -238,13 +229,13 @@ def test_a_drafter_drafts_the_same_tree_from_a_cache_of_fixed_shapes() -> None:
 
 @pytest.mark.parametrize("token", [-1, ACTIONS.tokens])
 @pytest.mark.parametrize("where", ["proposer", "prefill_draft"])
-def test_a_token_out_of_range_is_refused_with_its_proposers_name(where: str, token: int) -> None:
+def test_a_token_out_of_range_is_refused_with_its_proposers_name(where, token):
     target = random_target(1, 1, 1, 1)
 
     class Wrong(Proposer):
         name = "mine"
 
-        def propose(self, chunk: Chunk, depth: int) -> Draft:
+        def propose(self, chunk, depth):
             return Draft.of([0, token])
 
     with pytest.raises(KervError, match=f"'mine' drafted token {token}"):
@@ -275,9 +266,7 @@ def spaces(draw: st.DrawFn) -> ActionSpace:
     nodes=st.integers(0, 24),
     inside=st.booleans(),
 )
-def test_any_target_is_decoded_losslessly(
-    seed: int, actions: ActionSpace, chunk: int, words: int, nodes: int, inside: bool
-) -> None:
+def test_any_target_is_decoded_losslessly(seed, actions, chunk, words, nodes, inside):
     target = MockTarget(actions, chunk, seed=seed)
     shown = Observation(np.array([0.1 * seed]), np.zeros(0), " ".join("word" * (1 + i % 3) for i in range(words)))
     prompt = target.encode(shown)
@@ -290,7 +279,7 @@ def test_any_target_is_decoded_losslessly(
     assert_adds_up(result)
 
 
-def test_the_mock_sees_a_wrong_mask_position_or_cache() -> None:
+def test_the_mock_sees_a_wrong_mask_position_or_cache():
     """Otherwise it would prove nothing."""
     target = MockTarget()
     x, positions = torch.randn(1, 5, 8).double(), torch.arange(5)
@@ -308,7 +297,7 @@ def test_the_mock_sees_a_wrong_mask_position_or_cache() -> None:
         assert not torch.allclose(target.head(wrong)[0, -1], right)
 
 
-def test_a_target_of_your_own_is_loaded_by_its_family(tmp_path: Path) -> None:
+def test_a_target_of_your_own_is_loaded_by_its_family(tmp_path):
     fields = target_fields("mock", {"chunk": 3}, "metaworld", SEVEN, OBSERVATION)
     save_module(tmp_path, "target", torch.nn.Module(), fields)
     target, described = load_target(tmp_path)

@@ -42,7 +42,7 @@ def commands() -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """The YAML files that the pages show, under their names."""
     place = tmp_path_factory.mktemp("pages")
     for page in PAGES:
@@ -51,7 +51,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-def test_every_choice_that_a_page_a_preset_or_a_help_text_names_is_there() -> None:
+def test_every_choice_that_a_page_a_preset_or_a_help_text_names_is_there():
     known = groups()
     del known["target"]  # in other commands a policy's name, or a family of policies
     texts = {page.name: page.read_text(encoding="utf-8") for page in [*PAGES, *conf_dir().rglob("*.yaml")]}
@@ -66,12 +66,12 @@ def test_every_choice_that_a_page_a_preset_or_a_help_text_names_is_there() -> No
                 assert shown or f'add("{group}", "{name}"' in plugins, f"{place}: {group}={name}"
 
 
-def test_the_pages_show_commands() -> None:
+def test_the_pages_show_commands():
     assert len(commands()) > 40
 
 
 @pytest.mark.parametrize("command", [line for line in commands() if line.startswith("kerv ")])
-def test_a_documented_command_runs(command: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_documented_command_runs(command, folder, monkeypatch):
     monkeypatch.chdir(folder)
     words = shlex.split(command)[1:]
     monkeypatch.setenv("HOME", str(folder))
@@ -86,7 +86,7 @@ def test_a_documented_command_runs(command: str, folder: Path, monkeypatch: pyte
     assert result.exit_code == 0, f"{command}: {result.output}"
 
 
-def test_documented_rules_of_make_are_there() -> None:
+def test_documented_rules_of_make_are_there():
     rules = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
     for command in commands():
         words = command.split()
@@ -95,7 +95,7 @@ def test_documented_rules_of_make_are_there() -> None:
 
 
 @pytest.mark.parametrize("study", groups()["study"])
-def test_every_study_resolves(study: str) -> None:
+def test_every_study_resolves(study):
     """Beside the documented commands: what one composes, the other has."""
     resolved = resolve([f"study={study}"])
     assert resolved.study.name == study

@@ -37,7 +37,7 @@ def along(state: DrafterProposer, target: CompactTarget, tokens: list[int]) -> t
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize(("depth", "top_k", "nodes"), [(4, 3, 12), (3, 8, 50), (5, 2, 7), (5, 1, 5)])
-def test_every_child_is_among_its_own_paths_best(seed: int, depth: int, top_k: int, nodes: int) -> None:
+def test_every_child_is_among_its_own_paths_best(seed, depth, top_k, nodes):
     state, target, tree = drafted(seed, depth, top_k, nodes)
     assert 0 < len(tree) <= nodes
     assert max(tree.depths) < depth
@@ -50,7 +50,7 @@ def test_every_child_is_among_its_own_paths_best(seed: int, depth: int, top_k: i
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_kept_nodes_are_the_most_probable_ones(seed: int) -> None:
+def test_the_kept_nodes_are_the_most_probable_ones(seed):
     """With every child expanded (top_k wide enough for two levels) the ranking can be done by brute force."""
     state, target, tree = drafted(seed, 2, 4, 9)
     scores: dict[tuple[int, ...], float] = {}
@@ -64,7 +64,7 @@ def test_the_kept_nodes_are_the_most_probable_ones(seed: int) -> None:
     assert sorted(tuple(tree.tokens[i] for i in tree.path_to(n)) for n in range(len(tree))) == expected
 
 
-def test_true_states_replace_what_was_drafted() -> None:
+def test_true_states_replace_what_was_drafted():
     """After a round the cache holds what a drafter that never drafted would hold."""
     state, _, _ = drafted(1, 4, 3, 12)
     length = state.cache.length

@@ -1,7 +1,6 @@
 """The early drafter: what it reads, what it is trained on, and that it only serves the target it imitates."""
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -62,7 +61,7 @@ def drafter(settings: EarlySettings = SMALL, target: CompactTarget | None = None
     return early
 
 
-def test_pooling_takes_every_part_of_the_prompt_once() -> None:
+def test_pooling_takes_every_part_of_the_prompt_once():
     """Token i of the prompt is i everywhere, so the pooled vector shows what was taken from where."""
     prompt = torch.arange(10.0)[None, :, None].expand(1, 10, 16)
     target = shaped()
@@ -79,11 +78,11 @@ def tokens_of(early: EarlyNetwork, features: torch.Tensor, radius: int) -> list[
     return early.draft(features, radius)[0, :-1].long().tolist()
 
 
-def test_a_draft_is_the_argmax_of_the_forward_and_depends_on_all_it_is_shown() -> None:
+def test_a_draft_is_the_argmax_of_the_forward_and_depends_on_all_it_is_shown():
     early, target = drafter(), shaped()
     prompt = torch.randn(1, 10, 16, generator=torch.Generator().manual_seed(1))
 
-    def drafted(prompt: torch.Tensor, radius: int = 0) -> list[int]:
+    def drafted(prompt, radius=0):
         return tokens_of(early, target.pooled(prompt), radius)
 
     logits = early(target.pooled(prompt))
@@ -98,7 +97,7 @@ def test_a_draft_is_the_argmax_of_the_forward_and_depends_on_all_it_is_shown() -
 
 
 @pytest.mark.bits
-def test_packed_weights_give_the_same_logits() -> None:
+def test_packed_weights_give_the_same_logits():
     torch.manual_seed(0)
     early = drafter(EarlySettings(layers=2, width=24, rank=6))
     for parameter in early.parameters():  # fresh blocks begin as the identity, with gains of one
@@ -116,7 +115,7 @@ def test_packed_weights_give_the_same_logits() -> None:
     assert early.packed is None
 
 
-def test_features_are_standardised_and_constants_survive() -> None:
+def test_features_are_standardised_and_constants_survive():
     early = drafter()
     features = torch.randn(50, FEATURES, generator=torch.Generator().manual_seed(0)) * 30 + 7
     features[:, 3] = 1.25
@@ -126,7 +125,7 @@ def test_features_are_standardised_and_constants_survive() -> None:
     assert torch.allclose(early(features), plain(expected), atol=1e-3)
 
 
-def test_the_chosen_bin_is_the_one_most_likely_to_be_accepted() -> None:
+def test_the_chosen_bin_is_the_one_most_likely_to_be_accepted():
     """Against brute force: among all 255 bins, the chosen one's probability within the radius is the greatest (up to
     the small weight of closeness)."""
     generator = torch.Generator().manual_seed(3)
@@ -146,7 +145,7 @@ def test_the_chosen_bin_is_the_one_most_likely_to_be_accepted() -> None:
 
 
 @given(st.integers(0, 10_000), st.integers(0, 20))
-def test_the_odds_are_those_of_independent_tokens(seed: int, radius: int) -> None:
+def test_the_odds_are_those_of_independent_tokens(seed, radius):
     logits = 3 * torch.randn(2, 8, 255, generator=torch.Generator().manual_seed(seed))
     tokens, found = choose_with_odds(logits, radius, STRICT)
     assert torch.equal(tokens, choose(logits, radius, STRICT))
@@ -159,7 +158,7 @@ def test_the_odds_are_those_of_independent_tokens(seed: int, radius: int) -> Non
         assert float(found[row]) == pytest.approx(odds, rel=1e-3)
 
 
-def test_plain_and_perturbed_episodes_count_alike() -> None:
+def test_plain_and_perturbed_episodes_count_alike():
     """Three perturbed samples that fail at once and one plain sample that is drafted whole: half, not a quarter."""
     tokens = torch.full((4, 8), 50)
     perturbed = torch.tensor([True, True, True, False])
@@ -174,7 +173,7 @@ def test_plain_and_perturbed_episodes_count_alike() -> None:
     assert only["accepted_r9"] == 0.0
 
 
-def test_the_network_learns_what_the_teacher_says() -> None:
+def test_the_network_learns_what_the_teacher_says():
     """Tokens that are a function of the features are learned, and the score shows it."""
     generator = torch.Generator().manual_seed(0)
     features = torch.randn(256, FEATURES, generator=generator).sign()
@@ -199,7 +198,7 @@ def test_the_network_learns_what_the_teacher_says() -> None:
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory, policies: Path) -> Path:
+def results(tmp_path_factory, policies):
     """The nano policies' results folder with a few real demonstrations."""
     import shutil
 
@@ -219,7 +218,7 @@ def examples_of(
 
 @pytest.mark.bits
 @pytest.mark.parametrize("name", ["nano-vision", "nano-state"])
-def test_the_teachers_tokens_are_the_targets_own_decodes(results: Path, name: str) -> None:
+def test_the_teachers_tokens_are_the_targets_own_decodes(results, name):
     """Batched over episodes, yet sample by sample what the decoder gives for that observation."""
     from kerv_cli.engine.decoder import Decoder
 
@@ -240,14 +239,14 @@ def test_the_teachers_tokens_are_the_targets_own_decodes(results: Path, name: st
     assert 12 <= sum(map(len, few)) <= 18
 
 
-def test_a_single_episode_cannot_be_held_out() -> None:
+def test_a_single_episode_cannot_be_held_out():
     zeros = torch.zeros(4, dtype=torch.long)
     one = EarlyExamples(zeros[:, None], zeros, zeros.bool(), torch.zeros(4, 1))
     with pytest.raises(CheckpointError):
         split(one, 0.1)
 
 
-def test_it_trains_from_the_command_line_and_drafts_for_its_target_alone(results: Path) -> None:
+def test_it_trains_from_the_command_line_and_drafts_for_its_target_alone(results):
     words = ["train", "drafter", "drafter=early", "demos=few", "policy.target=nano-vision"]
     words += [
         "policy.artifacts.early=whole",
@@ -277,7 +276,7 @@ def test_it_trains_from_the_command_line_and_drafts_for_its_target_alone(results
 
 
 @pytest.mark.bits
-def test_a_saved_drafter_drafts_the_same_and_a_missing_one_says_what_to_run(tmp_path: Path, policies: Path) -> None:
+def test_a_saved_drafter_drafts_the_same_and_a_missing_one_says_what_to_run(tmp_path, policies):
     target, description = load_target(policies / "artifacts/target/nano-state")
     early = drafter(SMALL, target)
     early.standardise(torch.randn(20, target.pooled_width))
@@ -293,7 +292,7 @@ def test_a_saved_drafter_drafts_the_same_and_a_missing_one_says_what_to_run(tmp_
         EarlyDrafter().load(tmp_path, of_target(description, target))
 
 
-def test_the_config_brings_its_own_optimisation_and_yields_to_the_command_line() -> None:
+def test_the_config_brings_its_own_optimisation_and_yields_to_the_command_line():
     assert compose("train_drafter", ["drafter=early"], TrainDrafterSettings).train.batch == 256
     assert compose("train_drafter", ["drafter=early", "train.batch=9"], TrainDrafterSettings).train.batch == 9
     with pytest.raises(UnknownName, match=r"drafter\.kind"):

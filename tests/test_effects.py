@@ -33,12 +33,12 @@ from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
         ("rollout.clock=real rollout.latency=constant rollout.ar_ms=20", "rollout.ar_ms=20"),
     ],
 )
-def test_an_override_without_effect_is_found(words: str, idle: str) -> None:
+def test_an_override_without_effect_is_found(words, idle):
     settings = compose("rollout", words.split(), RolloutSettings)
     assert " ".join(without_effect(settings, words.split())) == idle
 
 
-def test_no_rectifier_counts_in_the_shipped_methods_that_verify_nothing() -> None:
+def test_no_rectifier_counts_in_the_shipped_methods_that_verify_nothing():
     names = [path.stem for path in conf_dir().glob("method/*_unverified.yaml")]
     assert len(names) == 3
     for name in names:
@@ -47,7 +47,7 @@ def test_no_rectifier_counts_in_the_shipped_methods_that_verify_nothing() -> Non
         assert "rectifier" not in effective(asdict(settings))
 
 
-def test_a_sweep_names_what_none_of_its_settings_reads() -> None:
+def test_a_sweep_names_what_none_of_its_settings_reads():
     written = {"a": "method=ar threshold.r=3", "b": "method=spec_vla"}
     settings = {label: compose("rollout", text.split(), RolloutSettings) for label, text in written.items()}
     points = {label: Point(label, tuple(text.split())) for label, text in written.items()}

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from kerv_cli.base.config import compose
@@ -28,7 +27,7 @@ def episodes(chosen: RolloutSettings, count: int = 2) -> list[EpisodeRecord]:
 
 @pytest.mark.bits
 @pytest.mark.parametrize("policy", ["nano-state", "nano-vision"])
-def test_strict_speculation_is_ar_in_closed_loop(policies: Path, policy: str) -> None:
+def test_strict_speculation_is_ar_in_closed_loop(policies, policy):
     ar = episodes(settings(policies, "method=ar", f"policy.target={policy}"))
     strict = episodes(settings(policies, "method=naive_sd", f"policy.target={policy}", "proposer.depth=4"))
     for a, b in zip(ar, strict, strict=True):
@@ -39,7 +38,7 @@ def test_strict_speculation_is_ar_in_closed_loop(policies: Path, policy: str) ->
     assert all(d.mode == "drafter" for e in strict for d in e.decodes)
 
 
-def test_the_record_of_an_episode_adds_up(policies: Path) -> None:
+def test_the_record_of_an_episode_adds_up(policies):
     wanted = settings(policies, "method=spec_vla", "threshold.r=200", "acceptance.strict_dofs=false")
     wanted.record = 1
     record = episodes(compose_with(wanted, "nano-vision"), 1)[0]
@@ -66,8 +65,8 @@ def compose_with(chosen: RolloutSettings, target: str) -> RolloutSettings:
     return chosen
 
 
-def test_a_state_policy_never_draws(policies: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def drawn(self: MetaWorld, camera: object = None) -> np.ndarray:
+def test_a_state_policy_never_draws(policies, monkeypatch):
+    def drawn(self, camera=None):
         raise AssertionError("a frame was drawn that nobody reads")
 
     monkeypatch.setattr(MetaWorld, "_draw", drawn)
@@ -76,14 +75,14 @@ def test_a_state_policy_never_draws(policies: Path, monkeypatch: pytest.MonkeyPa
         episodes(settings(policies, "policy.target=nano-vision"), 1)
 
 
-def test_deviation_is_sampled_and_zero_for_ar_itself(policies: Path) -> None:
+def test_deviation_is_sampled_and_zero_for_ar_itself(policies):
     ar = episodes(settings(policies, "policy.target=nano-state", "deviation_every=2"), 1)[0]
     assert [d.deviation for d in ar.decodes] == [None, 0.0, None]
     loose = settings(policies, "policy.target=nano-state", "deviation_every=1", "method=spec_vla", "threshold.r=120")
     assert any(d.deviation for d in episodes(loose, 1)[0].decodes)
 
 
-def test_what_cannot_run_is_refused_beforehand(policies: Path) -> None:
+def test_what_cannot_run_is_refused_beforehand(policies):
     with pytest.raises(UsageError, match="trained on 96 pixels"):
         policies_of.check(settings(policies, "policy.target=nano-vision", "world.camera.size=64"))
     drafter = f"policy.artifacts.drafter={policies}/artifacts/drafter/nano-state"

@@ -1,7 +1,6 @@
 """An environment in one file of its own: run and drawn like those that kerv ships."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from kerv_cli.report.viewing import save_recording
 from kerv_cli.worlds.settings import CameraSettings
 
 
-def test_an_episode_runs_and_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_episode_runs_and_is_recorded(tmp_path, monkeypatch):
     part = Part("environment", SPEC.name, "examples.point_mass:SPEC")
     monkeypatch.setitem(registry._PARTS, "environment", {**registry.parts("environment"), SPEC.name: part})
     with SPEC.open_world("push-point") as world:
@@ -36,6 +35,6 @@ def test_an_episode_runs_and_is_recorded(tmp_path: Path, monkeypatch: pytest.Mon
     assert found["timelines"]["time"] == (0, record.steps * 100_000_000)
 
 
-def test_an_environment_may_have_no_experts() -> None:
+def test_an_environment_may_have_no_experts():
     with pytest.raises(UsageError, match="point-mass has no scripted experts"):
         dataclasses.replace(SPEC, expert_class="").expert("push-point")

@@ -11,7 +11,6 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -38,7 +37,6 @@ from kerv_cli.base.errors import KervError, StorageError, UsageError
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.cli.common import progress_bar
 from kerv_cli.cli.work import event_printer
-from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, WANTED, Database
 from kerv_cli.lab.events import BlockStarted, BlockWaits, EpisodeEnd, Event, SettingFailed
@@ -54,7 +52,7 @@ PACKAGES = {"slurm": "submitit", "ray": "ray"}
 
 
 @pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+def quick(monkeypatch):
     monkeypatch.setattr("kerv_cli.lab.execute._POLL_SECONDS", 0.02)
 
 
@@ -80,11 +78,11 @@ def until(condition: Any, seconds: float = 60.0) -> None:
         time.sleep(0.02)
 
 
-def test_the_settings_of_a_block_take_turns_in_a_recorded_order(database: Database) -> None:
+def test_the_settings_of_a_block_take_turns_in_a_recorded_order(database):
     study, ran = threshold_study(["reach-v3"], episodes=7), []  # two blocks: five seeds and two
 
-    def noting(setting: Setting, task: str) -> RunEpisode:
-        def run(seed: int) -> EpisodeRecord:
+    def noting(setting, task):
+        def run(seed):
             ran.append((setting.label, seed))
             return episode(setting, task, seed)
 
@@ -103,10 +101,10 @@ def test_the_settings_of_a_block_take_turns_in_a_recorded_order(database: Databa
     assert len(outcome.reused) == 28
 
 
-def test_each_episode_is_committed_when_it_ends(database: Database) -> None:
+def test_each_episode_is_committed_when_it_ends(database):
     told: list[tuple[int, int]] = []
 
-    def on_event(event: Event) -> None:
+    def on_event(event):
         if isinstance(event, EpisodeEnd):
             told.append(StudyStore(Database(database.results), "threshold").counts())
 
@@ -121,7 +119,7 @@ def test_each_episode_is_committed_when_it_ends(database: Database) -> None:
     assert (len(outcome.reused), len(outcome.done)) == (there, 32 - there)
 
 
-def test_a_setting_that_raises_is_dropped_from_its_block_alone(database: Database) -> None:
+def test_a_setting_that_raises_is_dropped_from_its_block_alone(database):
     events: list[Event] = []
     bad = raising(RuntimeError("the gripper\nfell off"), "naive_sd", [100_002])
     store, outcome = swept(database.results, STUDY, bad, on_event=events.append)
@@ -137,8 +135,8 @@ def test_a_setting_that_raises_is_dropped_from_its_block_alone(database: Databas
     assert store.counts() == (16, 16)
 
 
-def test_an_error_of_kerv_is_told_in_its_own_words(database: Database) -> None:
-    def unprepared(setting: Setting, task: str) -> RunEpisode:
+def test_an_error_of_kerv_is_told_in_its_own_words(database):
+    def unprepared(setting, task):
         raise UsageError("no drafter fits this target: run `kerv train drafter`")
 
     _, outcome = swept(database.results, STUDY, unprepared)
@@ -149,8 +147,8 @@ def test_an_error_of_kerv_is_told_in_its_own_words(database: Database) -> None:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_study_that_is_deleted_while_it_runs_says_so(tmp_path: Path, workers: int) -> None:
-    def remove(event: Event) -> None:
+def test_a_study_that_is_deleted_while_it_runs_says_so(tmp_path, workers):
+    def remove(event):
         if isinstance(event, EpisodeEnd):
             StudyStore(tmp_path, "threshold").remove()
 
@@ -160,7 +158,7 @@ def test_a_study_that_is_deleted_while_it_runs_says_so(tmp_path: Path, workers: 
     assert (outcome.failed, store.counts(), claims(store.database)) == ([], (16, 16), 0)
 
 
-def test_over_processes_only_the_guilty_settings_fail(tmp_path: Path) -> None:
+def test_over_processes_only_the_guilty_settings_fail(tmp_path):
     """One setting kills its process, one raises what cannot be pickled; the rest of their blocks still takes turns."""
     study = threshold_study(["reach-v3", "push-v3"], episodes=2, radii=(1, 3, 5))
     for setting in study.settings:
@@ -199,7 +197,7 @@ if all(children):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_workers_of_a_killed_sweep_end_and_its_claims_are_taken_over(tmp_path: Path) -> None:
+def test_workers_of_a_killed_sweep_end_and_its_claims_are_taken_over(tmp_path):
     store = StudyStore(tmp_path, "threshold")
     with python(SWEEP, tmp_path, "slow_elsewhere", 2, 1) as process:  # the first task at once, the other in a minute
         until(lambda: store.counts()[0] == 6)
@@ -219,18 +217,18 @@ CHANGES = [(SILENT, True), (FAR, True), (FAR | SILENT, False), ({"status": "fail
 
 
 @pytest.mark.parametrize(("change", "held"), CHANGES)
-def test_a_claim_lasts_as_long_as_its_run(database: Database, change: dict[str, Any], held: bool) -> None:
+def test_a_claim_lasts_as_long_as_its_run(database, change, held):
     """On another machine as long as it was heard of. What it runs meanwhile is not run again."""
     seen: list[bool] = []
 
-    def claimed(event: Event) -> None:
+    def claimed(event):
         if isinstance(event, BlockStarted):
             with database.writing() as connection:
                 connection.execute(sa.update(RUNS).values(**change))
             with contextlib.suppress(InterruptedError):
                 swept(database.results, STUDY, on_event=noted)
 
-    def noted(event: Event) -> None:
+    def noted(event):
         if isinstance(event, BlockWaits | BlockStarted):
             seen.append(isinstance(event, BlockWaits))
             raise InterruptedError
@@ -239,7 +237,7 @@ def test_a_claim_lasts_as_long_as_its_run(database: Database, change: dict[str, 
     assert seen == [held]
 
 
-def test_sweeps_at_once_run_each_episode_once(database: Database) -> None:
+def test_sweeps_at_once_run_each_episode_once(database):
     with python(SWEEP, database.results, "unhurried", 1, 4) as process:
         assert process.wait(60) == 0
     assert episodes(database) == 12
@@ -247,12 +245,12 @@ def test_sweeps_at_once_run_each_episode_once(database: Database) -> None:
     assert claims(database) == 0
 
 
-def test_a_sweep_that_begins_in_the_middle_of_another_runs_nothing_twice(database: Database) -> None:
+def test_a_sweep_that_begins_in_the_middle_of_another_runs_nothing_twice(database):
     """Its blocks are smaller: some of their episodes were there when it was planned."""
     outcomes = []
     with ThreadPoolExecutor(1) as pool:
 
-        def on_event(event: Event) -> None:
+        def on_event(event):
             if isinstance(event, EpisodeEnd) and not outcomes and StudyStore(database, "threshold").counts()[0] == 5:
                 outcomes.append(pool.submit(swept, database.results, STUDY))
                 until(lambda: plan_study(database, STUDY).existing)
@@ -272,7 +270,7 @@ def in_order() -> Study:
 
 
 def killed_at_the_third(setting: Setting, task: str) -> RunEpisode:
-    def run(seed: int) -> EpisodeRecord:
+    def run(seed):
         if (setting.label, seed) == ("ar", 100_002):
             os.kill(os.getpid(), signal.SIGKILL)
         return episode(setting, task, seed)
@@ -280,7 +278,7 @@ def killed_at_the_third(setting: Setting, task: str) -> RunEpisode:
     return run
 
 
-def test_episodes_whose_order_counts_run_whole_again_when_their_process_dies(tmp_path: Path) -> None:
+def test_episodes_whose_order_counts_run_whole_again_when_their_process_dies(tmp_path):
     store, outcome = swept(tmp_path, in_order(), killed_at_the_third, runtime=RuntimeSettings(workers=2))
     assert [one.setting.label for failure in outcome.failed for one in failure.episodes] == ["ar", "ar"]
     assert len(outcome.done) == 2 + 4
@@ -289,8 +287,8 @@ def test_episodes_whose_order_counts_run_whole_again_when_their_process_dies(tmp
     assert {one.setting.label for one in plan_study(store.database, in_order()).missing} == {"ar"}
 
 
-def test_estimates_say_what_they_rest_on(database: Database) -> None:
-    def planned(workers: int) -> Any:
+def test_estimates_say_what_they_rest_on(database):
+    def planned(workers):
         return plan_study(database, TWO, runtime=RuntimeSettings(workers=workers))
 
     seconds, source = estimate(planned(1), 10.0)
@@ -302,7 +300,7 @@ def test_estimates_say_what_they_rest_on(database: Database) -> None:
     assert source == "measured on 8 stored episodes"
 
 
-def test_progress_without_a_terminal_is_plain_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress_without_a_terminal_is_plain_lines(tmp_path, capsys):
     swept(tmp_path, threshold_study(["reach-v3"], episodes=1))
     with progress_bar("episodes") as show:
         bad = raising(ValueError("[bold] is not markup"), "naive_sd")
@@ -317,7 +315,7 @@ def test_progress_without_a_terminal_is_plain_lines(tmp_path: Path, capsys: pyte
     assert "\x1b" not in written
 
 
-def test_progress_on_a_terminal_is_a_bar_that_goes_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_on_a_terminal_is_a_bar_that_goes_away(tmp_path, monkeypatch):
     written = io.StringIO()
     monkeypatch.setattr(written, "isatty", lambda: True, raising=False)
     monkeypatch.setattr(sys, "stderr", written)
@@ -334,7 +332,7 @@ def runtime(executor: str, **options: Any) -> RuntimeSettings:
 
 
 @pytest.fixture(params=["slurm", "ray"])
-def cluster(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[RuntimeSettings]:
+def cluster(request, monkeypatch):
     """Both kinds of cluster, on this machine."""
     pytest.importorskip(PACKAGES[request.param])
     if request.param == "slurm":  # seconds that it waits for the result of a job that was killed
@@ -348,7 +346,7 @@ def cluster(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
         gc.collect()
 
 
-def test_a_cluster_loses_only_the_guilty_settings_and_resumes(cluster: RuntimeSettings, tmp_path: Path) -> None:
+def test_a_cluster_loses_only_the_guilty_settings_and_resumes(cluster, tmp_path):
     study = threshold_study(["reach-v3"], episodes=2, radii=(1, 5))
     store, outcome = swept(tmp_path, study, misbehave, runtime=cluster)
     reasons = {failure.episodes[0].setting.label: failure.reason for failure in outcome.failed}
@@ -364,10 +362,10 @@ def test_a_cluster_loses_only_the_guilty_settings_and_resumes(cluster: RuntimeSe
     assert (len(again.reused), len(again.done)) == (5, 3)
 
 
-def test_an_interrupt_ends_a_clusters_work(cluster: RuntimeSettings, tmp_path: Path) -> None:
+def test_an_interrupt_ends_a_clusters_work(cluster, tmp_path):
     ended: list[Event] = []
 
-    def interrupt(event: Event) -> None:
+    def interrupt(event):
         ended.extend([event] if isinstance(event, EpisodeEnd) else [])
         if len(ended) == 16:
             raise KeyboardInterrupt
@@ -378,13 +376,13 @@ def test_an_interrupt_ends_a_clusters_work(cluster: RuntimeSettings, tmp_path: P
     assert (store.counts(), claims(store.database)) == ((16, 32), 0)
 
 
-def test_an_executor_from_outside(tmp_path: Path) -> None:
+def test_an_executor_from_outside(tmp_path):
     """One file, `examples/thread_executor.py`, named in KERV_PLUGINS."""
     importlib.import_module("examples.thread_executor")
     threads = set()
 
-    def noting(setting: Setting, task: str) -> RunEpisode:
-        def run(seed: int) -> EpisodeRecord:
+    def noting(setting, task):
+        def run(seed):
             threads.add(threading.current_thread().name)
             return episodes_of(setting, task)(seed)
 
@@ -397,7 +395,7 @@ def test_an_executor_from_outside(tmp_path: Path) -> None:
         check_executor(runtime("threads", nam="x"))
 
 
-def test_options_come_from_the_command_line() -> None:
+def test_options_come_from_the_command_line():
     for executor, option, value in (("slurm", "partition", "short"), ("ray", "gpus", 0.5)):
         words = [f"runtime={executor}", f"runtime.executor_options.{option}={value}"]
         composed = compose("rollout", words, RolloutSettings).runtime
@@ -417,7 +415,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("message", WRONG)
-def test_a_wrong_executor_is_refused_in_one_line(message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_executor_is_refused_in_one_line(message, tmp_path, monkeypatch):
     settings = WRONG[message]
     if "pip install" in message:
         monkeypatch.setattr(importlib.util, "find_spec", lambda package: None)

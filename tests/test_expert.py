@@ -2,8 +2,6 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,7 +10,7 @@ from rerun_synthetic import read_recording
 
 from kerv_cli.base.errors import KervError, UnknownName
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.record import PHASES, EpisodeRecord
+from kerv_cli.engine.record import PHASES
 from kerv_cli.episodes.episode import run_episode
 from kerv_cli.episodes.policy import ExpertDecoder
 from kerv_cli.episodes.rows import decodes_table, episode_row, read_decodes, table_blob
@@ -21,24 +19,23 @@ from kerv_cli.report.viewing import save_recording
 from kerv_cli.report.viewing.token_outcomes import summary
 from kerv_cli.worlds.metaworld.spec import SPEC
 from kerv_cli.worlds.settings import EVALUATION_SEED
-from kerv_cli.worlds.spec import World
 
 NAME = "window-close-v3"
 STAMPS = {"device": "cpu", "device_name": "x", "dtype": "float32", "threads": 1, "run": "r"}
 
 
 @pytest.fixture(scope="module")
-def world() -> Iterator[World]:
+def world():
     with SPEC.open_world(NAME) as opened:
         yield opened
 
 
 @pytest.fixture(scope="module")
-def episode(world: World) -> EpisodeRecord:
+def episode(world):
     return run_episode(world, ExpertDecoder(), EVALUATION_SEED)
 
 
-def test_the_decoder_executes_the_experts_own_actions(world: World, episode: EpisodeRecord) -> None:
+def test_the_decoder_executes_the_experts_own_actions(world, episode):
     expert, observation, actions = SPEC.expert(NAME), world.reset(EVALUATION_SEED), []
     while not world.done:
         actions.append(expert(observation))
@@ -49,7 +46,7 @@ def test_the_decoder_executes_the_experts_own_actions(world: World, episode: Epi
     assert np.abs(episode.actions).max() == 1.0  # raw outputs reach far beyond
 
 
-def test_a_record_has_one_step_and_no_target(episode: EpisodeRecord) -> None:
+def test_a_record_has_one_step_and_no_target(episode):
     assert episode.decode_steps == tuple(range(episode.steps))
     for decode in episode.decodes:
         assert decode.actions.shape == (1, 4)
@@ -59,7 +56,7 @@ def test_a_record_has_one_step_and_no_target(episode: EpisodeRecord) -> None:
         assert 0 < decode.seconds == pytest.approx(sum(decode.phases.values()))
 
 
-def test_rows_keep_it_and_measures_are_undefined_instead_of_divided_by_zero(episode: EpisodeRecord) -> None:
+def test_rows_keep_it_and_measures_are_undefined_instead_of_divided_by_zero(episode):
     row = episode_row(episode)
     assert (row["forwards"], row["verifications"], row["tokens"], row["first_rejected_count"]) == (0, 0, 0, 0)
     stored = read_decodes(table_blob(decodes_table(episode)))
@@ -81,7 +78,7 @@ def test_rows_keep_it_and_measures_are_undefined_instead_of_divided_by_zero(epis
 
 
 @pytest.mark.parametrize("frames", [False, True])
-def test_its_recording_can_be_written_and_read(episode: EpisodeRecord, tmp_path: Path, frames: bool) -> None:
+def test_its_recording_can_be_written_and_read(episode, tmp_path, frames):
     drawn = {i: np.zeros((8, 8, 3), dtype=np.uint8) for i in range(episode.steps + 1)} if frames else {}
     shown = dataclasses.replace(episode, frames=drawn)
     found = read_recording(save_recording(shown, tmp_path / "expert.rrd", method="expert"))
@@ -99,7 +96,7 @@ def seen(state: np.ndarray) -> Observation:
     return Observation(state[:4], state)
 
 
-def test_it_follows_the_task_and_refuses_what_it_cannot_answer() -> None:
+def test_it_follows_the_task_and_refuses_what_it_cannot_answer():
     decoder = ExpertDecoder()
     with pytest.raises(KervError, match="reset it before decoding"):
         decoder.decode(seen(np.zeros(39)))

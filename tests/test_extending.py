@@ -28,12 +28,12 @@ def own_parts() -> dict[str, dict[str, Part]]:
     }
 
 
-def test_the_worked_example_is_the_file() -> None:
+def test_the_worked_example_is_the_file():
     page = (ROOT / "docs/extending.md").read_text(encoding="utf-8")
     assert f"```python\n{(EXAMPLES / 'own_threshold.py').read_text(encoding='utf-8')}```" in page
 
 
-def test_every_kind_is_named_with_its_files() -> None:
+def test_every_kind_is_named_with_its_files():
     named = {kind for first, *_ in ROWS for kind in re.findall(r"`(\w+)`", first)}
     assert named >= {*registry.kinds(), "column"}
     for _, files, example, _ in ROWS:
@@ -43,9 +43,7 @@ def test_every_kind_is_named_with_its_files() -> None:
 
 
 @pytest.mark.parametrize(("command", "kind"), TRIED, ids=[row[1] for row in TRIED])
-def test_an_example_runs_by_its_documented_command(
-    command: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_example_runs_by_its_documented_command(command, kind, tmp_path, monkeypatch):
     (plugins,) = re.findall(r"KERV_PLUGINS=(\S+)", command)
     monkeypatch.setattr(registry, "_PARTS", own_parts())  # of the examples, this one alone
     monkeypatch.delitem(sys.modules, plugins, raising=False)

@@ -29,14 +29,14 @@ def episode(path: Path, seed: int, frames: int = 5) -> DemoEpisode:
 
 
 @pytest.fixture
-def two(tmp_path: Path) -> tuple[list[DemoEpisode], list[DemoEpisode]]:
+def two(tmp_path):
     """Two episodes as written, and as read."""
     paths = [tmp_path / f"{seed}.safetensors" for seed in range(2)]
     written = [episode(path, seed, 5 + seed) for seed, path in enumerate(paths)]
     return written, [load_episode(path) for path in paths]
 
 
-def test_pixels_are_those_that_were_written(two: tuple[list[DemoEpisode], list[DemoEpisode]]) -> None:
+def test_pixels_are_those_that_were_written(two):
     for written, found in zip(*two, strict=True):
         assert isinstance(found.frames, EncodedFrames)
         assert np.array_equal(found.frames.pixels(), written.frames)
@@ -45,9 +45,7 @@ def test_pixels_are_those_that_were_written(two: tuple[list[DemoEpisode], list[D
         assert np.array_equal(np.stack(list(found.frames)), written.frames)
 
 
-def test_observations_of_several_files_keep_none_of_them_in_memory(
-    two: tuple[list[DemoEpisode], list[DemoEpisode]],
-) -> None:
+def test_observations_of_several_files_keep_none_of_them_in_memory(two):
     written, found = two
     words = WordTokenizer.build(["reach the goal"])
     parts = [read_observations(e, TargetSettings(), SPEC.observation, words) for e in found]

@@ -3,7 +3,6 @@
 
 import json
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 from loaded import module_of
@@ -12,17 +11,17 @@ from kerv_cli.episodes.identity import ENGINE
 
 
 @pytest.fixture(scope="module")
-def golden() -> ModuleType:
+def golden():
     return module_of(Path(__file__).parent / "golden" / "write.py")
 
 
 @pytest.mark.bits
-def test_every_method_of_the_main_study_decodes_the_same_tokens(golden: ModuleType) -> None:
+def test_every_method_of_the_main_study_decodes_the_same_tokens(golden):
     """Also under each of `make test-cpus`' kernels: the logits' last bits differ there, their argmax does not."""
     assert golden.measure() == json.loads(golden.FILE.read_text())
 
 
-def test_the_engine_is_that_of_the_golden_tokens(golden: ModuleType) -> None:
+def test_the_engine_is_that_of_the_golden_tokens(golden):
     engines = json.loads(golden.ENGINES.read_text())
     assert engines[str(ENGINE)] == golden.hash_of(json.loads(golden.FILE.read_text()))
     assert len(set(engines.values())) == len(engines), "it was raised without a change of tokens"
@@ -38,5 +37,5 @@ def test_the_engine_is_that_of_the_golden_tokens(golden: ModuleType) -> None:
         (1, "a", "ENGINE 1 is an earlier one"),
     ],
 )
-def test_tokens_and_engine_change_together(golden: ModuleType, engine: int, digest: str, told: str) -> None:
+def test_tokens_and_engine_change_together(golden, engine, digest, told):
     assert golden.refusal({"1": "a", "2": "b"}, engine, digest) == told

@@ -1,7 +1,6 @@
 """A grown target decodes the tokens of its policy, and takes the policy's artifacts."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,7 +33,7 @@ def observation(seed: int, size: int = 96) -> Observation:
 
 
 @pytest.mark.parametrize(("width", "heads", "units", "layers"), [(64, 2, 64, 2), (128, 4, 96, 3), (96, 3, 65, 4)])
-def test_grown_layers_compute_the_same(policies: Path, width: int, heads: int, units: int, layers: int) -> None:
+def test_grown_layers_compute_the_same(policies, width, heads, units, layers):
     target, _ = load_target(find_target(str(policies), "nano-vision"))
     x, positions = torch.randn(1, 9, target.width), torch.arange(9)
     with torch.inference_mode():
@@ -46,14 +45,14 @@ def test_grown_layers_compute_the_same(policies: Path, width: int, heads: int, u
         torch.testing.assert_close(target.trunk(x, positions), expected, rtol=1e-3, atol=1e-5)
 
 
-def test_a_shape_that_is_too_small_is_refused(policies: Path) -> None:
+def test_a_shape_that_is_too_small_is_refused(policies):
     target, _ = load_target(find_target(str(policies), "nano-vision"))
     for shape in (GrowSettings(width=16, heads=2, feed_forward=64), GrowSettings(width=72, heads=3, feed_forward=64)):
         with pytest.raises(UsageError, match=r"grow\.width"):
             grow_stack(target.trunk, shape, 2)
 
 
-def test_a_policy_grows_by_command_and_keeps_its_drafter(policies: Path, tmp_path: Path) -> None:
+def test_a_policy_grows_by_command_and_keeps_its_drafter(policies, tmp_path):
     shape = ["grow.width=128", "grow.heads=2", "grow.feed_forward=160", "grow.layers=3", "grow.drafter=true"]
     command = ["build", "target", *shape, "policy.target=nano-vision", f"name={tmp_path}/large"]
     run = CliRunner().invoke(app, [*command, f"results={policies}", "--json"])
@@ -78,7 +77,7 @@ def test_a_policy_grows_by_command_and_keeps_its_drafter(policies: Path, tmp_pat
     assert all(chunk == chunks[0] for chunk in chunks), "AR and strict drafts, small and grown"
 
 
-def test_a_grown_target_whose_policy_changed_is_refused(policies: Path, tmp_path: Path) -> None:
+def test_a_grown_target_whose_policy_changed_is_refused(policies, tmp_path):
     command = ["build", "target", "grow=60m", "policy.target=nano-vision", f"name={tmp_path}/large"]
     assert CliRunner().invoke(app, [*command, f"results={policies}"]).exit_code == 0
     path = tmp_path / "large/target.json"

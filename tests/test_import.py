@@ -48,7 +48,7 @@ def refusal(*words: str) -> str:
 
 
 @pytest.fixture(scope="module")
-def older(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def older(tmp_path_factory):
     folder = tmp_path_factory.mktemp("older")
     with tarfile.open(ARCHIVE) as archive:
         archive.extractall(folder, filter="data")
@@ -58,7 +58,7 @@ def older(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_every_run_of_0_1_0_is_listed_shown_and_compared(older: Path) -> None:
+def test_every_run_of_0_1_0_is_listed_shown_and_compared(older):
     results = f"results={older}/results"
     runs = {run["id"]: run for run in answer("runs", "list", results) if run["state"] == "complete"}
     kinds = ["calibration", "datastore", "demos", "drafter", "early", "rollout", "rollout", "sweep", "target"]
@@ -71,7 +71,7 @@ def test_every_run_of_0_1_0_is_listed_shown_and_compared(older: Path) -> None:
     assert {"proposer.kind", "datastore"} <= {row["key"] for row in found["settings"]}
 
 
-def test_it_is_reported_as_it_was(older: Path) -> None:
+def test_it_is_reported_as_it_was(older):
     """Columns have the values of then, but for what is inferred from them: intervals of ratios and averages."""
     before = pd.read_csv(older / "results/report/tables/four-methods.csv")
     renamed = {name: f"{name}_tuned" for name in ("spec_vla", "heisd")}
@@ -94,7 +94,7 @@ def test_it_is_reported_as_it_was(older: Path) -> None:
         pd.testing.assert_frame_equal(text.loc[rows, columns], before.loc[rows, columns])
 
 
-def test_nothing_of_it_is_run_again_and_more_seeds_are_added(older: Path, tmp_path: Path) -> None:
+def test_nothing_of_it_is_run_again_and_more_seeds_are_added(older, tmp_path):
     shutil.copytree(older, tmp_path, dirs_exist_ok=True)
     study, results = f"study={tmp_path}/study.yaml", f"results={tmp_path}/results"
     plan = answer("sweep", study, "--plan", results)
@@ -107,7 +107,7 @@ def test_nothing_of_it_is_run_again_and_more_seeds_are_added(older: Path, tmp_pa
     assert (told["studies"], len(told["notes"])) == ([], 3)
 
 
-def test_a_damaged_cell_is_left_out_with_a_line(older: Path, tmp_path: Path) -> None:
+def test_a_damaged_cell_is_left_out_with_a_line(older, tmp_path):
     shutil.copytree(older / "results", tmp_path / "old", ignore=shutil.ignore_patterns("kerv.db*", "artifacts"))
     (cell, *_) = sorted((tmp_path / "old/studies/four-methods/cells").iterdir())
     (cell / "decodes.parquet").write_bytes(b"PAR1")
@@ -118,21 +118,21 @@ def test_a_damaged_cell_is_left_out_with_a_line(older: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.bits
-def test_its_tokens_are_those_of_today(older: Path, tmp_path: Path) -> None:
+def test_its_tokens_are_those_of_today(older, tmp_path):
     shutil.copytree(older, tmp_path, dirs_exist_ok=True)
     told = answer("runs", "rerun", "four-methods", f"results={tmp_path}/results")
     assert (told["episodes"], told["same_tokens"]) == (24, 24)
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("made")
     swept(folder, threshold_study(["reach-v3", "push-v3"]))
     swept(folder, threshold_study(["reach-v3"], name="other"))
     return folder
 
 
-def test_an_exported_database_is_the_study_elsewhere(made: Path, tmp_path: Path) -> None:
+def test_an_exported_database_is_the_study_elsewhere(made, tmp_path):
     answer("runs", "export", "threshold", "--to", "db", "--dir", f"{tmp_path}/out", f"results={made}")
     (run,) = answer("runs", "list", f"results={tmp_path}/out/threshold")
     assert (run["id"], run["state"]) == ("threshold", "complete")
@@ -146,7 +146,7 @@ def test_an_exported_database_is_the_study_elsewhere(made: Path, tmp_path: Path)
     assert "newer kerv" in said
 
 
-def test_episodes_and_decodes_as_parquet(made: Path, tmp_path: Path) -> None:
+def test_episodes_and_decodes_as_parquet(made, tmp_path):
     answer("runs", "export", "threshold", "--to", "parquet", "--dir", str(tmp_path), f"results={made}")
     episodes, decodes = (pd.read_parquet(tmp_path / f"threshold/{name}.parquet") for name in ("episodes", "decodes"))
     assert len(episodes) == len(StudyStore(made, "threshold").frame()) == 32
@@ -163,7 +163,7 @@ def info(folder: Path, successes: list[list[bool]]) -> Path:
     return folder
 
 
-def test_results_of_lerobot_are_compared_as_pairs(tmp_path: Path) -> None:
+def test_results_of_lerobot_are_compared_as_pairs(tmp_path):
     act = info(tmp_path / "act", [[True, False], [True, True]])
     pi0 = info(tmp_path / "pi0", [[False, False], [True, True]])
     told = answer("runs", "import", str(act), str(pi0), "name=libero", "baseline=act", f"results={tmp_path}/new")
@@ -179,7 +179,7 @@ def test_results_of_lerobot_are_compared_as_pairs(tmp_path: Path) -> None:
     assert "lerobot-eval" in refusal("runs", "import", str(act), f"results={tmp_path}/new")
 
 
-def test_a_foreign_database_that_never_ends_is_refused(tmp_path: Path) -> None:
+def test_a_foreign_database_that_never_ends_is_refused(tmp_path):
     path, endless = tmp_path / "recording-1.sqlite", "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)"
     with sqlite3.connect(path) as file:
         file.execute("CREATE TABLE t (x)")
@@ -194,7 +194,7 @@ def test_a_foreign_database_that_never_ends_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "new").exists()
 
 
-def test_a_small_parquet_file_that_expands_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_small_parquet_file_that_expands_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "MOST_EXPANDED", 2**24)
     for name, column in enumerate((pa.array(["x" * 1000] * 50_000), np.zeros(2**22))):
         path = tmp_path / f"{name}.parquet"

@@ -27,7 +27,7 @@ def outcome(world: World, seed: int, turn: bool = True) -> tuple[bool, np.ndarra
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_the_expert_succeeds_and_nobody_who_does_not_turn(task: str) -> None:
+def test_the_expert_succeeds_and_nobody_who_does_not_turn(task):
     with SPEC.open_world(task) as world:
         assert np.mean([outcome(world, seed)[0] for seed in range(50)]) >= 0.95
         for seed in range(8):
@@ -37,7 +37,7 @@ def test_the_expert_succeeds_and_nobody_who_does_not_turn(task: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def demonstrations(tmp_path_factory: pytest.TempPathFactory) -> DemoDataset:
+def demonstrations(tmp_path_factory):
     out = tmp_path_factory.mktemp("insertion")
     config = DemoConfig(("INSERTION",), episodes=4, camera=SMALL, frame_stride=10, workers=1, tail=5)
     assert (config.camera.name, config.horizon) == ("front", 120)
@@ -45,7 +45,7 @@ def demonstrations(tmp_path_factory: pytest.TempPathFactory) -> DemoDataset:
     return DemoDataset.open(out)
 
 
-def test_demonstrations_carry_their_spaces(demonstrations: DemoDataset) -> None:
+def test_demonstrations_carry_their_spaces(demonstrations):
     manifest = demonstrations.manifest
     assert (manifest.actions, manifest.observation) == (SPEC.actions, SPEC.observation)
     assert set(manifest.versions) == {"mujoco", "numpy", "python"}

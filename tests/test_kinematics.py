@@ -66,9 +66,7 @@ log_scale = st.floats(-4, 3).map(lambda x: 10.0**x)
 
 @settings(deadline=None)  # the machine is shared
 @given(windows, log_scale, log_scale, st.integers(1, HORIZON), st.sampled_from([1.0, 0.7]))
-def test_the_weights_are_those_of_the_most_probable_path(
-    window: np.ndarray, q: float, r: float, steps: int, damping: float
-) -> None:
+def test_the_weights_are_those_of_the_most_probable_path(window, q, r, steps, damping):
     weights = kalman_weights(q, r, len(window), steps, damping)
     assert weights.shape == (steps, len(window))
     expected = most_probable_path(window, q, r, steps, damping)
@@ -77,7 +75,7 @@ def test_the_weights_are_those_of_the_most_probable_path(
 
 @settings(deadline=None)  # the machine is shared
 @given(arrays(np.float64, st.tuples(st.integers(3, 14), st.just(DOFS)), elements=st.floats(-1, 1)))
-def test_predict_goes_on_along_the_newest_actions_most_probable_path_clipped(history: np.ndarray) -> None:
+def test_predict_goes_on_along_the_newest_actions_most_probable_path_clipped(history):
     for kind in FILTERS:
         noise = NOISE[kind]
         ahead = predictor(kind, minimum=3).predict(history, 4)
@@ -88,7 +86,7 @@ def test_predict_goes_on_along_the_newest_actions_most_probable_path_clipped(his
             np.testing.assert_allclose(ahead[:, dof], np.clip(expected, -1, 1), atol=1e-9)
 
 
-def test_hold_and_linear() -> None:
+def test_hold_and_linear():
     history = np.array([[0.9, 0.0, 0.1, 1.0], [0.2, 0.0, 0.2, 1.0], [0.3, 0.5, 0.1, -1.0]])
     held = Hold(np.array(HELD), minimum=1).predict(history, 2)
     np.testing.assert_allclose(held, [history[-1]] * 2)
@@ -105,9 +103,7 @@ def test_hold_and_linear() -> None:
     st.tuples(*[st.booleans()] * DOFS),
     st.integers(0, HORIZON),
 )
-def test_predictions_are_bounded_and_held_dofs_keep_their_last_value(
-    kind: str, history: np.ndarray, held: tuple[bool, ...], steps: int
-) -> None:
+def test_predictions_are_bounded_and_held_dofs_keep_their_last_value(kind, history, held, steps):
     ahead = predictor(kind, held).predict(history, steps)
     assert ahead is not None
     assert ahead.shape == (steps, DOFS)
@@ -120,14 +116,14 @@ def test_predictions_are_bounded_and_held_dofs_keep_their_last_value(
 
 
 @pytest.mark.parametrize("kind", PREDICTORS)
-def test_a_short_history_gives_no_prediction(kind: str) -> None:
+def test_a_short_history_gives_no_prediction(kind):
     built = predictor(kind, minimum=5)
     assert built.predict(np.zeros((4, DOFS)), 1) is None
     assert built.predict(np.zeros((0, DOFS)), 1) is None
     assert built.predict(np.zeros((5, DOFS)), 1) is not None
 
 
-def test_the_history_keeps_the_newest() -> None:
+def test_the_history_keeps_the_newest():
     history = ActionHistory(DOFS, window=3)
     assert history.values().shape == (0, DOFS)
     for i in range(5):

@@ -1,12 +1,11 @@
 """Success at a latency that the world feels, from a made-up study: every setting beside AR at the same latency."""
 
 import dataclasses
-from pathlib import Path
 
 import pytest
 from studies_synthetic import episode, settings_of, study_of, swept
 
-from kerv_cli.engine.record import Delay, EpisodeRecord
+from kerv_cli.engine.record import Delay
 from kerv_cli.episodes.settings import RolloutSettings, TimingSettings
 from kerv_cli.lab.execute import RunEpisode
 from kerv_cli.lab.plan import Setting
@@ -30,7 +29,7 @@ def prepare(setting: Setting, task: str) -> RunEpisode:
     """AR takes 30 ms, or what it is asked to; where it takes 100 ms it fails."""
     timing, method = setting.settings["rollout"], setting.settings["method"]
 
-    def run(seed: int) -> EpisodeRecord:
+    def run(seed):
         record = episode(setting, task, seed)
         if timing["clock"] == "waits":
             return record
@@ -45,7 +44,7 @@ def prepare(setting: Setting, task: str) -> RunEpisode:
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(tmp_path_factory):
     settings = {"ar waits": settings_of("ar")}
     for method, r in (("ar", 0), ("spec_vla", 9)):
         for ms in (0.0, 20.0, 100.0):
@@ -57,7 +56,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_every_setting_is_compared_with_ar_at_its_latency(results: Path) -> None:
+def test_every_setting_is_compared_with_ar_at_its_latency(results):
     whole = load_study(StudyStore(results, "latency")).table
     rows = latency_table(whole).set_index("label")
     assert len(rows) == 12  # not the world that waits
@@ -78,7 +77,7 @@ def test_every_setting_is_compared_with_ar_at_its_latency(results: Path) -> None
     assert latency_table(whole[whole["label"] == "ar waits"]).empty
 
 
-def test_the_figure_has_a_panel_per_compensation_and_a_line_per_method(results: Path) -> None:
+def test_the_figure_has_a_panel_per_compensation_and_a_line_per_method(results):
     table = latency_table(load_study(StudyStore(results, "latency")).table)
     figure = latency_figure(table, "title")
     panels = figure.axes
@@ -92,6 +91,6 @@ def test_the_figure_has_a_panel_per_compensation_and_a_line_per_method(results: 
     assert list(ar.get_ydata()) == [100.0, 100.0, 0.0]
 
 
-def test_a_report_has_the_table_and_the_figure(results: Path) -> None:
+def test_a_report_has_the_table_and_the_figure(results):
     names = {path.name for path in report(results, "latency").files}
     assert {"latency.csv", "latency_latency.csv", "latency_latency.png", "report.html"} <= names

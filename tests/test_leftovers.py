@@ -21,13 +21,13 @@ def of_process(path: Path, pid: int, host: str = "") -> Path:
 
 
 @pytest.fixture
-def dead() -> int:
+def dead():
     child = subprocess.Popen([sys.executable, "-c", ""])
     child.wait()
     return child.pid
 
 
-def test_only_what_a_dead_process_left_is_left_over(tmp_path: Path, dead: int) -> None:
+def test_only_what_a_dead_process_left_is_left_over(tmp_path, dead):
     theirs, mine = of_process(tmp_path / "a.b.json", dead), temporary_beside(tmp_path / "a.b.json")
     far = of_process(tmp_path / "a.b.json", 1, "elsewhere")
     for path in (theirs, mine, far, tmp_path / ".hidden.tmp", tmp_path / "a.b.json", tmp_path / ".x.1-00.tmp"):
@@ -43,7 +43,7 @@ def test_only_what_a_dead_process_left_is_left_over(tmp_path: Path, dead: int) -
     assert mine.exists()
 
 
-def test_the_next_write_removes_what_a_killed_one_left(tmp_path: Path, dead: int) -> None:
+def test_the_next_write_removes_what_a_killed_one_left(tmp_path, dead):
     left = of_process(tmp_path / "value.json", dead)
     left.touch()
     with atomic_path(tmp_path / "other.json") as temporary:
@@ -55,7 +55,7 @@ def write(folder: Path, text: str, replace: bool = True) -> bool:
     return write_folder(folder, lambda new: (new / "file").write_text(text), replace)
 
 
-def test_a_folder_is_exchanged_in_one_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_is_exchanged_in_one_step(tmp_path, monkeypatch):
     folder = tmp_path / "store"
     assert write(folder, "old")
     assert not write(folder, "none", replace=False)
@@ -69,7 +69,7 @@ def test_a_folder_is_exchanged_in_one_step(tmp_path: Path, monkeypatch: pytest.M
     assert [path.name for path in tmp_path.iterdir()] == ["store"]
 
 
-def test_where_folders_cannot_be_exchanged_two_renames_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_folders_cannot_be_exchanged_two_renames_do(tmp_path, monkeypatch):
     folder = tmp_path / "store"
     write(folder, "old")
     monkeypatch.setattr(files.ctypes, "CDLL", lambda name, use_errno: object())
@@ -83,7 +83,7 @@ def fail(folder: Path) -> None:
     raise KeyboardInterrupt
 
 
-def test_a_folder_that_fails_leaves_the_old_one(tmp_path: Path) -> None:
+def test_a_folder_that_fails_leaves_the_old_one(tmp_path):
     folder = tmp_path / "store"
     write(folder, "old")
     with pytest.raises(KeyboardInterrupt):
@@ -109,7 +109,7 @@ files.write_folder(Path(sys.argv[1]), lambda new: (new / "file").write_text("new
 
 
 @pytest.mark.parametrize("moment", [1, 2, 3])
-def test_a_kill_while_a_folder_is_replaced_leaves_a_whole_one(tmp_path: Path, moment: int) -> None:
+def test_a_kill_while_a_folder_is_replaced_leaves_a_whole_one(tmp_path, moment):
     folder = tmp_path / "store"
     write(folder, "old")
     run = subprocess.run([sys.executable, "-c", SIGKILLED, str(folder), str(moment)], check=False)

@@ -21,7 +21,7 @@ SIZE = 56
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(tmp_path_factory):
     """Demonstrations of insertion, the same as a LeRobot dataset, and read back under the name `back`."""
     results = tmp_path_factory.mktemp("lerobot")
     config = DemoConfig(("insert-peg", "fetch-peg"), 2, camera=CameraSettings(size=SIZE), workers=1)
@@ -37,7 +37,7 @@ def both(results: Path) -> tuple[DemoDataset, DemoDataset]:
     return DemoDataset.open(folder / "pegs"), DemoDataset.open(folder / "back")
 
 
-def test_the_published_layout(results: Path) -> None:
+def test_the_published_layout(results):
     """Against the format's description: paths, columns and their types, tasks by the index, statistics."""
     import pandas as pd
 
@@ -70,7 +70,7 @@ def test_the_published_layout(results: Path) -> None:
     assert np.shape(stats["observation.images.front"]["mean"]) == (3, 1, 1)
 
 
-def test_what_was_written_is_read_back(results: Path) -> None:
+def test_what_was_written_is_read_back(results):
     before, after = both(results)
     assert len(before.episodes) == len(after.episodes) == 4
     for index in range(4):
@@ -89,7 +89,7 @@ def test_what_was_written_is_read_back(results: Path) -> None:
 
 
 @pytest.mark.usefixtures("few_validations")
-def test_everything_trains_on_recorded_observations_of_an_openvla(results: Path) -> None:
+def test_everything_trains_on_recorded_observations_of_an_openvla(results):
     imported(write_checkpoint(results / "tiny"), results, name="rec", control_hz=20.0)
     common = ["policy.target=rec", "demos=back", f"results={results}"]
     short = ["train.steps=2", "train.batch=2", "train.warmup=1", "train.validate_every=2", "drafter.samples=6"]
@@ -105,7 +105,7 @@ def test_everything_trains_on_recorded_observations_of_an_openvla(results: Path)
     assert "unknown part of the prompt 'scene'" in line
 
 
-def test_a_recording_cannot_be_rolled_out(results: Path) -> None:
+def test_a_recording_cannot_be_rolled_out(results):
     both(results)
     words = ["rollout", "task=BACK", "policy.target=rec", "method=ar", "episodes=1", "world.camera.size=56"]
     code, line = kerv(*words, f"results={results}")
@@ -132,9 +132,7 @@ def edited(results: Path, tmp_path: Path, **changes: Any) -> Path:
         ({}, ["name=front"], "another name"),
     ],
 )
-def test_an_import_refuses_in_one_line(
-    results: Path, tmp_path: Path, changes: dict[str, Any], words: list[str], said: str
-) -> None:
+def test_an_import_refuses_in_one_line(results, tmp_path, changes, words, said):
     source = edited(results, tmp_path, **changes)
     (tmp_path / "artifacts/demos/front").mkdir(parents=True)
     given = words if words == ["source="] else [f"source={source}", *words]
@@ -143,7 +141,7 @@ def test_an_import_refuses_in_one_line(
     assert said in line
 
 
-def test_a_truncated_table_is_refused(results: Path, tmp_path: Path) -> None:
+def test_a_truncated_table_is_refused(results, tmp_path):
     source = edited(results, tmp_path)
     data = source / "data/chunk-000/file-000.parquet"
     data.write_bytes(data.read_bytes()[:-2000])
@@ -151,7 +149,7 @@ def test_a_truncated_table_is_refused(results: Path, tmp_path: Path) -> None:
     assert (code, data.name in line) == (1, True)
 
 
-def test_a_dataset_with_videos_is_read(results: Path, tmp_path: Path) -> None:
+def test_a_dataset_with_videos_is_read(results, tmp_path):
     av = pytest.importorskip("av")
     source = edited(results, tmp_path)
     info = json.loads((source / "meta/info.json").read_text())

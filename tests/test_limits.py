@@ -33,7 +33,7 @@ def numbers(kind: type) -> Iterator[tuple[type, Field[Any]]]:
             yield kind, at
 
 
-def test_every_number_has_limits_and_its_default_lies_within_them() -> None:
+def test_every_number_has_limits_and_its_default_lies_within_them():
     kinds = list(SCHEMAS.values())
     kinds += [part.settings for group in (*SETTINGS_GROUPS, "executor") for part in parts(group).values()]
     open_ended = [f"{kind.__name__}.{at.name}" for k in kinds for kind, at in numbers(k) if "limits" not in at.metadata]
@@ -61,7 +61,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("command", "override", "says"), WRONG)
-def test_what_is_wrong_or_out_of_range_is_refused_in_one_line(command: str, override: str, says: str) -> None:
+def test_what_is_wrong_or_out_of_range_is_refused_in_one_line(command, override, says):
     with pytest.raises(UsageError) as refused:
         compose(command, override.split(), SCHEMAS[command])
     assert says in str(refused.value)
@@ -72,7 +72,7 @@ def test_what_is_wrong_or_out_of_range_is_refused_in_one_line(command: str, over
     "override",
     ["boundary.f_star=nan", "boundary.window=2", "boundary.alpha=1.5", "boundary.alpha=nan", "skip.up=inf"],
 )
-def test_a_parts_numbers_have_ranges_too(override: str) -> None:
+def test_a_parts_numbers_have_ranges_too(override):
     with pytest.raises(UsageError, match=override.partition("=")[0]):
         compose("rollout", ["method=heisd", override], RolloutSettings)
 
@@ -88,7 +88,7 @@ def test_a_parts_numbers_have_ranges_too(override: str) -> None:
         "seed='1",
     ],
 )
-def test_a_grid_is_counted_before_it_is_expanded(grid: str) -> None:
+def test_a_grid_is_counted_before_it_is_expanded(grid):
     began = time.monotonic()
     with pytest.raises(UsageError) as refused:
         expand(grid.split())
@@ -96,31 +96,31 @@ def test_a_grid_is_counted_before_it_is_expanded(grid: str) -> None:
     assert "\n" not in str(refused.value)
 
 
-def test_a_grid_as_large_as_allowed_is_expanded() -> None:
+def test_a_grid_as_large_as_allowed_is_expanded():
     assert len(expand([f"seed=range(0,{MOST_POINTS})"])) == MOST_POINTS
     assert expand(["seed=range(3,0,-1)"]) == [["seed=3"], ["seed=2"], ["seed=1"]]
 
 
 @pytest.mark.parametrize("name", ["..", ".", "", ".hidden", "a b", "a\0b", "n" * 300, "n" * 300 + "/x", "/a\0b"])
-def test_a_name_stays_in_its_own_kind_of_folder(name: str) -> None:
+def test_a_name_stays_in_its_own_kind_of_folder(name):
     with pytest.raises(UsageError):
         artifact("results", "drafter", name)
     with pytest.raises(UsageError):
         find_target("results", name)
 
 
-def test_a_plain_name_or_a_path_is_taken() -> None:
+def test_a_plain_name_or_a_path_is_taken():
     assert artifact("results", "drafter", "mt10-v1.2+b").parts[-2:] == ("drafter", "mt10-v1.2+b")
     assert artifact("results", "drafter", "a/b").parts == ("a", "b")
     assert results_dir("results/x").parts == ("results", "x")
 
 
-def test_limits_that_repeat_a_constant_agree_with_it() -> None:
+def test_limits_that_repeat_a_constant_agree_with_it():
     window = next(at for at in fields(CalibrateSettings) if at.name == "window")
     assert window.metadata["limits"][0] == MINIMUM
 
 
 @pytest.mark.parametrize("label", ["a\nb", "a\tb", "", "a" * 2000])
-def test_a_label_is_one_line(label: str) -> None:
+def test_a_label_is_one_line(label):
     with pytest.raises(UsageError):
         check_label(label)

@@ -1,7 +1,6 @@
 """Bad input gets one line that says what is wrong, where, and what to type."""
 
 import shlex
-from pathlib import Path
 
 import pytest
 from test_cli import kerv, one_line
@@ -115,9 +114,7 @@ ANSWERS = [
 
 
 @pytest.mark.parametrize(("line", "says"), ANSWERS)
-def test_a_mistake_is_answered_in_one_line(
-    line: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_mistake_is_answered_in_one_line(line, says, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name, text in FILES.items():
         (tmp_path / name).write_text(text)

@@ -34,7 +34,7 @@ from kerv_cli.targets.settings import BuildTargetSettings
 
 
 @pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def checkpoint(tmp_path_factory):
     return write_checkpoint(tmp_path_factory.mktemp("openvla") / "tiny")
 
 
@@ -50,7 +50,7 @@ def loaded(folder: Path, dtype: torch.dtype = torch.float32) -> OpenVLATarget:
 
 
 @pytest.fixture(scope="module")
-def target(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> OpenVLATarget:
+def target(checkpoint, tmp_path_factory):
     return loaded(imported(checkpoint, tmp_path_factory.mktemp("results")))
 
 
@@ -74,7 +74,7 @@ def published() -> dict[str, Any]:
     return {**card, "tensors": tensors}
 
 
-def test_the_layout_and_the_shape_are_those_of_the_published_checkpoint(tmp_path: Path) -> None:
+def test_the_layout_and_the_shape_are_those_of_the_published_checkpoint(tmp_path):
     card = published()
     first, second = TOWERS.values()
     shape = Shape((first, second))
@@ -227,9 +227,7 @@ def published_action(ids: list[int], vocabulary: int) -> np.ndarray:
 
 @pytest.mark.bits
 @pytest.mark.parametrize("key_value_heads", [None, 2])
-def test_logits_and_actions_equal_transformers(
-    checkpoint: Path, target: OpenVLATarget, tmp_path: Path, key_value_heads: int | None
-) -> None:
+def test_logits_and_actions_equal_transformers(checkpoint, target, tmp_path, key_value_heads):
     if key_value_heads:
         language = Language(704, 64, 96, 3, 4, key_value_heads, rms_norm_eps=1e-5, rope_theta=5000.0)
         checkpoint = write_checkpoint(tmp_path / "grouped", Shape(TINY.towers, language), seed=5)
@@ -255,7 +253,7 @@ def test_logits_and_actions_equal_transformers(
 
 
 @given(value=st.floats(-1.2, 1.2) | st.sampled_from([-1.0, 1.0]))
-def test_tokens_are_those_of_the_published_tokenizer(value: float) -> None:
+def test_tokens_are_those_of_the_published_tokenizer(value):
     space = action_space(TINY, Bounds((-1.0,) * 7, (1.0,) * 7), None, 5.0)
     number = int(np.digitize(np.clip(value, -1.0, 1.0), np.linspace(-1, 1, 256)))  # published: id = vocabulary − number
     token = int(space.bins_of(np.array(np.clip(value, -1.0, 1.0))))
@@ -275,7 +273,7 @@ def lanczos(pixels: np.ndarray, size: int) -> np.ndarray:
     return np.tensordot(weights / weights.sum(1, keepdims=True), pixels, 1)
 
 
-def test_a_frame_is_prepared_as_in_openvlas_evaluation_on_libero() -> None:
+def test_a_frame_is_prepared_as_in_openvlas_evaluation_on_libero():
     smooth = np.linspace(40, 200, 64)[:, None, None] + np.array([0.0, 20.0, -30.0]) + np.zeros((64, 64, 3))
     image = smooth.round().astype(np.uint8)
     expected = lanczos(lanczos(smooth, 56).swapaxes(0, 1), 56).swapaxes(0, 1)
@@ -291,7 +289,7 @@ def test_a_frame_is_prepared_as_in_openvlas_evaluation_on_libero() -> None:
     assert np.abs(as_in_libero(noise, 56) - expected).max() <= 1
 
 
-def test_the_crop_is_tensorflows(target: OpenVLATarget) -> None:
+def test_the_crop_is_tensorflows(target):
     image = np.random.default_rng(3).integers(0, 256, (90, 61, 3), dtype=np.uint8)
     side = math.sqrt(0.9)
     axis = torch.linspace(-side, side, 56)  # of grid_sample: −1 and 1 are the centres of the outermost pixels
@@ -312,9 +310,7 @@ def test_the_crop_is_tensorflows(target: OpenVLATarget) -> None:
 @pytest.mark.bits
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 10_000), nodes=st.integers(0, 24), inside=st.booleans(), fixed=st.booleans())
-def test_strict_decoding_equals_ar(
-    target: OpenVLATarget, monkeypatch: pytest.MonkeyPatch, seed: int, nodes: int, inside: bool, fixed: bool
-) -> None:
+def test_strict_decoding_equals_ar(target, monkeypatch, seed, nodes, inside, fixed):
     monkeypatch.setattr(target, "new_cache", lambda batch, size: OpenVLATarget.new_cache(target, batch, size, fixed))
     with torch.inference_mode():
         prompt = target.encode(shown(seed, "move " * (1 + seed % 9)))
@@ -330,14 +326,14 @@ def test_strict_decoding_equals_ar(
 # --- formats of the weights
 
 
-def test_weights_stay_in_the_files_memory_map(checkpoint: Path, target: OpenVLATarget) -> None:
+def test_weights_stay_in_the_files_memory_map(checkpoint, target):
     address = target.model.language_model.model.layers[0].mlp.up_proj.weight.data_ptr()
     mapped = [line.split() for line in Path("/proc/self/maps").read_text().splitlines() if str(checkpoint) in line]
     spans = [tuple(int(x, 16) for x in line[0].split("-")) for line in mapped]
     assert any(low <= address < high for low, high in spans)
 
 
-def test_bfloat16_and_int8_decode_nearly_the_same(checkpoint: Path, tmp_path: Path, target: OpenVLATarget) -> None:
+def test_bfloat16_and_int8_decode_nearly_the_same(checkpoint, tmp_path, target):
     half = loaded(imported(checkpoint, tmp_path), torch.bfloat16)
     small = loaded(imported(checkpoint, tmp_path, int8=True, name="int8"))
     layer = small.model.language_model.model.layers[0].mlp.up_proj
@@ -371,7 +367,7 @@ def edited(checkpoint: Path, tmp_path: Path, file: str, **changes: Any) -> Path:
     return copy
 
 
-def test_an_import_is_a_target_like_any_other(checkpoint: Path, tmp_path: Path) -> None:
+def test_an_import_is_a_target_like_any_other(checkpoint, tmp_path):
     words = [f"checkpoint={checkpoint}", "name=vla", "environment=insertion", "prompt_tokens=120"]
     assert kerv("build", "target", "target=openvla", *words, f"results={tmp_path}")[0] == 0
     run = ["rollout", "method=ar", "policy.target=vla", "episodes=1", "record=0", "world.camera.size=56"]
@@ -398,9 +394,7 @@ def test_an_import_is_a_target_like_any_other(checkpoint: Path, tmp_path: Path) 
         ({"preprocessor_config.json": {"image_resize_strategy": "letterbox"}}, [], "letterbox"),
     ],
 )
-def test_an_import_refuses_in_one_line(
-    checkpoint: Path, tmp_path: Path, changes: dict[str, Any], words: list[str], said: str
-) -> None:
+def test_an_import_refuses_in_one_line(checkpoint, tmp_path, changes, words, said):
     for file, values in changes.items():
         checkpoint = edited(checkpoint, tmp_path, file, **values)
     words = words if "checkpoint" in "".join(words) else [f"checkpoint={checkpoint}", *words]
@@ -419,7 +413,7 @@ def test_an_import_refuses_in_one_line(
         ("no tokenizer", "no tokenizer.json in"),
     ],
 )
-def test_damaged_files_are_refused_in_one_line(checkpoint: Path, tmp_path: Path, harm: str, said: str) -> None:
+def test_damaged_files_are_refused_in_one_line(checkpoint, tmp_path, harm, said):
     copy = edited(checkpoint, tmp_path, "config.json")
     norm = "language_model.model.norm.weight"
     shard = next(path for path in copy.glob("*.safetensors") if norm in load_file(path))
@@ -442,7 +436,7 @@ def test_damaged_files_are_refused_in_one_line(checkpoint: Path, tmp_path: Path,
     assert said in line
 
 
-def test_weights_that_changed_after_the_import_are_refused(checkpoint: Path, tmp_path: Path) -> None:
+def test_weights_that_changed_after_the_import_are_refused(checkpoint, tmp_path):
     copy = edited(checkpoint, tmp_path, "config.json")
     imported(copy, tmp_path)
     run = ["rollout", "method=ar", "task=insert-peg", "policy.target=openvla", f"results={tmp_path}"]
@@ -459,7 +453,7 @@ def test_weights_that_changed_after_the_import_are_refused(checkpoint: Path, tmp
         (np.zeros((56, 56, 3), np.uint8), "turn " * 90),
     ],
 )
-def test_a_wrong_observation_is_refused(target: OpenVLATarget, image: np.ndarray | None, words: str) -> None:
+def test_a_wrong_observation_is_refused(target, image, words):
     images = {} if image is None else {"primary": image}
     with pytest.raises(KervError):
         target.encode(Observation(np.zeros(0), np.zeros(0), words, images))

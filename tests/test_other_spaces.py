@@ -1,7 +1,6 @@
 """Files and demonstrations that were made for other actions: every command refuses them in one line."""
 
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,7 +25,7 @@ def refusal(*words: str) -> str:
 
 
 @pytest.fixture(scope="module")
-def results(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(policies, tmp_path_factory):
     """A policy of Meta-World, and demonstrations of another environment."""
     results = tmp_path_factory.mktemp("spaces") / "results"
     shutil.copytree(policies, results)
@@ -34,7 +33,7 @@ def results(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return results
 
 
-def test_a_rollout_refuses_a_target_of_other_actions(results: Path) -> None:
+def test_a_rollout_refuses_a_target_of_other_actions(results):
     words = ["rollout", "policy=state", TARGET, "episodes=1", "record=0", f"results={results}", "task=insert-peg"]
     said = "target 'nano-state' has an action space with names dx, dy, dz, gripper, environment insertion one with"
     assert said in refusal(*words)
@@ -50,15 +49,13 @@ def test_a_rollout_refuses_a_target_of_other_actions(results: Path) -> None:
         (["calibrate", "task=drawer-close", TARGET], "the target"),
     ],
 )
-def test_demonstrations_of_another_environment_are_refused_at_once(
-    results: Path, command: list[str], owner: str
-) -> None:
+def test_demonstrations_of_another_environment_are_refused_at_once(results, command, owner):
     line = refusal(*command, "demos=pegs", f"results={results}", "--plan")
     assert "artifacts/demos/pegs has an action space with names dx, dy, dz, droll" in line
     assert f"{owner} one with dx, dy, dz, gripper" in line
 
 
-def test_a_fine_tuned_target_must_be_of_the_demonstrations_environment(results: Path) -> None:
+def test_a_fine_tuned_target_must_be_of_the_demonstrations_environment(results):
     words = ["train", "target", "task=insert-peg", "name=new", "target=nano", "target.observation=state"]
     words += ["train.init=nano-state", "demos=pegs", "world.camera.name=front", f"results={results}"]
     assert "the target in" in refusal(*words)
@@ -66,7 +63,7 @@ def test_a_fine_tuned_target_must_be_of_the_demonstrations_environment(results: 
 
 @pytest.mark.bits
 @pytest.mark.usefixtures("few_validations")
-def test_a_policy_of_seven_dofs_is_trained_and_decodes_with_its_drafters(results: Path) -> None:
+def test_a_policy_of_seven_dofs_is_trained_and_decodes_with_its_drafters(results):
     common = ["demos=pegs", "train.steps=4", "train.batch=4", "train.validate_every=2", "train.held_out=0.34"]
     common.append(f"results={results}")
     words = ["task=insert-peg", "name=arm", "target=nano", "target.observation=state", "world.camera.name=front"]

@@ -1,7 +1,7 @@
 """Experts of our own on real Meta-World, beside those that they replace."""
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ Acts = Callable[[Observation], np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def world() -> Iterator[World]:
+def world():
     with SPEC.open_world(NAME) as opened:
         yield opened
 
@@ -33,7 +33,7 @@ def metaworlds(name: str) -> Acts:
 
     policy = ENV_POLICY_MAP[name]()
 
-    def act(observation: Observation) -> np.ndarray:
+    def act(observation):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return np.clip(policy.get_action(observation.state), -1.0, 1.0)
@@ -64,7 +64,7 @@ def slip(world: World, seed: int) -> Observation:
     return observation
 
 
-def test_the_handle_is_pulled_sooner_than_by_metaworlds_expert(world: World) -> None:
+def test_the_handle_is_pulled_sooner_than_by_metaworlds_expert(world):
     for seed in SEEDS:
         ours, pressed = solve(world, world.reset(seed), SPEC.expert(NAME))
         assert world.success
@@ -72,7 +72,7 @@ def test_the_handle_is_pulled_sooner_than_by_metaworlds_expert(world: World) -> 
         assert ours < solve(world, world.reset(seed), metaworlds(NAME))[0]
 
 
-def test_after_a_slip_it_grips_again_instead_of_pressing(world: World) -> None:
+def test_after_a_slip_it_grips_again_instead_of_pressing(world):
     steps, pressed = solve(world, slip(world, SEEDS[0]), SPEC.expert(NAME))
     assert world.success
     assert steps < 100
@@ -82,7 +82,7 @@ def test_after_a_slip_it_grips_again_instead_of_pressing(world: World) -> None:
     assert pressed > 0.04
 
 
-def test_the_peg_is_carried_without_being_dragged() -> None:
+def test_the_peg_is_carried_without_being_dragged():
     fails = 5  # Meta-World's expert drops the peg there
     with SPEC.open_world(PEG) as opened:
         solve(opened, opened.reset(fails), metaworlds(PEG))
@@ -93,7 +93,7 @@ def test_the_peg_is_carried_without_being_dragged() -> None:
             assert steps < 150
 
 
-def test_what_ours_did_is_told_from_what_metaworlds_did() -> None:
+def test_what_ours_did_is_told_from_what_metaworlds_did():
     """In the identity of an expert's cells, and in a recording's configuration; of other tasks nothing changes."""
     peg, reach = (compose("rollout", ["policy=expert", f"task={task}"], RolloutSettings) for task in (PEG, "reach"))
     assert check(peg)["expert"] == f"{PEG} {VERSION}"

@@ -45,7 +45,7 @@ def files_of(asked: RolloutSettings) -> Artifacts:
 
 
 @pytest.fixture
-def results(policies: Path, tmp_path: Path) -> Path:
+def results(policies, tmp_path):
     """The small policies, and a table of `nano-state`."""
     copied = Path(shutil.copytree(policies, tmp_path / "results"))
     random = np.random.default_rng(0)
@@ -60,9 +60,7 @@ def results(policies: Path, tmp_path: Path) -> Path:
 @given(seed=st.integers(0, 10_000), chunk=st.sampled_from([1, 2, 4]), depth=st.integers(0, 20), data=st.data())
 @pytest.mark.parametrize("place", ["proposer", "prefill_draft", "merged"])
 @pytest.mark.parametrize("mock", [True, False])
-def test_it_is_lossless_wherever_it_drafts(
-    place: str, mock: bool, seed: int, chunk: int, depth: int, data: st.DataObject
-) -> None:
+def test_it_is_lossless_wherever_it_drafts(place, mock, seed, chunk, depth, data):
     if mock:
         target: Any = MockTarget(SEVEN, chunk=chunk, seed=seed)
         prompt = torch.randn(1, 5, target.width, generator=torch.Generator().manual_seed(seed)).double()
@@ -99,9 +97,7 @@ def test_it_is_lossless_wherever_it_drafts(
         ("prefill_draft=merged prefill_draft.sources=[follow] prefill_draft.fallback=[hold]", {"follow"}),
     ],
 )
-def test_every_place_loads_its_weights_once_and_decodes_ars_tokens(
-    results: Path, overrides: str, wanted: set[str]
-) -> None:
+def test_every_place_loads_its_weights_once_and_decodes_ars_tokens(results, overrides, wanted):
     asked = settings_of(results, *overrides.split())
     method = Method.of(asked)
     assert set(method.needs) == wanted
@@ -122,17 +118,17 @@ def test_every_place_loads_its_weights_once_and_decodes_ars_tokens(
     assert any(r.proposer == "follow" or r.proposer == "merged" for r in record.rounds)
 
 
-def test_its_weights_are_a_run_of_the_results_folder(results: Path) -> None:
+def test_its_weights_are_a_run_of_the_results_folder(results):
     (run,) = matching(find_runs(results), {"kind": "follow"})
     assert (run.id, run.state, run.is_training) == ("follow/mine", "complete", True)
     assert set(run.made_from) == {"target"}
 
 
-def test_it_is_trained_from_the_command_line_and_drafts_in_a_rollout(results: Path) -> None:
+def test_it_is_trained_from_the_command_line_and_drafts_in_a_rollout(results):
     write_dataset(results / "artifacts/demos/few")
     policy = ("policy.target=nano-state", "policy.artifacts.follow=learnt", f"results={results}")
 
-    def kerv(*words: str) -> str:
+    def kerv(*words):
         done = CliRunner().invoke(app, [*words, *policy])
         assert done.exit_code == 0, done.output
         return done.output
@@ -155,6 +151,6 @@ def test_it_is_trained_from_the_command_line_and_drafts_in_a_rollout(results: Pa
         (["drafter.kind=follow"], "drafter.kind=follow: choose drafter=follow, each has settings of its own"),
     ],
 )
-def test_its_training_has_settings_of_its_own(words: list[str], says: str) -> None:
+def test_its_training_has_settings_of_its_own(words, says):
     with pytest.raises(UsageError, match=says):
         DrafterRun(compose("train_drafter", words, TrainDrafterSettings))

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import zipfile
 from configparser import ConfigParser
-from email.message import Message
 from pathlib import Path
 
 import pytest
@@ -22,7 +21,7 @@ TOOLS = ("awk", "bash", "cat", "chmod", "dirname", "env", "grep", "make", "mkdir
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
+def wheel(tmp_path_factory):
     folder = tmp_path_factory.mktemp("wheel")
     command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
     built = subprocess.run([*command, "--wheel-dir", folder, ROOT], capture_output=True, text=True, check=False)
@@ -32,25 +31,25 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
 
 
 @pytest.fixture(scope="module")
-def metadata(wheel: zipfile.ZipFile) -> Message:
+def metadata(wheel):
     (name,) = [name for name in wheel.namelist() if name.endswith(".dist-info/METADATA")]
     return email.message_from_bytes(wheel.read(name))
 
 
-def test_the_wheel_carries_every_config_file(wheel: zipfile.ZipFile) -> None:
+def test_the_wheel_carries_every_config_file(wheel):
     expected = {f"kerv_cli/{path.relative_to(ROOT).as_posix()}" for path in (ROOT / "conf").rglob("*.yaml")}
     assert expected, "conf/ holds no YAML file"
     assert expected <= set(wheel.namelist())
 
 
-def test_the_wheel_carries_the_package_and_nothing_else(wheel: zipfile.ZipFile) -> None:
+def test_the_wheel_carries_the_package_and_nothing_else(wheel):
     names = {name for name in wheel.namelist() if ".dist-info/" not in name and not name.startswith("kerv_cli/conf/")}
     assert names >= {path.relative_to(ROOT).as_posix() for path in (ROOT / "kerv_cli").rglob("*.py")}
     assert {name.split("/")[0] for name in names} == {"kerv_cli"}
     assert {"kerv_cli/__init__.pyi", "kerv_cli/py.typed"} <= names, "types of the library"
 
 
-def test_the_command_names_a_function_that_the_wheel_holds(wheel: zipfile.ZipFile) -> None:
+def test_the_command_names_a_function_that_the_wheel_holds(wheel):
     (name,) = [name for name in wheel.namelist() if name.endswith("entry_points.txt")]
     entry_points = ConfigParser()
     entry_points.read_string(wheel.read(name).decode())
@@ -58,13 +57,13 @@ def test_the_command_names_a_function_that_the_wheel_holds(wheel: zipfile.ZipFil
     assert f"def {function}(" in wheel.read(module.replace(".", "/") + ".py").decode()
 
 
-def test_the_requirements_keep_the_physics_engine_that_results_depend_on(metadata: Message) -> None:
+def test_the_requirements_keep_the_physics_engine_that_results_depend_on(metadata):
     requirements = metadata.get_all("Requires-Dist") or []
     assert "mujoco==3.3.0" in requirements
     assert any(line.startswith("metaworld") and ">=3.1.1" in line for line in requirements)
 
 
-def test_an_installed_wheel_runs_its_main_job_from_another_folder(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
+def test_an_installed_wheel_runs_its_main_job_from_another_folder(wheel, tmp_path):
     site = tmp_path / "site"
     wheel.extractall(site)
     sizes = [entry.file_size for entry in wheel.infolist() if entry.filename.startswith("kerv_cli/pretrained/")]
@@ -161,7 +160,7 @@ class Checkout:
 
 
 @pytest.fixture
-def checkout(tmp_path: Path) -> Checkout:
+def checkout(tmp_path):
     return Checkout(tmp_path)
 
 
@@ -170,7 +169,7 @@ def setup_lines(result: subprocess.CompletedProcess[str]) -> list[str]:
     return [line for line in result.stderr.splitlines() if not line.startswith("make")]
 
 
-def test_setup_installs_once(checkout: Checkout) -> None:
+def test_setup_installs_once(checkout):
     assert checkout.setup().returncode == 0
     pip = "pip install --quiet --disable-pip-version-check"
     index = "https://download.pytorch.org/whl/cpu"
@@ -193,7 +192,7 @@ def locked(build: str, package: str) -> str:
     return next(line for line in lines if line.startswith(f"{package}=="))
 
 
-def test_another_pytorch_is_taken_where_the_locked_build_is_not_to_be_had(checkout: Checkout) -> None:
+def test_another_pytorch_is_taken_where_the_locked_build_is_not_to_be_had(checkout):
     (checkout.root / "no-torch").touch()
     result = checkout.setup()
     assert result.returncode == 0
@@ -205,7 +204,7 @@ def test_another_pytorch_is_taken_where_the_locked_build_is_not_to_be_had(checko
     assert locked("cpu", "numpy") in kept
 
 
-def test_an_nvidia_driver_or_a_request_chooses_the_build_and_setup_says_what_it_fetches(checkout: Checkout) -> None:
+def test_an_nvidia_driver_or_a_request_chooses_the_build_and_setup_says_what_it_fetches(checkout):
     asked = checkout.setup(CUDA="1")
     assert "CUDA build of PyTorch" in asked.stdout
     assert "CUDA=0" in asked.stdout
@@ -220,7 +219,7 @@ def test_an_nvidia_driver_or_a_request_chooses_the_build_and_setup_says_what_it_
     assert "CPU build of PyTorch" in checkout.setup(CUDA="0").stdout
 
 
-def test_the_two_lock_files_differ_in_pytorch_alone_and_hold_every_requirement(metadata: Message) -> None:
+def test_the_two_lock_files_differ_in_pytorch_alone_and_hold_every_requirement(metadata):
     cpu, cuda = ((ROOT / "requirements" / f"{build}.txt").read_text().splitlines()[1:] for build in ("cpu", "cuda"))
     assert set(cpu) ^ set(cuda) == {locked("cpu", "torch"), locked("cuda", "torch")}
     names = {line.split("==")[0].lower().replace("_", "-") for line in cpu}
@@ -232,7 +231,7 @@ def test_the_two_lock_files_differ_in_pytorch_alone_and_hold_every_requirement(m
             assert requirement.specifier.contains(pinned[requirement.name.lower()]), requirement
 
 
-def test_a_failed_installation_is_tried_again(checkout: Checkout) -> None:
+def test_a_failed_installation_is_tried_again(checkout):
     (checkout.root / "pip-fails").touch()
     assert checkout.setup().returncode != 0
     assert not checkout.stamped
@@ -242,12 +241,12 @@ def test_a_failed_installation_is_tried_again(checkout: Checkout) -> None:
 
 
 @pytest.mark.parametrize("version", ["3, 11", "3, 13"])
-def test_setup_accepts_the_pythons_that_kerv_runs_on(checkout: Checkout, version: str) -> None:
+def test_setup_accepts_the_pythons_that_kerv_runs_on(checkout, version):
     assert checkout.setup(KERV_TEST_VERSION=version).returncode == 0
 
 
 @pytest.mark.parametrize("version", ["3, 10", "3, 14"])
-def test_setup_without_a_suitable_python_says_so_in_one_line(checkout: Checkout, version: str) -> None:
+def test_setup_without_a_suitable_python_says_so_in_one_line(checkout, version):
     result = checkout.setup(KERV_TEST_VERSION=version)
     assert result.returncode != 0
     (line,) = setup_lines(result)
@@ -255,14 +254,14 @@ def test_setup_without_a_suitable_python_says_so_in_one_line(checkout: Checkout,
     assert not (checkout.root / ".venv").exists()
 
 
-def test_setup_prefers_python_3_11(checkout: Checkout) -> None:
+def test_setup_prefers_python_3_11(checkout):
     for name in ("python3.11", "python3.12", "python3"):
         executable(checkout.bin / name, f'[ "$2" != venv ] || echo {name} >> log\n{PYTHON}')
     checkout.setup()
     assert checkout.log[0] == "python3.11"
 
 
-def test_root_gets_the_graphics_libraries_from_fresh_lists(checkout: Checkout) -> None:
+def test_root_gets_the_graphics_libraries_from_fresh_lists(checkout):
     (checkout.root / "drawable").unlink()
     assert checkout.setup().returncode == 0
     update, install = (line for line in checkout.log if line.startswith("apt-get"))
@@ -276,7 +275,7 @@ def test_root_gets_the_graphics_libraries_from_fresh_lists(checkout: Checkout) -
     assert "libosmesa6" not in checkout.log[-1].split()
 
 
-def test_sudo_is_used_where_it_asks_nothing(checkout: Checkout) -> None:
+def test_sudo_is_used_where_it_asks_nothing(checkout):
     (checkout.root / "drawable").unlink()
     checkout.user(1000)
     executable(checkout.bin / "sudo", 'echo "sudo $*" >> log; shift; "$@"')
@@ -285,7 +284,7 @@ def test_sudo_is_used_where_it_asks_nothing(checkout: Checkout) -> None:
 
 
 @pytest.mark.parametrize("sudo", [None, "exit 1"])
-def test_without_the_right_to_install_setup_prints_the_command(checkout: Checkout, sudo: str | None) -> None:
+def test_without_the_right_to_install_setup_prints_the_command(checkout, sudo):
     (checkout.root / "drawable").unlink()
     checkout.user(1000)
     if sudo:
@@ -298,7 +297,7 @@ def test_without_the_right_to_install_setup_prints_the_command(checkout: Checkou
     assert checkout.stamped, "the Python part is done and need not be done again"
 
 
-def test_libraries_that_do_not_help_are_an_error(checkout: Checkout) -> None:
+def test_libraries_that_do_not_help_are_an_error(checkout):
     (checkout.root / "drawable").unlink()
     executable(checkout.bin / "apt-get", "true")
     result = checkout.setup()
@@ -309,7 +308,7 @@ def test_libraries_that_do_not_help_are_an_error(checkout: Checkout) -> None:
 # --- the check for graphics ---
 
 
-def test_a_library_that_is_absent_or_not_opengl_does_not_count_as_graphics() -> None:
+def test_a_library_that_is_absent_or_not_opengl_does_not_count_as_graphics():
     check = module_of(ROOT / "scripts" / "check_gl.py")
     assert not check.egl_works(("libkerv-absent.so.1",))
     assert not check.osmesa_works(("libkerv-absent.so.1",))
@@ -319,7 +318,7 @@ def test_a_library_that_is_absent_or_not_opengl_does_not_count_as_graphics() -> 
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems bring their own OpenGL")
-def test_the_graphics_check_agrees_that_this_machine_can_draw() -> None:
+def test_the_graphics_check_agrees_that_this_machine_can_draw():
     command = [sys.executable, "-I", "-S", ROOT / "scripts" / "check_gl.py"]
     check = subprocess.run(command, capture_output=True, text=True, check=False)
     assert check.returncode == 0

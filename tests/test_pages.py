@@ -3,7 +3,6 @@
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 from loaded import module_of
@@ -13,7 +12,7 @@ PAGES = ("README.md", "results/README.md")
 
 
 @pytest.fixture
-def figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+def figures(tmp_path, monkeypatch):
     """The script over a table of two settings."""
     module = module_of(ROOT / "scripts/figures.py")
     module.table_of.cache_clear()
@@ -30,24 +29,24 @@ def figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_every_figure_on_a_page_is_the_tables(page: str) -> None:
+def test_every_figure_on_a_page_is_the_tables(page):
     command = [sys.executable, str(ROOT / "scripts/figures.py"), "--check", str(ROOT / page)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
-def test_the_results_page_stays_a_page() -> None:
+def test_the_results_page_stays_a_page():
     assert len((ROOT / "results/README.md").read_text(encoding="utf-8").splitlines()) <= 250
 
 
 @pytest.mark.parametrize("folder", ["tables", "plots"])
-def test_the_log_names_the_command_of_every_file(folder: str) -> None:
+def test_the_log_names_the_command_of_every_file(folder):
     rows = (ROOT / "results/LOG.md").read_text(encoding="utf-8").partition("## Files")[2]
     files = [file.name for file in (ROOT / "results" / folder).iterdir() if not file.name.startswith("demo")]  # ignored
     assert [name for name in files if f"`{name}`" not in rows] == []
 
 
-def test_tables_and_figures_are_filled_and_stay_as_they_are_then(figures: Any) -> None:
+def test_tables_and_figures_are_filled_and_stay_as_they_are_then(figures):
     page = (
         "<!-- table small: setting success lost/won speedup -->\nold\n<!-- /table -->\n"
         "It is <!-- figure small one_pass speedup -->9<!-- /figure -->× as fast, macro "
@@ -70,14 +69,12 @@ def test_tables_and_figures_are_filled_and_stay_as_they_are_then(figures: Any) -
         ("<!-- figure small two_pass speedup --><!-- /figure -->", "0 settings two_pass"),
     ],
 )
-def test_a_wrong_reference_is_named(figures: Any, page: str, says: str) -> None:
+def test_a_wrong_reference_is_named(figures, page, says):
     with pytest.raises(figures.BadReference, match=says):
         figures.filled(page)
 
 
-def test_a_page_that_differs_fails_the_check_and_is_mended_without(
-    figures: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_page_that_differs_fails_the_check_and_is_mended_without(figures, tmp_path, capsys):
     page = tmp_path / "page.md"
     page.write_text("<!-- figure small one_pass success -->7/10<!-- /figure -->", encoding="utf-8")
     assert figures.main(["--check", str(page)]) == 1

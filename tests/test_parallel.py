@@ -62,7 +62,7 @@ def oracle(policy: CompactTarget, prompt: torch.Tensor) -> list[int]:
 @pytest.mark.bits
 @torch.inference_mode()
 @pytest.mark.parametrize("packed", [False, True])
-def test_all_tokens_come_from_one_forward_in_which_they_see_each_other(packed: bool) -> None:
+def test_all_tokens_come_from_one_forward_in_which_they_see_each_other(packed):
     policy = target("target.parallel=true")
     wanted = oracle(policy, policy.encode(some_observation()))
     if packed:
@@ -77,7 +77,7 @@ def test_all_tokens_come_from_one_forward_in_which_they_see_each_other(packed: b
 
 
 @pytest.mark.bits
-def test_training_shows_it_no_action_token() -> None:
+def test_training_shows_it_no_action_token():
     policy = target("target.parallel=true")
     one = some_observation()
     inputs: Inputs = policy.inputs(one)
@@ -86,7 +86,7 @@ def test_training_shows_it_no_action_token() -> None:
     assert torch.equal(*logits)
 
 
-def test_it_continues_an_autoregressive_target_with_fresh_queries() -> None:
+def test_it_continues_an_autoregressive_target_with_fresh_queries():
     plain = target()
     made = continued_target(nano("target.parallel=true"), plain, "")
     assert torch.equal(made.head.weight, plain.head.weight)
@@ -98,7 +98,7 @@ def test_it_continues_an_autoregressive_target_with_fresh_queries() -> None:
 
 
 @pytest.fixture
-def results(tmp_path: Path) -> Path:
+def results(tmp_path):
     for name, policy in (("plain", target()), ("parallel", target("target.parallel=true"))):
         save_target(tmp_path / "artifacts/target" / name, policy, "metaworld", {})
     return tmp_path
@@ -114,13 +114,13 @@ def results(tmp_path: Path) -> Path:
         ("policy.target=parallel method=parallel deviation_every=2", "no AR to differ from"),
     ],
 )
-def test_target_and_method_must_fit(results: Path, words: str, message: str) -> None:
+def test_target_and_method_must_fit(results, words, message):
     settings = compose("rollout", [f"results={results}", "task=drawer-open-v3", *words.split()], RolloutSettings)
     with pytest.raises(UsageError, match=message):
         check(settings)
 
 
-def test_no_drafter_is_distilled_from_it(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_drafter_is_distilled_from_it(results, monkeypatch):
     from kerv_cli.worlds.demos.dataset import DemoDataset
 
     of_them = {"actions": SPEC.actions, "observation": SPEC.observation, "environment": SPEC.name, "tasks": {}}

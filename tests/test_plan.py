@@ -17,7 +17,6 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.episodes import identity
 from kerv_cli.episodes.identity import ENGINE, code_hash, hash_of, work_of
 from kerv_cli.episodes.settings import RolloutSettings
-from kerv_cli.lab.database import Database
 from kerv_cli.lab.plan import Block, Setting, Study, all_episodes, blocks_of, plain_settings
 from kerv_cli.lab.runs import interrupted_since
 from kerv_cli.lab.store import Plan, StudyStore, plan_study
@@ -65,7 +64,7 @@ def same_wanted(store: StudyStore, study: Study) -> bool:
     }
 
 
-def test_what_determines_a_result_is_another_episode() -> None:
+def test_what_determines_a_result_is_another_episode():
     for path, value in {
         "proposer.kind": "hold", "proposer.depth": 3, "acceptance.strict_dofs": False, "threshold.r": 5,
         "rectifier.kind": "compensate", "boundary.kind": "fused", "world.horizon": 200, "world.camera.size": 64,
@@ -81,7 +80,7 @@ def test_what_determines_a_result_is_another_episode() -> None:
         assert work(changed(path, value)) == work(settings_of("spec_vla", 9)), path
 
 
-def test_weights_and_engine_are_part_of_the_meaning() -> None:
+def test_weights_and_engine_are_part_of_the_meaning():
     settings = settings_of("ar")
     assert work(settings, {**IDENTITY, "drafter": "c" * 64}) != work(settings)
     assert work_of(asdict(settings), IDENTITY, engine=ENGINE + 1) != work(settings)
@@ -91,11 +90,11 @@ def test_weights_and_engine_are_part_of_the_meaning() -> None:
         hash_of({"a": float("nan")})
 
 
-def test_the_code_below_the_commands_counts_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_code_below_the_commands_counts_and_nothing_else(tmp_path, monkeypatch):
     shutil.copytree(Path(kerv_cli.__file__).parent, tmp_path / "kerv_cli")
     monkeypatch.setattr(kerv_cli, "__file__", str(tmp_path / "kerv_cli" / "__init__.py"))
 
-    def hash_after(file: str, more: str) -> str:
+    def hash_after(file, more):
         path = tmp_path / "kerv_cli" / file
         path.write_text(f"{path.read_text()}\n{more}\n")
         return code_hash.__wrapped__()
@@ -107,7 +106,7 @@ def test_the_code_below_the_commands_counts_and_nothing_else(tmp_path: Path, mon
     assert len({before, *computing}) == 4
 
 
-def test_blocks_go_by_repeat_task_and_seeds() -> None:
+def test_blocks_go_by_repeat_task_and_seeds():
     settings = {"ar": settings_of("ar", episodes=7), "b": settings_of("spec_vla", 9, episodes=7)}
     study = study_of(settings, TASKS, block=3, repeats=2)
     assert len({one.key for one in study.episodes}) == len(study.episodes) == 2 * 2 * 2 * 7
@@ -119,7 +118,7 @@ def test_blocks_go_by_repeat_task_and_seeds() -> None:
     assert blocks[-1].name == "push-v3 100006 repeat 1"
 
 
-def test_settings_take_turns_seed_by_seed_in_a_drawn_order() -> None:
+def test_settings_take_turns_seed_by_seed_in_a_drawn_order():
     (block,) = blocks_of(threshold_study(["reach-v3"], episodes=5).episodes, 5)
     turns = list(block.turns())
     assert [one.seed for one in turns] == sorted(one.seed for one in turns)
@@ -129,12 +128,12 @@ def test_settings_take_turns_seed_by_seed_in_a_drawn_order() -> None:
     assert list(Block(block.episodes).turns()) == turns
 
 
-def test_what_differs_in_threads_cannot_take_turns_in_one_process() -> None:
+def test_what_differs_in_threads_cannot_take_turns_in_one_process():
     study = study_of({"a": settings_of("ar"), "b": changed("runtime.threads", 2)}, ["reach-v3"])
     assert [len(block.settings) for block in blocks_of(study.episodes, 5)] == [1, 1]
 
 
-def test_a_batch_takes_any_tasks_of_one_setting_in_a_block_per_worker() -> None:
+def test_a_batch_takes_any_tasks_of_one_setting_in_a_block_per_worker():
     settings = {"ar": settings_of("ar"), "b": settings_of("spec_vla", 9)}
     for one in settings.values():
         one.rollout.batch = 2
@@ -145,14 +144,14 @@ def test_a_batch_takes_any_tasks_of_one_setting_in_a_block_per_worker() -> None:
     assert [len(block.episodes) for block in blocks_of(study_of(settings, TASKS).episodes, 5)] == [8, 8]
 
 
-def test_a_study_is_counted_before_it_is_planned() -> None:
+def test_a_study_is_counted_before_it_is_planned():
     setting = study_of({"ar": settings_of("ar", episodes=1)}, ["reach-v3"]).settings[0]
     large = dataclasses.replace(setting, settings={**setting.settings, "episodes": 10**7})
     with pytest.raises(UsageError, match="10000000 episodes: at most 1000000"):
         all_episodes([large], ["reach-v3"])
 
 
-def test_more_episodes_run_only_the_new_seeds_in_turn(database: Database) -> None:
+def test_more_episodes_run_only_the_new_seeds_in_turn(database):
     swept(database.results, threshold_study(TASKS, episodes=3, radii=(3,)))
     study = threshold_study(TASKS, episodes=5, radii=(3,))
     new = {(label, task): ([100_003, 100_004], "new seeds") for label in study.labels for task in TASKS}
@@ -167,7 +166,7 @@ def test_more_episodes_run_only_the_new_seeds_in_turn(database: Database) -> Non
     assert table_of(store)["episodes"].tolist() == [4, 4, 4]
 
 
-def test_sweeps_over_other_tasks_end_in_one_study(database: Database) -> None:
+def test_sweeps_over_other_tasks_end_in_one_study(database):
     swept(database.results, threshold_study(["reach-v3"]))
     store, _ = swept(database.results, threshold_study(["push-v3"]))
     assert same_wanted(store, threshold_study(TASKS))
@@ -181,7 +180,7 @@ def test_sweeps_over_other_tasks_end_in_one_study(database: Database) -> None:
     }  # fmt: skip
 
 
-def test_another_study_runs_only_what_it_does_not_share(database: Database) -> None:
+def test_another_study_runs_only_what_it_does_not_share(database):
     store, _ = swept(database.results, threshold_study(["reach-v3"]))
     settings = {"renamed": settings_of("spec_vla", 3), "ar": settings_of("ar"), "new": settings_of("spec_vla", 15)}
     study = study_of(settings, ["reach-v3"], "other")
@@ -195,14 +194,14 @@ def test_another_study_runs_only_what_it_does_not_share(database: Database) -> N
     assert len(to_run(plan_study(database, threshold_study(["reach-v3"])))) == 2  # only naive_sd and r=9 are gone
 
 
-def test_two_labels_of_one_result_run_once(database: Database) -> None:
+def test_two_labels_of_one_result_run_once(database):
     study = study_of({"ar": settings_of("ar"), "again": settings_of("ar")}, ["reach-v3"])
     store, outcome = swept(database.results, study)
     assert len(outcome.done) == 4
     assert store.counts() == (8, 8)
 
 
-def test_times_of_other_blocks_are_no_ratio_until_they_are_taken_in_turn(database: Database) -> None:
+def test_times_of_other_blocks_are_no_ratio_until_they_are_taken_in_turn(database):
     swept(database.results, threshold_study(["reach-v3"], radii=(3,)))
     study = threshold_study(["reach-v3"], radii=(3, 9))
     store, _ = swept(database.results, study)
@@ -214,7 +213,7 @@ def test_times_of_other_blocks_are_no_ratio_until_they_are_taken_in_turn(databas
     assert not plan_study(database, study, "timed").missing
 
 
-def test_other_code_runs_again_on_request_only(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_code_runs_again_on_request_only(database, monkeypatch):
     study = threshold_study(["reach-v3"])
     swept(database.results, study)
     assert not plan_study(database, study, "changed").missing
@@ -223,7 +222,7 @@ def test_other_code_runs_again_on_request_only(database: Database, monkeypatch: 
     assert why(plan_study(database, study, "changed")) == {"other code"}
 
 
-def test_a_rerun_keeps_the_older_measurement(database: Database) -> None:
+def test_a_rerun_keeps_the_older_measurement(database):
     study = threshold_study(["reach-v3"])
     store, _ = swept(database.results, study)
     first = set(store.frame()["episode"])
@@ -234,7 +233,7 @@ def test_a_rerun_keeps_the_older_measurement(database: Database) -> None:
     assert newest == set(store.frame()["episode"])
 
 
-def test_an_interrupted_rerun_goes_on(database: Database) -> None:
+def test_an_interrupted_rerun_goes_on(database):
     study = threshold_study(["reach-v3"])
     swept(database.results, study)
     with database.writing() as connection:  # not in the second in which the next one begins
@@ -250,10 +249,10 @@ def test_an_interrupted_rerun_goes_on(database: Database) -> None:
     assert to_run(plan_study(database, study, "all", since)) == rest
 
 
-def test_reasons_name_what_changed(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reasons_name_what_changed(database, monkeypatch):
     swept(database.results, threshold_study(["reach-v3"]))
 
-    def reason(settings: RolloutSettings, task: str = "reach-v3", weights: dict[str, str] = IDENTITY) -> str:
+    def reason(settings, task="reach-v3", weights=IDENTITY):
         setting = Setting("spec_vla r=3", "", plain_settings(asdict(settings)), weights)
         split = plan_study(database, Study("threshold", (setting,), all_episodes([setting], [task])))
         return next(iter(split.missing.values()), "")
@@ -275,8 +274,8 @@ def test_reasons_name_what_changed(database: Database, monkeypatch: pytest.Monke
     assert reason(same) == f"engine {ENGINE} → 4"
 
 
-def test_what_depends_on_the_order_of_episodes_is_reused_whole(database: Database) -> None:
-    def study(episodes: int) -> Study:
+def test_what_depends_on_the_order_of_episodes_is_reused_whole(database):
+    def study(episodes):
         settings = settings_of("retrieval", episodes=episodes)
         settings.skip = part("skip", "similarity", up=0.25)
         return study_of({"ar": settings_of("ar", episodes=episodes), "heisd": settings}, ["reach-v3"])

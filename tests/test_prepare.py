@@ -32,7 +32,7 @@ def kerv(*words: str, code: int = 0) -> str:
 
 
 @pytest.fixture
-def results(policies: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def results(policies, tmp_path, monkeypatch):
     """A folder to work in, with the target `mine`, trained on one of the two tasks of the demonstrations `few`."""
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "results"
@@ -51,13 +51,13 @@ def results(policies: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.usefixtures("results")
 @pytest.mark.parametrize("command", ["build datastore", "calibrate"])
-def test_tasks_and_demonstrations_are_those_of_the_target(command: str) -> None:
+def test_tasks_and_demonstrations_are_those_of_the_target(command):
     plan = " ".join(kerv(*command.split(), MINE, "--plan").split())
     assert "1 tasks" in plan
     assert "2 tasks" in " ".join(kerv(*command.split(), MINE, "task=[reach,push]", "--plan").split())
 
 
-def test_a_target_is_trained_on_the_demonstrations_that_are_named(results: Path) -> None:
+def test_a_target_is_trained_on_the_demonstrations_that_are_named(results):
     planned = kerv("train", "target", "name=new", "demos=few", "--plan")
     assert "8 demonstrations of 2 tasks, 6000 steps of 64 samples" in planned
     refused = kerv("train", "target", "name=new", "demos=few", "task=drawer-open", "--plan", code=1)
@@ -67,7 +67,7 @@ def test_a_target_is_trained_on_the_demonstrations_that_are_named(results: Path)
     assert "4 demonstrations of 1 tasks" in kerv("train", "target", "name=new", "task=reach", "--plan")
 
 
-def test_missing_demonstrations_are_recorded_by_the_command_that_is_named(results: Path) -> None:
+def test_missing_demonstrations_are_recorded_by_the_command_that_is_named(results):
     (results / "artifacts/demos/few").rename(results / "artifacts/demos/other")
     line = kerv("build", "datastore", MINE, code=1)
     assert "kerv demos name=few task=reach episodes=4'" in line
@@ -80,8 +80,8 @@ def test_missing_demonstrations_are_recorded_by_the_command_that_is_named(result
 
 
 @pytest.mark.usefixtures("results")
-def test_a_rollout_and_a_study_run_on_the_tasks_that_the_target_knows() -> None:
-    def tasks(*words: str) -> list[str]:
+def test_a_rollout_and_a_study_run_on_the_tasks_that_the_target_knows():
+    def tasks(*words):
         (chosen,) = {tuple(one.task) for one in resolve(list(words)).settings.values()}
         return list(chosen)
 
@@ -95,7 +95,7 @@ def test_a_rollout_and_a_study_run_on_the_tasks_that_the_target_knows() -> None:
 
 
 @pytest.mark.usefixtures("few_validations")
-def test_prepare_makes_what_is_missing_and_skips_what_is_there(results: Path) -> None:
+def test_prepare_makes_what_is_missing_and_skips_what_is_there(results):
     plan = kerv("prepare", MINE, "--plan")
     words = [line.split() for line in plan.splitlines() if "│" in line]
     assert [(row[1], row[3]) for row in words] == [
@@ -117,12 +117,10 @@ def test_prepare_makes_what_is_missing_and_skips_what_is_there(results: Path) ->
 
 @pytest.mark.usefixtures("few_validations")
 @pytest.mark.parametrize("file", [RESUME, "log.csv", "curves.png"])
-def test_prepare_ends_with_all_files_after_a_full_disk(
-    results: Path, monkeypatch: pytest.MonkeyPatch, file: str
-) -> None:
+def test_prepare_ends_with_all_files_after_a_full_disk(results, monkeypatch, file):
     replace = files.os.replace
 
-    def full(source: object, target: Path) -> None:
+    def full(source, target):
         if Path(target).name == file:
             raise OSError(errno.ENOSPC, "No space left on device")
         replace(source, target)
@@ -141,7 +139,7 @@ def typed(line: str) -> Iterator[list[str]]:
 
 
 @pytest.mark.usefixtures("few_validations")
-def test_the_remedy_for_weights_of_another_target_works_as_it_is_typed(results: Path) -> None:
+def test_the_remedy_for_weights_of_another_target_works_as_it_is_typed(results):
     rollout = ("rollout", "method=spec_vla", "task=reach", MINE, "--plan")
     fast = ("train.steps=1", "train.batch=2", "drafter.samples=40")
     for path in (results / "artifacts/drafter/mine").iterdir():
@@ -163,7 +161,7 @@ def test_the_remedy_for_weights_of_another_target_works_as_it_is_typed(results: 
 
 
 @pytest.mark.usefixtures("results", "few_validations")
-def test_an_artifact_is_shown_with_the_settings_that_it_was_made_with() -> None:
+def test_an_artifact_is_shown_with_the_settings_that_it_was_made_with():
     quick = ["demos=few", "task=[reach-v3]", "train.steps=1", "train.batch=2"]
     made = {
         "target/new": ["train", "target", "target=nano", "name=new", "target.observation=state", *quick],
@@ -176,7 +174,7 @@ def test_an_artifact_is_shown_with_the_settings_that_it_was_made_with() -> None:
     assert "made by   kerv train target target=nano " in kerv("runs", "show", "target/new")
 
 
-def test_a_certificate_is_made_from_what_its_candidates_read() -> None:
+def test_a_certificate_is_made_from_what_its_candidates_read():
     assert needs(("one_pass_certified",), sees=True) == ("drafter", "early", "scout", "certificate")
     assert needs(("one_pass",), sees=True) == ("early",)
 
@@ -199,7 +197,7 @@ class Tracker:
         self.ended = True
 
 
-def test_a_training_is_logged_as_it_runs_and_draws_its_curves(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_training_is_logged_as_it_runs_and_draws_its_curves(results, monkeypatch):
     words = ("train", "target", "name=short", "demos=few", "target=nano", "target.observation=state", "train.steps=3")
     assert "pip install 'kerv[trackio]'" in kerv(*words, "log=trackio", code=2)
     tracker = Tracker()
@@ -220,11 +218,11 @@ def test_a_training_is_logged_as_it_runs_and_draws_its_curves(results: Path, mon
         (["policy=parallel"], "decodes all tokens at once"),
     ],
 )
-def test_prepare_refuses_what_cannot_be(words: list[str], says: str) -> None:
+def test_prepare_refuses_what_cannot_be(words, says):
     assert says in kerv("prepare", *words, code=2)
 
 
 @pytest.mark.usefixtures("results")
 @pytest.mark.parametrize("command", ["prepare", "build datastore", "calibrate", "train drafter", "rollout", "serve"])
-def test_a_wrong_target_is_noticed_before_anything_else(command: str) -> None:
+def test_a_wrong_target_is_noticed_before_anything_else(command):
     assert "no target 'min'" in kerv(*command.split(), "policy.target=min", code=2)

@@ -125,30 +125,30 @@ def killed(script: str, path: Path, count: int, *arguments: str) -> list[int]:
     return [*found, *started]
 
 
-def test_workers_that_record_end_with_a_killed_command(tmp_path: Path) -> None:
+def test_workers_that_record_end_with_a_killed_command(tmp_path):
     assert all(map(ends, killed(DEMOS, tmp_path / "pids", 2)))
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
-def test_jobs_on_this_machine_end_with_a_killed_command(tmp_path: Path) -> None:
+def test_jobs_on_this_machine_end_with_a_killed_command(tmp_path):
     pytest.importorskip("submitit")
     assert all(map(ends, killed(JOBS, tmp_path / "pids", 2)))
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
-def test_what_a_library_starts_ends_with_a_killed_command(tmp_path: Path) -> None:
+def test_what_a_library_starts_ends_with_a_killed_command(tmp_path):
     assert all(map(ends, killed(GUARD, tmp_path / "pids", 1, "60")))
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
-def test_what_a_library_starts_ends_with_the_block(tmp_path: Path) -> None:
+def test_what_a_library_starts_ends_with_the_block(tmp_path):
     subprocess.run([sys.executable, "-c", GUARD, str(tmp_path / "pids"), "0"], check=True)
     assert all(map(ends, pids(tmp_path / "pids", 1)))
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("library", [IMPORT, FINALISER])
-def test_an_interrupt_waits_for_code_that_cannot_raise(library: str, number: signal.Signals, tmp_path: Path) -> None:
+def test_an_interrupt_waits_for_code_that_cannot_raise(library, number, tmp_path):
     (tmp_path / "library.py").write_text(library)
     run = subprocess.run(
         [sys.executable, "-c", COMMAND, str(number.value)], capture_output=True, text=True,
@@ -158,8 +158,8 @@ def test_an_interrupt_waits_for_code_that_cannot_raise(library: str, number: sig
     assert (run.returncode, run.stdout) == (0, "loaded\ncleared\n"), run.stderr
 
 
-def test_without_shared_memory_workers_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def refused(self: object) -> None:
+def test_without_shared_memory_workers_are_refused(monkeypatch, tmp_path):
+    def refused(self):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(type(multiprocessing.get_context("fork")), "Lock", refused)

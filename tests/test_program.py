@@ -93,9 +93,7 @@ def close(a: torch.Tensor, b: torch.Tensor) -> bool:
     prompt=st.integers(1, 40),
     nodes=st.integers(0, 40),
 )
-def test_the_packed_trunk_is_the_trunk(
-    seed: int, layers: int, heads: int, channels: int, prompt: int, nodes: int
-) -> None:
+def test_the_packed_trunk_is_the_trunk(seed, layers, heads, channels, prompt, nodes):
     """A prefill, a tree behind it, its commit, single tokens behind that; and the tree inside the prefill."""
     plain, packed = both_trunks(seed, layers, heads, channels)
     random = np.random.default_rng(seed)
@@ -123,7 +121,7 @@ def test_the_packed_trunk_is_the_trunk(
 
 
 @pytest.mark.parametrize("tokens", [1, 5, 30])
-def test_the_packed_trunk_takes_batches(tokens: int) -> None:
+def test_the_packed_trunk_takes_batches(tokens):
     plain, packed = both_trunks(7, 2, 2, 16)
     for batch in (1, 3):
         x, outputs = torch.randn(batch, tokens + 1, 32), []
@@ -146,9 +144,7 @@ def test_the_packed_trunk_takes_batches(tokens: int) -> None:
     norm=st.sampled_from(["group", "instance"]),
     space=st.sampled_from([OBSERVATION, ALONE, THREE]),
 )
-def test_the_packed_prompt_is_the_prompt(
-    seed: int, grid: int, keypoints: int, channels: int, norm: str, space: ObservationSpace
-) -> None:
+def test_the_packed_prompt_is_the_prompt(seed, grid, keypoints, channels, norm, space):
     plain, packed = both_targets("vision", seed, space, grid=grid, keypoints=keypoints, channels=channels, norm=norm)
     assert packed.vision.packed is not None
     random = np.random.default_rng(seed)
@@ -161,7 +157,7 @@ def test_the_packed_prompt_is_the_prompt(
     assert close(a[1], b[1])
 
 
-def test_a_sharp_temperature_does_not_overflow() -> None:
+def test_a_sharp_temperature_does_not_overflow():
     plain, packed = both_targets("vision", 3)
     for target in (plain, packed):
         target.vision.temperature.data.fill_(1e4)
@@ -174,7 +170,7 @@ def test_a_sharp_temperature_does_not_overflow() -> None:
 
 
 @pytest.mark.parametrize("observation", ["vision", "state"])
-def test_batches_and_teacher_forcing_agree(observation: str) -> None:
+def test_batches_and_teacher_forcing_agree(observation):
     plain, packed = both_targets(observation, 5)
     images = torch.randint(0, 256, (3, 3, 48, 48), dtype=torch.uint8) if observation == "vision" else None
     words = torch.ones(3, plain.settings.instruction_tokens).long()
@@ -184,7 +180,7 @@ def test_batches_and_teacher_forcing_agree(observation: str) -> None:
         assert close(plain.teacher_forced(inputs, tokens)[0], packed.teacher_forced(inputs, tokens)[0])
 
 
-def test_the_drafter_is_packed_too() -> None:
+def test_the_drafter_is_packed_too():
     target, _ = both_targets("state", 1)
     plain = shaken(EagleDrafter().network(DrafterSettings(), target), 1)
     packed = copy.deepcopy(plain)
@@ -200,7 +196,7 @@ def test_the_drafter_is_packed_too() -> None:
     assert close(*outputs)
 
 
-def test_packed_weights_never_outlive_their_weights() -> None:
+def test_packed_weights_never_outlive_their_weights():
     for change in (
         lambda m: m.load_state_dict(m.state_dict()),
         lambda m: m.to(torch.float64),
@@ -216,7 +212,7 @@ def test_packed_weights_never_outlive_their_weights() -> None:
     assert packed.state_dict().keys() == plain.state_dict().keys()
 
 
-def test_what_trains_is_not_packed_and_gets_its_gradients() -> None:
+def test_what_trains_is_not_packed_and_gets_its_gradients():
     _, frozen = both_trunks(6, 1, 2, 8)
     learning = copy.deepcopy(frozen).requires_grad_(True)
     pack(learning)
@@ -231,7 +227,7 @@ def test_what_trains_is_not_packed_and_gets_its_gradients() -> None:
     assert close(x.grad, twin.grad)
 
 
-def test_one_row_behind_a_mask_sees_what_the_modules_see() -> None:
+def test_one_row_behind_a_mask_sees_what_the_modules_see():
     plain, packed = both_trunks(3, 2, 2, 8)
     x, seen = torch.randn(1, 6, 16), np.array([[True, False, True, True]])
     outputs = []
@@ -243,12 +239,12 @@ def test_one_row_behind_a_mask_sees_what_the_modules_see() -> None:
     assert close(*outputs)
 
 
-def test_plain_decoders_in_numpy_and_c_give_the_shipped_policys_tokens(tmp_path: Path) -> None:
+def test_plain_decoders_in_numpy_and_c_give_the_shipped_policys_tokens(tmp_path):
     assert plain_decoder.main("mt10-vision", 100, tmp_path)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_row_has_the_same_bits_alone_and_among_many(seed: int) -> None:
+def test_a_row_has_the_same_bits_alone_and_among_many(seed):
     """So a verification equals single forwards even where two logits tie but for the last bit."""
     target = both_targets("vision", seed)[1]
     x, positions, caches = torch.randn(1, 40, 32), torch.arange(40), [target.new_cache(1, 48) for _ in range(3)]
@@ -266,7 +262,7 @@ def test_a_row_has_the_same_bits_alone_and_among_many(seed: int) -> None:
 
 
 @pytest.mark.parametrize("stored", ["float16", "int8"])
-def test_weights_stay_as_they_are_stored(stored: str) -> None:
+def test_weights_stay_as_they_are_stored(stored):
     plain, _ = both_trunks(2, 1, 2, 32)
     plain.load_state_dict(expanded(compact(plain.state_dict(), stored)))
     packed = copy.deepcopy(plain)
@@ -278,12 +274,12 @@ def test_weights_stay_as_they_are_stored(stored: str) -> None:
         assert close(plain(x, positions), packed(x, positions))
 
 
-def test_processes_compile_once_and_say_so(tmp_path: Path) -> None:
+def test_processes_compile_once_and_say_so(tmp_path):
     """Of two at once one compiles and the other waits; a third has a cache folder that cannot be written."""
     script = "from kerv_cli.targets.compact.program import kernels; kernels()"
     variables = os.environ | {"TMPDIR": str(tmp_path), "PYTHONPATH": str(Path(__file__).parent.parent)}
 
-    def begun(cache: str) -> subprocess.Popen[bytes]:
+    def begun(cache):
         environment = variables | {"NUMBA_CACHE_DIR": cache}
         return subprocess.Popen([sys.executable, "-c", script], env=environment, stderr=subprocess.PIPE)
 
@@ -293,7 +289,7 @@ def test_processes_compile_once_and_say_so(tmp_path: Path) -> None:
     assert sorted("compiling for this CPU" in text for text in told[:2]) == [False, True]
 
 
-def test_a_join_of_two_values_is_copied_together() -> None:
+def test_a_join_of_two_values_is_copied_together():
     x = torch.randn(2, 1, 4)
     program = Program(lambda x: torch.cat([x, x[..., :1].expand(1, 1, 3) * 3.0], -1), (1, 1, 4))
     assert torch.equal(program(x)[0], torch.cat([x, 3.0 * x[..., :1].expand(2, 1, 3)], -1))

@@ -94,7 +94,7 @@ def proposers(target: CompactTarget, prompt: torch.Tensor, truth: list[int], see
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10_000), chunk=st.sampled_from([1, 4, 8]), data=st.data())
 @pytest.mark.parametrize("name", ["hold", "linear", "kalman", "early", "retrieval", "merged", "hybrid"])
-def test_every_proposer_is_lossless(name: str, seed: int, chunk: int, data: st.DataObject) -> None:
+def test_every_proposer_is_lossless(name, seed, chunk, data):
     target = random_target(seed, 2, 2, chunk)
     prompt = random_prompt(target, seed)
     truth = plain_greedy(target, prompt)
@@ -116,7 +116,7 @@ def test_every_proposer_is_lossless(name: str, seed: int, chunk: int, data: st.D
     seed=st.integers(0, 10_000), chunk=st.sampled_from([1, 4, 8]), executed=st.integers(0, 12), carry_on=st.booleans()
 )
 @pytest.mark.parametrize("name", ["hold", "kalman", "early", "retrieval", "merged"])
-def test_every_in_prefill_draft_is_lossless(name: str, seed: int, chunk: int, executed: int, carry_on: bool) -> None:
+def test_every_in_prefill_draft_is_lossless(name, seed, chunk, executed, carry_on):
     target = random_target(seed, 2, 2, chunk)
     prompt = random_prompt(target, seed)
     truth = plain_greedy(target, prompt)
@@ -131,7 +131,7 @@ def test_every_in_prefill_draft_is_lossless(name: str, seed: int, chunk: int, ex
     assert_adds_up(result)
 
 
-def test_a_prediction_counts_committed_steps_as_executed() -> None:
+def test_a_prediction_counts_committed_steps_as_executed():
     target = random_target(1, 1, 1, 4)
     chunk = Chunk(torch.zeros(1, 1, 16), 4, SPACE, target.new_cache(1, 4), situation(np.random.default_rng(0), 5))
     chunk.tokens = [10, 20, 30, 254, 40]
@@ -142,15 +142,15 @@ def test_a_prediction_counts_committed_steps_as_executed() -> None:
     assert proposer.chains(chunk, 15) == [(last * 4)[:15]]
 
 
-def test_merging_drops_what_is_named_last_and_cuts_the_last_branch() -> None:
+def test_merging_drops_what_is_named_last_and_cuts_the_last_branch():
     class Fixed:
-        def __init__(self, name: str, chains: list[list[int]]) -> None:
+        def __init__(self, name, chains):
             self.name, self.found, self.sure = name, chains, False
 
-        def is_sure(self, chunk: Chunk) -> bool:
+        def is_sure(self, chunk):
             return self.sure
 
-        def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        def chains(self, chunk, depth):
             return [c[:depth] for c in self.found]
 
     one, two = Fixed("one", [[1, 2, 3], [1, 5, 6]]), Fixed("two", [[9, 9, 9]])
@@ -183,7 +183,7 @@ def skipping(
     return decoder, prompt, tokens
 
 
-def test_a_similar_enough_chunk_is_executed_without_a_forward() -> None:
+def test_a_similar_enough_chunk_is_executed_without_a_forward():
     decoder, prompt, tokens = skipping(max_skips=2)
     truth = plain_greedy(decoder.target, prompt)
     assert truth != tokens
@@ -196,7 +196,7 @@ def test_a_similar_enough_chunk_is_executed_without_a_forward() -> None:
     assert_adds_up(chunks[2])
 
 
-def test_a_stored_episode_is_not_executed_beyond_its_end_or_below_s_min() -> None:
+def test_a_stored_episode_is_not_executed_beyond_its_end_or_below_s_min():
     decoder, prompt, _ = skipping(left=4, max_skips=9)
     assert [decoder.decode_prompt(prompt).forwards > 0 for _ in range(3)] == [False, True, True]
     decoder.reset("t", 0, np.zeros(3))  # a new episode may use it again
@@ -206,7 +206,7 @@ def test_a_stored_episode_is_not_executed_beyond_its_end_or_below_s_min() -> Non
     assert decoder.decode_prompt(prompt).forwards > 0
 
 
-def test_s_min_rises_after_a_failure_and_falls_after_a_success_within_bounds() -> None:
+def test_s_min_rises_after_a_failure_and_falls_after_a_success_within_bounds():
     decoder, _, _ = skipping(up=0.5, down=0.1)
     skip = decoder.parts.skip
     assert skip is not None
@@ -219,7 +219,7 @@ def test_s_min_rises_after_a_failure_and_falls_after_a_success_within_bounds() -
     assert skip.s_min == pytest.approx(0.4)
 
 
-def test_nothing_is_skipped_on_the_drafters_side() -> None:
+def test_nothing_is_skipped_on_the_drafters_side():
     decoder, prompt, _ = skipping()
     retrieval = decoder.parts.proposer
     drafter = EagleDrafter().network(DrafterSettings(), decoder.target).eval().requires_grad_(False)
@@ -233,7 +233,7 @@ def test_nothing_is_skipped_on_the_drafters_side() -> None:
 
 @pytest.mark.bits
 @pytest.mark.parametrize("before", [True, False])
-def test_the_cache_has_room_for_the_largest_tree_a_proposer_names(before: bool) -> None:
+def test_the_cache_has_room_for_the_largest_tree_a_proposer_names(before):
     """A proposer that drafts more nodes than a chunk has tokens."""
     target = random_target(1, 1, 1, 1)
     prompt = random_prompt(target, 1)
@@ -242,7 +242,7 @@ def test_the_cache_has_room_for_the_largest_tree_a_proposer_names(before: bool) 
     class Wide(Proposer):
         name, nodes = "wide", 200
 
-        def propose(self, chunk: Chunk, depth: int) -> Draft:
+        def propose(self, chunk, depth):
             right = truth[len(chunk.tokens)]
             return Draft.of([*[(right + 1) % 255] * 199, right], [-1] * 200)
 

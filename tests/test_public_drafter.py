@@ -18,7 +18,6 @@ from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.eagle.public import Convention, PublicDrafter, PublicShape
 from kerv_cli.targets.checkpoint import read_target
 from kerv_cli.targets.openvla.config import Language
-from kerv_cli.targets.openvla.target import OpenVLATarget
 
 LANGUAGE = Language(704, 64, 96, 1, 4)
 KERV, TEXT, PROMPT = Convention(), Convention("text"), Convention(mask="prompt")
@@ -26,19 +25,19 @@ PATCHES = 16
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(tmp_path_factory):
     folder = tmp_path_factory.mktemp("public")
     imported(write_checkpoint(folder / "tiny"), folder)
     return folder
 
 
 @pytest.fixture(scope="module")
-def target(results: Path) -> OpenVLATarget:
+def target(results):
     return loaded(results / "artifacts/target/openvla")
 
 
 @pytest.fixture(scope="module")
-def drafter() -> PublicDrafter:
+def drafter():
     """Untrained: what is drafted does not matter to what these tests say."""
     torch.manual_seed(1)
     return PublicDrafter(PublicShape(LANGUAGE, True, KERV, PATCHES)).eval().requires_grad_(False)
@@ -59,7 +58,7 @@ def written(folder: Path, drafter: PublicDrafter, embedding: Tensor) -> Path:
 
 
 @pytest.mark.bits
-def test_it_computes_what_the_public_layer_does(target: OpenVLATarget) -> None:
+def test_it_computes_what_the_public_layer_does(target):
     """EAGLE's forward, spelt out with transformers' layer: fc over (embedding, state), no norm in front or behind."""
     from transformers import LlamaConfig
     from transformers.models.llama.modeling_llama import LlamaDecoderLayer, LlamaRotaryEmbedding
@@ -85,9 +84,7 @@ def test_it_computes_what_the_public_layer_does(target: OpenVLATarget) -> None:
 @pytest.mark.bits
 @pytest.mark.parametrize("convention", [KERV, TEXT, PROMPT, Convention("text", "prompt")])
 @pytest.mark.parametrize("top_k", [1, 3])
-def test_decoding_with_it_is_lossless_under_every_convention(
-    target: OpenVLATarget, drafter: PublicDrafter, convention: Convention, top_k: int
-) -> None:
+def test_decoding_with_it_is_lossless_under_every_convention(target, drafter, convention, top_k):
     own = with_convention(drafter, convention)
     for seed in (100, 101):
         with torch.inference_mode():
@@ -96,7 +93,7 @@ def test_decoding_with_it_is_lossless_under_every_convention(
         assert decode(target, DrafterProposer(own, target, 5, top_k, 16), prompt).tokens == truth
 
 
-def test_the_prompt_mask_hides_every_key_behind_the_prompt(drafter: PublicDrafter) -> None:
+def test_the_prompt_mask_hides_every_key_behind_the_prompt(drafter):
     own = with_convention(drafter, PROMPT)
     following, hidden = torch.randn(2, 1, 12, 64)
     outputs = []
@@ -108,9 +105,7 @@ def test_the_prompt_mask_hides_every_key_behind_the_prompt(drafter: PublicDrafte
     torch.testing.assert_close(outputs[0], outputs[1])
 
 
-def test_it_is_imported_beside_its_target(
-    results: Path, target: OpenVLATarget, drafter: PublicDrafter, tmp_path: Path
-) -> None:
+def test_it_is_imported_beside_its_target(results, target, drafter, tmp_path):
     folder = written(tmp_path / "eagle", drafter, target.model.language_model.model.embed_tokens.weight)
     words = [f"checkpoint={folder}", "policy.target=openvla", f"results={results}"]
     assert kerv("build", "drafter", *words, "positions=text")[0] == 0
@@ -134,9 +129,7 @@ def test_it_is_imported_beside_its_target(
         ("nothing", "checkpoint=DIR"),
     ],
 )
-def test_a_drafter_that_does_not_fit_is_refused_in_one_line(
-    results: Path, target: OpenVLATarget, drafter: PublicDrafter, tmp_path: Path, harm: str, said: str
-) -> None:
+def test_a_drafter_that_does_not_fit_is_refused_in_one_line(results, target, drafter, tmp_path, harm, said):
     folder = written(tmp_path / "eagle", drafter, torch.zeros(704, 64))
     words = [f"checkpoint={folder}"]
     if harm == "rename":

@@ -1,6 +1,5 @@
 """Qdrant finds the neighbours of exact search; tried with the client's local mode."""
 
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -36,7 +35,7 @@ def vectors_of(kind: str, width: int) -> np.ndarray:
 @pytest.mark.bits
 @pytest.mark.parametrize("kind", ["random", "ties", "still"])
 @pytest.mark.parametrize("width", [3, 48])
-def test_the_neighbours_are_those_of_exact_search(kind: str, width: int) -> None:
+def test_the_neighbours_are_those_of_exact_search(kind, width):
     vectors = vectors_of(kind, width)
     qdrant = searched(vectors)
     exact = ExactIndex(qdrant.store, None)
@@ -48,7 +47,7 @@ def test_the_neighbours_are_those_of_exact_search(kind: str, width: int) -> None
                 assert (rows.tolist(), similarity.tolist()) == (expected.tolist(), scores.tolist())
 
 
-def test_a_folder_is_kept_and_completed(tmp_path: Path) -> None:
+def test_a_folder_is_kept_and_completed(tmp_path):
     vectors, shards = vectors_of("random", 8)[:20], {"a": slice(0, 20)}
     for removed in ([2, 17], [3]):
         index = searched(vectors, shards, path=str(tmp_path))
@@ -57,7 +56,7 @@ def test_a_folder_is_kept_and_completed(tmp_path: Path) -> None:
         index.client.close()
 
 
-def test_what_cannot_be_used_gets_one_line(tmp_path: Path) -> None:
+def test_what_cannot_be_used_gets_one_line(tmp_path):
     (tmp_path / "file").touch()
     for name, value in (("url", "http://127.0.0.1:9"), ("url", "http://127.0.0.1:no"), ("path", tmp_path / "file")):
         with pytest.raises(UsageError, match=rf"datastore.{name}={value}: Qdrant cannot search here \([^\n]*\)$"):

@@ -80,7 +80,7 @@ def constant(steps: float, compensation: str = "none") -> RealClock:
 
 @pytest.mark.bits
 @pytest.mark.parametrize("compensation", ["none", "chunk"])
-def test_without_latency_an_episode_is_the_one_in_a_waiting_world(compensation: str) -> None:
+def test_without_latency_an_episode_is_the_one_in_a_waiting_world(compensation):
     waiting, real = point_episode(None), point_episode(constant(0, compensation))
     assert (waiting.actions == real.actions).all()
     assert (waiting.path == real.path).all()
@@ -91,7 +91,7 @@ def test_without_latency_an_episode_is_the_one_in_a_waiting_world(compensation: 
 
 @pytest.mark.bits
 @pytest.mark.parametrize("compensation", ["none", "chunk"])
-def test_without_latency_a_policy_is_bit_for_bit_the_same(policies: Path, compensation: str) -> None:
+def test_without_latency_a_policy_is_bit_for_bit_the_same(policies, compensation):
     real = ["rollout.clock=real", "rollout.latency=constant", f"rollout.delay_compensation={compensation}"]
     a, b = (episode_of(policies, "method=spec_vla", *words) for words in ([], real))
     assert (a.actions == b.actions).all()
@@ -109,7 +109,7 @@ def episode_of(results: Path, *overrides: str) -> EpisodeRecord:
 @pytest.mark.parametrize(
     ("steps", "chunk"), [(1, (0, 1, 2, 3)), (3, (0, 1, 2, 3)), (4, (0, 1, 2, 3)), (6, (0, 1, 2, 3, 3, 3))]
 )
-def test_the_chunk_before_is_executed_on_and_then_its_last_action_is_held(steps: int, chunk: tuple[int, ...]) -> None:
+def test_the_chunk_before_is_executed_on_and_then_its_last_action_is_held(steps, chunk):
     """k <= H: k old actions after an observation, and no pause after the first chunk."""
     record, pause = point_episode(constant(steps)), max(0, steps - 4)
     assert played(record)[: steps + 2 * len(chunk)] == [(0, 0)] * steps + [(n, i) for n in (1, 2) for i in chunk]
@@ -118,7 +118,7 @@ def test_the_chunk_before_is_executed_on_and_then_its_last_action_is_held(steps:
     assert record.decode_steps[:2] == (steps, steps + len(chunk))
 
 
-def test_k_steps_are_between_observation_and_first_action_whatever_the_chunk() -> None:
+def test_k_steps_are_between_observation_and_first_action_whatever_the_chunk():
     for chunk, steps in itertools.product((1, 2, 5), (1, 3, 7)):
         record = point_episode(constant(steps), Numbered(chunk))
         begun = zip(record.decodes[:-1], record.decode_steps, strict=False)
@@ -128,7 +128,7 @@ def test_k_steps_are_between_observation_and_first_action_whatever_the_chunk() -
             assert played(record)[start] == (number, 0)
 
 
-def test_a_fake_clock_says_how_long_each_decode_took() -> None:
+def test_a_fake_clock_says_how_long_each_decode_took():
     """Measured seconds, rounded up; a decode begins as early as the one before took long."""
     seconds = {1: 0.11, 2: 0.31, 3: 0.05}
     decoder = Numbered(4, lambda n: seconds.get(n, 0.2))
@@ -140,7 +140,7 @@ def test_a_fake_clock_says_how_long_each_decode_took() -> None:
     assert len(decoder.told) == record.steps  # held actions are part of the history
 
 
-def test_an_episode_can_end_while_the_policy_decodes() -> None:
+def test_an_episode_can_end_while_the_policy_decodes():
     record = point_episode(constant(6), horizon=9)
     assert record.steps == 9
     assert record.decodes[-1].delay == Delay(0.6, 6, 6, carried=3, held=0)
@@ -159,14 +159,14 @@ def test_an_episode_can_end_while_the_policy_decodes() -> None:
     assert (sums["delay_decodes"], sums["delay_seconds"]) == (0, 0.0)
 
 
-def test_rounding_up_ignores_float_noise_and_refuses_nonsense() -> None:
+def test_rounding_up_ignores_float_noise_and_refuses_nonsense():
     assert [steps_of(s, 80.0) for s in (0.0, 0.0001, 0.0125, 0.0126, 5 * 0.0125, 0.2)] == [0, 1, 1, 2, 5, 16]
     for wrong in (-0.001, float("nan"), float("inf")):
         with pytest.raises(KervError):
             steps_of(wrong, 80.0)
 
 
-def test_chunk_drops_what_is_stale() -> None:
+def test_chunk_drops_what_is_stale():
     record = point_episode(constant(2, "chunk"))
     assert played(record)[:8] == [(0, 0), (0, 0), (1, 2), (1, 3), (2, 2), (2, 3), (3, 2), (3, 3)]
     assert {d.delay.dropped for d in record.decodes if d.delay} == {2}
@@ -175,7 +175,7 @@ def test_chunk_drops_what_is_stale() -> None:
     assert slow.decodes[0].delay == Delay(0.6, 6, 0, carried=0, held=6, dropped=3)
 
 
-def test_before_its_first_action_a_robot_stands_still() -> None:
+def test_before_its_first_action_a_robot_stands_still():
     assert METAWORLD.standstill(1.0).tolist() == [0.0, 0.0, 0.0, -1.0]
     assert METAWORLD.standstill(0.0).tolist() == [0.0, 0.0, 0.0, 1.0]
     assert INSERTION.standstill(0.0).tolist() == [0.0] * 7  # a held peg stays held
@@ -209,7 +209,7 @@ def decode_of(rounds: Sequence[Round], propose: float = 0.0) -> DecodeRecord:
 AR = decode_of([Round("decode" if i else "prefill", "none", i, (), (i,), 0, 1, 0, ()) for i in range(16)])
 
 
-def test_a_profile_prices_the_records_forwards() -> None:
+def test_a_profile_prices_the_records_forwards():
     """All on another device but acceptance and the like, whose seconds are the record's own."""
     assert profiled(PROFILE)(AR) == pytest.approx(0.005 + 0.008 + 15 * 0.002 + 0.001)
     skipped = decode_of([Round("skip", "early", 0, (0,) * 16, (), 16, 16, 0, ())], propose=0.002)
@@ -237,13 +237,13 @@ def profile_file(folder: Path, **phases: Any) -> Path:
 
 
 @pytest.fixture
-def results(policies: Path, tmp_path: Path) -> Path:
+def results(policies, tmp_path):
     """The policies, in a folder to which a bench can be added."""
     (tmp_path / "artifacts").symlink_to(policies / "artifacts")
     return tmp_path
 
 
-def test_ar_takes_what_was_asked_for_and_the_others_their_share(results: Path) -> None:
+def test_ar_takes_what_was_asked_for_and_the_others_their_share(results):
     profile_file(results)
     words = ("rollout.clock=real", "rollout.latency=profile", "rollout.profile=there", "rollout.ar_ms=43")
     ar = episode_of(results, "method=ar", *words)
@@ -256,7 +256,7 @@ def test_ar_takes_what_was_asked_for_and_the_others_their_share(results: Path) -
     assert steps_of(felt[0], 80.0) == ar.decodes[0].delay_steps
 
 
-def test_measured_latency_is_scaled_by_ars_median_here(policies: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_measured_latency_is_scaled_by_ars_median_here(policies, monkeypatch):
     monkeypatch.setattr(policies_of, "ar_seconds", lambda *key: 0.02)
     record = episode_of(policies, "method=ar", "rollout.clock=real", "rollout.ar_ms=100")
     for decode in record.decodes:
@@ -264,7 +264,7 @@ def test_measured_latency_is_scaled_by_ars_median_here(policies: Path, monkeypat
         assert decode.delay.seconds == pytest.approx(5 * decode.seconds)
 
 
-def test_ar_is_measured_once_per_process(policies: Path) -> None:
+def test_ar_is_measured_once_per_process(policies):
     chosen = compose("rollout", [f"results={policies}", "policy.target=nano-state"], RolloutSettings)
     chosen.rollout = dataclasses.replace(chosen.rollout, clock="real", ar_ms=50)
     policies_of.ar_seconds.cache_clear()
@@ -275,7 +275,7 @@ def test_ar_is_measured_once_per_process(policies: Path) -> None:
     assert 0 < clock.latency(AR) / AR.seconds < 1000
 
 
-def test_a_profile_is_part_of_the_results_identity(results: Path) -> None:
+def test_a_profile_is_part_of_the_results_identity(results):
     words = [f"results={results}", "policy.target=nano-state", "rollout.clock=real", "rollout.latency=profile"]
     chosen = compose("rollout", [*words, "rollout.profile=there"], RolloutSettings)
     found = []
@@ -311,7 +311,7 @@ FROM_PROFILE = "rollout.clock=real rollout.latency=profile rollout.profile=there
         ("rollout.clock=real rollout.ar_ms=20 policy=expert", "it has no forwards"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(results: Path, words: str, message: str) -> None:
+def test_what_cannot_be_is_refused_in_one_line(results, words, message):
     profile_file(results, draft={"rows": [], "seconds": []})
     assert_refused(results, words, message)
 
@@ -337,6 +337,6 @@ def assert_refused(results: Path, words: str, message: str) -> None:
         ({"prefill": 3}, "holds no latency profile"),
     ],
 )
-def test_an_impossible_profile_is_refused(results: Path, phases: dict[str, Any], message: str) -> None:
+def test_an_impossible_profile_is_refused(results, phases, message):
     profile_file(results, **phases)
     assert_refused(results, FROM_PROFILE, message)

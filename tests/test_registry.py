@@ -35,7 +35,7 @@ def build(settings, context):
 
 
 @pytest.fixture
-def shelf(monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[str, Part]]:
+def shelf(monkeypatch):
     """The registry's own parts; what a test adds is gone after it."""
     kinds()
     copy = {kind: dict(named) for kind, named in registry._PARTS.items()}
@@ -47,7 +47,7 @@ def shelf(monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[str, Part]]:
 EVERY = [(kind, name) for kind in kinds() for name, part in parts(kind).items() if "examples." not in part.build]
 
 
-def test_a_name_belongs_to_one_piece_of_code(shelf: dict[str, dict[str, Part]]) -> None:
+def test_a_name_belongs_to_one_piece_of_code(shelf):
     first = register(Part("proposer", "mine", "one:build", traits={"when": PREFILL}))
     again = register(Part("proposer", "mine", "one:build", colour=1, traits={"when": PREFILL}))
     assert find("proposer", "mine") is again is not first
@@ -61,7 +61,7 @@ def test_a_name_belongs_to_one_piece_of_code(shelf: dict[str, dict[str, Part]]) 
     assert list(parts("proposer"))[-1] == "mine"  # in the order of registration
 
 
-def test_an_unknown_name_lists_the_near_ones() -> None:
+def test_an_unknown_name_lists_the_near_ones():
     with pytest.raises(UnknownName, match="unknown acceptance 'relaxd': did you mean relaxed"):
         find("acceptance", "relaxd")
     with pytest.raises(UnknownName, match=r"unknown acceptance\.kind 'x': known: strict, relaxed, sequence, hybrid"):
@@ -70,7 +70,7 @@ def test_an_unknown_name_lists_the_near_ones() -> None:
 
 
 @pytest.mark.parametrize(("kind", "name"), EVERY)
-def test_what_a_part_names_is_there(kind: str, name: str) -> None:
+def test_what_a_part_names_is_there(kind, name):
     part = find(kind, name)
     assert (part.kind, part.name) == (kind, name)
     if part.build:
@@ -83,13 +83,13 @@ def test_what_a_part_names_is_there(kind: str, name: str) -> None:
         check_settings(chosen, kind)  # defaults are in range
 
 
-def test_every_proposer_says_when_it_can_draft() -> None:
+def test_every_proposer_says_when_it_can_draft():
     assert {part.traits["when"] for part in parts("proposer").values()} == {PREFILL, STATES}
     chains = {name for name, part in parts("proposer").items() if part.traits.get("chains")}
     assert all(find("proposer", name).traits["when"] == PREFILL for name in chains)
 
 
-def test_what_is_not_there_gets_one_line() -> None:
+def test_what_is_not_there_gets_one_line():
     with pytest.raises(UsageError, match=r"kerv_cli.methods.streak has no nothing_there"):
         load("kerv_cli.methods.streak:nothing_there")
     with pytest.raises(UsageError):
@@ -103,7 +103,7 @@ def kerv(*words: str, folder: Path, plugins: str = "") -> subprocess.CompletedPr
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=120)
 
 
-def test_a_plugins_proposer_is_a_choice_like_any_other(tmp_path: Path) -> None:
+def test_a_plugins_proposer_is_a_choice_like_any_other(tmp_path):
     (tmp_path / "my_parts.py").write_text(PLUGIN.format(name="mine", module="my_parts"))
     words = ["rollout", "--cfg", "proposer=mine", "prefill_draft=mine"]
     shown = kerv(*words, "proposer.width=3", folder=tmp_path, plugins="my_parts")
@@ -126,7 +126,7 @@ def test_a_plugins_proposer_is_a_choice_like_any_other(tmp_path: Path) -> None:
         ("unknown", "unknown.py:1: NameError: name 'nothing' is not defined"),
     ],
 )
-def test_a_plugin_that_does_not_work_gets_one_line(tmp_path: Path, plugins: str, says: str) -> None:
+def test_a_plugin_that_does_not_work_gets_one_line(tmp_path, plugins, says):
     (tmp_path / "collides.py").write_text(PLUGIN.format(name="drafter", module="collides"))
     (tmp_path / "unfinished.py").write_text("x = 1\ndef f(:\n")
     (tmp_path / "unknown.py").write_text("nothing\n")
@@ -136,13 +136,11 @@ def test_a_plugin_that_does_not_work_gets_one_line(tmp_path: Path, plugins: str,
     assert done.stderr.count("\n") == 1
 
 
-def test_an_installed_package_registers_by_an_entry_point(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shelf: dict[str, dict[str, Part]]
-) -> None:
+def test_an_installed_package_registers_by_an_entry_point(tmp_path, monkeypatch, shelf):
     (tmp_path / "installed_parts.py").write_text(PLUGIN.format(name="installed", module="installed_parts"))
     monkeypatch.syspath_prepend(tmp_path)
 
-    def entry_points(group: str) -> list[EntryPoint]:
+    def entry_points(group):
         return [EntryPoint("anything", "installed_parts", group)] if group == "kerv.parts" else []
 
     monkeypatch.setattr(registry, "entry_points", entry_points)
@@ -150,7 +148,7 @@ def test_an_installed_package_registers_by_an_entry_point(
     assert find("proposer", "installed").built.__self__.build == "installed_parts:build"
 
 
-def test_parts_are_known_without_anything_heavy() -> None:
+def test_parts_are_known_without_anything_heavy():
     heavy = "{'torch', 'mujoco', 'metaworld', 'numpy', 'pyarrow', 'hydra', 'pydantic'}"
     asked = "import sys; from kerv_cli.base.registry import parts; assert len(parts('proposer')) > 9; "
     asked += "from kerv_cli.worlds import task_names; assert len(list(task_names())) > 50; "

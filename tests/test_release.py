@@ -25,13 +25,13 @@ def kerv(*words: str, code: int = 0) -> str:
     return run.output
 
 
-def test_the_hashes_are_those_of_the_shipped_policies() -> None:
+def test_the_hashes_are_those_of_the_shipped_policies():
     shipped = (ROOT / "results/pretrained").glob("*/target/target.json")
     assert {path.parts[-3]: json.loads(path.read_text())["sha256"] for path in shipped} == folders.RELEASED
 
 
 @pytest.fixture
-def archive(policies: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def archive(policies, tmp_path, monkeypatch):
     """An archive of a policy that this kerv does not have beside it, called as one of the released ones."""
     monkeypatch.setattr(folders, "shipped_dir", lambda: tmp_path / "nothing")
     policy = tmp_path / "release/mt50-vision"
@@ -45,7 +45,7 @@ def archive(policies: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     return path
 
 
-def test_a_policy_that_the_wheel_leaves_out_is_fetched(archive: Path, tmp_path: Path) -> None:
+def test_a_policy_that_the_wheel_leaves_out_is_fetched(archive, tmp_path):
     results = f"results={tmp_path}/results"
     words = ("rollout", "policy=mt50", "task=reach", results, "--plan")
     assert "kerv build policy source=mt50-vision.tar.gz" in kerv(*words, code=2)
@@ -61,10 +61,8 @@ def test_a_policy_that_the_wheel_leaves_out_is_fetched(archive: Path, tmp_path: 
     gc.collect()  # a connection that was left open is an error now, in this test
 
 
-def test_another_file_than_the_one_asked_for_is_refused(
-    archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refused(*words: str, code: int = 1) -> str:
+def test_another_file_than_the_one_asked_for_is_refused(archive, tmp_path, monkeypatch):
+    def refused(*words, code=1):
         return kerv("build", "policy", f"source={archive}", f"results={tmp_path}/results", *words, code=code)
 
     assert "not sha256=00" in refused("sha256=00")

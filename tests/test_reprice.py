@@ -15,7 +15,7 @@ from kerv_cli.cli.app import app
 from kerv_cli.engine.cost import Profile, prices, work_of_record
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.reprice import NamedProfile, open_profiles, repriced_table
-from kerv_cli.report.tables import StudyData, load_study
+from kerv_cli.report.tables import load_study
 
 PROFILE = Profile(
     31,
@@ -33,14 +33,14 @@ ABOUT = {"target": "vla-150m", "dtype": "bfloat16", "device_name": "GPU", "kerv_
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(tmp_path_factory):
     folder = tmp_path_factory.mktemp("results")
     swept(folder, threshold_study(["reach-v3", "push-v3"], radii=(9,)))
     return folder
 
 
 @pytest.fixture
-def data(results: Path) -> StudyData:
+def data(results):
     return load_study(StudyStore(results, "threshold"))
 
 
@@ -52,7 +52,7 @@ def profile_file(results: Path, name: str = "there", without: str = "", **change
     (folder / f"{name}.json").write_text(json.dumps({**ABOUT, "profile": profile}))
 
 
-def test_an_episode_costs_its_decodes_at_the_profiles_costs(results: Path, data: StudyData) -> None:
+def test_an_episode_costs_its_decodes_at_the_profiles_costs(results, data):
     """Ratios of means over episodes and over times per step, of the very records of the sweep."""
     table = repriced_table(data, StudyStore(results, "threshold"), [NamedProfile("there", PROFILE)]).set_index("label")
     seconds: dict[str, list[float]] = {}
@@ -80,7 +80,7 @@ def report(results: Path, *words: str) -> Any:
     return CliRunner().invoke(app, ["report", "study=threshold", f"results={results}", *words])
 
 
-def test_a_report_prices_the_study_on_several_machines(results: Path) -> None:
+def test_a_report_prices_the_study_on_several_machines(results):
     profile_file(results)
     profile_file(results, "elsewhere")
     document = json.loads((results / "bench/elsewhere.json").read_text())
@@ -107,7 +107,7 @@ def test_a_report_prices_the_study_on_several_machines(results: Path) -> None:
         ({"prompt": "many"}, "holds no latency profile"),
     ],
 )
-def test_a_profile_that_cannot_price_the_study_is_refused(results: Path, changes: Any, says: str) -> None:
+def test_a_profile_that_cannot_price_the_study_is_refused(results, changes, says):
     profile_file(results, "odd", **changes)
     done = report(results, "on=odd")
     assert done.exit_code == 2
@@ -115,7 +115,7 @@ def test_a_profile_that_cannot_price_the_study_is_refused(results: Path, changes
     assert done.stderr.count("\n") == 1
 
 
-def test_what_is_not_there_is_refused(results: Path) -> None:
+def test_what_is_not_there_is_refused(results):
     profile_file(results)
     done = report(results, "on=nowhere")
     assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
@@ -125,7 +125,7 @@ def test_what_is_not_there_is_refused(results: Path) -> None:
     assert "name the study" in every.stderr
 
 
-def test_shipped_profiles_can_price_what_ships(tmp_path: Path) -> None:
+def test_shipped_profiles_can_price_what_ships(tmp_path):
     from kerv_cli.engine.cost import FORWARDS, read_profile, source_costs
     from kerv_cli.targets.folders import shipped_dir
 
@@ -139,7 +139,7 @@ def test_shipped_profiles_can_price_what_ships(tmp_path: Path) -> None:
     ]
 
 
-def test_the_hands_way_of_an_episode() -> None:
+def test_the_hands_way_of_an_episode():
     record = still_episode("reach-v3", 0, True, [])
     hz = record.space.control_hz
     t = np.arange(6) / hz

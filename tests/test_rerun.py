@@ -60,7 +60,7 @@ def strings(value: Any) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("kind", ["ar", "drafter", "mixed"])
-def test_a_recording_holds_what_the_record_says(kind: str, tmp_path: Path) -> None:
+def test_a_recording_holds_what_the_record_says(kind, tmp_path):
     record = episode(kind, frames=16)
     record = replace(record, places={"goal": np.zeros_like(record.path)})
     path = saved(record, tmp_path)
@@ -80,7 +80,7 @@ def test_a_recording_holds_what_the_record_says(kind: str, tmp_path: Path) -> No
     assert path.stat().st_size < 600_000
 
 
-def test_seven_dofs_have_their_names_and_limits(tmp_path: Path) -> None:
+def test_seven_dofs_have_their_names_and_limits(tmp_path):
     limits = (9, 9, 9, 5, 5, 5, 0)
     tokens = tuple(range(50, 64))
     rounds = (prefill(50), verify(1, tokens[1:13], tokens[1:], 12, limits))
@@ -98,7 +98,7 @@ def test_seven_dofs_have_their_names_and_limits(tmp_path: Path) -> None:
     assert read_recording(path)["timelines"]["time"] == (0, 100_000_000)
 
 
-def test_values_survive_to_the_last_digit(tmp_path: Path) -> None:
+def test_values_survive_to_the_last_digit(tmp_path):
     record = episode("drafter")
     path = saved(record, tmp_path)
     assert np.array_equal(np.array(column(path, "/actions", "scalars"), dtype=np.float32), record.actions)
@@ -115,8 +115,8 @@ def test_values_survive_to_the_last_digit(tmp_path: Path) -> None:
     assert str(first.target_tokens[0]) in table
 
 
-def test_a_failure_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(path: Path, content: bytes) -> int:
+def test_a_failure_leaves_no_file(tmp_path, monkeypatch):
+    def full(path, content):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full)
@@ -126,7 +126,7 @@ def test_a_failure_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("share", [0.01, 0.5, 0.99])
-def test_a_damaged_recording_gets_one_line(share: float, tmp_path: Path) -> None:
+def test_a_damaged_recording_gets_one_line(share, tmp_path):
     path = saved(episode("drafter"), tmp_path)
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
     with pytest.raises(KervError) as caught:
@@ -135,7 +135,7 @@ def test_a_damaged_recording_gets_one_line(share: float, tmp_path: Path) -> None
     assert "record the episode again" in str(caught.value)
 
 
-def test_every_place_of_a_chunk_has_its_outcome() -> None:
+def test_every_place_of_a_chunk_has_its_outcome():
     target_tokens = (60, 70, 80, 90, 100, 110, 120)
     rounds = (prefill(50), verify(1, (60, 73, 99), target_tokens[:3], 2), verify(4, (90, 101), target_tokens[3:6], 2))
     decode = decode_of((50, 60, 73, 80, 90, 101, 110, 128), rounds, 2, compensated=1)
@@ -146,7 +146,7 @@ def test_every_place_of_a_chunk_has_its_outcome() -> None:
     assert [f.limit for f in outcomes[1:6]] == [9, 9, 0, 9, 9]
 
 
-def test_a_rejection_stays_visible_whoever_fills_the_place() -> None:
+def test_a_rejection_stays_visible_whoever_fills_the_place():
     refused = Round("verify", "drafter", 1, (60, 99), (60, 70), 1, 1, 20, (9,))
     filled = decode_of((50, 60, 128, 128), (prefill(50), refused), 1, compensated=2)
     assert [f.kind for f in outcomes_of(filled, 8, DOFS)[:4]] == ["target", "accepted", "rejected", "compensated"]
@@ -161,7 +161,7 @@ def test_a_rejection_stays_visible_whoever_fills_the_place() -> None:
     assert [f.kind for f in outcomes_of(cut, 8, DOFS)[4:]] == ["dropped", "rejected", "dropped", "dropped"]
 
 
-def test_decodes_without_rounds_are_told_apart() -> None:
+def test_decodes_without_rounds_are_told_apart():
     held = decode_of((9,) * DOFS, (), 1, forwards=0, mode="hold")
     assert {f.kind for f in outcomes_of(held, DOFS, DOFS)} == {"skipped"}
     scripted = decode_of((), (), 1, forwards=0, mode="expert")
@@ -171,7 +171,7 @@ def test_decodes_without_rounds_are_told_apart() -> None:
 
 
 @pytest.mark.parametrize("kind", ["ar", "drafter", "mixed"])
-def test_drawn_tokens_add_up_with_the_records(kind: str) -> None:
+def test_drawn_tokens_add_up_with_the_records(kind):
     for decode in episode(kind).decodes:
         size = chunk_size([decode], DOFS)
         assert size == 16
@@ -184,7 +184,7 @@ def test_drawn_tokens_add_up_with_the_records(kind: str) -> None:
         assert first is None or decode.first_rejected in (first, decode.size)
 
 
-def test_optional_numbers_have_rows_only_where_they_are(tmp_path: Path) -> None:
+def test_optional_numbers_have_rows_only_where_they_are(tmp_path):
     record = episode("mixed")
     path = saved(record, tmp_path)
     for signal in ("variability", "metric", "similarity"):
@@ -210,9 +210,7 @@ def test_optional_numbers_have_rows_only_where_they_are(tmp_path: Path) -> None:
         ("drafter", 16, {"Camera", "Acceptance threshold r, bins", "K, kinematic variability"}, set()),
     ],
 )
-def test_the_layout_shows_what_there_is(
-    kind: str, frames: int, present: set[str], absent: set[str], tmp_path: Path
-) -> None:
+def test_the_layout_shows_what_there_is(kind, frames, present, absent, tmp_path):
     path = saved(episode(kind, frames=frames), tmp_path)
     reader = RrdReader(path)
     (layout,) = reader.blueprints()
@@ -231,14 +229,14 @@ def test_the_layout_shows_what_there_is(
     assert states == [[1]]  # paused
 
 
-def test_a_mistake_in_a_column_raises_instead_of_vanishing(tmp_path: Path) -> None:
+def test_a_mistake_in_a_column_raises_instead_of_vanishing(tmp_path):
     record = episode("ar")
     with pytest.raises(ValueError, match="shorter"):
         saved(replace(record, actions=record.actions[:-1]), tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_texts_hold_only_what_the_viewers_font_has(tmp_path: Path) -> None:
+def test_texts_hold_only_what_the_viewers_font_has(tmp_path):
     record = replace(episode("mixed", horizon=12), instruction="open the 🟩 抽屉\ndrawer")
     path = saved(record, tmp_path, method="spéc 🚀")
     reader = RrdReader(path)
@@ -248,9 +246,7 @@ def test_texts_hold_only_what_the_viewers_font_has(tmp_path: Path) -> None:
     assert all(line == readable(line) for t in texts for line in t.splitlines())
 
 
-def test_the_newest_recordings_come_first_and_not_all_are_opened(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_newest_recordings_come_first_and_not_all_are_opened(tmp_path, monkeypatch):
     first = saved(episode("ar", horizon=4), tmp_path / "deep")
     for i in range(MOST_OPENED + 3):
         copy = tmp_path / f"copy{i:02d}.rrd"
@@ -264,7 +260,7 @@ def test_the_newest_recordings_come_first_and_not_all_are_opened(
 
 
 @pytest.mark.parametrize("name", ["nowhere.rrd", "notes.txt", ""])
-def test_what_is_no_recording_is_refused(tmp_path: Path, name: str) -> None:
+def test_what_is_no_recording_is_refused(tmp_path, name):
     (tmp_path / "notes.txt").write_text("x")
     with pytest.raises(UsageError):
         find_recordings([tmp_path / name])
@@ -273,7 +269,7 @@ def test_what_is_no_recording_is_refused(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the stand-in is a shell script")
-def test_the_viewer_is_started_and_left_alone_or_says_why_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_viewer_is_started_and_left_alone_or_says_why_not(tmp_path, monkeypatch):
     path, asked, program = saved(episode("ar", horizon=4), tmp_path), tmp_path / "asked", tmp_path / "rerun"
     monkeypatch.setattr(viewer, "has_display", lambda: True)
     monkeypatch.setattr(viewer, "_START_SECONDS", 0.3)

@@ -10,7 +10,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -25,7 +24,6 @@ from typer.testing import CliRunner
 from kerv_cli.catalogue.entries import find_runs, matching
 from kerv_cli.cli.app import app
 from kerv_cli.lab.database import EPISODES, RUNS, WANTED, Database
-from kerv_cli.lab.plan import Setting
 from kerv_cli.lab.runs import INTERRUPTED
 from kerv_cli.lab.study import EpisodeRunner
 from kerv_cli.report.export import TRACKERS, export
@@ -44,7 +42,7 @@ def works(*arguments: str) -> str:
 
 
 @pytest.fixture(scope="module")
-def results(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(policies, tmp_path_factory):
     """Read only: a rollout of two settings, one of a single one, and a training."""
     folder = tmp_path_factory.mktemp("runs") / "results"
     shutil.copytree(policies / "artifacts", folder / "artifacts")
@@ -61,9 +59,7 @@ def listed(results: Path, *words: str) -> list[dict[str, Any]]:
     return found
 
 
-def test_runs_are_viewed_by_their_ids_and_last_is_the_newest_with_recordings(
-    policies: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_runs_are_viewed_by_their_ids_and_last_is_the_newest_with_recordings(policies, tmp_path, monkeypatch):
     results, other = f"results={tmp_path}/results", f"results={tmp_path}/other"
     words = ["policy=vision", "policy.target=nano-vision", "task=reach-v3", "world.horizon=3", "record_size=32"]
     for folder, methods in ((results, ("jacobi", "ar")), (other, ("jacobi",))):
@@ -82,7 +78,7 @@ def test_runs_are_viewed_by_their_ids_and_last_is_the_newest_with_recordings(
     assert "nobodys/either does not exist" in kerv("view", "nobodys/either", results).stderr
 
 
-def test_runs_are_listed_and_filtered(results: Path) -> None:
+def test_runs_are_listed_and_filtered(results):
     runs = listed(results)
     assert [run["kind"] for run in runs].count("rollout") == 2
     assert {run["state"] for run in runs if run["kind"] == "rollout"} == {"complete"}
@@ -98,7 +94,7 @@ def test_runs_are_listed_and_filtered(results: Path) -> None:
     assert matching(find_runs(results), {"since": "2999"}) == []
 
 
-def test_a_run_is_shown_and_a_wrong_name_refused(results: Path) -> None:
+def test_a_run_is_shown_and_a_wrong_name_refused(results):
     told = works("runs", "show", "last", f"results={results}")
     assert re.search(r"^(command +kerv rollout|made by +unknown)", told, re.MULTILINE)
     missing = kerv("runs", "show", "nothing-like-it", f"results={results}")
@@ -107,7 +103,7 @@ def test_a_run_is_shown_and_a_wrong_name_refused(results: Path) -> None:
     assert "kerv rollout" in kerv("runs", "show", "last", "results=/tmp/no-such-results").stderr
 
 
-def test_two_runs_of_a_study_are_compared_setting_by_setting(tmp_path: Path) -> None:
+def test_two_runs_of_a_study_are_compared_setting_by_setting(tmp_path):
     for name in ("one", "two"):
         swept(tmp_path, threshold_study(["reach-v3", "push-v3"], name=name))
     pairs = json.loads(works("runs", "compare", "one", "two", f"results={tmp_path}", "--json"))
@@ -116,7 +112,7 @@ def test_two_runs_of_a_study_are_compared_setting_by_setting(tmp_path: Path) -> 
     assert all(rows["speed, per step"]["change"] == 1.0 and rows["success"]["change"] == 0.0 for rows in results)
 
 
-def test_comparison_says_what_differs_in_settings_and_results(results: Path) -> None:
+def test_comparison_says_what_differs_in_settings_and_results(results):
     grid = next(run["id"] for run in listed(results, "method=spec_vla"))
     (found,) = json.loads(
         works("runs", "compare", f"{grid}:spec_vla r=5", f"{grid}:spec_vla r=9", f"results={results}", "--json")
@@ -130,7 +126,7 @@ def test_comparison_says_what_differs_in_settings_and_results(results: Path) -> 
 
 
 @pytest.mark.bits
-def test_a_rerun_repeats_the_tokens_in_a_folder_of_its_own(results: Path, tmp_path: Path) -> None:
+def test_a_rerun_repeats_the_tokens_in_a_folder_of_its_own(results, tmp_path):
     copy = tmp_path / "results"
     shutil.copytree(results, copy)
     single = next(run["id"] for run in listed(copy, "method=ar"))
@@ -153,17 +149,15 @@ def test_a_rerun_repeats_the_tokens_in_a_folder_of_its_own(results: Path, tmp_pa
     assert kerv("runs", "rerun", "spec_vla", f"results={copy}").exit_code == 1
 
 
-def test_an_interrupted_rollout_goes_on_where_it_was(
-    policies: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_rollout_goes_on_where_it_was(policies, tmp_path, monkeypatch):
     shutil.copytree(policies / "artifacts", tmp_path / "results" / "artifacts")
     command = ["rollout", "method=ar", "episodes=3", *FAST, f"results={tmp_path}/results"]
     original = EpisodeRunner.__call__
 
-    def interrupted(self: EpisodeRunner, setting: Setting, task: str) -> Callable[[int], Any]:
+    def interrupted(self, setting, task):
         run = original(self, setting, task)
 
-        def episode(seed: int) -> Any:
+        def episode(seed):
             if seed == 100_001:
                 raise KeyboardInterrupt
             return run(seed)
@@ -184,7 +178,7 @@ def test_an_interrupted_rollout_goes_on_where_it_was(
     assert len(listed(tmp_path / "results", "kind=rollout")) == 2
 
 
-def test_results_that_cannot_be_written_are_refused_at_once(tmp_path: Path) -> None:
+def test_results_that_cannot_be_written_are_refused_at_once(tmp_path):
     (tmp_path / "file").touch()
     for command in (["rollout"], ["sweep", "study=demo"], ["demos"], ["train", "target"], ["calibrate"], ["report"]):
         refused = kerv(*command, f"results={tmp_path}/file/below")
@@ -193,7 +187,7 @@ def test_results_that_cannot_be_written_are_refused_at_once(tmp_path: Path) -> N
     assert list(tmp_path.iterdir()) == [tmp_path / "file"]
 
 
-def test_a_task_that_the_policy_never_saw_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_task_that_the_policy_never_saw_is_named(tmp_path, capsys):
     from kerv_cli.cli.work import planned_rollout
     from kerv_cli.episodes.resolve import resolve_rollout
 
@@ -213,13 +207,13 @@ def test_a_task_that_the_policy_never_saw_is_named(tmp_path: Path, capsys: pytes
         (["method=ar,kerv"], ["ar", "kerv"]),
     ],
 )  # fmt: skip
-def test_a_method_composed_on_the_command_line_is_called_what_it_is(words: list[str], labels: list[str]) -> None:
+def test_a_method_composed_on_the_command_line_is_called_what_it_is(words, labels):
     from kerv_cli.episodes.resolve import resolve_rollout
 
     assert list(resolve_rollout(words, multirun=True).settings) == labels
 
 
-def test_the_commands_behind_a_rollout_run_too(results: Path, tmp_path: Path) -> None:
+def test_the_commands_behind_a_rollout_run_too(results, tmp_path):
     copy = tmp_path / "results"
     shutil.copytree(results, copy)
     told = works("rollout", "method=ar", "episodes=1", *FAST, f"results={copy}")
@@ -259,9 +253,7 @@ class Calls(ModuleType):
 
 
 @pytest.mark.parametrize("tracker", ["trackio", "wandb", "mlflow"])
-def test_a_tracker_gets_settings_every_episode_and_the_summary(
-    tracker: str, results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_tracker_gets_settings_every_episode_and_the_summary(tracker, results, tmp_path, monkeypatch):
     fake = Calls(tracker)
     monkeypatch.setitem(sys.modules, tracker, fake)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
@@ -274,7 +266,7 @@ def test_a_tracker_gets_settings_every_episode_and_the_summary(
     assert "forwards_per_step" in text
 
 
-def test_csv_and_a_missing_package(results: Path, tmp_path: Path) -> None:
+def test_csv_and_a_missing_package(results, tmp_path):
     written = works("runs", "export", "target/nano-state", "--dir", str(tmp_path), f"results={results}")
     assert list(pd.read_csv(written.splitlines()[0])["score"]) == [0.1, 0.3]
     for name in TRACKERS.keys() - {"csv"}:
@@ -308,7 +300,7 @@ remove(run, sys.argv[1])
 
 
 @pytest.mark.parametrize("moment", range(4))
-def test_a_removal_that_is_killed_can_be_repeated(results: Path, tmp_path: Path, moment: int) -> None:
+def test_a_removal_that_is_killed_can_be_repeated(results, tmp_path, moment):
     copy = tmp_path / "results"
     shutil.copytree(results, copy)
     name = next(run["id"] for run in listed(copy) if run["kind"] == "rollout")
@@ -323,7 +315,7 @@ def test_a_removal_that_is_killed_can_be_repeated(results: Path, tmp_path: Path,
     assert not list((copy / "rollouts").iterdir())
 
 
-def test_removal_refuses_links_and_parts_of_names(results: Path, tmp_path: Path) -> None:
+def test_removal_refuses_links_and_parts_of_names(results, tmp_path):
     copy = tmp_path / "results"
     shutil.copytree(results, copy)
     name = next(run["id"] for run in listed(copy) if run["kind"] == "rollout")

@@ -1,7 +1,6 @@
 """The scout and the certificate of success: drafts without the target's encoder, and what a certificate covers."""
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -38,7 +37,7 @@ TASK = "drawer-close-v3"
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory, policies: Path) -> Path:
+def results(tmp_path_factory, policies):
     """The nano policies' results folder with a few real demonstrations."""
     import shutil
 
@@ -49,12 +48,12 @@ def results(tmp_path_factory: pytest.TempPathFactory, policies: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def target(policies: Path) -> CompactTarget:
+def target(policies):
     return load_target(policies / "artifacts/target/nano-vision")[0]
 
 
 @pytest.fixture
-def scout(target: CompactTarget) -> ScoutNetwork:
+def scout(target):
     torch.manual_seed(0)
     scout = ScoutDrafter().network(SMALL, target).eval().requires_grad_(False)
     for parameter in scout.parameters():
@@ -76,9 +75,7 @@ def decoder(target: CompactTarget, proposer: ScoutProposer, **parts: Any) -> Dec
     return made
 
 
-def test_an_unverified_decode_never_runs_the_targets_encoder(
-    target: CompactTarget, scout: ScoutNetwork, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unverified_decode_never_runs_the_targets_encoder(target, scout, monkeypatch):
     proposer = ScoutProposer(scout, target)
     unverified = decoder(target, proposer, skip=AlwaysSkip(proposer))
     seen = [observed(target, i) for i in range(3)]
@@ -94,7 +91,7 @@ def test_an_unverified_decode_never_runs_the_targets_encoder(
         assert (one.actions == together.actions).all()
 
 
-def test_verified_strictly_its_drafts_change_no_token(target: CompactTarget, scout: ScoutNetwork) -> None:
+def test_verified_strictly_its_drafts_change_no_token(target, scout):
     plain, drafted = Decoder(target), decoder(target, ScoutProposer(scout, target))
     plain.reset(TASK, 1, np.zeros(3))
     for seed in range(4):
@@ -105,7 +102,7 @@ def test_verified_strictly_its_drafts_change_no_token(target: CompactTarget, sco
 
 
 @pytest.mark.parametrize("views", [1, 2])
-def test_packed_weights_give_the_same_draft(target: CompactTarget, scout: ScoutNetwork, views: int) -> None:
+def test_packed_weights_give_the_same_draft(target, scout, views):
     inputs = target.inputs(observed(target, 0))
     assert inputs.images is not None
     inputs = dataclasses.replace(inputs, images=torch.cat([inputs.images, 255 - inputs.images][:views], -1))
@@ -126,7 +123,7 @@ def test_packed_weights_give_the_same_draft(target: CompactTarget, scout: ScoutN
     assert torch.allclose(again, places, atol=1e-4)
 
 
-def test_it_is_trained_from_the_command_line_for_its_target_alone(results: Path) -> None:
+def test_it_is_trained_from_the_command_line_for_its_target_alone(results):
     words = ["train", "drafter", "drafter=scout", "demos=few", "policy.target=nano-vision"]
     words += [
         "policy.artifacts.scout=mine",
@@ -188,7 +185,7 @@ def context(target: CompactTarget, artifacts: dict[str, Any], task: str, **metho
     return Context(target, artifacts.__getitem__, task, {}, settings, 0)
 
 
-def test_a_certified_task_gets_its_rule_and_any_other_a_streak(target: CompactTarget, scout: ScoutNetwork) -> None:
+def test_a_certified_task_gets_its_rule_and_any_other_a_streak(target, scout):
     artifacts: dict[str, Any] = {"certificate": certificate(target, 1), "scout": scout}
     drafts = ScopedSettings(outside="hold")
     for task, source, rule in ((TASK, "scout", AlwaysSkip), ("reach-v3", "hold", StreakSkip)):
@@ -207,8 +204,8 @@ def test_a_certified_task_gets_its_rule_and_any_other_a_streak(target: CompactTa
     assert (skip.settings.most, skip.settings.opening) == (8, 1)
 
 
-def test_a_certificate_of_another_draft_method_chunk_format_or_world_is_refused(target: CompactTarget) -> None:
-    def deploy(issued: Certificate, **method: Any) -> None:
+def test_a_certificate_of_another_draft_method_chunk_format_or_world_is_refused(target):
+    def deploy(issued, **method):
         certified(CertifiedSkipSettings(), context(target, {"certificate": issued}, TASK, **method))
 
     issued = certificate(target, 0)
@@ -228,7 +225,7 @@ def test_a_certificate_of_another_draft_method_chunk_format_or_world_is_refused(
         CertificateArtifact().check_use(issued, Use({}, "float32", "metaworld", world={**world, "horizon": 120}))
 
 
-def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results: Path) -> None:
+def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results):
     study = results / "tiny.yaml"
     study.write_text(
         "common: method=early_unverified prefill_draft=hold proposer=none threshold.r=9 "
@@ -276,9 +273,7 @@ def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results: Pat
         ("", "", "rollout.clock=real", "rollout.clock=real: a certificate is of a world that waits"),
     ],
 )
-def test_settings_of_other_conditions_get_no_certificate(
-    policies: Path, tmp_path: Path, ar: str, scout: str, common: str, says: str
-) -> None:
+def test_settings_of_other_conditions_get_no_certificate(policies, tmp_path, ar, scout, common, says):
     study = tmp_path / "mixed.yaml"
     study.write_text(
         f"settings:\n  early: method=early_unverified\n  scout: method=scout_unverified {scout}\n  ar: method=ar {ar}\n"
@@ -289,6 +284,6 @@ def test_settings_of_other_conditions_get_no_certificate(
     assert says in str(refused.value)
 
 
-def test_the_shipped_study_of_certificates_passes(policies: Path) -> None:
+def test_the_shipped_study_of_certificates_passes(policies):
     words = ["study=certify", "proposer=none", "policy.target=nano-vision", "policy.artifacts.certificate=mine"]
     assert folder_of(resolve([*words, f"results={policies}"])) == policies / "artifacts/certificate/mine"

@@ -67,9 +67,7 @@ def slow_acceptance(
 
 @settings(max_examples=400, deadline=None)
 @given(bushes(), st.data(), layouts, st.integers(0, 15), st.integers(0, 6))
-def test_the_sequence_rule_is_its_definition(
-    tree: TokenTree, data: st.DataObject, space: ActionSpace, start: int, group_limit: int
-) -> None:
+def test_the_sequence_rule_is_its_definition(tree, data, space, start, group_limit):
     limits = data.draw(st.lists(st.integers(0, 4), min_size=space.dofs, max_size=space.dofs))
     target_tokens = [data.draw(st.integers(0, 5)) for _ in range(len(tree) + 1)]
     found = accept_by_group(tree, target_tokens, start, limits, group_limit=group_limit, bounds=space.bounds)
@@ -81,7 +79,7 @@ def test_the_sequence_rule_is_its_definition(
         assert found.rejected in children
 
 
-def test_a_rejected_group_is_shown_by_its_first_token() -> None:
+def test_a_rejected_group_is_shown_by_its_first_token():
     tree = TokenTree.build([100, 100, 100, 100, 104, 100, 90, 103], [-1, 0, 1, 2, 3, 4, 5, 3])
     found = accept_by_group(tree, [100] * 9, 0, LIMITS, group_limit=10, bounds=POSITION_GRIPPER.bounds)
     assert found.path == (0, 1, 2, 3)
@@ -96,7 +94,7 @@ def rule(kind: str, space: ActionSpace = POSITION_GRIPPER, **values: object) -> 
     return built
 
 
-def test_the_settings_become_the_rule() -> None:
+def test_the_settings_become_the_rule():
     chosen = rule("sequence", group_limit=20, token_limit=9)
     assert chosen.limits(3) == (9, 9, 9, 0)
     assert rule("sequence", SEVEN, token_limit=9).limits(3) == (9, 9, 9, 9, 9, 9, 0)
@@ -109,13 +107,13 @@ def test_the_settings_become_the_rule() -> None:
     assert (rule("sequence").group_limit, rule("sequence").token_limit) == (30, 15)  # HeiSD's
 
 
-def test_every_strict_dof_must_match_wherever_it_stands() -> None:
+def test_every_strict_dof_must_match_wherever_it_stands():
     wrist = ActionSpace(("grip", "x", "lock"), (Group("all", 3),), ("grip", "lock"), 10.0, (-1.0,) * 3, (1.0,) * 3)
     assert rule("relaxed", wrist).limits(4) == (0, 4, 0)
     assert rule("sequence", wrist, token_limit=7).limits(4) == (0, 7, 0)
 
 
-def test_hybrid_judges_retrieved_drafts_by_group_and_all_others_by_distance() -> None:
+def test_hybrid_judges_retrieved_drafts_by_group_and_all_others_by_distance():
     chosen = rule("hybrid", group_limit=20, token_limit=9, strict_dofs=False)
     retrieved, drafted = chosen.of_drafts_from("retrieval"), chosen.of_drafts_from("drafter")
     tree = TokenTree.build([107, 107, 107, 100])
@@ -125,7 +123,7 @@ def test_hybrid_judges_retrieved_drafts_by_group_and_all_others_by_distance() ->
         assert rule(kind).of_drafts_from("retrieval") == rule(kind)
 
 
-def test_groups_that_do_not_cover_the_action_are_refused() -> None:
+def test_groups_that_do_not_cover_the_action_are_refused():
     for sizes in ((3,), (3, 2), (4, 0), ()):
         groups = tuple(Group("group", size) for size in sizes)
         with pytest.raises(ValueError, match="do not cover the 4 DoFs in order"):
@@ -133,7 +131,7 @@ def test_groups_that_do_not_cover_the_action_are_refused() -> None:
 
 
 @given(layouts, st.integers(0, 30), st.integers(0, 30))
-def test_segments_cut_a_stretch_of_the_chunk_at_the_groups(space: ActionSpace, start: int, stop: int) -> None:
+def test_segments_cut_a_stretch_of_the_chunk_at_the_groups(space, start, stop):
     cut = list(space.segments(start, stop))
     dofs, name = space.dofs, group_of_dof(space)
     expected = [

@@ -69,7 +69,7 @@ class Client:
 
 
 @pytest.fixture(scope="module")
-def policy(policies: Path) -> Policy:
+def policy(policies):
     words = ["policy.target=nano-vision", f"results={policies}", "method=naive_sd"]
     return Policy(compose_settings("serve", words, ServeSettings))
 
@@ -106,7 +106,7 @@ def until(condition: Any, seconds: float = 5) -> None:
 
 
 @pytest.mark.bits
-def test_a_client_gets_the_actions_of_the_policy(policy: Policy, policies: Path) -> None:
+def test_a_client_gets_the_actions_of_the_policy(policy, policies):
     target: Any = Artifacts(str(policies), PolicySettings(target="nano-vision")).target
     with serving(policy, log_every=2) as (port, log):
         client = Client(port)
@@ -151,7 +151,7 @@ def frame_of(**changes: Any) -> bytes:
         (msgpack.packb({}), "the message has nothing"),
     ],
 )
-def test_a_wrong_frame_gets_one_line_and_the_next_one_an_answer(policy: Policy, frame: bytes | str, said: str) -> None:
+def test_a_wrong_frame_gets_one_line_and_the_next_one_an_answer(policy, frame, said):
     with serving(policy) as (port, log):
         client = Client(port)
         client.infer(seen(0))
@@ -164,7 +164,7 @@ def test_a_wrong_frame_gets_one_line_and_the_next_one_an_answer(policy: Policy, 
         assert client.infer(seen(0))["actions"].shape == (4, 4)
 
 
-def test_whoever_leaves_in_mid_message_leaves_the_server_running(policy: Policy) -> None:
+def test_whoever_leaves_in_mid_message_leaves_the_server_running(policy):
     with serving(policy) as (port, log):
         client = Client(port)
         raw: socket.socket = client.connection.socket
@@ -178,7 +178,7 @@ def test_whoever_leaves_in_mid_message_leaves_the_server_running(policy: Policy)
         assert Client(port).infer(seen(1))["actions"].shape == (4, 4)
 
 
-def test_one_client_at_a_time(policy: Policy) -> None:
+def test_one_client_at_a_time(policy):
     with serving(policy) as (port, _):
         first = Client(port)
         with pytest.raises(ConnectionClosed, match="another client"):
@@ -212,7 +212,7 @@ class Watching(Decoder):
         super().observe(action, end_effector)
 
 
-def test_the_decoder_is_told_what_was_executed(policy: Policy) -> None:
+def test_the_decoder_is_told_what_was_executed(policy):
     target: Any = Finite(policy.artifacts.target)
     decoder = Watching(target)
     client = OpenPi(policy)
@@ -233,7 +233,7 @@ def test_the_decoder_is_told_what_was_executed(policy: Policy) -> None:
 @pytest.mark.parametrize(
     ("gripper", "values"), [("as_is", [0.1, 0.9]), ("signed", [-1, 1]), ("signed_inverted", [1, -1])]
 )
-def test_grippers(policy: Policy, gripper: str, values: list[float]) -> None:
+def test_grippers(policy, gripper, values):
     made = replace(policy.interface, gripper=gripper).converted(np.array([[0.3, 0, 0, 0.1], [0, 0, 0, 0.9]]))
     np.testing.assert_allclose(made[:, 3], values)
     np.testing.assert_allclose(made[:, 0], [0.3, 0])
@@ -249,14 +249,14 @@ def test_grippers(policy: Policy, gripper: str, values: list[float]) -> None:
         (["host=256.1.1.1", "port=0"], "cannot listen on 256.1.1.1:0"),
     ],
 )
-def test_a_server_that_cannot_start_says_so(policies: Path, words: list[str], said: str) -> None:
+def test_a_server_that_cannot_start_says_so(policies, words, said):
     target = [] if "policy.target=nobody" in words else ["policy.target=nano-vision"]
     run = CliRunner().invoke(app, ["serve", *target, f"results={policies}", *words])
     assert run.exit_code in (1, 2)
     assert said in run.output
 
 
-def test_the_command_answers_and_stops_when_told(policies: Path, tmp_path: Path) -> None:
+def test_the_command_answers_and_stops_when_told(policies, tmp_path):
     words = ["serve", "policy.target=nano-state", f"results={policies}", "port=0"]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with (tmp_path / "log").open("w") as log:
@@ -272,7 +272,7 @@ def test_the_command_answers_and_stops_when_told(policies: Path, tmp_path: Path)
     assert "stopped" in (tmp_path / "log").read_text()
 
 
-def test_a_policy_that_reads_images_alone_needs_no_state(policy: Policy) -> None:
+def test_a_policy_that_reads_images_alone_needs_no_state(policy):
     message = {key: value for key, value in seen(0).items() if key != "observation/state"}
     given = observation_of(replace(policy.interface, images_alone=True), message)
     assert (given.proprioception.shape, given.state.shape) == ((4,), (39,))
@@ -292,7 +292,7 @@ def silent(port: int) -> socket.socket:
 
 
 @pytest.mark.parametrize(("limit", "said"), [("ping_s", "keepalive ping timeout"), ("idle_s", "no message for 0.3 s")])
-def test_a_silent_client_loses_its_seat(policy: Policy, monkeypatch: pytest.MonkeyPatch, limit: str, said: str) -> None:
+def test_a_silent_client_loses_its_seat(policy, monkeypatch, limit, said):
     monkeypatch.setattr(OpenPi, limit, 0.3)
     with serving(policy) as (port, log):
         lost = silent(port)
@@ -302,7 +302,7 @@ def test_a_silent_client_loses_its_seat(policy: Policy, monkeypatch: pytest.Monk
         lost.close()
 
 
-def test_quick_reconnects_are_all_served(policy: Policy) -> None:
+def test_quick_reconnects_are_all_served(policy):
     with serving(policy) as (port, log):
         for _ in range(100):
             client = Client(port)
@@ -312,7 +312,7 @@ def test_quick_reconnects_are_all_served(policy: Policy) -> None:
 
 
 @pytest.mark.parametrize(("origins", "accepted"), [([], False), (["http://robot.local"], True)])
-def test_a_web_page_may_connect_only_where_it_is_named(policy: Policy, origins: list[str], accepted: bool) -> None:
+def test_a_web_page_may_connect_only_where_it_is_named(policy, origins, accepted):
     with serving(policy, origins=origins) as (port, _):
         url = f"ws://127.0.0.1:{port}"
         refused = pytest.raises(InvalidStatus, match="403")
@@ -334,7 +334,7 @@ def ranged(policies: Path, tmp_path: Path, *words: str) -> Policy:
 
 
 @pytest.mark.parametrize("height", [1e39, -2.5, 3.5])
-def test_a_state_far_from_the_demonstrations_is_refused(policies: Path, tmp_path: Path, height: float) -> None:
+def test_a_state_far_from_the_demonstrations_is_refused(policies, tmp_path, height):
     state = np.array([0.5, 0.5, height, 0.5])
     with serving(ranged(policies, tmp_path, "margin=2")) as (port, log):
         client = Client(port)
@@ -344,7 +344,7 @@ def test_a_state_far_from_the_demonstrations_is_refused(policies: Path, tmp_path
         assert client.infer(seen(0, **{"observation/state": np.array([0.5, 0.5, 2.9, 0.5])}))["actions"].shape == (4, 4)
 
 
-def test_or_the_last_action_is_held(policies: Path, tmp_path: Path) -> None:
+def test_or_the_last_action_is_held(policies, tmp_path):
     near, far = ({"observation/state": np.full(4, value)} for value in (0.5, 9.0))
     with serving(ranged(policies, tmp_path, "outside=hold")) as (port, log):
         client = Client(port)
@@ -369,9 +369,7 @@ def fails(*arguments: object) -> None:
         (lambda self, hidden: self._noted(self._target.head(hidden) * float("nan")), "not finite: no action is sent"),
     ],
 )
-def test_a_policy_that_fails_sends_one_line_and_no_action(
-    policy: Policy, monkeypatch: pytest.MonkeyPatch, head: Any, said: str
-) -> None:
+def test_a_policy_that_fails_sends_one_line_and_no_action(policy, monkeypatch, head, said):
     with serving(policy) as (port, log):
         client = Client(port)
         client.infer(seen(0))
@@ -386,7 +384,7 @@ def test_a_policy_that_fails_sends_one_line_and_no_action(
         assert client.infer(seen(0))["actions"].shape == (4, 4)
 
 
-def test_a_client_that_breaks_off_is_a_line_of_the_log(policy: Policy, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_client_that_breaks_off_is_a_line_of_the_log(policy, capfd):
     with serving(policy) as (port, _):
         for _ in range(20):  # now and then one is gone before the server asks for its address
             lost = silent(port)
@@ -396,7 +394,7 @@ def test_a_client_that_breaks_off_is_a_line_of_the_log(policy: Policy, capfd: py
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_health_is_answered_without_a_seat(policy: Policy) -> None:
+def test_health_is_answered_without_a_seat(policy):
     with serving(policy) as (port, _):
         first = Client(port)
         for path in ("healthz", "health"):

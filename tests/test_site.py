@@ -3,7 +3,6 @@ not needed: `make docs` runs it."""
 
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -22,7 +21,7 @@ SOURCES = (
 
 
 @pytest.fixture(scope="module")
-def docs() -> Any:
+def docs():
     return module_of(ROOT / "scripts/docs.py")
 
 
@@ -38,7 +37,7 @@ def anchors(source: str) -> set[str]:
 
 
 @pytest.mark.parametrize("source", SOURCES)
-def test_every_link_leads_to_a_file_and_a_heading(source: str) -> None:
+def test_every_link_leads_to_a_file_and_a_heading(source):
     for target in re.findall(r"\]\(([^)\s]+)\)", text_of(source)):
         if re.match(r"[a-z]+:", target):
             continue
@@ -49,14 +48,14 @@ def test_every_link_leads_to_a_file_and_a_heading(source: str) -> None:
             assert anchor in anchors(str(file.relative_to(ROOT))), f"{source}: {target}"
 
 
-def test_the_site_lists_every_page(docs: Any) -> None:
+def test_the_site_lists_every_page(docs):
     settings = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
     listed = re.findall(r"[\w-]+\.md", str(settings["nav"]))
     assert sorted(listed) == sorted([*(p.name for p in (ROOT / "docs").glob("*.md")), *docs.PAGES, "reference.md"])
     assert settings["strict"]
 
 
-def test_links_of_the_repository_become_links_of_the_site(docs: Any) -> None:
+def test_links_of_the_repository_become_links_of_the_site(docs):
     text = "[a](docs/methods.md#7-measures) ![b](docs/decode.png) [c](results/README.md) [d](https://rerun.io)"
     expected = "[a](methods.md#7-measures) ![b](decode.png) [c](results.md) [d](https://rerun.io)"
     assert docs.relinked(text, "README.md") == expected
@@ -64,7 +63,7 @@ def test_links_of_the_repository_become_links_of_the_site(docs: Any) -> None:
     assert docs.relinked("[a](../results/README.md) [b](#here)", "docs/shipped.md") == "[a](results.md) [b](#here)"
 
 
-def test_the_reference_has_the_help_of_every_command(docs: Any) -> None:
+def test_the_reference_has_the_help_of_every_command(docs):
     page = docs.reference()
     for words in (("rollout",), ("train", "target"), ("runs", "compare")):
         assert f"## `kerv {' '.join(words)}`" in page
@@ -73,5 +72,5 @@ def test_the_reference_has_the_help_of_every_command(docs: Any) -> None:
     assert len(page.split("\n## ")) > 20
 
 
-def test_the_first_page_fits_on_two_screens() -> None:
+def test_the_first_page_fits_on_two_screens():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 100

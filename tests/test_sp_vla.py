@@ -31,7 +31,7 @@ def least_squares(history: np.ndarray, penalty: float, steps: int) -> np.ndarray
 
 @pytest.mark.parametrize("penalty", [0.0, 1e-4, 0.7, 50.0])
 @pytest.mark.parametrize("window", [2, 6, 10])
-def test_the_regression_is_that_of_least_squares(penalty: float, window: int) -> None:
+def test_the_regression_is_that_of_least_squares(penalty, window):
     history = np.random.default_rng(window).uniform(-0.1, 0.1, (10, 4))  # small: nothing is clipped
     predicted = Ridge(SPACE.is_strict, penalty, window, 5).predict(history, 5)
     expected = least_squares(history[-window:], penalty, 5)
@@ -39,7 +39,7 @@ def test_the_regression_is_that_of_least_squares(penalty: float, window: int) ->
     assert predicted == pytest.approx(expected, abs=1e-9)
 
 
-def test_a_steep_line_ends_at_the_limits_and_a_short_history_gives_none() -> None:
+def test_a_steep_line_ends_at_the_limits_and_a_short_history_gives_none():
     ridge = Ridge(SPACE.is_strict, 1e-4, 6, 4)
     climb = np.repeat(np.linspace(-0.5, 0.8, 6)[:, None], 4, 1)
     predicted = ridge.predict(climb, 4)
@@ -93,15 +93,15 @@ def schedule(records: list[DecodeRecord]) -> str:
         (0.5, {"buffer": 4}, "trtrtrt"),
     ],
 )
-def test_speed_and_the_targets_share_decide(speed: float, settings: dict[str, float], expected: str) -> None:
+def test_speed_and_the_targets_share_decide(speed, settings, expected):
     assert schedule(played(speed, 7, MockTarget(SPACE, 4), **settings)) == expected
 
 
-def test_an_episode_begins_with_the_target_whatever_was_before() -> None:
+def test_an_episode_begins_with_the_target_whatever_was_before():
     assert schedule(played(0.5, 3, MockTarget(SPACE, 4), seeds=2)) == "ttrttr"
 
 
-def test_an_intuitive_decode_runs_nothing_of_the_target() -> None:
+def test_an_intuitive_decode_runs_nothing_of_the_target():
     target = Counting(SPACE, 4)
     *before, intuitive = played(0.5, 3, target)
     assert (intuitive.forwards, target.encoded) == (0, 2)
@@ -113,6 +113,6 @@ def test_an_intuitive_decode_runs_nothing_of_the_target() -> None:
     assert intuitive.unverified == intuitive.actions.size == 16
 
 
-def test_speeds_that_are_not_in_order_are_refused() -> None:
+def test_speeds_that_are_not_in_order_are_refused():
     with pytest.raises(UsageError, match=r"skip\.v_min=2 skip\.v_max=1"):
         check_settings(SpeedSkipSettings(v_min=2, v_max=1))

@@ -24,26 +24,26 @@ def openvla_bin(value: float) -> int:
     return int(np.clip(np.digitize(np.clip(value, -1, 1), np.linspace(-1, 1, 256)) - 1, 0, 254))
 
 
-def test_both_ends_belong_to_the_outermost_bins() -> None:
+def test_both_ends_belong_to_the_outermost_bins():
     assert len(SPACE.edges) == 256
     assert SPACE.tokens == len(SPACE.centres) == 255
     assert SPACE.bins_of(np.array([-1.0, 1.0, -7.0, 7.0])).tolist() == [0, 254, 0, 254]
     assert SPACE.values_of(np.array([0, 254])) == pytest.approx([-1 + WIDTH / 2, 1 - WIDTH / 2])
 
 
-def test_every_token_survives_the_round_trip() -> None:
+def test_every_token_survives_the_round_trip():
     tokens = np.arange(SPACE.tokens)
     assert (SPACE.bins_of(SPACE.values_of(tokens)) == tokens).all()
 
 
 @given(st.floats(-1.0, 1.0))
-def test_the_round_trip_is_within_half_a_bin_and_equals_openvla(value: float) -> None:
+def test_the_round_trip_is_within_half_a_bin_and_equals_openvla(value):
     token = SPACE.bins_of(np.array(value))
     assert token == openvla_bin(value)
     assert abs(SPACE.values_of(token) - value) <= WIDTH / 2 + 1e-12
 
 
-def test_statistics_are_the_percentiles_and_a_still_dof_stays_finite() -> None:
+def test_statistics_are_the_percentiles_and_a_still_dof_stays_finite():
     rng = np.random.default_rng(0)
     actions = rng.uniform(-3, 5, (5000, 4))
     actions[:, 3] = 0.25
@@ -56,7 +56,7 @@ def test_statistics_are_the_percentiles_and_a_still_dof_stays_finite() -> None:
     assert back[:, 3] == pytest.approx(0.25, abs=WIDTH)
 
 
-def test_groups_and_strict_dofs_follow_from_the_space() -> None:
+def test_groups_and_strict_dofs_follow_from_the_space():
     assert SPACE.bounds == ((0, 3), (0, 3), (0, 3), (3, 4))
     assert SPACE.is_strict.tolist() == [False, False, False, True]
     seven = INSERTION.actions
@@ -65,7 +65,7 @@ def test_groups_and_strict_dofs_follow_from_the_space() -> None:
     assert np.flatnonzero(seven.strict_tokens(14)).tolist() == [6, 13]
 
 
-def test_a_space_survives_its_json_and_a_damaged_one_gets_one_line() -> None:
+def test_a_space_survives_its_json_and_a_damaged_one_gets_one_line():
     for space in (METAWORLD.actions, INSERTION.actions):
         assert read(ActionSpace, json.loads(json.dumps(space.as_dict())), "a space") == space
     for space in (METAWORLD.observation, INSERTION.observation):
@@ -84,7 +84,7 @@ def test_a_space_survives_its_json_and_a_damaged_one_gets_one_line() -> None:
         assert "\n" not in str(refused.value)
 
 
-def test_what_was_made_for_other_actions_is_refused_by_the_first_difference() -> None:
+def test_what_was_made_for_other_actions_is_refused_by_the_first_difference():
     fitted = replace(SPACE, low=(-0.5,) * 4)
     fitted.check_same(SPACE, "the target", "the environment")
     others = {
@@ -98,7 +98,7 @@ def test_what_was_made_for_other_actions_is_refused_by_the_first_difference() ->
             SPACE.check_same(other, "the target", "the drafter", statistics=True)
 
 
-def test_words_keep_their_ids_and_a_long_sentence_is_refused() -> None:
+def test_words_keep_their_ids_and_a_long_sentence_is_refused():
     words = WordTokenizer.build(["open the drawer", "close the door"])
     ids = words.encode("Open the window", 5)
     assert ids[2] == UNKNOWN

@@ -27,7 +27,7 @@ class Event:
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_phases_add_up_to_the_decode(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_phases_add_up_to_the_decode(device, monkeypatch):
     waits: list[str] = []
     monkeypatch.setattr(torch.cuda, "synchronize", lambda: waits.append("wait"))
     monkeypatch.setattr(torch.cuda, "Event", Event)

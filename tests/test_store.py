@@ -45,7 +45,7 @@ def listed(results: Path) -> list[dict[str, Any]]:
     return json.loads(kerv("runs", "list", f"results={results}", "--json"))
 
 
-def test_a_name_in_use_is_refused_and_a_killed_command_is_listed_with_how_to_go_on(tmp_path: Path) -> None:
+def test_a_name_in_use_is_refused_and_a_killed_command_is_listed_with_how_to_go_on(tmp_path):
     again = "kerv demos name=mine episodes=7 results="
     place = tmp_path / "artifacts/demos/mine"
     with subprocess.Popen(
@@ -73,7 +73,7 @@ def test_a_name_in_use_is_refused_and_a_killed_command_is_listed_with_how_to_go_
 
 
 @pytest.mark.usefixtures("few_validations")
-def test_every_command_that_makes_something_has_a_row(policies: Path, tmp_path: Path) -> None:
+def test_every_command_that_makes_something_has_a_row(policies, tmp_path):
     import shutil
 
     shutil.copytree(policies / "artifacts", tmp_path / "artifacts")
@@ -96,7 +96,7 @@ def test_every_command_that_makes_something_has_a_row(policies: Path, tmp_path: 
     assert len(Path(csv).read_text().splitlines()) == 3
 
 
-def test_a_curve_has_each_validation_once(tmp_path: Path) -> None:
+def test_a_curve_has_each_validation_once(tmp_path):
     curve = Curve.of(tmp_path / "artifacts/target/mine")
     curve.write([{"step": 1.0, "score": 9.0}, {"step": 99.0, "score": 9.0}])  # of a run that is gone
     for steps in (20, 40):
@@ -107,9 +107,7 @@ def test_a_curve_has_each_validation_once(tmp_path: Path) -> None:
     assert len({row["step"] for row in curve.read()}) == len(curve.read())
 
 
-def test_a_store_is_used_by_one_command_and_no_password_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_is_used_by_one_command_and_no_password_is_kept(tmp_path, monkeypatch):
     monkeypatch.delenv(STORE, raising=False)
     other, where = Database(tmp_path, f"sqlite:///{tmp_path}/other.db"), f"results={tmp_path}"
     kerv("build", "target", f"checkpoint={tmp_path}", f"store={other.url}", where, code=1)

@@ -34,7 +34,7 @@ def near(target: MockTarget, bins: int = 0) -> Near:
 
 
 @torch.inference_mode()
-def test_agreement_doubles_what_is_allowed_up_to_the_most() -> None:
+def test_agreement_doubles_what_is_allowed_up_to_the_most():
     target = MockTarget()
     assert (
         modes(decoder_of(near(target), target, most=4), 17)
@@ -43,7 +43,7 @@ def test_agreement_doubles_what_is_allowed_up_to_the_most() -> None:
 
 
 @torch.inference_mode()
-def test_a_disagreement_ends_the_streak_and_counting_begins_anew() -> None:
+def test_a_disagreement_ends_the_streak_and_counting_begins_anew():
     target = MockTarget()
     source = near(target)
     decoder = decoder_of(source, target, tolerance=0.0)
@@ -56,7 +56,7 @@ def test_a_disagreement_ends_the_streak_and_counting_begins_anew() -> None:
 
 
 @torch.inference_mode()
-def test_an_episode_begins_with_a_verification() -> None:
+def test_an_episode_begins_with_a_verification():
     target = MockTarget()
     decoder = decoder_of(near(target), target)
     assert modes(decoder, 4) == "vsvs"
@@ -83,7 +83,7 @@ class ByPlace(MockTarget):
 
 @torch.inference_mode()
 @pytest.mark.parametrize(("bins", "agrees"), [(2, True), (12, False)])
-def test_a_rejected_draft_near_enough_on_its_own_path_agrees(bins: int, agrees: bool) -> None:
+def test_a_rejected_draft_near_enough_on_its_own_path_agrees(bins, agrees):
     """A draft that is off by `bins` everywhere but in the strict DoF: 2 bins are 0.013 on average, 12 are 0.08."""
     target = ByPlace()
     truth = np.array(near(target).drafted)
@@ -94,7 +94,7 @@ def test_a_rejected_draft_near_enough_on_its_own_path_agrees(bins: int, agrees: 
 
 
 @torch.inference_mode()
-def test_a_flipped_strict_dof_never_agrees() -> None:
+def test_a_flipped_strict_dof_never_agrees():
     target = MockTarget()
     source = near(target)
     strict = np.flatnonzero(target.actions.strict_tokens(len(source.drafted)))
@@ -103,7 +103,7 @@ def test_a_flipped_strict_dof_never_agrees() -> None:
 
 
 @torch.inference_mode()
-def test_another_sources_accepted_chain_does_not_count() -> None:
+def test_another_sources_accepted_chain_does_not_count():
     """The fallback's draft is right, the first source's is not: what would be executed unverified is the first's."""
     target = MockTarget()
     wrong, right = near(target, bins=30), near(target)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,13 +31,13 @@ SEEN = ("sensor", "light", "colour", "camera")  # kinds that change what the pol
 
 
 @pytest.fixture(scope="module")
-def insertion() -> Iterator[Any]:
+def insertion():
     with INSERTION.open_world("fetch-peg", CameraSettings(size=SIZE)) as world:
         yield world
 
 
 @pytest.fixture(scope="module")
-def metaworld() -> Iterator[Any]:
+def metaworld():
     with METAWORLD.open_world("push", CameraSettings(size=SIZE)) as world:
         yield world
 
@@ -78,9 +77,7 @@ def model_of(world: MujocoWorld) -> dict[str, np.ndarray]:
 @pytest.mark.bits
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", ["insertion", "metaworld"])
-def test_a_kind_changes_what_it_should_as_the_seed_says_and_level_0_nothing(
-    kind: str, name: str, request: pytest.FixtureRequest
-) -> None:
+def test_a_kind_changes_what_it_should_as_the_seed_says_and_level_0_nothing(kind, name, request):
     world = request.getfixturevalue(name)
     plain, other = play(world, "none", 0), play(world, kind, 4, SEED + 1)
     zero, stressed, again = (play(world, kind, level) for level in (0, 4, 4))
@@ -96,7 +93,7 @@ def test_a_kind_changes_what_it_should_as_the_seed_says_and_level_0_nothing(
 
 @pytest.mark.bits
 @pytest.mark.parametrize("name", ["insertion", "metaworld"])
-def test_the_model_is_whole_again_at_the_next_episode(name: str, request: pytest.FixtureRequest) -> None:
+def test_the_model_is_whole_again_at_the_next_episode(name, request):
     world = request.getfixturevalue(name)
     play(world, "none", 0, steps=1)
     before = model_of(world)
@@ -109,7 +106,7 @@ def test_the_model_is_whole_again_at_the_next_episode(name: str, request: pytest
         assert [key for key in before if after[key].tobytes() != before[key].tobytes()] == []
 
 
-def test_cameras_are_moved_and_turned_by_the_levels_numbers(insertion: MujocoWorld) -> None:
+def test_cameras_are_moved_and_turned_by_the_levels_numbers(insertion):
     play(insertion, "none", 0, steps=1)
     plain = model_of(insertion)
     for level, (metres, degrees) in enumerate(CameraJitter.levels, 1):
@@ -121,10 +118,10 @@ def test_cameras_are_moved_and_turned_by_the_levels_numbers(insertion: MujocoWor
 
 
 @pytest.mark.parametrize("kind", ["push", "actuation"])
-def test_executed_actions_differ_more_at_higher_levels(kind: str) -> None:
+def test_executed_actions_differ_more_at_higher_levels(kind):
     space = METAWORLD.actions
 
-    def gap(level: int) -> float:
+    def gap(level):
         total = 0.0
         for seed in range(50_000, 50_010):
             stress = stressing.build(StressSettings(kind, level))
@@ -142,7 +139,7 @@ def test_executed_actions_differ_more_at_higher_levels(kind: str) -> None:
     assert 0.0 == gaps[0] < gaps[1]
 
 
-def test_a_push_drives_the_hand_off_for_a_tenth_of_a_second_in_one_direction() -> None:
+def test_a_push_drives_the_hand_off_for_a_tenth_of_a_second_in_one_direction():
     stress = stressing.build(StressSettings("push", 4))
     space, still = METAWORLD.actions, np.zeros(4)
     stress.begin("push-v3", SEED, space)
@@ -155,10 +152,10 @@ def test_a_push_drives_the_hand_off_for_a_tenth_of_a_second_in_one_direction() -
 
 
 @pytest.mark.bits
-def test_a_picture_depends_on_the_control_step_and_not_on_how_often_the_policy_looked(insertion: MujocoWorld) -> None:
+def test_a_picture_depends_on_the_control_step_and_not_on_how_often_the_policy_looked(insertion):
     camera = INSERTION.cameras[0]
 
-    def seen(looks: tuple[int, ...]) -> np.ndarray:
+    def seen(looks):
         insertion.stress = stressing.build(StressSettings("sensor", 1))
         insertion.reset(50_005)
         for step in range(9):
@@ -170,7 +167,7 @@ def test_a_picture_depends_on_the_control_step_and_not_on_how_often_the_policy_l
     assert seen(()).tobytes() == seen((0, 3)).tobytes()
 
 
-def test_a_dropped_picture_is_the_one_observed_before(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dropped_picture_is_the_one_observed_before(monkeypatch):
     monkeypatch.setattr(Sensor, "levels", ((1.0, 0.0, 1.0),) * 4)
     stress = stressing.build(StressSettings("sensor", 4))
     stress.begin("push-v3", SEED, METAWORLD.actions)
@@ -179,7 +176,7 @@ def test_a_dropped_picture_is_the_one_observed_before(monkeypatch: pytest.Monkey
     assert stress.see("topview", np.full((4, 4, 3), 200, np.uint8), 4).mean() > 190  # another camera's first
 
 
-def test_the_object_is_what_the_robot_is_not(metaworld: MujocoWorld) -> None:
+def test_the_object_is_what_the_robot_is_not(metaworld):
     metaworld.stress = stressing.build(StressSettings())
     metaworld.reset(SEED)
     model = metaworld._drawable()[0]
@@ -189,7 +186,7 @@ def test_the_object_is_what_the_robot_is_not(metaworld: MujocoWorld) -> None:
     assert not painted & {"obj", "hand", "right_arm_base_link", "mocap"}
 
 
-def test_an_object_has_another_size_mass_and_friction(metaworld: MujocoWorld) -> None:
+def test_an_object_has_another_size_mass_and_friction(metaworld):
     play(metaworld, "none", 0, steps=1)
     before, model = model_of(metaworld), metaworld._drawable()[0]
     body = objects(model)[0]
@@ -207,7 +204,7 @@ def test_an_object_has_another_size_mass_and_friction(metaworld: MujocoWorld) ->
     assert np.isclose(after["body_subtreemass"][0] - before["body_subtreemass"][0], grown)
 
 
-def test_initial_ranges_are_widened_around_their_centre_and_heights_stay(metaworld: MujocoWorld) -> None:
+def test_initial_ranges_are_widened_around_their_centre_and_heights_stay(metaworld):
     inside = play(metaworld, "none", 0, steps=1).start
     outside = play(metaworld, "object", 1, steps=1).start
     space = metaworld._env._random_reset_space
@@ -223,7 +220,7 @@ def test_initial_ranges_are_widened_around_their_centre_and_heights_stay(metawor
 
 
 @pytest.mark.bits
-def test_worlds_are_shared_between_stressed_and_plain_settings() -> None:
+def test_worlds_are_shared_between_stressed_and_plain_settings():
     stressed = settings("record=0", "world.stress.kind=object", "world.stress.level=4")
     plain = Runner(settings("record=0"), "insert-peg")
     try:
@@ -238,8 +235,8 @@ def settings(*words: str) -> RolloutSettings:
     return compose("rollout", ["policy=expert", "task=insert-peg", *words], RolloutSettings)
 
 
-def test_a_stress_of_level_0_is_no_stress() -> None:
-    def whole(plain: dict[str, Any]) -> str:
+def test_a_stress_of_level_0_is_no_stress():
+    def whole(plain):
         return work_of(plain, {})
 
     now, zero = dataclasses.asdict(settings()), dataclasses.asdict(settings("world.stress.kind=light"))
@@ -249,14 +246,14 @@ def test_a_stress_of_level_0_is_no_stress() -> None:
     assert [stress_of(plain)["kind"] for plain in (now, zero, two)] == ["none", "none", "light"]
 
 
-def test_a_level_without_a_kind_and_an_unknown_kind_are_refused() -> None:
+def test_a_level_without_a_kind_and_an_unknown_kind_are_refused():
     with pytest.raises(UsageError):
         settings("world.stress.level=1")
     with pytest.raises(UnknownName):
         settings("world.stress.kind=pusch")
 
 
-def test_what_an_environment_cannot_do_is_refused() -> None:
+def test_what_an_environment_cannot_do_is_refused():
     from examples.point_mass import SPEC as POINT
 
     renamed = tuple(dataclasses.replace(group, name=f"my {group.name}") for group in INSERTION.actions.groups)
@@ -277,7 +274,7 @@ def test_what_an_environment_cannot_do_is_refused() -> None:
     check(settings("world.stress.kind=object", "world.stress.level=4"))
 
 
-def test_the_command_line_stresses_and_records_it_in_every_row(tmp_path: Path) -> None:
+def test_the_command_line_stresses_and_records_it_in_every_row(tmp_path):
     words = ["rollout", "-m", "policy=expert", "task=insert-peg", "episodes=2", "record=0", f"results={tmp_path}"]
     run = CliRunner().invoke(app, [*words, "world.stress.kind=push", "world.stress.level=0,2", "--json"])
     assert run.exit_code == 0, run.stderr

@@ -1,9 +1,7 @@
 """The report of a study of stress: what a stressed setting is compared with, the figure, the sentence."""
 
 from dataclasses import replace
-from pathlib import Path
 
-import pandas as pd
 import pytest
 from studies_synthetic import episode, settings_of, study_of, swept
 
@@ -18,7 +16,7 @@ from kerv_cli.report.decide import verdict_of
 from kerv_cli.report.plots import study_figures
 from kerv_cli.report.report import report
 from kerv_cli.report.stressed import by_kind, is_stressed, summed_table
-from kerv_cli.report.tables import StudyData, load_study, rows_of
+from kerv_cli.report.tables import load_study, rows_of
 from kerv_cli.worlds.settings import StressSettings
 
 TASKS = ["reach-v3", "push-v3"]
@@ -45,25 +43,23 @@ def prepare(setting: Setting, task: str) -> RunEpisode:
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(tmp_path_factory):
     folder = tmp_path_factory.mktemp("stress")
     swept(folder, study_of(settings(), TASKS, "stress", title="", axis=""), prepare)
     return folder
 
 
 @pytest.fixture(scope="module")
-def data(results: Path) -> StudyData:
+def data(results):
     return load_study(StudyStore(results, "stress"))
 
 
 @pytest.fixture(scope="module")
-def table(data: StudyData) -> pd.DataFrame:
+def table(data):
     return data.table
 
 
-def test_a_stressed_setting_is_compared_with_the_baseline_under_the_same_stress(
-    data: StudyData, table: pd.DataFrame
-) -> None:
+def test_a_stressed_setting_is_compared_with_the_baseline_under_the_same_stress(data, table):
     rows = {row["label"]: row for row in rows_of(table, "micro over tasks")}
     assert data.references["bold"] == "ar"
     assert rows["bold, kind=push level=4"]["baseline"] == "ar, kind=push level=4"
@@ -74,7 +70,7 @@ def test_a_stressed_setting_is_compared_with_the_baseline_under_the_same_stress(
     assert (rows["ar"]["stress"], rows["ar"]["stress_level"]) == ("none", 0)
 
 
-def test_lines_begin_with_the_unstressed_setting(table: pd.DataFrame) -> None:
+def test_lines_begin_with_the_unstressed_setting(table):
     kinds = by_kind(table)
     assert list(kinds) == ["push", "light"]
     assert [row["label"] for row in kinds["light"]["bold"]] == [
@@ -82,7 +78,7 @@ def test_lines_begin_with_the_unstressed_setting(table: pd.DataFrame) -> None:
     ]  # fmt: skip
 
 
-def test_the_figure_has_a_panel_per_kind_and_a_line_per_method(table: pd.DataFrame) -> None:
+def test_the_figure_has_a_panel_per_kind_and_a_line_per_method(table):
     figures = study_figures(table, "", "Success under stress")
     assert list(figures) == [""]
     panels = figures[""].axes
@@ -90,7 +86,7 @@ def test_the_figure_has_a_panel_per_kind_and_a_line_per_method(table: pd.DataFra
     assert [list(bars.lines[0].get_ydata()) for bars in panels[1].containers] == [[100, 100, 100], [100, 100, 50]]
 
 
-def test_sums_count_every_stressed_world_once(table: pd.DataFrame) -> None:
+def test_sums_count_every_stressed_world_once(table):
     """20 seeds x 2 tasks; level 4 of a push fails half of everything, level 4 of light half of what is bold."""
     found = {row["label"]: row for row in rows_of(summed_table(table))}
     sums = ["light", "push", "level 1", "level 4", "all"]
@@ -112,12 +108,12 @@ def test_sums_count_every_stressed_world_once(table: pd.DataFrame) -> None:
     assert found["bold push"]["non_inferior"] is (found["bold push"]["difference_low"] > -0.03)
 
 
-def test_the_report_writes_the_sums(results: Path) -> None:
+def test_the_report_writes_the_sums(results):
     written = {path.name for path in report(results, "stress").files}
     assert {"stress_summed.csv", "stress.png"} <= written
 
 
-def test_the_verdict_says_who_falls_behind_where(table: pd.DataFrame) -> None:
+def test_the_verdict_says_who_falls_behind_where(table):
     behind, is_shown = verdict_of(table, 3.0)
     assert "less successful than ar: bold, kind=light level=4. More successful: no setting" in behind
     assert not is_shown
@@ -128,7 +124,7 @@ def test_the_verdict_says_who_falls_behind_where(table: pd.DataFrame) -> None:
     assert not is_stressed(table[table["stress"] == "none"])
 
 
-def test_the_shipped_study_has_every_method_under_every_kind_and_level() -> None:
+def test_the_shipped_study_has_every_method_under_every_kind_and_level():
     resolved = resolve(["study=stress", "task=reach", "episodes=1"])
     found = {(s.method, s.world.stress.kind, s.world.stress.level) for s in resolved.settings.values()}
     methods = {method for method, _, _ in found}

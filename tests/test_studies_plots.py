@@ -28,7 +28,7 @@ def table_of(results: Path, settings: dict[str, RolloutSettings], baseline: str 
 
 
 @pytest.fixture(scope="module")
-def boundaries(tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
+def boundaries(tmp_path_factory):
     settings = {"ar": setting("ar"), "always drafter": setting(boundary={"kind": "always_drafter"})}
     for value in (0.1, 0.3, 0.7):
         settings[f"fused f_star={value}"] = setting(boundary={"kind": "fused", "f_star": value})
@@ -40,7 +40,7 @@ def legend(figure: Figure) -> set[str]:
     return {text.get_text() for drawn in figure.legends for text in drawn.get_texts()}
 
 
-def test_settings_along_the_axis_are_a_line_and_others_levels(boundaries: pd.DataFrame) -> None:
+def test_settings_along_the_axis_are_a_line_and_others_levels(boundaries):
     rows = boundaries[boundaries["averaging"] == MICRO]
     series = series_of(rows, "boundary.f_star")
     counts = {"ar": 1, "always drafter": 1, "fused": 3, "radius alone": 1}
@@ -55,7 +55,7 @@ def test_settings_along_the_axis_are_a_line_and_others_levels(boundaries: pd.Dat
     assert levels[:2] == [1.0, series["always drafter"][0]["episode_speedup"]]
 
 
-def test_a_baseline_that_is_a_point_of_a_series_is_drawn_in_it(tmp_path: Path) -> None:
+def test_a_baseline_that_is_a_point_of_a_series_is_drawn_in_it(tmp_path):
     settings = {}
     for method in ("ar", "kerv"):
         for steps in (1, 4, 8):
@@ -71,7 +71,7 @@ def test_a_baseline_that_is_a_point_of_a_series_is_drawn_in_it(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("axis", ["boundary.kind", "rectifier.use_target_token", "no.such"])
-def test_without_numbers_on_the_axis_every_setting_is_a_point(boundaries: pd.DataFrame, axis: str) -> None:
+def test_without_numbers_on_the_axis_every_setting_is_a_point(boundaries, axis):
     figures = study_figures(boundaries, axis, "Title")
     assert set(figures) == {"_tradeoff"}
     assert legend(figures["_tradeoff"]) == set(boundaries["label"])

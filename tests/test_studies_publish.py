@@ -1,8 +1,6 @@
 """What `kerv report --publish` writes, and what it refuses."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -18,17 +16,17 @@ STUDY = threshold_study(["reach-v3", "push-v3"])
 
 
 @pytest.fixture(autouse=True)
-def commit(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+def commit(monkeypatch):
     """Sets the commit that computes what follows."""
 
-    def is_of(name: str) -> None:
+    def is_of(name):
         monkeypatch.setattr("kerv_cli.targets.provenance.git_commit", lambda: name)
 
     is_of(COMMIT)
     return is_of
 
 
-def test_one_run_of_one_commit_is_published_where_it_is_committed(tmp_path: Path) -> None:
+def test_one_run_of_one_commit_is_published_where_it_is_committed(tmp_path):
     swept(tmp_path, STUDY)
     draft = report(tmp_path, "threshold")
     assert not (tmp_path / "tables").exists()
@@ -39,7 +37,7 @@ def test_one_run_of_one_commit_is_published_where_it_is_committed(tmp_path: Path
     assert len(draft.files) == len(published.files)
 
 
-def test_what_is_missing_or_not_committed_is_refused(tmp_path: Path, commit: Callable[[str], None]) -> None:
+def test_what_is_missing_or_not_committed_is_refused(tmp_path, commit):
     commit(f"{COMMIT}+changes")
     swept(tmp_path, replace(STUDY, episodes=STUDY.episodes[:-1]))
     StudyStore(tmp_path, "threshold").save(STUDY, plan_study(Database(tmp_path), STUDY).existing)
@@ -51,7 +49,7 @@ def test_what_is_missing_or_not_committed_is_refused(tmp_path: Path, commit: Cal
     assert not (tmp_path / "tables").exists()
 
 
-def test_sides_of_several_runs_or_commits_are_refused(tmp_path: Path, commit: Callable[[str], None]) -> None:
+def test_sides_of_several_runs_or_commits_are_refused(tmp_path, commit):
     swept(tmp_path, replace(STUDY, episodes=tuple(one for one in STUDY.episodes if one.setting.label == "ar")))
     commit("d" * 40)
     store, _ = swept(tmp_path, STUDY)
@@ -61,7 +59,7 @@ def test_sides_of_several_runs_or_commits_are_refused(tmp_path: Path, commit: Ca
     assert any(reason.startswith("not measured in turn with the baseline") for reason in found)
 
 
-def test_several_machines_are_refused() -> None:
+def test_several_machines_are_refused():
     rows = {"label": ["ar", "x"], "baseline": "ar", "pairs": [0, 3], "same_run": True, "same_block": 1.0}
     table = pd.DataFrame(rows | {"git_commit": COMMIT, "host": ["a", "a;b"], "device_name": "chip", "engine": 1})
     assert refusals(table) == ["its episodes are from 2 machines"]

@@ -25,7 +25,7 @@ from kerv_cli.report.statistics import (
 SCRIPT = Path(__file__).parents[1] / "scripts/coverage.py"
 
 
-def test_the_mean_of_groups_combines_their_intervals() -> None:
+def test_the_mean_of_groups_combines_their_intervals():
     one, other = wilson(9, 10), wilson(6, 20)
     low = 0.6 - 0.5 * math.hypot(0.9 - one.low, 0.3 - other.low)
     high = 0.6 + 0.5 * math.hypot(one.high - 0.9, other.high - 0.3)
@@ -33,7 +33,7 @@ def test_the_mean_of_groups_combines_their_intervals() -> None:
     assert mean_of([one]) == pytest.approx(one, abs=1e-12)
 
 
-def test_without_data_nothing_is_estimated() -> None:
+def test_without_data_nothing_is_estimated():
     assert all(math.isnan(number) for number in (*wilson(0, 0), *paired_difference(PairedCounts(0, 0, 0, 0))))
     assert math.isnan(pairs_to_settle(PairedCounts(0, 0, 0, 0), 0.03))
     assert math.isnan(speedup(np.array([]), np.array([]), []).value)
@@ -41,13 +41,13 @@ def test_without_data_nothing_is_estimated() -> None:
     assert (single.value, math.isnan(single.low), math.isnan(single.high)) == (2.0, True, True)
 
 
-def test_paired_counts_are_the_four_cells() -> None:
+def test_paired_counts_are_the_four_cells():
     baseline = np.array([1, 1, 1, 0, 0, 0, 0], bool)
     method = np.array([1, 1, 0, 1, 1, 1, 0], bool)
     assert paired_counts(baseline, method) == PairedCounts(both=2, only_baseline=1, only_method=3, neither=1)
 
 
-def test_macro_speedup_weighs_groups_equally() -> None:
+def test_macro_speedup_weighs_groups_equally():
     baseline, method = np.array([2.0, 4.0, 6.0, 30.0, 34.0]), np.array([1.0, 2.0, 3.0, 20.0, 20.0])
     groups = ["easy", "easy", "easy", "hard", "hard"]
     found = speedup(baseline, method, ["a", "a", "a", "b", "b"], groups)
@@ -55,7 +55,7 @@ def test_macro_speedup_weighs_groups_equally() -> None:
     assert speedup(baseline, method, ["a", "a", "a", "b", "b"]).value == pytest.approx(76.0 / 46.0)
 
 
-def test_the_interval_of_a_speedup_by_hand() -> None:
+def test_the_interval_of_a_speedup_by_hand():
     """Two tasks with blocks of two and three pairs: blocks are the clusters of a task, Student's t with one and two
     degrees of freedom together."""
     rng = np.random.default_rng(8)
@@ -70,7 +70,7 @@ def test_the_interval_of_a_speedup_by_hand() -> None:
     assert speedup(a, b, tasks, blocks=blocks) == pytest.approx((value, value / reach, value * reach))
 
 
-def test_tasks_are_the_clusters_where_each_has_one_block() -> None:
+def test_tasks_are_the_clusters_where_each_has_one_block():
     rng = np.random.default_rng(3)
     a, b, tasks = rng.uniform(2, 3, 20), rng.uniform(1, 2, 20), [str(i // 5) for i in range(20)]
     assert speedup(a, b, tasks, blocks=tasks) == speedup(a, b, ["a"] * 20, blocks=tasks)
@@ -79,16 +79,14 @@ def test_tasks_are_the_clusters_where_each_has_one_block() -> None:
 
 
 @pytest.fixture(scope="module")
-def coverage() -> Callable[[int, int, int], dict[str, float]]:
+def coverage():
     """`coverage` of scripts/coverage.py: tasks, blocks per task, studies -> interval -> share that holds the truth."""
     found: Callable[[int, int, int], dict[str, float]] = module_of(SCRIPT).coverage
     return found
 
 
 @pytest.mark.parametrize("blocks", [1, 4])
-def test_every_interval_of_a_study_of_ten_tasks_covers_the_truth(
-    coverage: Callable[[int, int, int], dict[str, float]], blocks: int
-) -> None:
+def test_every_interval_of_a_study_of_ten_tasks_covers_the_truth(coverage, blocks):
     """At a nominal 95 %: no less, up to the 150 simulated studies' own error; some are wider than necessary."""
     for name, inside in coverage(10, blocks, 150).items():
         assert inside >= 0.95 - 2.6 * math.sqrt(0.05 * 0.95 / 150), name
@@ -96,20 +94,20 @@ def test_every_interval_of_a_study_of_ten_tasks_covers_the_truth(
 
 @pytest.mark.parametrize(("successes", "episodes"), [(0, 7), (12, 12), (3, 8), (187, 200)])
 @pytest.mark.parametrize("confidence", [0.9, 0.95])
-def test_wilson_is_statsmodels(successes: int, episodes: int, confidence: float) -> None:
+def test_wilson_is_statsmodels(successes, episodes, confidence):
     expected = proportion_confint(successes, episodes, 1 - confidence, method="wilson")
     assert wilson(successes, episodes, confidence)[1:] == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.parametrize("counts", [(10, 0, 0, 3), (10, 5, 2, 3), (150, 13, 4, 33), (0, 9, 1, 0), (10, 0, 1, 10)])
-def test_mcnemar_is_statsmodels(counts: tuple[int, int, int, int]) -> None:
+def test_mcnemar_is_statsmodels(counts):
     both, lost, won, neither = counts
     expected = statsmodels_mcnemar([[both, lost], [won, neither]], exact=True).pvalue
     assert mcnemar(PairedCounts(*counts)) == pytest.approx(min(1.0, expected), abs=1e-12)
 
 
 @pytest.mark.parametrize(("counts", "correction"), [((36, 12, 2, 0), 0), ((20, 2, 4, 14), 20)])
-def test_paired_difference_by_hand(counts: tuple[int, int, int, int], correction: int) -> None:
+def test_paired_difference_by_hand(counts, correction):
     """Positively correlated pairs are corrected for continuity by half their number."""
     both, lost, won, neither = counts
     pairs, a, b = sum(counts), both + won, both + lost
@@ -127,7 +125,7 @@ def test_paired_difference_by_hand(counts: tuple[int, int, int, int], correction
 @pytest.mark.parametrize(
     "counts", [(0, 0, 0, 5), (5, 0, 0, 0), (3, 4, 0, 0), (20, 2, 4, 14), (0, 3, 9, 0), (1, 0, 0, 0)]
 )
-def test_paired_difference_is_symmetric_and_bounded(counts: tuple[int, int, int, int]) -> None:
+def test_paired_difference_is_symmetric_and_bounded(counts):
     both, lost, won, neither = counts
     value, low, high = paired_difference(PairedCounts(both, lost, won, neither))
     assert -1 <= low <= value <= high <= 1
@@ -139,13 +137,13 @@ def test_paired_difference_is_symmetric_and_bounded(counts: tuple[int, int, int,
 
 
 @pytest.mark.parametrize("counts", [(80, 5, 5, 10), (80, 6, 4, 10), (80, 0, 0, 20), (188, 2, 2, 8)])
-def test_pairs_to_settle_are_just_enough(counts: tuple[int, int, int, int]) -> None:
+def test_pairs_to_settle_are_just_enough(counts):
     """So many pairs of the same rates show non-inferiority by the interval of the tables, two per cent fewer do not."""
     needed = pairs_to_settle(PairedCounts(*counts), 0.03)
     enough, short = (PairedCounts(*(c * n / sum(counts) for c in counts)) for n in (needed, 0.98 * needed - 1))
     assert paired_difference(enough).low > -0.03 >= paired_difference(short).low
 
 
-def test_no_number_of_pairs_shows_what_is_not_so() -> None:
+def test_no_number_of_pairs_shows_what_is_not_so():
     assert pairs_to_settle(PairedCounts(80, 10, 5, 5), 0.03) == math.inf
     assert pairs_to_settle(PairedCounts(97, 3, 0, 0), 0.03) == math.inf

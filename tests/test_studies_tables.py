@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ import pytest
 from rich.console import Console
 from studies_synthetic import settings_of, still_episode, study_of, swept, threshold_study
 
-from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
+from kerv_cli.engine.record import DecodeRecord, Round
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.execute import RunEpisode
 from kerv_cli.lab.plan import Episode, Setting, Study
@@ -67,7 +66,7 @@ DISTANCES = (0.01, 0.015, 0.03)  # metres between hand and object at the closest
 
 
 def by_hand(setting: Setting, task: str) -> RunEpisode:
-    def run(seed: int) -> EpisodeRecord:
+    def run(seed):
         record = still_episode(task, seed, *EPISODES[task, setting.label][seed - 100_000])
         return replace(record, closest_approach=DISTANCES[seed - 100_000])
 
@@ -87,7 +86,7 @@ def hand_study() -> Study:
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> StudyData:
+def data(tmp_path_factory):
     return load_study(swept(tmp_path_factory.mktemp("hand"), hand_study(), by_hand)[0])
 
 
@@ -98,7 +97,7 @@ def row_of(table: pd.DataFrame, **wanted: str) -> dict[str, Any]:
     return {str(name): value for name, value in row.items()}
 
 
-def test_one_task_by_hand(data: StudyData) -> None:
+def test_one_task_by_hand(data):
     row = row_of(data.per_task, task="reach-v3", label="kerv")
     expected = {
         "episodes": 2,
@@ -136,14 +135,14 @@ def test_one_task_by_hand(data: StudyData) -> None:
     assert (row["speedup_low"], row["speedup_high"]) == pytest.approx((found.low, found.high))
 
 
-def test_failures_near_the_object_are_a_share_of_the_failures(data: StudyData) -> None:
+def test_failures_near_the_object_are_a_share_of_the_failures(data):
     shares = {(row["task"], row["label"]): row["near_contact_failure"] for _, row in data.per_task.iterrows()}
     assert shares["push-v3", "kerv"] == 0.5  # it failed at 0.015 m and at 0.03 m
     assert shares["push-v3", "ar"] == 0.0
     assert math.isnan(shares["reach-v3", "kerv"])  # nothing failed
 
 
-def test_the_baseline_has_no_verifications_and_a_speedup_of_one(data: StudyData) -> None:
+def test_the_baseline_has_no_verifications_and_a_speedup_of_one(data):
     row = row_of(data.per_task, task="reach-v3", label="ar")
     assert row["speedup"] == row["speedup_low"] == row["speedup_high"] == 1.0
     assert row["forwards_per_step"] == 4.0
@@ -151,7 +150,7 @@ def test_the_baseline_has_no_verifications_and_a_speedup_of_one(data: StudyData)
     assert row["skip_rate"] == row["unverified_share"] == 0.0
 
 
-def test_micro_pools_episodes_and_macro_averages_difficulty(data: StudyData) -> None:
+def test_micro_pools_episodes_and_macro_averages_difficulty(data):
     table = data.table
     micro, macro = row_of(table, averaging=MICRO, label="kerv"), row_of(table, averaging=MACRO, label="kerv")
     own, reference = [0.25, 0.05, 0.2, 0.2, 0.2], [0.5, 0.3, 1.0, 1.0, 1.0]
@@ -180,7 +179,7 @@ def test_micro_pools_episodes_and_macro_averages_difficulty(data: StudyData) -> 
         assert (row["difference"], row["difference_low"], row["difference_high"]) == pytest.approx(found)
 
 
-def test_a_row_says_everything(data: StudyData) -> None:
+def test_a_row_says_everything(data):
     row = row_of(data.table, averaging=MICRO, label="kerv")
     expected = {
         "study": "hand",
@@ -214,7 +213,7 @@ def reach_of(data: StudyData) -> dict[str, Any]:
     return row_of(data.per_task, label="kerv", task="reach-v3")
 
 
-def test_other_devices_and_initial_states_are_no_pair(data: StudyData) -> None:
+def test_other_devices_and_initial_states_are_no_pair(data):
     row = reach_of(harmed(data, device_name="another chip"))
     assert (row["pairs"], row["same_run"], row["success"]) == (0, False, 1.0)
     assert math.isnan(row["speedup"])
@@ -225,7 +224,7 @@ def test_other_devices_and_initial_states_are_no_pair(data: StudyData) -> None:
     assert alone.table["speedup"].isna().all()
 
 
-def test_pairs_of_one_block_are_told_from_others(tmp_path: Path) -> None:
+def test_pairs_of_one_block_are_told_from_others(tmp_path):
     """Two blocks of two pairs; of the second, the setting ran alone, later."""
     study = two_settings(block=2)
     early = [one for one in study.episodes if one.seed < 100_002 or one.setting.label == "ar"]
@@ -241,14 +240,14 @@ def test_pairs_of_one_block_are_told_from_others(tmp_path: Path) -> None:
     assert row_of(alone.table, label="kerv", averaging=MICRO)["pairs"] == 2
 
 
-def test_repeats_are_paired_with_their_own(tmp_path: Path) -> None:
+def test_repeats_are_paired_with_their_own(tmp_path):
     """The machine was ten times slower in the second repeat: for both sides."""
     ran: set[tuple[str, int]] = set()
 
-    def prepare(setting: Setting, task: str) -> RunEpisode:
+    def prepare(setting, task):
         one = ar(0.4) if setting.label == "ar" else ALL_ACCEPTED
 
-        def run(seed: int) -> EpisodeRecord:
+        def run(seed):
             slower = 10 if (setting.label, seed) in ran else 1
             ran.add((setting.label, seed))
             return still_episode(task, seed, True, [replace(one, seconds=one.seconds * slower)])
@@ -263,7 +262,7 @@ def test_repeats_are_paired_with_their_own(tmp_path: Path) -> None:
     assert row["speedup"] == row["speedup_low"] == row["speedup_high"] == pytest.approx(2.0)
 
 
-def test_csv_has_sensible_digits_and_empty_cells(data: StudyData) -> None:
+def test_csv_has_sensible_digits_and_empty_cells(data):
     text = csv_text(data.per_task)
     lines = text.splitlines()
     assert len(lines) == 5
@@ -280,7 +279,7 @@ def printed(table: pd.DataFrame, width: int = 80) -> list[str]:
     return console.export_text().splitlines()
 
 
-def test_a_terminal_shows_the_columns_that_fit(data: StudyData) -> None:
+def test_a_terminal_shows_the_columns_that_fit(data):
     wide, narrow = printed(data.table, 200), printed(data.table, 60)
     (line,) = [line for line in wide if line.startswith("kerv")]
     assert {"60", "(23–88)", "4.22", "1.86"} <= set(line.split())
@@ -291,7 +290,7 @@ def test_a_terminal_shows_the_columns_that_fit(data: StudyData) -> None:
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(tmp_path_factory):
     """A threshold study over three tasks, three episodes missing."""
     folder = tmp_path_factory.mktemp("results")
     study = threshold_study(["reach-v3", "push-v3", "door-open-v3"], episodes=3)
@@ -301,12 +300,12 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def written(results: Path) -> list[Path]:
+def written(results):
     """The files of its report."""
     return report(results).files
 
 
-def test_report_writes_the_same_bytes_again(results: Path, written: list[Path]) -> None:
+def test_report_writes_the_same_bytes_again(results, written):
     names = [path.relative_to(results).as_posix() for path in written]
     assert names == [
         "report/tables/threshold.csv",
@@ -330,7 +329,7 @@ def test_report_writes_the_same_bytes_again(results: Path, written: list[Path]) 
 
 
 @pytest.mark.usefixtures("written")
-def test_the_page_stands_alone(results: Path) -> None:
+def test_the_page_stands_alone(results):
     page = (results / "studies" / "threshold" / "report.html").read_text(encoding="utf-8")
     page, figures = re.subn(r'src="data:image/png;base64,[^"]*"', "", page)
     assert figures == 1

@@ -54,13 +54,13 @@ def rounded(r: float) -> int:
 
 @settings(deadline=None)  # the machine is shared
 @given(levels, st.floats(0.01, 5), st.floats(0.5, 4))
-def test_kinematic_is_the_level_form(k: float, k_s: float, phi: float) -> None:
+def test_kinematic_is_the_level_form(k, k_s, phi):
     r = radius_after(threshold("kinematic", k_s=k_s, phi=phi), k)
     exact = 5 + 10 * math.exp(-((k / k_s) ** phi))
     assert abs(r - exact) <= 0.5 + 1e-9
 
 
-def test_kinematic_at_its_landmarks() -> None:
+def test_kinematic_at_its_landmarks():
     chosen = threshold("kinematic")
     assert chosen.radius() == rounded(5 + 10 / math.e) == 9  # an episode begins at the reference level
     assert radius_after(chosen, 0.0) == 15
@@ -73,7 +73,7 @@ def test_kinematic_at_its_landmarks() -> None:
 
 @settings(deadline=None)  # the machine is shared
 @given(st.lists(st.one_of(st.none(), levels, st.floats(0, 1)), max_size=20))
-def test_change_is_its_closed_form(history: list[float | None]) -> None:
+def test_change_is_its_closed_form(history):
     chosen = threshold("change")
     r, last = 5 + 10 * math.exp(-1), 0.4
     assert chosen.radius() == 9
@@ -87,7 +87,7 @@ def test_change_is_its_closed_form(history: list[float | None]) -> None:
     assert chosen.radius() == 9
 
 
-def test_schedule_is_the_public_codes_and_open_loop() -> None:
+def test_schedule_is_the_public_codes_and_open_loop():
     asked = compose("rollout", ["threshold=schedule", "threshold.tau=8"], RolloutSettings).threshold
     chosen, other = built(asked), built(asked)
     for t in range(40):
@@ -99,7 +99,7 @@ def test_schedule_is_the_public_codes_and_open_loop() -> None:
 
 
 @pytest.mark.parametrize("kind", CLOSED_LOOP)
-def test_the_reference_level_is_the_tasks_where_none_is_given(kind: str) -> None:
+def test_the_reference_level_is_the_tasks_where_none_is_given(kind):
     asked = find("threshold", kind).settings(kind=kind)
     assert find("threshold", kind).needs(asked) == ("calibration",)
     assert find("threshold", kind).needs(replace(asked, k_s=0.4)) == ()
@@ -124,7 +124,7 @@ def test_the_reference_level_is_the_tasks_where_none_is_given(kind: str) -> None
         ("schedule", {"tau": 0.0}, r"threshold\.tau=0"),
     ],
 )
-def test_bad_values_get_one_line(kind: str, values: dict[str, Any], says: str) -> None:
+def test_bad_values_get_one_line(kind, values, says):
     with pytest.raises(UsageError, match=says) as caught:
         threshold(kind, **values)
     assert "\n" not in str(caught.value)

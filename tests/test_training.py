@@ -8,7 +8,6 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -41,7 +40,7 @@ TINY = TrainSettings(steps=12, batch=4, lr=0.01, warmup=2, validate_every=4, ema
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(tmp_path_factory):
     """A results folder with a few real demonstrations of one task."""
     folder = tmp_path_factory.mktemp("training")
     config = DemoConfig(("drawer-close-v3",), 6, camera=CameraSettings(), frame_stride=8, workers=1)
@@ -79,8 +78,8 @@ def interrupt() -> None:
 @pytest.mark.bits
 @pytest.mark.parametrize(("number", "last"), [(signal.SIGINT, 7), (signal.SIGTERM, 7), (signal.SIGINT, 2)])
 def test_ctrl_c_saves_the_step_that_ran_and_the_run_goes_on_there(
-    tmp_path: Path, number: signal.Signals, last: int
-) -> None:  # step 2 comes before the first validation
+    tmp_path, number, last
+):  # step 2 comes before the first validation
     whole = quadratic(tmp_path / "whole")
     whole.run()
     cut = quadratic(tmp_path / "cut")
@@ -99,8 +98,8 @@ def test_ctrl_c_saves_the_step_that_ran_and_the_run_goes_on_there(
         assert torch.equal(tensor, resumed.module.state_dict()[name])
 
 
-def test_one_request_that_arrives_twice_is_one_and_a_run_without_validation_says_so(tmp_path: Path) -> None:
-    def stop(step: int, metrics: Metrics) -> None:
+def test_one_request_that_arrives_twice_is_one_and_a_run_without_validation_says_so(tmp_path):
+    def stop(step, metrics):
         for _ in range(2):  # schedulers pass on what the process heard already
             os.kill(os.getpid(), signal.SIGTERM)
 
@@ -112,7 +111,7 @@ def test_one_request_that_arrives_twice_is_one_and_a_run_without_validation_says
         over.run()
 
 
-def test_a_damaged_or_senseless_resume_file_is_one_line(tmp_path: Path) -> None:
+def test_a_damaged_or_senseless_resume_file_is_one_line(tmp_path):
     quadratic(tmp_path).run()
     path = tmp_path / "resume.safetensors"
     whole = path.read_bytes()
@@ -132,13 +131,11 @@ def test_a_damaged_or_senseless_resume_file_is_one_line(tmp_path: Path) -> None:
         quadratic(tmp_path).run()
 
 
-def test_a_kill_between_the_weights_and_the_resume_file_keeps_the_right_best(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kill_between_the_weights_and_the_resume_file_keeps_the_right_best(tmp_path, monkeypatch):
     """Cut at every write of a run: the one that goes on saves the best of the uninterrupted run."""
     writes: list[int] = []
 
-    def saving(folder: Path) -> Loop:
+    def saving(folder):
         loop = quadratic(folder)
         loop.save = lambda module, metrics: save_tensors(folder / "best", module.state_dict())
         return loop
@@ -147,7 +144,7 @@ def test_a_kill_between_the_weights_and_the_resume_file_keeps_the_right_best(
     best = (tmp_path / "whole/best").read_bytes()
     real = files.os.replace
 
-    def counted(source: object, target: object) -> None:
+    def counted(source, target):
         writes.append(1)
         if len(writes) == cut:
             raise KeyboardInterrupt
@@ -165,7 +162,7 @@ def test_a_kill_between_the_weights_and_the_resume_file_keeps_the_right_best(
         assert (folder / "log.csv").read_bytes() == (tmp_path / "whole/log.csv").read_bytes()
 
 
-def test_weights_can_be_stored_in_fewer_bits(tmp_path: Path) -> None:
+def test_weights_can_be_stored_in_fewer_bits(tmp_path):
     settings = TargetSettings(observation="state", width=64, layers=1, heads=2, feed_forward=96, scene_tokens=2)
     target = CompactTarget(settings, ACTIONS, OBSERVATION, vocabulary("metaworld"))
     sizes = {}
@@ -187,7 +184,7 @@ def test_weights_can_be_stored_in_fewer_bits(tmp_path: Path) -> None:
     assert sizes["int8"] < 0.6 * sizes["float16"]
 
 
-def test_the_schedule_warms_up_and_decays_in_both_phases() -> None:
+def test_the_schedule_warms_up_and_decays_in_both_phases():
     settings = TrainSettings(steps=100, warmup=10, scene_steps=40)
     rates = [schedule(step, settings) for step in range(100)]
     assert rates[9] == rates[49] == 1.0
@@ -196,7 +193,7 @@ def test_the_schedule_warms_up_and_decays_in_both_phases() -> None:
     assert rates[0] == rates[40] == 0.1
 
 
-def test_soft_labels_are_distributions_that_fall_off_with_distance() -> None:
+def test_soft_labels_are_distributions_that_fall_off_with_distance():
     labels = soft_labels(255, 1.5)
     assert torch.allclose(labels.sum(-1), torch.ones(len(labels)), atol=1e-5)
     assert labels[100, 100] > labels[100, 101] > labels[100, 103]
@@ -206,7 +203,7 @@ def test_soft_labels_are_distributions_that_fall_off_with_distance() -> None:
     assert torch.allclose(token_loss(logits, tokens, soft_labels(255, 0.0)), plain)
 
 
-def test_random_light_depends_only_on_sample_and_step_and_moves_nothing() -> None:
+def test_random_light_depends_only_on_sample_and_step_and_moves_nothing():
     images = torch.randint(30, 60, (4, 3, 16, 32), dtype=torch.uint8)
     images[:, :, 5, 7] = 200  # a marker
     indices = torch.arange(4)
@@ -218,7 +215,7 @@ def test_random_light_depends_only_on_sample_and_step_and_moves_nothing() -> Non
     assert torch.equal(lit(images, indices, 3, 0.0), images)
 
 
-def test_waypoints_are_where_the_gripper_changes_next_and_where_the_episode_ends() -> None:
+def test_waypoints_are_where_the_gripper_changes_next_and_where_the_episode_ends():
     states = np.zeros((10, 39), np.float32)
     states[:, :3] = np.arange(10)[:, None] + np.array([0, 0.1, 0.2])
     labels = np.zeros((13, 4), np.float32)
@@ -244,7 +241,7 @@ def train(results: Path, *arguments: str) -> str:
 
 
 @pytest.mark.bits
-def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results: Path) -> None:
+def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results):
     settings = ["target=nano", "target.observation=state", "task=drawer-close"]
     settings += ["train.batch=4", "train.validate_every=4", "train.steps=16"]
     train(results, "target", "name=whole", *settings)
@@ -265,12 +262,10 @@ def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results
 
 
 @pytest.mark.usefixtures("few_validations")
-def test_training_counts_subnormal_numbers_as_zero_and_this_thread_nothing_later(
-    results: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_training_counts_subnormal_numbers_as_zero_and_this_thread_nothing_later(results, monkeypatch):
     halves, loss = [], Imitation.loss
 
-    def watched(*given: Any) -> tuple[torch.Tensor, Metrics]:
+    def watched(*given):
         halves.append(float(torch.tensor(1e-39) * 0.5))
         return loss(*given)
 
@@ -283,7 +278,7 @@ def test_training_counts_subnormal_numbers_as_zero_and_this_thread_nothing_later
 
 
 @pytest.mark.parametrize("tiles", [True, False])
-def test_bfloat16_is_for_cpus_with_tiles(tiles: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bfloat16_is_for_cpus_with_tiles(tiles, monkeypatch):
     monkeypatch.setattr(imitation, "has_tiles", lambda: tiles)
     lesson = object.__new__(Imitation)
     lesson.device = torch.device("cpu")
@@ -293,7 +288,7 @@ def test_bfloat16_is_for_cpus_with_tiles(tiles: bool, monkeypatch: pytest.Monkey
             assert torch.is_autocast_enabled("cpu") == (asked and tiles)
 
 
-def test_a_run_learns_the_experts_own_path(results: Path) -> None:
+def test_a_run_learns_the_experts_own_path(results):
     words = ["target=nano", "train=plain", "task=drawer-close", "train.batch=2", "train.steps=3"]
     out = train(results, "target", "name=path", *words, "train.validate_every=3")
     assert "waypoint_1_error_cm" in out
@@ -303,7 +298,7 @@ def test_a_run_learns_the_experts_own_path(results: Path) -> None:
 
 
 @pytest.mark.usefixtures("few_validations")
-def test_vision_target_and_its_drafter_train_from_the_command_line(results: Path) -> None:
+def test_vision_target_and_its_drafter_train_from_the_command_line(results):
     settings = ["target=nano", "task=drawer-close", "train.batch=2", "train.steps=4", "train.scene_steps=1"]
     settings += ["train.validate_every=2", "train.closed_loop=1", "world.horizon=4"]
     assert "closed_loop_success" in train(results, "target", "name=seen", *settings)

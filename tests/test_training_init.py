@@ -44,7 +44,7 @@ class Demos:
 
 
 @pytest.fixture
-def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def results(tmp_path, monkeypatch):
     """A results folder with the target `old` (H = 4), whose statistics and words no fresh run would have."""
     monkeypatch.setattr(DemoDataset, "open", classmethod(lambda cls, folder: Demos()))
     save_old(tmp_path, 3)
@@ -77,7 +77,7 @@ def interrupt() -> None:
 
 
 @pytest.mark.bits
-def test_a_run_begins_with_the_weights_statistics_and_words(results: Path) -> None:
+def test_a_run_begins_with_the_weights_statistics_and_words(results):
     folder = trained(results, "train.lr=0", "train.weight_decay=0")
     old, _ = load_target(results / "artifacts/target/old")
     new, description = load_target(folder)
@@ -89,7 +89,7 @@ def test_a_run_begins_with_the_weights_statistics_and_words(results: Path) -> No
     assert description.provenance["init"] == read_target(results / "artifacts/target/old").sha256
 
 
-def test_the_weights_belong_to_the_runs_identity_and_their_name_does_not(results: Path) -> None:
+def test_the_weights_belong_to_the_runs_identity_and_their_name_does_not(results):
     trained(results)
     shutil.copytree(results / "artifacts/target/old", results / "artifacts/target/renamed")
     trained(results, "train.init=renamed", "train.steps=5")
@@ -99,7 +99,7 @@ def test_the_weights_belong_to_the_runs_identity_and_their_name_does_not(results
             trained(results, other)
 
 
-def test_scores_with_and_without_success_are_of_different_runs(results: Path) -> None:
+def test_scores_with_and_without_success_are_of_different_runs(results):
     alone, some, more = (TargetRun(settings(results, f"train.closed_loop={n}")).hash for n in (0, 1, 2))
     assert some == more != alone
 
@@ -108,7 +108,7 @@ def test_scores_with_and_without_success_are_of_different_runs(results: Path) ->
     ("override", "shape"),
     [("target.width=64", "width"), ("target.observation=vision", "observation"), ("target.layers=1", "layers")],
 )
-def test_another_shape_is_refused_by_its_name(results: Path, override: str, shape: str) -> None:
+def test_another_shape_is_refused_by_its_name(results, override, shape):
     old = read_target(results / "artifacts/target/old").settings[shape]
     with pytest.raises(UsageError, match=rf"{shape}={old}, the run {override}"):
         TargetRun(settings(results, override))
@@ -123,18 +123,18 @@ def test_another_shape_is_refused_by_its_name(results: Path, override: str, shap
         (["train.places=path"], "train.places=path needs images"),
     ],
 )
-def test_what_cannot_be_trained_is_refused(results: Path, overrides: list[str], says: str) -> None:
+def test_what_cannot_be_trained_is_refused(results, overrides, says):
     with pytest.raises(UsageError, match=says):
         TargetRun(settings(results, *overrides))
 
 
 @pytest.mark.parametrize("setting", ["init=old", "colour=0.3", "places=path", "balance=0.5", "closed_loop=2"])
-def test_settings_of_targets_are_refused_for_a_drafter(setting: str) -> None:
+def test_settings_of_targets_are_refused_for_a_drafter(setting):
     with pytest.raises(UsageError, match=rf"train\.{setting}"):
         DrafterRun(compose("train_drafter", [f"train.{setting}"], TrainDrafterSettings))
 
 
-def test_demonstrations_without_places_are_refused(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_demonstrations_without_places_are_refused(results, monkeypatch):
     nameless = SimpleNamespace(**{**vars(Demos.manifest), "observation": dataclasses.replace(OBSERVATION, places=())})
     monkeypatch.setattr(Demos, "manifest", nameless)
     with pytest.raises(UsageError, match="no places"):

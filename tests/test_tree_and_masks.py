@@ -37,15 +37,13 @@ def reachable(tree: TokenTree) -> np.ndarray:
 
 
 @given(trees())
-def test_ancestors_are_the_transitive_closure_of_parents(tree: TokenTree) -> None:
+def test_ancestors_are_the_transitive_closure_of_parents(tree):
     assert (ancestors_of(tree.parents) == reachable(tree)).all()
     assert tree.depths == tuple(int(row.sum()) - 1 for row in ancestors_of(tree.parents))
 
 
 @given(trees(), st.integers(0, 9), st.integers(1, 6), st.booleans())
-def test_the_mask_shows_the_cache_what_stands_before_and_the_ancestors(
-    tree: TokenTree, cached: int, before: int, fixed: bool
-) -> None:
+def test_the_mask_shows_the_cache_what_stands_before_and_the_ancestors(tree, cached, before, fixed):
     like = torch.zeros(())
     cache = Cache(1, 1, 1, 40, 1, like, fixed)
     cache.length = cached
@@ -68,7 +66,7 @@ def test_the_mask_shows_the_cache_what_stands_before_and_the_ancestors(
 
 
 @pytest.mark.parametrize("fixed", [False, True])
-def test_without_a_statement_new_tokens_are_causal(fixed: bool) -> None:
+def test_without_a_statement_new_tokens_are_causal(fixed):
     like = torch.zeros(())
     cache = Cache(1, 1, 1, 8, 1, like, fixed)
     cache.length = 2
@@ -80,13 +78,13 @@ def test_without_a_statement_new_tokens_are_causal(fixed: bool) -> None:
     assert (attention_mask(None, 3, cache, like) is None) == (not fixed)
 
 
-def test_a_child_before_its_parent_is_refused() -> None:
+def test_a_child_before_its_parent_is_refused():
     with pytest.raises(ValueError, match="parents come before their children"):
         TokenTree.build([1, 2], [1, -1])
 
 
 @given(st.lists(st.lists(st.integers(0, 3), min_size=1, max_size=4), max_size=5))
-def test_a_merged_tree_holds_exactly_the_prefixes(chains: list[list[int]]) -> None:
+def test_a_merged_tree_holds_exactly_the_prefixes(chains):
     tree = merge(chains)
     prefixes = {tuple(c[: k + 1]) for c in chains for k in range(len(c))}
     paths = [tuple(tree.tokens[i] for i in tree.path_to(node)) for node in range(len(tree))]
@@ -107,7 +105,7 @@ def slow_acceptance(tree: TokenTree, target_tokens: list[int], start: int, limit
 
 @settings(max_examples=200)
 @given(trees(), st.data(), st.integers(0, 7), st.lists(st.integers(0, 5), min_size=1, max_size=4))
-def test_acceptance_is_its_definition(tree: TokenTree, data: st.DataObject, start: int, limits: list[int]) -> None:
+def test_acceptance_is_its_definition(tree, data, start, limits):
     target_tokens = [data.draw(st.integers(0, 11)) for _ in range(len(tree) + 1)]
     found = accept_by_distance(tree, target_tokens, start, limits)
     gaps = [abs(tree.tokens[i] - target_tokens[tree.parents[i] + 1]) for i in found.path]
@@ -120,7 +118,7 @@ def test_acceptance_is_its_definition(tree: TokenTree, data: st.DataObject, star
 
 @settings(max_examples=60, deadline=None)
 @given(data=st.data(), n=st.integers(1, 12))
-def test_ancestors_of_tensors_are_those_of_the_tree(data: st.DataObject, n: int) -> None:
+def test_ancestors_of_tensors_are_those_of_the_tree(data, n):
     parents = [data.draw(st.integers(ROOT, i - 1)) for i in range(n)]
     tree = TokenTree.build([0] * n, parents)
     found = ancestors_on_device(torch.tensor(parents), max(tree.depths) + 1)

@@ -45,7 +45,7 @@ class Near(ChainProposer):
 # --- the clock
 
 
-def test_a_proposer_that_sleeps_is_in_the_clock_in_its_phase() -> None:
+def test_a_proposer_that_sleeps_is_in_the_clock_in_its_phase():
     target = MockTarget()
     slow = Near(target, target.encode(SHOWN), bins=1, pause=PAUSE)
     decoder = Decoder(target, Parts(proposer=slow))
@@ -57,7 +57,7 @@ def test_a_proposer_that_sleeps_is_in_the_clock_in_its_phase() -> None:
     assert record.seconds - record.phases["propose"] < PAUSE * slow.calls / 2
 
 
-def test_an_in_prefill_draft_that_sleeps_is_not_the_prefills_time() -> None:
+def test_an_in_prefill_draft_that_sleeps_is_not_the_prefills_time():
     target = MockTarget()
     slow = Near(target, target.encode(SHOWN), pause=PAUSE)
     decoder = Decoder(target, Parts(prefill_draft=slow))
@@ -70,7 +70,7 @@ def test_an_in_prefill_draft_that_sleeps_is_not_the_prefills_time() -> None:
     assert record.seconds >= record.phases["propose"] >= PAUSE
 
 
-def test_a_merged_draft_goes_unverified_as_its_first_chain() -> None:
+def test_a_merged_draft_goes_unverified_as_its_first_chain():
     target = MockTarget()
     prompt = target.encode(SHOWN)
     first, second = Near(target, prompt, bins=1), Near(target, prompt)
@@ -80,9 +80,9 @@ def test_a_merged_draft_goes_unverified_as_its_first_chain() -> None:
 
 
 @pytest.mark.parametrize(("slow", "phase"), [("encode", "vision"), ("forward", "prefill")])
-def test_a_target_that_sleeps_is_in_the_clock_in_its_phase(slow: str, phase: str) -> None:
+def test_a_target_that_sleeps_is_in_the_clock_in_its_phase(slow, phase):
     class Slow(MockTarget):
-        def __getattribute__(self, name: str) -> Any:
+        def __getattribute__(self, name):
             if name == slow:
                 time.sleep(PAUSE)
             return super().__getattribute__(name)
@@ -103,7 +103,7 @@ def test_a_target_that_sleeps_is_in_the_clock_in_its_phase(slow: str, phase: str
 
 
 @pytest.mark.bits
-def test_always_skip_executes_the_sources_tokens_without_a_forward() -> None:
+def test_always_skip_executes_the_sources_tokens_without_a_forward():
     target = MockTarget()
     source = Near(target, target.encode(SHOWN), bins=5)
     decoder = Decoder(target, Parts(prefill_draft=source, skip=AlwaysSkip(source)))
@@ -115,7 +115,7 @@ def test_always_skip_executes_the_sources_tokens_without_a_forward() -> None:
         assert record.unverified == record.actions.size == len(record.tokens)
 
 
-def test_always_skip_without_a_history_lets_the_target_decode() -> None:
+def test_always_skip_without_a_history_lets_the_target_decode():
     target = MockTarget()
     hold = PredictionProposer(Hold(SEVEN.is_strict, minimum=1, horizon=2))
     decoder = Decoder(target, Parts(prefill_draft=hold, skip=AlwaysSkip(hold)))
@@ -160,7 +160,7 @@ def swept(blocks: list[list[int]]) -> dict[int, list[tuple[int, ...]]]:
 ORDERS = [[[0, 1, 2, 3, 4, 5]], [[5, 3, 1, 4, 2, 0]], [[0, 1], [2, 3], [4, 5]], [[4], [0], [5], [2], [1], [3]]]
 
 
-def test_frozen_skip_levels_know_no_order_and_no_block() -> None:
+def test_frozen_skip_levels_know_no_order_and_no_block():
     found = [swept(blocks) for blocks in ORDERS]
     assert found[0] == found[1] == found[2] == found[3]
     forwards = [tokens[0] for record in found[0].values() for tokens in record]
@@ -172,14 +172,14 @@ def test_frozen_skip_levels_know_no_order_and_no_block() -> None:
 # --- the path
 
 
-def test_the_boundarys_path_begins_where_the_episode_does() -> None:
+def test_the_boundarys_path_begins_where_the_episode_does():
     seen: list[np.ndarray] = []
 
     class Watching:
-        def numbers(self, task: str, seed: int) -> np.random.Generator:
+        def numbers(self, task, seed):
             return np.random.default_rng(seed)
 
-        def choose(self, path: np.ndarray, random: np.random.Generator) -> None:
+        def choose(self, path, random):
             seen.append(path.copy())
 
     decoder = Decoder(MockTarget(SPEC.actions, 1), Parts(boundary=Watching()))  # type: ignore[arg-type]

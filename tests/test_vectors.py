@@ -26,7 +26,7 @@ SMALL = CameraSettings(size=24, supersample=1)
 
 
 @given(st.lists(st.floats(1e-100, 1e100).flatmap(lambda x: st.sampled_from([x, -x])), max_size=9))
-def test_a_length_is_rounded_once_per_number_and_for_the_root(numbers: list[float]) -> None:
+def test_a_length_is_rounded_once_per_number_and_for_the_root(numbers):
     total = 0.0
     for number in numbers:
         total = float(Fraction(number) ** 2 + Fraction(total))
@@ -62,7 +62,7 @@ def digests(folder: Path) -> list[str]:
     return recordings(folder) + stressed()
 
 
-def test_another_kernel_records_and_draws_the_same(tmp_path: Path) -> None:
+def test_another_kernel_records_and_draws_the_same(tmp_path):
     """OpenBLAS's kernels for Prescott run on every x86-64 and round other bits than those of later CPUs; on other
     machines the variable has no effect. Of Meta-World the float32 state of recordings is compared: in float64 the last
     bit of its gripper's opening is `np.linalg.norm`'s."""

@@ -1,7 +1,6 @@
 """Frames of several views: their names, what a world draws, recordings, the policy that sees them."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,14 +31,14 @@ HAND = "corner4+gripperPOV:75"
 
 
 @pytest.fixture(scope="module")
-def world() -> Iterator[MetaWorld]:
+def world():
     made = SPEC.open_world("drawer-close", CameraSettings(HAND, size=SIZE, supersample=1))
     assert isinstance(made, MetaWorld)
     with made:
         yield made
 
 
-def test_a_name_says_cameras_and_fields_of_view() -> None:
+def test_a_name_says_cameras_and_fields_of_view():
     assert views_of("corner4") == (View("corner4"),)
     assert views_of("a+b:75.5+b:60") == (View("a"), View("b", 75.5), View("b", 60.0))
     assert frame_shape("a+b", 96) == (96, 192, 3)
@@ -47,12 +46,12 @@ def test_a_name_says_cameras_and_fields_of_view() -> None:
 
 
 @pytest.mark.parametrize("name", ["a+", "+a", "a@4", "a:0", "a:180", "a:", "a:x", "a:²"])
-def test_a_name_that_says_none_of_them_is_refused(name: str) -> None:
+def test_a_name_that_says_none_of_them_is_refused(name):
     with pytest.raises(UsageError, match="is no view"):
         views_of(name)
 
 
-def test_views_lie_side_by_side_as_their_cameras_draw_them(world: MetaWorld) -> None:
+def test_views_lie_side_by_side_as_their_cameras_draw_them(world):
     world.reset(0)
     left, right = np.split(world.frame(), 2, axis=1)
     assert left.tobytes() == world.frame(CameraSettings("corner4", size=SIZE, supersample=1)).tobytes()
@@ -62,9 +61,9 @@ def test_views_lie_side_by_side_as_their_cameras_draw_them(world: MetaWorld) -> 
         world.observe(["corner4+gripperPOW"])
 
 
-def test_a_stress_changes_each_camera(world: MetaWorld) -> None:
+def test_a_stress_changes_each_camera(world):
     class Numbered(Stress):
-        def see(self, camera: str, image: np.ndarray, step: int) -> np.ndarray:
+        def see(self, camera, image, step):
             return np.full_like(image, 10 * step + (camera == "gripperPOV:75"))
 
     world.stress = Numbered()
@@ -98,7 +97,7 @@ def shown(camera: str, seed: int = 0) -> Observation:
 
 
 @pytest.mark.bits
-def test_every_view_has_tokens_of_its_own() -> None:
+def test_every_view_has_tokens_of_its_own():
     one, two = made("corner4"), made(HAND)
     cells = one.settings.grid**2
     assert two.segments["vision"] == slice(0, 2 * cells)
@@ -115,7 +114,7 @@ def test_every_view_has_tokens_of_its_own() -> None:
 
 @pytest.mark.bits
 @pytest.mark.parametrize("camera", ["corner4", HAND, "corner4+corner4:25+gripperPOV"])
-def test_packed_weights_compute_the_same_prompt(camera: str) -> None:
+def test_packed_weights_compute_the_same_prompt(camera):
     plain, packed = made(camera), made(camera)
     pack(packed)
     assert packed.packed is not None
@@ -125,14 +124,14 @@ def test_packed_weights_compute_the_same_prompt(camera: str) -> None:
             assert torch.allclose(ours, theirs, atol=1e-4)
 
 
-def test_a_frame_of_other_views_is_refused() -> None:
+def test_a_frame_of_other_views_is_refused():
     seen = shown("corner4")
     with pytest.raises(CheckpointError, match=r"\(32, 32, 3\), the target takes \(32, 64, 3\)"):
         made(HAND).encode(seen.with_images({HAND: seen.images["corner4"]}))
 
 
 @pytest.mark.bits
-def test_a_view_is_added_to_a_trained_policy_without_moving_its_estimates() -> None:
+def test_a_view_is_added_to_a_trained_policy_without_moving_its_estimates():
     one = made("corner4", seed=3)
     two = continued_target(one.settings, one, HAND).eval()
     seen = shown(HAND)
@@ -152,7 +151,7 @@ def test_a_view_is_added_to_a_trained_policy_without_moving_its_estimates() -> N
     assert two.locate[0].weight.grad[:, 2 * one.settings.keypoints : 4 * one.settings.keypoints].abs().sum() > 0
 
 
-def test_training_goes_on_only_with_views_behind_those_it_has() -> None:
+def test_training_goes_on_only_with_views_behind_those_it_has():
     one = made("corner4")
     described = type("D", (), {"settings": vars(one.settings), "cameras": one.cameras})()
     for camera in ("corner4", HAND):
@@ -167,11 +166,11 @@ def weights_of(results: Path, name: str) -> str:
     return sha256_of(results / "artifacts/target" / name / "model.safetensors")
 
 
-def test_from_recording_to_rollout_and_export(tmp_path: Path) -> None:
+def test_from_recording_to_rollout_and_export(tmp_path):
     """Every command of a policy that sees two views, as docs/training.md gives them, small."""
     common = ["task=drawer-close", f"world.camera.name={HAND}", "world.camera.size=32", f"results={tmp_path}"]
 
-    def run(*words: str) -> str:
+    def run(*words):
         result = CliRunner().invoke(app, list(words))
         assert result.exit_code == 0, result.output
         return result.output

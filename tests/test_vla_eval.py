@@ -8,7 +8,7 @@ import sqlite3
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -55,7 +55,7 @@ PARAMS = {"tasks": ["reach"], "seed": 100_000, "horizon": HORIZON}
 
 
 @pytest.fixture(scope="module")
-def results(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(policies, tmp_path_factory):
     """The policies in a folder that may be written to; the one that sees names its camera, as trained ones do."""
     copy = shutil.copytree(policies, tmp_path_factory.mktemp("results") / "results")
     path = copy / "artifacts" / "target" / "nano-vision" / "target.json"
@@ -100,9 +100,7 @@ def kerv(*words: str) -> str:
     ("target", "words"),
     [("nano-state", ["method=naive_sd"]), ("nano-state", ["method=sp_vla"]), ("nano-vision", ["method=spec_vla"])],
 )
-def test_a_benchmark_run_by_vla_eval_has_the_episodes_of_a_rollout(
-    results: Path, tmp_path: Path, target: str, words: list[str]
-) -> None:
+def test_a_benchmark_run_by_vla_eval_has_the_episodes_of_a_rollout(results, tmp_path, target, words):
     name = f"{target}-{words[0][7:]}"
     evaluated(policy_of(results, target, *words), METAWORLD, tmp_path, name)
     typed = [f"policy.target={target}", f"results={results}", f"world.horizon={HORIZON}", "episodes=2", *words]
@@ -167,11 +165,11 @@ def seen(seed: int) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def policy(results: Path) -> Policy:
+def policy(results):
     return policy_of(results, "nano-vision")
 
 
-def test_hello_says_what_the_policy_reads_and_sends(policy: Policy) -> None:
+def test_hello_says_what_the_policy_reads_and_sends(policy):
     with serving(policy) as (port, _):
         kind, about = Client(port).ask("hello", {"protocol_version": 1, "harness_version": "0.8.0"})
     assert kind == "hello"
@@ -202,9 +200,7 @@ BOMB = {"__image__": True, "format": "raw", "data": b"", "dtype": "<f8", "shape"
         ("observation", {"state": [0.0] * 7, "images": {"corner4": BLACK}}, "4 or 39 numbers are wanted"),
     ],
 )
-def test_a_wrong_message_gets_one_line_and_the_next_one_an_answer(
-    policy: Policy, kind: str, payload: Any, said: str
-) -> None:
+def test_a_wrong_message_gets_one_line_and_the_next_one_an_answer(policy, kind, payload, said):
     with serving(policy) as (port, log):
         client = Client(port)
         answer, told = client.ask(kind, payload)
@@ -215,7 +211,7 @@ def test_a_wrong_message_gets_one_line_and_the_next_one_an_answer(
         assert client.act().shape == (4,)
 
 
-def test_names_that_are_no_file_names_are_not_kept(policy: Policy, results: Path) -> None:
+def test_names_that_are_no_file_names_are_not_kept(policy, results):
     with serving(policy) as (port, _):
         client = Client(port)
         client.tell("episode_start", {"recording": {"eval_id": "../../outside", "eid": "x"}})
@@ -225,14 +221,14 @@ def test_names_that_are_no_file_names_are_not_kept(policy: Policy, results: Path
     assert not list(results.parent.rglob("x.arrow"))
 
 
-def test_clients_of_a_batch_get_the_actions_that_each_would_alone(results: Path) -> None:
+def test_clients_of_a_batch_get_the_actions_that_each_would_alone(results):
     alone, together = policy_of(results, "nano-state"), policy_of(results, "nano-state", "batch=3")
     states = [np.random.default_rng(seed).normal(size=39) for seed in range(3)]
 
-    def actions(policy: Policy) -> list[np.ndarray]:
+    def actions(policy):
         made: dict[int, np.ndarray] = {}
 
-        def client(i: int, port: int) -> None:
+        def client(i, port):
             made[i] = Client(port).act(images={}, state=states[i])
 
         with serving(policy) as (port, _):
@@ -248,11 +244,11 @@ def test_clients_of_a_batch_get_the_actions_that_each_would_alone(results: Path)
         policy_of(results, "nano-state", "batch=3", "method=naive_sd")
 
 
-def test_one_bad_observation_of_a_batch_is_no_others_fault(results: Path) -> None:
+def test_one_bad_observation_of_a_batch_is_no_others_fault(results):
     policy = policy_of(results, "nano-state", "batch=2")
     outcomes: dict[str, Any] = {}
 
-    def ask(instruction: str) -> None:
+    def ask(instruction):
         client = VlaEval(policy)
         client.begin("reach-v3", 0, np.zeros(3))
         try:
@@ -274,7 +270,7 @@ def test_one_bad_observation_of_a_batch_is_no_others_fault(results: Path) -> Non
 # --- Meta-World as a benchmark
 
 
-def test_the_benchmark_is_reached_without_a_simulator() -> None:
+def test_the_benchmark_is_reached_without_a_simulator():
     code = (
         "import sys; from kerv_cli.worlds.vla_eval import MetaWorld; b = MetaWorld(tasks=['MT10'], stress='push', "
         "stress_level=2); print(len(b.get_tasks()), [m for m in ('torch', 'mujoco', 'metaworld') if m in sys.modules])"
@@ -292,7 +288,7 @@ def test_the_benchmark_is_reached_without_a_simulator() -> None:
         ({"seed": -1}, "seed"),
     ],
 )
-def test_a_benchmark_that_cannot_be_says_so(params: dict[str, Any], said: str) -> None:
+def test_a_benchmark_that_cannot_be_says_so(params, said):
     with pytest.raises(UsageError, match=said):
         MetaWorld(**params).reset({"name": "reach-v3"})
 
@@ -315,7 +311,7 @@ class Scripted(PredictModelServer):
 
 
 @pytest.fixture(scope="module")
-def recordings(results: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def recordings(results, tmp_path_factory):
     """Evaluations of the same episodes, served by kerv and by vla-eval's own server."""
     root = tmp_path_factory.mktemp("recordings")
     config = config_of("kerv_cli.worlds.vla_eval:MetaWorld", 3, **{**PARAMS, "horizon": 40})
@@ -331,7 +327,7 @@ def recordings(results: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[
 # --- recordings as studies
 
 
-def test_evaluations_of_the_same_episodes_are_paired(results: Path, recordings: dict[str, Path]) -> None:
+def test_evaluations_of_the_same_episodes_are_paired(results, recordings):
     said = kerv("runs", "import", *map(str, recordings.values()), "name=three", f"results={results}", "--json")
     rows = {r["label"]: r for r in json.loads(said)["settings"] if r["averaging"].startswith("micro")}
     assert list(rows) == ["ar", "naive_sd", "Scripted"]
@@ -354,7 +350,7 @@ def test_evaluations_of_the_same_episodes_are_paired(results: Path, recordings: 
     assert (refused.exit_code, "was imported: run vla-eval again" in refused.output) == (2, True)
 
 
-def test_an_import_again_replaces_the_study_and_no_other(results: Path, recordings: dict[str, Path]) -> None:
+def test_an_import_again_replaces_the_study_and_no_other(results, recordings):
     for _ in range(2):
         kerv("runs", "import", str(recordings["ar"]), "name=again", "labels=mine", f"results={results}")
     assert "mine" in kerv("runs", "show", "again", f"results={results}")
@@ -363,12 +359,12 @@ def test_an_import_again_replaces_the_study_and_no_other(results: Path, recordin
     assert "study 'own' exists and was not imported" in refused.output
 
 
-def test_a_killed_shard_leaves_episodes_that_are_missing_until_it_ran_again(results: Path, tmp_path: Path) -> None:
+def test_a_killed_shard_leaves_episodes_that_are_missing_until_it_ran_again(results, tmp_path):
     config = config_of("kerv_cli.worlds.vla_eval:MetaWorld", 4, **{**PARAMS, "horizon": 5})
     config["output_dir"] = str(tmp_path)
     claim, claimed = RecordingStore.claim, []
 
-    def killed(self: RecordingStore, *arguments: Any) -> int | None:
+    def killed(self, *arguments):
         """Shard 1 claims an episode and is never heard of again."""
         if arguments[1] == 1 and claimed:
             raise KeyboardInterrupt
@@ -410,9 +406,7 @@ def _empty(path: Path) -> None:
         (Path.unlink, "does not exist"),
     ],
 )
-def test_a_harmed_recording_is_refused_in_one_line(
-    recordings: dict[str, Path], tmp_path: Path, harm: Callable[[Path], Any], said: str
-) -> None:
+def test_a_harmed_recording_is_refused_in_one_line(recordings, tmp_path, harm, said):
     path = tmp_path / "recording-x.sqlite"
     shutil.copy(recordings["ar"], path)
     harm(path)
@@ -430,9 +424,7 @@ def test_a_harmed_recording_is_refused_in_one_line(
         ({"episodes": ()}, "have no episode in common"),
     ],
 )
-def test_evaluations_of_other_episodes_are_refused(
-    recordings: dict[str, Path], changes: dict[str, Any], said: str
-) -> None:
+def test_evaluations_of_other_episodes_are_refused(recordings, changes, said):
     (first,), (second,) = (read_evaluations(recordings[name]) for name in ("ar", "naive_sd"))
     changes = {**changes, **({"config": {**second.config, **changes["config"]}} if "config" in changes else {})}
     with pytest.raises(UsageError, match=said):
@@ -441,7 +433,7 @@ def test_evaluations_of_other_episodes_are_refused(
         labelled([[first], [second]], ["one"])
 
 
-def test_a_folder_with_recordings_of_two_servers_is_refused(recordings: dict[str, Path], tmp_path: Path) -> None:
+def test_a_folder_with_recordings_of_two_servers_is_refused(recordings, tmp_path):
     for name in ("ar", "naive_sd"):
         shutil.copy(recordings[name], tmp_path)
     with pytest.raises(UsageError, match="of several servers: name each file"):
@@ -491,7 +483,7 @@ class Stand(StepBenchmark):
         return {"agentview": IMAGE_RGB, "language": LANGUAGE}
 
 
-def test_openvla_on_liberos_interface_from_checkpoint_to_paired_table(tmp_path: Path) -> None:
+def test_openvla_on_liberos_interface_from_checkpoint_to_paired_table(tmp_path):
     results = tmp_path / "results"
     checkpoint = write_checkpoint(tmp_path / "checkpoint")
     built = ["target=openvla", f"checkpoint={checkpoint}", "name=libero", "camera=agentview", "control_hz=20"]

@@ -77,7 +77,7 @@ CASES = [
 
 @pytest.mark.bits
 @pytest.mark.parametrize(("family", "captured"), dict.fromkeys(CASES))
-def test_a_round_waits_once(family: str, captured: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_round_waits_once(family, captured, monkeypatch):
     """And the tokens are those of the host, draft for draft: the same rounds."""
     target = random_target(2, 1, 2, CHUNK)
     prompt = random_prompt(target, 2)
@@ -97,8 +97,8 @@ def test_a_round_waits_once(family: str, captured: bool, monkeypatch: pytest.Mon
         decoder = Decoder(target, parts_of_device(parts))
         waits: list[int] = []
 
-        def counted(work: Any) -> Any:
-            def run(*arguments: Any) -> Any:
+        def counted(work):
+            def run(*arguments):
                 before = len(device.waits)
                 result = work(*arguments)
                 waits.append(len(device.waits) - before)
