@@ -128,8 +128,6 @@ def test_fused_sends_straight_reaches_to_retrieval_and_bends_to_the_drafter():
     boundary = boundary_of("fused")
     reach, bend = boundary.choose(line(rng, 0.14), rng), boundary.choose(arc(rng, 0.02, 0.05), rng)
     assert (reach.mode, bend.mode) == ("retrieval", "drafter")
-    assert reach.metric is not None
-    assert bend.metric is not None
     assert reach.metric > 0.9 > 0.3 > bend.metric
     exact = boundary_of("fused", f_star=reach.metric)
     assert exact.choose(line(np.random.default_rng(3), 0.14), rng).mode == "retrieval"  # F ≥ F*

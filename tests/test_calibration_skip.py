@@ -161,7 +161,6 @@ def test_tasks_that_the_datastore_does_not_hold_are_left_out():
     store = store_of(np.linspace(0, 1, 40), np.full((40, 8), 100), np.arange(40) % 2)
     seen: list[int] = []
     section = skip_section(store, ["b", "a"], 0.1, 0.9, lambda done, total: seen.append(done))
-    assert section is not None
     assert (list(section.tasks), section.datastore) == (["a"], store.content)
     assert seen == [1, 2]
     assert skip_section(store, ["b"], 0.1, 0.9, silent) is None
@@ -183,7 +182,6 @@ def test_the_ranges_are_those_of_the_training_episodes(copy):
 def test_the_skip_levels_belong_to_one_datastore(copy):
     run, made = calibrated(copy, "epsilon=1.9", "confidence=0.5")
     folder = copy / "artifacts/datastore/nano-state"
-    assert made.skip is not None
     row = made.skip.tasks["reach-v3"]
     store = Datastore.open(folder, run.description)
     assert row == task_levels(match(store, "reach-v3"), 1.9, 0.5)
@@ -205,7 +203,6 @@ def test_what_cannot_be_computed_now_is_kept(copy):
     shutil.rmtree(copy / "artifacts/datastore")
     run, second = calibrated(copy, "window=8", "boundary_windows=[5]")
     assert (second.variability, second.skip) == (levels, first.skip)
-    assert second.boundary is not None
     assert (second.window, list(second.boundary.windows)) == (8, ["5"])
     assert [line.endswith("kept from the earlier run") for line in run.notes] == [True, True]
     _, third = calibrated(copy, "window=9")

@@ -276,8 +276,6 @@ def test_an_interrupted_command_says_so_in_one_line(number, late, policies, tmp_
         [sys.executable, "-c", code, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )  # fmt: skip
-    assert begun.stdout is not None
-    assert begun.stderr is not None
     begun.stdout.readline()
     if late:
         assert begun.stderr.readline() == "ar of nano-vision on reach-v3: 50 episodes\n"

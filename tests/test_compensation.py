@@ -51,7 +51,6 @@ def test_assembly_for_every_position(known, min_verified):
     tokens = [10 * i for i in range(known)]
     settings = CompensateSettings(min_verified=min_verified)
     actions = assemble(tokens, chunk_with(PAST), HOLD, settings)
-    assert actions is not None
     expected: list[list[float]] = []
     last = [0.2, 0.1, 0.3, 1.0]
     for step in range(N // D):
@@ -69,7 +68,6 @@ def test_further_steps_are_predicted_from_the_accepted_prefix():
     settings = CompensateSettings(steps=3)
     tokens = [127, 127, 127, 254, 150]
     actions = assemble(tokens, chunk_with(PAST), Linear(SPACE.is_strict, minimum=2), settings)
-    assert actions is not None
     assert actions.shape == (4, 4)
     first = SPACE.values_of(np.array(tokens[:4]))
     slope = first - np.array([0.2, 0.1, 0.3, 1.0])
@@ -183,7 +181,6 @@ def test_what_the_rejected_draft_had_goes_before_the_prediction(wrong):
     if end > wrong + 1:
         # whatever was drafted for the gripper, and whether or not it was: as in the step before
         expected[end - 1] = expected[end - 1 - D] if end > D else PAST.values()[-1][D - 1]
-    assert chunk.closed is not None
     assert chunk.closed.reshape(-1) == pytest.approx(expected)
     assert chunk.compensated == end - wrong - 1
 
@@ -198,6 +195,5 @@ def test_without_a_gripper_to_hold_the_drafts_is_taken(wrong):
     decoder = Decoder(TARGET, Parts(prefill_draft=draft, rectifier=compensation(predictor="draft")))
     chunk = decoder.decode_prompt(prompt)
     assert chunk.forwards == 1
-    assert chunk.closed is not None
     gripper = drafted[D - 1] if wrong < D - 1 else truth[D - 1]  # the first step's, until it is known
     assert chunk.closed[-1, D - 1] == pytest.approx(SPACE.values_of(np.array(gripper)))

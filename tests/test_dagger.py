@@ -85,7 +85,6 @@ def test_a_target_acts_and_the_expert_labels(tmp_path):
     assert 0 < same.mean() < 1  # the expert's chunks, and the target's
     world = SPEC.open_world("reach-v3", SHORT)
     again = run_expert(world, 0, config, acts(config))
-    assert again is not None
     np.testing.assert_array_equal(again.executed, episode.executed)
     expert, observation = world.spec.expert("reach-v3"), world.reset(0)
     for action, label in zip(episode.executed, episode.labels, strict=False):

@@ -51,7 +51,6 @@ def test_the_record_of_an_episode_adds_up(policies):
         assert sum(decode.phases.values()) == pytest.approx(decode.seconds, rel=1e-6)
         assert decode.forwards == len(decode.rounds)
         assert sum(r.committed for r in decode.rounds) == len(decode.tokens) == 16
-        assert decode.variability is not None
         assert decode.variability > 0
     assert (record.environment, record.space) == ("metaworld", SPEC.actions)
     first = SPEC.open_world("drawer-open-v3")

@@ -223,7 +223,6 @@ def test_what_trains_is_not_packed_and_gets_its_gradients():
     frozen(x, torch.arange(4)).sum().backward()
     twin = x.detach().clone().requires_grad_(True)
     copy.deepcopy(frozen)(twin, torch.arange(4)).sum().backward()
-    assert x.grad is not None
     assert close(x.grad, twin.grad)
 
 

@@ -209,7 +209,6 @@ def test_a_stored_episode_is_not_executed_beyond_its_end_or_below_s_min():
 def test_s_min_rises_after_a_failure_and_falls_after_a_success_within_bounds():
     decoder, _, _ = skipping(up=0.5, down=0.1)
     skip = decoder.parts.skip
-    assert skip is not None
     decoder.finish(False)
     assert skip.s_min == pytest.approx(0.75)
     decoder.finish(False)

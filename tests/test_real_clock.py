@@ -123,7 +123,6 @@ def test_k_steps_are_between_observation_and_first_action_whatever_the_chunk():
         record = point_episode(constant(steps), Numbered(chunk))
         begun = zip(record.decodes[:-1], record.decode_steps, strict=False)
         for number, (decode, start) in enumerate(begun, 1):
-            assert decode.delay is not None
             assert start - decode.delay.observed == steps == decode.delay.carried + decode.delay.held
             assert played(record)[start] == (number, 0)
 
@@ -251,7 +250,6 @@ def test_ar_takes_what_was_asked_for_and_the_others_their_share(results):
     felt = [d.delay.seconds for d in ar.decodes if d.delay is not None]
     assert felt == pytest.approx([0.043 * (1 + h / 0.043) for h in host])  # the profile's AR takes 43 ms
     double = episode_of(results, "method=ar", *words[:3], "rollout.ar_ms=86").decodes[0]
-    assert double.delay is not None
     assert double.delay.seconds >= 2 * 0.043
     assert steps_of(felt[0], 80.0) == ar.decodes[0].delay_steps
 
@@ -260,7 +258,6 @@ def test_measured_latency_is_scaled_by_ars_median_here(policies, monkeypatch):
     monkeypatch.setattr(policies_of, "ar_seconds", lambda *key: 0.02)
     record = episode_of(policies, "method=ar", "rollout.clock=real", "rollout.ar_ms=100")
     for decode in record.decodes:
-        assert decode.delay is not None
         assert decode.delay.seconds == pytest.approx(5 * decode.seconds)
 
 
@@ -271,7 +268,6 @@ def test_ar_is_measured_once_per_process(policies):
     for _ in range(2):
         clock = policies_of.clock_for(chosen, TASK)
     assert policies_of.ar_seconds.cache_info().misses == 1
-    assert clock is not None
     assert 0 < clock.latency(AR) / AR.seconds < 1000
 
 

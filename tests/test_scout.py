@@ -104,7 +104,6 @@ def test_verified_strictly_its_drafts_change_no_token(target, scout):
 @pytest.mark.parametrize("views", [1, 2])
 def test_packed_weights_give_the_same_draft(target, scout, views):
     inputs = target.inputs(observed(target, 0))
-    assert inputs.images is not None
     inputs = dataclasses.replace(inputs, images=torch.cat([inputs.images, 255 - inputs.images][:views], -1))
     shape = target.actions, target.observation, target.chunk, views, target.settings.image_size, target.words.size
     made = ScoutNetwork(scout.settings, *shape).eval().requires_grad_(False)

@@ -51,7 +51,6 @@ def test_a_name_in_use_is_refused_and_a_killed_command_is_listed_with_how_to_go_
     with subprocess.Popen(
         [sys.executable, "-c", HOLD, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == "begun\n"
         line = kerv("demos", "name=mine", "task=reach", f"results={tmp_path}", code=2)
         assert f"demos mine is being made by process {process.pid}" in line

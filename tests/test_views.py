@@ -147,7 +147,6 @@ def test_a_view_is_added_to_a_trained_policy_without_moving_its_estimates():
     # further training reaches the new encoder
     two.requires_grad_(True)
     two.encode_batch(two.inputs(seen))[1].sum().backward()
-    assert two.locate[0].weight.grad is not None
     assert two.locate[0].weight.grad[:, 2 * one.settings.keypoints : 4 * one.settings.keypoints].abs().sum() > 0
 
 
