@@ -13,6 +13,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.lab.plan import seed_blocks
 from kerv_cli.report import decide
 from kerv_cli.report.decide import choices, confidence_of_a_look, decision_of, pareto, safest_first
+from kerv_cli.report.matched import with_matched_speed
 from kerv_cli.report.measures import MICRO
 from kerv_cli.report.statistics import PairedCounts, paired_difference, pairs_to_settle
 from kerv_cli.report.tables import load_study, rows_of
@@ -65,6 +66,18 @@ def test_the_fastest_setting_before_the_first_that_fails_is_chosen(table):
         "1.50 (1.40–1.60) times as fast per episode on this machine"
     )
     assert short_sentence(reach) == "reach: r=9"
+
+
+def test_the_matched_success_speed_of_a_method_is_that_of_its_fastest_setting_that_keeps_success(table):
+    """Of r = 3, 9 and 20, the last loses too much. `unverified` is another method. Where AR fails, there is none."""
+    methods = {"ar": "ar", "unverified": "early_unverified", "slow": "naive_sd"}
+    rows = rows_of(table.assign(method=[methods.get(label, "spec_vla") for label in table["label"]]))
+    found = {row["label"]: row["matched_success_speed"] for row in with_matched_speed(rows)}
+    assert (found["r=3"], found["r=9"], found["r=20"], found["unverified"]) == (1.5, 1.5, 1.5, 5.0)
+    assert math.isnan(found["slow"])
+    assert math.isnan(found["ar"])
+    failing = [row | {"success": 0.19} for row in rows]
+    assert all(math.isnan(row["matched_success_speed"]) for row in with_matched_speed(failing))
 
 
 def test_a_setting_is_called_faster_only_if_its_interval_is_above_one(table):

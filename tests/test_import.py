@@ -90,7 +90,12 @@ def test_it_is_reported_as_it_was(older):
     of_macro = {"difference", "difference_low", "difference_high", "non_inferior"}
     for rows, anew in ((~macro, inferred), (macro, inferred | of_macro)):
         columns = [name for name in text if name not in anew]
-        assert {*CSV_COLUMNS} - {*columns} <= {*anew, "steps_to_success", "near_contact_failure"}
+        assert {*CSV_COLUMNS} - {*columns} <= {
+            *anew,
+            "steps_to_success",
+            "near_contact_failure",
+            "matched_success_speed",
+        }
         pd.testing.assert_frame_equal(text.loc[rows, columns], before.loc[rows, columns])
 
 

@@ -28,6 +28,7 @@ from kerv_cli.lab.store import StudyStore
 from kerv_cli.lab.study import InterimAnalysis
 from kerv_cli.report import statistics as stats
 from kerv_cli.report import verdict
+from kerv_cli.report.matched import SOLVED, passing, safety
 from kerv_cli.report.measures import MICRO, Row, pair_counts, paired
 from kerv_cli.report.tables import StudyData, is_baseline, is_number, load_study, rows_of
 from kerv_cli.report.verdict import LARGER, OPEN, SMALLER, Choice, Decision
@@ -78,8 +79,8 @@ def _choice(where: str, rows: Sequence[Row], loss: float) -> Choice:
         loss: Largest acceptable loss of success against the baseline, in points.
     """
     success = next((float(row["success"]) for row in rows if is_baseline(row)), math.nan)
-    order = [] if success < verdict.SOLVED else safest_first(rows)
-    best = _fastest(list(itertools.takewhile(lambda row: -POINTS * row["difference_low"] < loss, order)))
+    order = [] if success < SOLVED else safest_first(rows)
+    best = _fastest(passing(order, loss / POINTS))
     # a setting is tested only after all safer ones have passed, so it needs the most pairs of all of these
     counts = (stats.PairedCounts(*(int(row[name]) for name in stats.PairedCounts._fields)) for row in order)
     pairs = itertools.accumulate((stats.pairs_to_settle(one, loss / POINTS) for one in counts), max)
@@ -103,18 +104,11 @@ def _choice(where: str, rows: Sequence[Row], loss: float) -> Choice:
 def safest_first(rows: Sequence[Row]) -> list[Row]:
     """Return the settings in the order in which `--choose` tests them. The order does not depend on success.
 
-    The setting with the smallest unverified share comes first: the share of executed actions that the target has not
-    verified, rounded to whole per cent. Settings that decode nothing come last. Ties go to more target forwards per
-    control step, then to the study's order. The baseline, settings without pairs, and settings that were timed and were
-    not faster are left out.
+    Settings that are equally safe keep the study's order. The baseline, settings without pairs, and settings that were
+    timed and were not faster are left out.
     """
-
-    def order(row: Row) -> tuple[float, float]:
-        unverified = row["unverified_share"]
-        return (round(float(unverified), 2) if is_number(unverified) else 1.0, -row["forwards_per_step"])
-
     compared = [row for row in rows if not is_baseline(row) and row["pairs"]]
-    return sorted((row for row in compared if not is_number(row[SPEED]) or row[SPEED] > 1), key=order)
+    return sorted((row for row in compared if not is_number(row[SPEED]) or row[SPEED] > 1), key=safety)
 
 
 def _fastest(rows: Sequence[Row]) -> Row | None:

@@ -120,6 +120,7 @@ def _columns() -> dict[str, TextOf]:
         "deviation from AR": numbers("deviation"),
         "failures near the object": shares("near_contact_failure"),
         **{name.replace("_", " "): numbers(name) for name in registered_columns()},
+        "speed at matched success": numbers("matched_success_speed"),
         "lost / won": lost_won,
     }
 

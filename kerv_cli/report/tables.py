@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any
@@ -16,6 +16,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, flat, stress_of, without
 from kerv_cli.lab.plan import Episode, Setting, Study, seeds_text
 from kerv_cli.lab.store import StudyStore
+from kerv_cli.report.matched import with_matched_speed
 from kerv_cli.report.measures import MACRO, MICRO, Row, measure
 from kerv_cli.targets.provenance import PACKAGES
 from kerv_cli.worlds import specs
@@ -24,10 +25,10 @@ CSV_COLUMNS = (
     "study", "averaging", "label", "method", "stress", "stress_level", "task", "seeds", "episodes", "baseline",
     "successes", "success", "success_low", "success_high", "speedup", "speedup_low", "speedup_high",
     "episode_speedup", "episode_speedup_low", "episode_speedup_high", "time_per_step_ms",
-    "time_per_episode_ms", "latency_p50_ms", "latency_p95_ms", "latency_worst_ms", "AL", "forwards_per_step",
+    "time_per_episode_ms", "latency_p50_ms", "latency_p95_ms", "AL", "forwards_per_step",
     "skip_rate", "unverified_share", "compensation_rate", "retrieval_share", "deviation", "pairs", "only_baseline",
     "only_method", "mcnemar_p", "difference", "difference_low", "difference_high", "non_inferior", "pairs_to_settle",
-    "steps", "decodes", "steps_to_success", "near_contact_failure",
+    "steps", "decodes", "steps_to_success", "near_contact_failure", "matched_success_speed",
 )  # fmt: skip
 """Columns of a study's CSV files. The remaining values are in tables/<study>.json (`further_of`)."""
 
@@ -159,8 +160,8 @@ def difficulty_of(task: str) -> str:
     return next((spec.tasks[task].difficulty for spec in specs().values() if task in spec.tasks), "other")
 
 
-def _rows(data: StudyData, episodes: pd.DataFrame, averaging: str) -> Iterator[Row]:
-    """Yield one table row per setting that has episodes among `episodes`.
+def _rows(data: StudyData, episodes: pd.DataFrame, averaging: str) -> list[Row]:
+    """Return one table row per setting that has episodes among `episodes`.
 
     Args:
         data: The study.
@@ -169,10 +170,14 @@ def _rows(data: StudyData, episodes: pd.DataFrame, averaging: str) -> Iterator[R
             of one task.
     """
     by_label = {str(label): group for label, group in episodes.groupby("label", sort=False)}
-    for label in data.study.labels:
-        if label in by_label:
-            baseline = by_label.get(data.references[label], episodes.iloc[:0])
-            yield _row(data, label, by_label[label], baseline, averaging)
+    none = episodes.iloc[:0]
+    return with_matched_speed(
+        [
+            _row(data, label, by_label[label], by_label.get(data.references[label], none), averaging)
+            for label in data.study.labels
+            if label in by_label
+        ]
+    )
 
 
 def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> Row:

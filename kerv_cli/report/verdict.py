@@ -12,12 +12,11 @@ from dataclasses import asdict, dataclass
 
 import pandas as pd
 
+from kerv_cli.report.matched import SOLVED
 from kerv_cli.report.measures import MICRO, Row
 from kerv_cli.report.statistics import MOST_PAIRS
 from kerv_cli.report.tables import is_baseline, is_number, rows_of
 
-SOLVED = 0.20
-"""Smallest success rate at which the baseline counts as solving its tasks."""
 SMALLER, LARGER, OPEN = "loss is smaller", "loss is larger", "open"
 
 
