@@ -28,7 +28,7 @@ ENVIRONMENTS = dict(registry.parts("environment"))
 
 LONGEST = (
     *("test_documented_commands", "test_execute", "test_training", "test_cli", "test_database"),
-    *("test_golden", "test_import", "test_extending", "test_coverage", "test_views", "test_early"),
+    *("test_golden", "test_import", "test_extending", "test_coverage", "test_views", "test_drafters"),
 )
 """Files that take longest, begun first: no process is left with one of them at the end while the others idle."""
 

@@ -53,11 +53,6 @@ def test_early_and_retrieved_drafts_have_costs_and_others_take_what_was_recorded
     assert beside.needs == ["encode", "prefill", "verify", "feed", "draft", "early", "retrieval"]
 
 
-def test_a_parallel_decode_is_one_forward_over_prompt_and_chunk():
-    found = work(("parallel", 0, 0, 0, "none"))
-    assert (found.calls["prefill"].rows.tolist(), found.needs) == ([16], ["encode", "prefill"])
-
-
 def test_a_skipped_decode_has_no_forward():
     found = work(("skip", 0, 0, 16, "early"))
     assert found.needs == ["encode", "early"]

@@ -220,11 +220,6 @@ def test_a_run_writes_what_the_next_session_reads(results, target):
         np.testing.assert_allclose(predictor.predict(np.full((10, 4), 0.25), 4), 0.25)
 
 
-def test_a_task_without_a_reference_level_is_named():
-    with pytest.raises(CheckpointError, match="no reference level K_S for push-v3, only for reach-v3"):
-        calibration({"reach-v3": 0.7}).k_s("push-v3")
-
-
 def calibration(levels: dict[str, float]) -> Calibration:
     return Calibration(
         target=MadeFor("a" * 64, SPACE, 4),
@@ -295,3 +290,8 @@ def test_the_command_prints_what_it_found(results):
         assert said in done.output
     assert "s_min" not in done.output
     assert (results / "artifacts/calibration/without/calibration.json").is_file()
+
+
+def test_a_task_without_a_reference_level_is_named():
+    with pytest.raises(CheckpointError, match="no reference level K_S for push-v3, only for reach-v3"):
+        calibration({"reach-v3": 0.7}).k_s("push-v3")

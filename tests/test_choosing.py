@@ -9,7 +9,6 @@ import pandas as pd
 import pytest
 from studies_synthetic import settings_of, study_of, swept
 
-from kerv_cli.base.errors import UsageError
 from kerv_cli.lab.plan import seed_blocks
 from kerv_cli.report import decide
 from kerv_cli.report.decide import choices, confidence_of_a_look, decision_of, pareto, safest_first
@@ -148,11 +147,6 @@ def test_the_boundary_misjudges_one_time_in_twenty_over_all_looks(looks):
 
     bound = norm.ppf(0.5 + confidence_of_a_look(looks) / 2)
     assert (np.abs(z) > bound).any(axis=1).mean() == pytest.approx(0.05, abs=0.003)
-
-
-def test_more_looks_than_are_tabled_are_refused():
-    with pytest.raises(UsageError):
-        confidence_of_a_look(21)
 
 
 def test_a_setting_is_open_until_its_interval_leaves_the_bound():

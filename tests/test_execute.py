@@ -3,7 +3,6 @@
 import contextlib
 import gc
 import importlib
-import io
 import os
 import re
 import signal
@@ -32,12 +31,10 @@ from studies_synthetic import (
     unhurried,
 )
 
-from kerv_cli.base.config import compose
 from kerv_cli.base.errors import KervError, StorageError, UsageError
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.cli.common import progress_bar
 from kerv_cli.cli.work import event_printer
-from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, WANTED, Database
 from kerv_cli.lab.events import BlockStarted, BlockWaits, EpisodeEnd, Event, SettingFailed
 from kerv_cli.lab.execute import RunEpisode
@@ -315,18 +312,6 @@ def test_progress_without_a_terminal_is_plain_lines(tmp_path, capsys):
     assert "\x1b" not in written
 
 
-def test_progress_on_a_terminal_is_a_bar_that_goes_away(tmp_path, monkeypatch):
-    written = io.StringIO()
-    monkeypatch.setattr(written, "isatty", lambda: True, raising=False)
-    monkeypatch.setattr(sys, "stderr", written)
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setenv("COLUMNS", "120")
-    with progress_bar("episodes") as show:
-        swept(tmp_path, STUDY, on_event=event_printer(show))
-    assert "16/16" in written.getvalue()
-    assert written.getvalue().count("\x1b[?25h") == 1  # the cursor is shown again
-
-
 def runtime(executor: str, **options: Any) -> RuntimeSettings:
     return RuntimeSettings(workers=2, executor=executor, executor_options=options)
 
@@ -393,13 +378,6 @@ def test_an_executor_from_outside(tmp_path):
     assert threads <= {"mine_0", "mine_1"}
     with pytest.raises(UsageError, match=r"runtime\.executor_options: nam: unexpected"):
         check_executor(runtime("threads", nam="x"))
-
-
-def test_options_come_from_the_command_line():
-    for executor, option, value in (("slurm", "partition", "short"), ("ray", "gpus", 0.5)):
-        words = [f"runtime={executor}", f"runtime.executor_options.{option}={value}"]
-        composed = compose("rollout", words, RolloutSettings).runtime
-        assert (composed.executor, composed.executor_options) == (executor, {option: value})
 
 
 WRONG = {

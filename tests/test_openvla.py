@@ -326,13 +326,6 @@ def test_strict_decoding_equals_ar(target, monkeypatch, seed, nodes, inside, fix
 # --- formats of the weights
 
 
-def test_weights_stay_in_the_files_memory_map(checkpoint, target):
-    address = target.model.language_model.model.layers[0].mlp.up_proj.weight.data_ptr()
-    mapped = [line.split() for line in Path("/proc/self/maps").read_text().splitlines() if str(checkpoint) in line]
-    spans = [tuple(int(x, 16) for x in line[0].split("-")) for line in mapped]
-    assert any(low <= address < high for low, high in spans)
-
-
 def test_bfloat16_and_int8_decode_nearly_the_same(checkpoint, tmp_path, target):
     half = loaded(imported(checkpoint, tmp_path), torch.bfloat16)
     small = loaded(imported(checkpoint, tmp_path, int8=True, name="int8"))
@@ -457,3 +450,10 @@ def test_a_wrong_observation_is_refused(target, image, words):
     images = {} if image is None else {"primary": image}
     with pytest.raises(KervError):
         target.encode(Observation(np.zeros(0), np.zeros(0), words, images))
+
+
+def test_weights_stay_in_the_files_memory_map(checkpoint, target):
+    address = target.model.language_model.model.layers[0].mlp.up_proj.weight.data_ptr()
+    mapped = [line.split() for line in Path("/proc/self/maps").read_text().splitlines() if str(checkpoint) in line]
+    spans = [tuple(int(x, 16) for x in line[0].split("-")) for line in mapped]
+    assert any(low <= address < high for low, high in spans)

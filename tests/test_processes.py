@@ -40,13 +40,6 @@ jobs = build(SlurmOptions(cluster="local"), 1, 1, Path(sys.argv[1]).with_name("j
 jobs.submit(partial(work, sys.argv[1]))
 time.sleep(60)
 """
-RANK = """
-import os, sys, time
-from kerv_cli.training.ranks import join
-join("cpu", 2)
-open(sys.argv[1], "a").write(f"{os.getpid()}\\n")
-time.sleep(60)
-"""
 GUARD = """
 import os, subprocess, sys, time
 from kerv_cli.lab.executors.clusters import guard

@@ -1,7 +1,6 @@
 """A world that goes on while the policy decodes: what is executed meanwhile, for how long, and what compensates it."""
 
 import dataclasses
-import itertools
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -116,15 +115,6 @@ def test_the_chunk_before_is_executed_on_and_then_its_last_action_is_held(steps,
     assert record.decodes[0].delay == Delay(steps / HZ, steps, 0, carried=0, held=steps)
     assert record.decodes[1].delay == Delay(steps / HZ, steps, max(4, steps), steps - pause, pause)
     assert record.decode_steps[:2] == (steps, steps + len(chunk))
-
-
-def test_k_steps_are_between_observation_and_first_action_whatever_the_chunk():
-    for chunk, steps in itertools.product((1, 2, 5), (1, 3, 7)):
-        record = point_episode(constant(steps), Numbered(chunk))
-        begun = zip(record.decodes[:-1], record.decode_steps, strict=False)
-        for number, (decode, start) in enumerate(begun, 1):
-            assert start - decode.delay.observed == steps == decode.delay.carried + decode.delay.held
-            assert played(record)[start] == (number, 0)
 
 
 def test_a_fake_clock_says_how_long_each_decode_took():
@@ -259,16 +249,6 @@ def test_measured_latency_is_scaled_by_ars_median_here(policies, monkeypatch):
     record = episode_of(policies, "method=ar", "rollout.clock=real", "rollout.ar_ms=100")
     for decode in record.decodes:
         assert decode.delay.seconds == pytest.approx(5 * decode.seconds)
-
-
-def test_ar_is_measured_once_per_process(policies):
-    chosen = compose("rollout", [f"results={policies}", "policy.target=nano-state"], RolloutSettings)
-    chosen.rollout = dataclasses.replace(chosen.rollout, clock="real", ar_ms=50)
-    policies_of.ar_seconds.cache_clear()
-    for _ in range(2):
-        clock = policies_of.clock_for(chosen, TASK)
-    assert policies_of.ar_seconds.cache_info().misses == 1
-    assert 0 < clock.latency(AR) / AR.seconds < 1000
 
 
 def test_a_profile_is_part_of_the_results_identity(results):

@@ -89,13 +89,6 @@ def test_every_proposer_says_when_it_can_draft():
     assert all(find("proposer", name).traits["when"] == PREFILL for name in chains)
 
 
-def test_what_is_not_there_gets_one_line():
-    with pytest.raises(UsageError, match=r"kerv_cli.methods.streak has no nothing_there"):
-        load("kerv_cli.methods.streak:nothing_there")
-    with pytest.raises(UsageError):
-        load("kerv_cli.nowhere:build")
-
-
 def kerv(*words: str, folder: Path, plugins: str = "") -> subprocess.CompletedProcess[str]:
     path = os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
     environment = {**os.environ, "PYTHONPATH": path, "KERV_PLUGINS": plugins}

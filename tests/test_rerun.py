@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from examples.insertion import SPEC as INSERTION
 from rerun.chunk import RrdReader
-from rerun_synthetic import DOFS, decode_of, episode, prefill, read_recording, skipped_decode, verify
+from rerun_synthetic import DOFS, decode_of, episode, prefill, read_recording, verify
 
 from kerv_cli.base.errors import KervError, StorageError, UsageError
 from kerv_cli.engine.record import EpisodeRecord, Round
@@ -161,15 +161,6 @@ def test_a_rejection_stays_visible_whoever_fills_the_place():
     assert [f.kind for f in outcomes_of(cut, 8, DOFS)[4:]] == ["dropped", "rejected", "dropped", "dropped"]
 
 
-def test_decodes_without_rounds_are_told_apart():
-    held = decode_of((9,) * DOFS, (), 1, forwards=0, mode="hold")
-    assert {f.kind for f in outcomes_of(held, DOFS, DOFS)} == {"skipped"}
-    scripted = decode_of((), (), 1, forwards=0, mode="expert")
-    assert {f.kind for f in outcomes_of(scripted, DOFS, DOFS)} == {"scripted"}
-    skipped = skipped_decode(np.random.default_rng(0))
-    assert {f.kind for f in outcomes_of(skipped, 16, DOFS)} == {"skipped"}
-
-
 @pytest.mark.parametrize("kind", ["ar", "drafter", "mixed"])
 def test_drawn_tokens_add_up_with_the_records(kind):
     for decode in episode(kind).decodes:
@@ -227,13 +218,6 @@ def test_the_layout_shows_what_there_is(kind, frames, present, absent, tmp_path)
     assert {"Current decode", "Episode"} | present <= views
     assert not absent & views
     assert states == [[1]]  # paused
-
-
-def test_a_mistake_in_a_column_raises_instead_of_vanishing(tmp_path):
-    record = episode("ar")
-    with pytest.raises(ValueError, match="shorter"):
-        saved(replace(record, actions=record.actions[:-1]), tmp_path)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_texts_hold_only_what_the_viewers_font_has(tmp_path):

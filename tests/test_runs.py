@@ -187,16 +187,6 @@ def test_results_that_cannot_be_written_are_refused_at_once(tmp_path):
     assert list(tmp_path.iterdir()) == [tmp_path / "file"]
 
 
-def test_a_task_that_the_policy_never_saw_is_named(tmp_path, capsys):
-    from kerv_cli.cli.work import planned_rollout
-    from kerv_cli.episodes.resolve import resolve_rollout
-
-    words = ["method=ar,spec_vla", "task=coffee-button,reach", f"results={tmp_path}"]
-    planned_rollout(resolve_rollout(words, multirun=True), ["rollout", *words])
-    line = "kerv: warning: policy mt10-vision was never trained on coffee-button-v3\n"
-    assert capsys.readouterr().err.endswith(f" episodes\n{line}")
-
-
 @pytest.mark.parametrize(
     ("words", "labels"),
     [

@@ -302,15 +302,6 @@ def test_a_silent_client_loses_its_seat(policy, monkeypatch, limit, said):
         lost.close()
 
 
-def test_quick_reconnects_are_all_served(policy):
-    with serving(policy) as (port, log):
-        for _ in range(100):
-            client = Client(port)
-            assert client.metadata["chunk"] == 4
-            client.connection.close()
-        assert not any("refused" in line for line in log)
-
-
 @pytest.mark.parametrize(("origins", "accepted"), [([], False), (["http://robot.local"], True)])
 def test_a_web_page_may_connect_only_where_it_is_named(policy, origins, accepted):
     with serving(policy, origins=origins) as (port, _):

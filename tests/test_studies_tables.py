@@ -1,4 +1,4 @@
-"""Tables against numbers worked out by hand; files that come out the same every time."""
+"""Tables against numbers worked out by hand; files that come out the same every time; what is published."""
 
 import io
 import json
@@ -20,10 +20,10 @@ from kerv_cli.lab.execute import RunEpisode
 from kerv_cli.lab.plan import Episode, Setting, Study
 from kerv_cli.lab.store import StudyStore, plan_study
 from kerv_cli.report.measures import MACRO, MICRO
-from kerv_cli.report.report import report
+from kerv_cli.report.report import Unpublishable, refusals, report
 from kerv_cli.report.statistics import PairedCounts, mean_of, paired_difference, speedup, wilson
 from kerv_cli.report.summary import SummaryTable, not_in_turn, summary_frame
-from kerv_cli.report.tables import StudyData, csv_text, load_study
+from kerv_cli.report.tables import StudyData, load_study
 
 PREFILL = Round("prefill", "none", 0, (), (1,), 0, 1, 0, ())
 
@@ -179,26 +179,6 @@ def test_micro_pools_episodes_and_macro_averages_difficulty(data):
         assert (row["difference"], row["difference_low"], row["difference_high"]) == pytest.approx(found)
 
 
-def test_a_row_says_everything(data):
-    row = row_of(data.table, averaging=MICRO, label="kerv")
-    expected = {
-        "study": "hand",
-        "method": "kerv",
-        "overrides": "method=kerv",
-        "proposer.kind": "drafter",
-        "threshold.r": 9,
-        "policy.target": "mt10-vision",
-        "seeds": "100000-100002",
-        "target_sha256": "a" * 64,
-        "runtime.dtype": "float32",
-        "workers": "1",
-        "world.horizon": 500,
-        "same_run": True,
-    }
-    assert {name: row[name] for name in expected} == expected
-    assert {"metaworld_version", "numpy_version", "python_version", "git_commit", "device_name", "run"} <= set(row)
-
-
 def harmed(data: StudyData, **harm: Any) -> StudyData:
     """The study with other values of kerv's first episode of reach; strings: of all its episodes."""
     episodes = data.episodes.copy()
@@ -260,17 +240,6 @@ def test_repeats_are_paired_with_their_own(tmp_path):
     assert (row["pairs"], row["episodes"], row["repeats"], row["seeds"]) == (2, 4, 2, "100000-100001")
     assert (row["successes"], row["both"], row["success_low"]) == (2, 2, pytest.approx(wilson(2, 2).low))
     assert row["speedup"] == row["speedup_low"] == row["speedup_high"] == pytest.approx(2.0)
-
-
-def test_csv_has_sensible_digits_and_empty_cells(data):
-    text = csv_text(data.per_task)
-    lines = text.splitlines()
-    assert len(lines) == 5
-    values = dict(zip(lines[0].split(","), lines[4].split(","), strict=True))
-    assert (values["task"], values["label"]) == ("reach-v3", "kerv")
-    assert values["speedup"] == "2.66667"
-    assert values["accepted_per_round"] == "1.66667"
-    assert dict(zip(lines[0].split(","), lines[3].split(","), strict=True))["AL"] == ""
 
 
 def printed(table: pd.DataFrame, width: int = 80) -> list[str]:
@@ -341,3 +310,60 @@ def test_the_page_stands_alone(results):
     assert {"All tasks", "By task", "Settings", "Tables"} <= set(re.findall(r"<h2>(.*?)</h2>", page))
     assert 'href="../../report/tables/threshold_per_task.csv"' in page
     assert len(re.findall(r"<thead><tr>", page)) == 2
+
+
+# --- studies publish
+
+COMMIT = "c" * 40
+STUDY = threshold_study(["reach-v3", "push-v3"])
+
+
+@pytest.fixture(autouse=True)
+def commit(monkeypatch):
+    """Sets the commit that computes what follows."""
+
+    def is_of(name):
+        monkeypatch.setattr("kerv_cli.targets.provenance.git_commit", lambda: name)
+
+    is_of(COMMIT)
+    return is_of
+
+
+def test_one_run_of_one_commit_is_published_where_it_is_committed(tmp_path):
+    swept(tmp_path, STUDY)
+    draft = report(tmp_path, "threshold")
+    assert not (tmp_path / "tables").exists()
+    published = report(tmp_path, "threshold", publish=True)
+    table = tmp_path / "tables" / "threshold.csv"
+    assert table in published.files
+    assert table.read_bytes() == (tmp_path / "report" / "tables" / "threshold.csv").read_bytes()
+    assert len(draft.files) == len(published.files)
+
+
+def test_what_is_missing_or_not_committed_is_refused(tmp_path, commit):
+    commit(f"{COMMIT}+changes")
+    swept(tmp_path, replace(STUDY, episodes=STUDY.episodes[:-1]))
+    StudyStore(tmp_path, "threshold").save(STUDY, plan_study(Database(tmp_path), STUDY).existing)
+    with pytest.raises(Unpublishable) as refused:
+        report(tmp_path, "threshold", publish=True)
+    assert "1 of its episodes are missing" in str(refused.value)
+    assert "not committed" in str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert not (tmp_path / "tables").exists()
+
+
+def test_sides_of_several_runs_or_commits_are_refused(tmp_path, commit):
+    swept(tmp_path, replace(STUDY, episodes=tuple(one for one in STUDY.episodes if one.setting.label == "ar")))
+    commit("d" * 40)
+    store, _ = swept(tmp_path, STUDY)
+    found = refusals(load_study(store).table)
+    assert "its episodes are from 2 commits" in found
+    assert any(reason.startswith("not measured in one run with the baseline: naive_sd") for reason in found)
+    assert any(reason.startswith("not measured in turn with the baseline") for reason in found)
+
+
+def test_several_machines_are_refused():
+    rows = {"label": ["ar", "x"], "baseline": "ar", "pairs": [0, 3], "same_run": True, "same_block": 1.0}
+    table = pd.DataFrame(rows | {"git_commit": COMMIT, "host": ["a", "a;b"], "device_name": "chip", "engine": 1})
+    assert refusals(table) == ["its episodes are from 2 machines"]
+    assert refusals(table.assign(host="a")) == []

@@ -25,9 +25,8 @@ from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.losses import soft_labels, token_loss
-from kerv_cli.training import imitation
 from kerv_cli.training.imitation import Imitation, lit, vocabulary, waypoints
-from kerv_cli.training.loop import Loop, Metrics, digest, read_state, schedule, write_state
+from kerv_cli.training.loop import Loop, Metrics, digest, read_state, write_state
 from kerv_cli.training.settings import TrainSettings
 from kerv_cli.worlds.demos.files import DemoEpisode
 from kerv_cli.worlds.demos.recording import DemoConfig, record
@@ -69,10 +68,6 @@ class Sums:
 def quadratic(folder: Path, identity: str = "a") -> Loop:
     torch.manual_seed(0)
     return Loop(Sums(), lambda module, metrics: None, TINY, folder, identity)
-
-
-def interrupt() -> None:
-    raise KeyboardInterrupt
 
 
 @pytest.mark.bits
@@ -184,15 +179,6 @@ def test_weights_can_be_stored_in_fewer_bits(tmp_path):
     assert sizes["int8"] < 0.6 * sizes["float16"]
 
 
-def test_the_schedule_warms_up_and_decays_in_both_phases():
-    settings = TrainSettings(steps=100, warmup=10, scene_steps=40)
-    rates = [schedule(step, settings) for step in range(100)]
-    assert rates[9] == rates[49] == 1.0
-    assert rates[39] < 0.05
-    assert rates[99] < 0.03
-    assert rates[0] == rates[40] == 0.1
-
-
 def test_soft_labels_are_distributions_that_fall_off_with_distance():
     labels = soft_labels(255, 1.5)
     assert torch.allclose(labels.sum(-1), torch.ones(len(labels)), atol=1e-5)
@@ -275,17 +261,6 @@ def test_training_counts_subnormal_numbers_as_zero_and_this_thread_nothing_later
     assert result.exit_code == 0, result.output
     assert halves == [0.0, 0.0]
     assert float(torch.tensor(1e-39) * 0.5) > 0
-
-
-@pytest.mark.parametrize("tiles", [True, False])
-def test_bfloat16_is_for_cpus_with_tiles(tiles, monkeypatch):
-    monkeypatch.setattr(imitation, "has_tiles", lambda: tiles)
-    lesson = object.__new__(Imitation)
-    lesson.device = torch.device("cpu")
-    for asked in (True, False):
-        lesson.settings = replace(TINY, bf16=asked)
-        with lesson.precision():
-            assert torch.is_autocast_enabled("cpu") == (asked and tiles)
 
 
 def test_a_run_learns_the_experts_own_path(results):

@@ -1,4 +1,4 @@
-"""The early drafter: what it reads, what it is trained on, and that it only serves the target it imitates."""
+"""Drafters: the dynamic tree against one that walks every path alone, and the early drafter's training."""
 
 import dataclasses
 from typing import Any
@@ -8,13 +8,16 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from loaded import of_target
+from test_decoding_lossless import random_prompt, random_target
 from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.cli.app import app
+from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.methods.artifacts import MadeFor
-from kerv_cli.methods.drafters import Training
+from kerv_cli.methods.eagle import DrafterSettings
+from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import (
     EarlyDrafter,
@@ -22,7 +25,6 @@ from kerv_cli.methods.early.drafter import (
     EarlyNetwork,
     choose,
     choose_with_odds,
-    measure,
 )
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.packable import pack
@@ -32,11 +34,82 @@ from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.observations import split
 from kerv_cli.training.drafter import DrafterRun
 from kerv_cli.training.imitation import load_samples
-from kerv_cli.training.settings import TrainDrafterSettings, TrainSettings
+from kerv_cli.training.settings import TrainDrafterSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.metaworld.spec import SPEC
 from kerv_cli.worlds.settings import CameraSettings
+
+
+def drafted(seed: int, depth: int, top_k: int, nodes: int) -> tuple[DrafterProposer, CompactTarget, TokenTree]:
+    target = random_target(seed, 2, 2, 4)
+    torch.manual_seed(seed)
+    drafter = EagleDrafter().network(DrafterSettings(), target).eval().requires_grad_(False)
+    for parameter in drafter.parameters():
+        if parameter.dim() == 2:
+            torch.nn.init.normal_(parameter, std=0.3)
+    prompt = random_prompt(target, seed)
+    hidden = torch.randn(prompt.shape, generator=torch.Generator().manual_seed(seed))
+    proposer = DrafterProposer(drafter, target, depth, top_k, nodes)
+    following = torch.cat([prompt[:, 1:], target.embed(torch.tensor([[7]]))], 1)
+    proposer.observe(following, hidden, 0)
+    return proposer, target, proposer.tree(depth).tree
+
+
+def along(state: DrafterProposer, target: CompactTarget, tokens: list[int]) -> torch.Tensor:
+    """Log-probabilities (V,) behind a path that is walked token by token, without tree or mask."""
+    base, hidden = state.cache.length, state.hidden[None, None]
+    for i, token in enumerate(tokens):
+        following = target.embed(torch.tensor([[token]]))
+        hidden = state.drafter(following, hidden, torch.tensor([base + i]), state.cache)
+    state.cache.length = base
+    return torch.log_softmax(target.head(hidden[0, 0]), -1)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("depth", "top_k", "nodes"), [(4, 3, 12), (3, 8, 50), (5, 2, 7), (5, 1, 5)])
+def test_every_child_is_among_its_own_paths_best(seed, depth, top_k, nodes):
+    state, target, tree = drafted(seed, depth, top_k, nodes)
+    assert 0 < len(tree) <= nodes
+    assert max(tree.depths) < depth
+    for parent in {*tree.parents}:
+        path = [tree.tokens[i] for i in tree.path_to(parent)] if parent != ROOT else []
+        best = along(state, target, path).topk(top_k).indices.tolist()
+        children = [tree.tokens[i] for i, p in enumerate(tree.parents) if p == parent]
+        assert set(children) <= set(best)
+        assert len(set(children)) == len(children)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_kept_nodes_are_the_most_probable_ones(seed):
+    """With every child expanded (top_k wide enough for two levels) the ranking can be done by brute force."""
+    state, target, tree = drafted(seed, 2, 4, 9)
+    scores: dict[tuple[int, ...], float] = {}
+    first = along(state, target, []).topk(4)
+    for value, token in zip(first.values.tolist(), first.indices.tolist(), strict=True):
+        scores[(token,)] = value
+        second = along(state, target, [token]).topk(4)
+        for more, child in zip(second.values.tolist(), second.indices.tolist(), strict=True):
+            scores[(token, child)] = value + more
+    expected = sorted(sorted(scores, key=lambda path: -scores[path])[:9])
+    assert sorted(tuple(tree.tokens[i] for i in tree.path_to(n)) for n in range(len(tree))) == expected
+
+
+def test_true_states_replace_what_was_drafted():
+    """After a round the cache holds what a drafter that never drafted would hold."""
+    state, _, _ = drafted(1, 4, 3, 12)
+    length = state.cache.length
+    following, hidden = torch.randn(2, 1, 3, 32).unbind(0)
+    state.observe(following, hidden, length)
+    fresh = drafted(1, 1, 1, 1)[0]
+    fresh.observe(following, hidden, length)
+    assert state.cache.length == fresh.cache.length == length + 3
+    assert torch.allclose(state.hidden, fresh.hidden, atol=1e-6)
+    kept = state.cache.buffer[..., : length + 3, :]
+    assert torch.allclose(kept, fresh.cache.buffer[..., : length + 3, :], atol=1e-6)
+
+
+# --- early
 
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
@@ -47,9 +120,6 @@ STRICT = torch.from_numpy(ACTIONS.strict_tokens(8))
 
 def shaped(settings: TargetSettings = SHAPE) -> CompactTarget:
     return CompactTarget(settings, ACTIONS, OBSERVATION, WordTokenizer.build(["open"]), "corner4")
-
-
-FEATURES = shaped().pooled_width
 
 
 def drafter(settings: EarlySettings = SMALL, target: CompactTarget | None = None) -> EarlyNetwork:
@@ -115,16 +185,6 @@ def test_packed_weights_give_the_same_logits():
     assert early.packed is None
 
 
-def test_features_are_standardised_and_constants_survive():
-    early = drafter()
-    features = torch.randn(50, FEATURES, generator=torch.Generator().manual_seed(0)) * 30 + 7
-    features[:, 3] = 1.25
-    early.standardise(features)
-    plain = drafter()
-    expected = (features - features.mean(0)) / features.std(0).clamp_min(1e-3)
-    assert torch.allclose(early(features), plain(expected), atol=1e-3)
-
-
 def test_the_chosen_bin_is_the_one_most_likely_to_be_accepted():
     """Against brute force: among all 255 bins, the chosen one's probability within the radius is the greatest (up to
     the small weight of closeness)."""
@@ -156,42 +216,6 @@ def test_the_odds_are_those_of_independent_tokens(seed, radius):
             window = slice(max(0, token - r), token + r + 1)
             odds *= float(logits[row, i].double().softmax(-1)[window].sum())
         assert float(found[row]) == pytest.approx(odds, rel=1e-3)
-
-
-def test_plain_and_perturbed_episodes_count_alike():
-    """Three perturbed samples that fail at once and one plain sample that is drafted whole: half, not a quarter."""
-    tokens = torch.full((4, 8), 50)
-    perturbed = torch.tensor([True, True, True, False])
-    samples = EarlyExamples(tokens, torch.arange(4), perturbed, torch.zeros(4, 1))
-    drafts = tokens.clone()
-    drafts[:3, 0] += 20
-    logits = 20.0 * torch.nn.functional.one_hot(drafts, 255)
-    metrics = measure(logits, samples, STRICT)
-    assert metrics["accepted_r9"] == metrics["accepted_strict"] == 4.0
-    assert metrics["whole_r9"] == 0.5
-    only = measure(logits[:3], samples.where(perturbed), STRICT)
-    assert only["accepted_r9"] == 0.0
-
-
-def test_the_network_learns_what_the_teacher_says():
-    """Tokens that are a function of the features are learned, and the score shows it."""
-    generator = torch.Generator().manual_seed(0)
-    features = torch.randn(256, FEATURES, generator=generator).sign()
-    tokens = torch.where(features[:, 1] > 0, 200, 40)[:, None].repeat(1, 8)
-    tokens[:, 1] = torch.where(features[:, 0] > 0, 90, 170)
-    samples = EarlyExamples(tokens, torch.arange(256), torch.arange(256) % 2 == 0, features)
-    torch.manual_seed(0)
-    early = EarlyNetwork(SMALL, ACTIONS, 2, FEATURES)
-    settings = TrainDrafterSettings(train=TrainSettings(label_sigma=1.0))
-    run = Training(EarlyDrafter(), early, shaped(), samples, samples, settings)
-    before = run.validate(early)["score"]
-    optimiser = torch.optim.AdamW(early.parameters(), lr=5e-3)
-    for step in range(350):
-        optimiser.zero_grad()
-        run.loss(torch.randint(256, (64,), generator=generator), step)[0].backward()
-        optimiser.step()
-    assert before < 2
-    assert run.validate(early)["score"] > 15  # of 8 strict + 8 relaxed
 
 
 # what it is trained on

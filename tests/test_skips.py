@@ -1,0 +1,406 @@
+"""What is executed unverified: always, by similarity, by agreement or by speed; and what lies inside the clock."""
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from examples.own_target import SEVEN, MockTarget
+from test_decoding_lossless import plain_greedy, random_prompt, random_target
+from test_proposers import stored
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.limits import check_settings
+from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.parts import Fixed
+from kerv_cli.engine.proposer import ChainProposer
+from kerv_cli.engine.record import DecodeRecord
+from kerv_cli.methods.heisd import SimilaritySkipSettings
+from kerv_cli.methods.heisd.rules import RetrievalProposer, VerifySkip
+from kerv_cli.methods.kerv.prediction import Hold, PredictionProposer, Ridge
+from kerv_cli.methods.merged import MergedProposer
+from kerv_cli.methods.sp_vla import SpeedSkip, SpeedSkipSettings
+from kerv_cli.methods.spec_vla import RelaxedRule
+from kerv_cli.methods.streak import AlwaysSkip, StreakSkip, StreakSkipSettings
+from kerv_cli.worlds.metaworld.spec import SPEC
+
+PAUSE = 0.03
+SHOWN = Observation(np.array([0.3]), np.zeros(0), "go there")
+HOME = np.array([0.1, 0.6, 0.2])
+
+
+class Near(ChainProposer):
+    """Drafts the target's own tokens, each off by `bins`."""
+
+    name = "near"
+
+    def __init__(self, target: Any, prompt: torch.Tensor, bins: int = 0, pause: float = 0.0) -> None:
+        truth = np.array(plain_greedy(target, prompt))
+        self.drafted = np.where(truth + bins < target.actions.tokens, truth + bins, truth - bins).tolist()
+        self.pause, self.calls = pause, 0
+
+    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        self.calls += 1
+        time.sleep(self.pause)
+        return [self.drafted[len(chunk.tokens) :][:depth]]
+
+
+# --- the clock
+
+
+def test_a_proposer_that_sleeps_is_in_the_clock_in_its_phase():
+    target = MockTarget()
+    slow = Near(target, target.encode(SHOWN), bins=1, pause=PAUSE)
+    decoder = Decoder(target, Parts(proposer=slow))
+    record = decoder.decode(SHOWN)
+    assert slow.calls > 5
+    assert record.phases["propose"] >= PAUSE * slow.calls
+    assert record.seconds >= PAUSE * slow.calls
+    assert record.seconds == pytest.approx(sum(record.phases.values()))
+    assert record.seconds - record.phases["propose"] < PAUSE * slow.calls / 2
+
+
+def test_an_in_prefill_draft_that_sleeps_is_not_the_prefills_time():
+    target = MockTarget()
+    slow = Near(target, target.encode(SHOWN), pause=PAUSE)
+    decoder = Decoder(target, Parts(prefill_draft=slow))
+    records = [decoder.decode(SHOWN) for _ in range(3)]
+    assert (slow.calls, [r.forwards for r in records]) == (3, [1, 1, 1])
+    assert min(r.phases["propose"] for r in records) >= PAUSE
+    assert min(r.phases["prefill"] for r in records) < PAUSE  # a busy machine does not stop it three times
+    record = Decoder(target, Parts(prefill_draft=slow, skip=AlwaysSkip(slow))).decode(SHOWN)
+    assert record.forwards == 0
+    assert record.seconds >= record.phases["propose"] >= PAUSE
+
+
+def test_a_merged_draft_goes_unverified_as_its_first_chain():
+    target = MockTarget()
+    prompt = target.encode(SHOWN)
+    first, second = Near(target, prompt, bins=1), Near(target, prompt)
+    merged = MergedProposer([first, second], 40)
+    record = Decoder(target, Parts(prefill_draft=merged, skip=AlwaysSkip(merged))).decode(SHOWN)
+    assert (record.forwards, list(record.tokens)) == (0, first.drafted)
+
+
+@pytest.mark.parametrize(("slow", "phase"), [("encode", "vision"), ("forward", "prefill")])
+def test_a_target_that_sleeps_is_in_the_clock_in_its_phase(slow, phase):
+    class Slow(MockTarget):
+        def __getattribute__(self, name):
+            if name == slow:
+                time.sleep(PAUSE)
+            return super().__getattribute__(name)
+
+    decoder = Decoder(Slow(), Parts())
+    records = [decoder.decode(SHOWN) for _ in range(3)]
+    decodes = records[0].forwards - 1 if slow == "forward" else 0
+    for record in records:
+        assert record.phases[phase] >= PAUSE
+        assert record.phases["verify"] >= PAUSE * decodes
+        assert record.seconds >= PAUSE * (1 + decodes)
+    # a busy machine does not stop the same phase three times
+    others = set(records[0].phases) - {phase, "verify"}
+    assert all(min(r.phases[name] for r in records) < PAUSE for name in others)
+
+
+# --- skip=always
+
+
+@pytest.mark.bits
+def test_always_skip_executes_the_sources_tokens_without_a_forward():
+    target = MockTarget()
+    source = Near(target, target.encode(SHOWN), bins=5)
+    decoder = Decoder(target, Parts(prefill_draft=source, skip=AlwaysSkip(source)))
+    for _ in range(4):  # there is no cap
+        record = decoder.decode(SHOWN)
+        assert record.tokens == tuple(source.drafted) != tuple(plain_greedy(target, target.encode(SHOWN)))
+        assert (record.forwards, record.skipped, record.mode) == (0, True, "skip")
+        assert [(r.mode, r.proposer) for r in record.rounds] == [("skip", "near")]
+        assert record.unverified == record.actions.size == len(record.tokens)
+
+
+def test_always_skip_without_a_history_lets_the_target_decode():
+    target = MockTarget()
+    hold = PredictionProposer(Hold(SEVEN.is_strict, minimum=1, horizon=2))
+    decoder = Decoder(target, Parts(prefill_draft=hold, skip=AlwaysSkip(hold)))
+    decoder.reset("t", 0, HOME)
+    first = decoder.decode(SHOWN)
+    assert first.tokens == tuple(plain_greedy(target, target.encode(SHOWN)))
+    assert (first.forwards, first.skipped, first.unverified) == (len(first.tokens), False, 0)
+    decoder.observe(first.actions[0], HOME)
+    second = decoder.decode(SHOWN)
+    assert second.tokens == 2 * first.tokens[:7]
+    assert (second.forwards, second.skipped, second.unverified) == (0, True, 14)
+
+
+# --- skip levels through a sweep
+
+
+def swept(blocks: list[list[int]]) -> dict[int, list[tuple[int, ...]]]:
+    """Seed -> its decodes' tokens and forwards; every block has a decoder of its own, odd seeds fail."""
+    target = random_target(2, 1, 1, 4)
+    prompt = random_prompt(target, 2)
+    store = stored(target, prompt, np.arange(64).reshape(4, 16))
+    prompts = {seed: prompt + 0.4 * random_prompt(target, 100 + seed) for block in blocks for seed in block}
+    every = [
+        float(store.query(store.key_of(store.pooled(x, target).numpy()), "t", 1).similarity[0])
+        for x in prompts.values()
+    ]
+    level = float(np.median(every))
+    records = {}
+    for block in blocks:
+        retrieval = RetrievalProposer(store, target, 1, 16)
+        levels = (level - 0.2, level, level + 0.2)
+        skip = VerifySkip(SimilaritySkipSettings(max_skips=2), retrieval, levels)
+        decoder = Decoder(target, Parts(proposer=retrieval, skip=skip))
+        for seed in block:
+            decoder.reset("t", seed, HOME)
+            chunks = [decoder.decode_prompt(prompts[seed]) for _ in range(4)]
+            records[seed] = [(c.forwards, *c.tokens) for c in chunks]
+            decoder.finish(success=seed % 2 == 0)
+    return records
+
+
+ORDERS = [[[0, 1, 2, 3, 4, 5]], [[5, 3, 1, 4, 2, 0]], [[0, 1], [2, 3], [4, 5]], [[4], [0], [5], [2], [1], [3]]]
+
+
+def test_frozen_skip_levels_know_no_order_and_no_block():
+    found = [swept(blocks) for blocks in ORDERS]
+    assert found[0] == found[1] == found[2] == found[3]
+    forwards = [tokens[0] for record in found[0].values() for tokens in record]
+    assert 0 in forwards  # some were skipped,
+    assert all(record[2][0] > 0 for record in found[0].values())  # never three in a row,
+    assert any(record[0][0] > 0 for record in found[0].values())  # and some episodes lie below s_min
+
+
+# --- the path
+
+
+def test_the_boundarys_path_begins_where_the_episode_does():
+    seen: list[np.ndarray] = []
+
+    class Watching:
+        def numbers(self, task, seed):
+            return np.random.default_rng(seed)
+
+        def choose(self, path, random):
+            seen.append(path.copy())
+
+    decoder = Decoder(MockTarget(SPEC.actions, 1), Parts(boundary=Watching()))  # type: ignore[arg-type]
+    for start in (HOME, 2 * HOME):
+        decoder.reset("t", 0, start)
+        decoder.decode(SHOWN)
+        decoder.observe(np.zeros(4), start + 0.01)
+        decoder.decode(SHOWN)
+    assert [path.tolist() for path in seen] == [
+        [HOME.tolist()],
+        [HOME.tolist(), (HOME + 0.01).tolist()],
+        [(2 * HOME).tolist()],
+        [(2 * HOME).tolist(), (2 * HOME + 0.01).tolist()],
+    ]
+
+
+# --- sp vla
+
+SPACE = SPEC.actions
+
+
+def least_squares(history: np.ndarray, penalty: float, steps: int) -> np.ndarray:
+    """The ridge regression as ordinary least squares with two rows more, one per coefficient."""
+    rows = np.stack([np.arange(len(history)), np.ones(len(history))], 1)
+    left = np.concatenate([rows, np.sqrt(penalty) * np.eye(2)])
+    right = np.concatenate([history, np.zeros((2, history.shape[1]))])
+    slope, start = np.linalg.lstsq(left, right, rcond=None)[0]
+    return np.stack([start + slope * (len(history) + ahead) for ahead in range(steps)])
+
+
+@pytest.mark.parametrize("penalty", [0.0, 1e-4, 0.7, 50.0])
+@pytest.mark.parametrize("window", [2, 6, 10])
+def test_the_regression_is_that_of_least_squares(penalty, window):
+    history = np.random.default_rng(window).uniform(-0.1, 0.1, (10, 4))  # small: nothing is clipped
+    predicted = Ridge(SPACE.is_strict, penalty, window, 5).predict(history, 5)
+    expected = least_squares(history[-window:], penalty, 5)
+    expected[:, SPACE.is_strict] = history[-1, SPACE.is_strict]
+    assert predicted == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_steep_line_ends_at_the_limits_and_a_short_history_gives_none():
+    ridge = Ridge(SPACE.is_strict, 1e-4, 6, 4)
+    climb = np.repeat(np.linspace(-0.5, 0.8, 6)[:, None], 4, 1)
+    predicted = ridge.predict(climb, 4)
+    assert predicted[-1] == pytest.approx([1.0, 1.0, 1.0, 0.8])
+    assert ridge.predict(climb[1:], 4) is None
+
+
+class Counting(MockTarget):
+    """Counts the observations that it encodes."""
+
+    encoded = 0
+
+    def encode(self, observation: Observation) -> torch.Tensor:
+        self.encoded += 1
+        return super().encode(observation)
+
+
+def played(speed: float, decodes: int, target: MockTarget, seeds: int = 1, **settings: Any) -> list[DecodeRecord]:
+    """The decodes of episodes whose hand moves at `speed`, m/s, in every control step."""
+    target_settings = SpeedSkipSettings(**settings)
+    ridge = Ridge(SPACE.is_strict, target_settings.penalty, target_settings.buffer, target.chunk)
+    decoder = Decoder(target, Parts(skip=SpeedSkip(target_settings, ridge)))
+    records = []
+    for seed in range(seeds):
+        hand = HOME.copy()
+        decoder.reset("t", seed, hand)
+        for _ in range(decodes):
+            records.append(decoder.decode(SHOWN))
+            for action in records[-1].actions:
+                hand = hand + np.array([0.6, 0.0, 0.8]) * speed / SPACE.control_hz
+                decoder.observe(action, hand)
+    return records
+
+
+def schedule(records: list[DecodeRecord]) -> str:
+    """t: the target decoded, r: the regression."""
+    return "".join("r" if record.skipped else "t" for record in records)
+
+
+@pytest.mark.parametrize(
+    ("speed", "settings", "expected"),
+    [
+        (0.5, {}, "ttrtrtr"),  # six actions, then more than half of the last six must be the target's
+        (0.29, {}, "ttttttt"),
+        (0.5, {"v_max": 0.4}, "ttttttt"),
+        (0.5, {"v_min": 0.51}, "ttttttt"),
+        (0.5, {"share": 0.2}, "ttrrtrr"),
+        (0.5, {"share": 1.0}, "ttttttt"),
+        (0.5, {"buffer": 9}, "tttrrtt"),  # five of nine, then one of nine
+        (0.5, {"buffer": 4}, "trtrtrt"),
+    ],
+)
+def test_speed_and_the_targets_share_decide(speed, settings, expected):
+    assert schedule(played(speed, 7, MockTarget(SPACE, 4), **settings)) == expected
+
+
+def test_an_episode_begins_with_the_target_whatever_was_before():
+    assert schedule(played(0.5, 3, MockTarget(SPACE, 4), seeds=2)) == "ttrttr"
+
+
+def test_an_intuitive_decode_runs_nothing_of_the_target():
+    target = Counting(SPACE, 4)
+    *before, intuitive = played(0.5, 3, target)
+    assert (intuitive.forwards, target.encoded) == (0, 2)
+    assert [(r.mode, r.proposer) for r in intuitive.rounds] == [("skip", "ridge")]
+    history = SPACE.normalise(np.concatenate([record.actions for record in before]))[-6:]
+    line = np.clip(least_squares(history, 1e-4, 4), -1, 1)
+    line[:, SPACE.is_strict] = history[-1, SPACE.is_strict]
+    assert intuitive.tokens == tuple(SPACE.bins_of(line).flatten())
+    assert intuitive.unverified == intuitive.actions.size == 16
+
+
+def test_speeds_that_are_not_in_order_are_refused():
+    with pytest.raises(UsageError, match=r"skip\.v_min=2 skip\.v_max=1"):
+        check_settings(SpeedSkipSettings(v_min=2, v_max=1))
+
+
+# --- streak
+
+
+def decoder_of(source: Any, target: MockTarget, draft: Any = None, radius: int = 0, **settings: Any) -> Decoder:
+    skip = StreakSkip(StreakSkipSettings(**settings), source)
+    acceptance = RelaxedRule(target.actions) if radius else None
+    parts = Parts(acceptance, Fixed(radius), prefill_draft=draft or source, skip=skip)
+    made = Decoder(target, parts)
+    made.reset("t", 0, np.zeros(3))
+    return made
+
+
+def modes(decoder: Decoder, decodes: int) -> str:
+    """s: skipped, v: verified, by decode."""
+    return "".join("s" if decoder.decode(SHOWN).skipped else "v" for _ in range(decodes))
+
+
+def near(target: MockTarget, bins: int = 0) -> Near:
+    return Near(target, target.encode(SHOWN), bins)
+
+
+@torch.inference_mode()
+def test_agreement_doubles_what_is_allowed_up_to_the_most():
+    target = MockTarget()
+    assert (
+        modes(decoder_of(near(target), target, most=4), 17)
+        == "v" + "s" + "v" + "ss" + "v" + "ssss" + "v" + "ssss" + "vs"
+    )
+
+
+@torch.inference_mode()
+def test_a_disagreement_ends_the_streak_and_counting_begins_anew():
+    target = MockTarget()
+    source = near(target)
+    decoder = decoder_of(source, target, tolerance=0.0)
+    good, bad = source.drafted, near(target, bins=1).drafted
+    assert modes(decoder, 5) == "vsvss"
+    source.drafted = bad
+    assert modes(decoder, 3) == "vvv"
+    source.drafted = good
+    assert modes(decoder, 5) == "vsvss"
+
+
+@torch.inference_mode()
+def test_an_episode_begins_with_a_verification():
+    target = MockTarget()
+    decoder = decoder_of(near(target), target)
+    assert modes(decoder, 4) == "vsvs"
+    decoder.finish(True)
+    decoder.reset("t", 1, np.zeros(3))
+    assert modes(decoder, 3) == "vsv"
+
+
+class ByPlace(MockTarget):
+    """A target whose tokens depend on their places alone, so that what it says behind a rejected token is known."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.answers = torch.randn(64, self.actions.tokens, generator=torch.Generator().manual_seed(3)).double()
+
+    def forward(self, x: torch.Tensor, positions: torch.Tensor, cache: Any = None, seen: Any = None) -> torch.Tensor:
+        hidden = super().forward(x, positions, cache, seen)
+        hidden[..., 0] = positions
+        return hidden
+
+    def head(self, hidden: torch.Tensor) -> torch.Tensor:
+        return self.answers[hidden[..., 0].long()]
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize(("bins", "agrees"), [(2, True), (12, False)])
+def test_a_rejected_draft_near_enough_on_its_own_path_agrees(bins, agrees):
+    """A draft that is off by `bins` everywhere but in the strict DoF: 2 bins are 0.013 on average, 12 are 0.08."""
+    target = ByPlace()
+    truth = np.array(near(target).drafted)
+    source = near(target, bins)
+    source.drafted = np.where(target.actions.strict_tokens(len(truth)), truth, source.drafted).tolist()
+    assert modes(decoder_of(source, target, tolerance=0.05), 2) == ("vs" if agrees else "vv")
+    assert modes(decoder_of(source, target, tolerance=0.0), 2) == "vv"
+
+
+@torch.inference_mode()
+def test_a_flipped_strict_dof_never_agrees():
+    target = MockTarget()
+    source = near(target)
+    strict = np.flatnonzero(target.actions.strict_tokens(len(source.drafted)))
+    source.drafted[int(strict[0])] = (source.drafted[int(strict[0])] + 1) % target.actions.tokens
+    assert modes(decoder_of(source, target, tolerance=2.0), 2) == "vv"
+
+
+@torch.inference_mode()
+def test_another_sources_accepted_chain_does_not_count():
+    """The fallback's draft is right, the first source's is not: what would be executed unverified is the first's."""
+    target = MockTarget()
+    wrong, right = near(target, bins=30), near(target)
+    merged = MergedProposer([wrong, right], nodes=64)
+    decoder = decoder_of(wrong, target, merged, tolerance=0.0)
+    record = decoder.decode(SHOWN)
+    assert record.forwards == 1  # the right one was accepted whole
+    assert modes(decoder, 2) == "vv"
