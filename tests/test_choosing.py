@@ -91,7 +91,7 @@ def test_a_setting_is_called_faster_only_if_its_interval_is_above_one(table):
 def test_nothing_is_recommended_where_the_baseline_does_not_solve_the_tasks():
     rows = [row("ar", 1.0, PairedCounts(30, 0, 0, 170), 4), row("r=9", 2.0, PairedCounts(30, 0, 0, 170))]
     whole, reach = choices(pd.DataFrame(rows), pd.DataFrame(rows).assign(task="reach"), 4.0)
-    assert (whole.chosen, whole.candidate, whole.is_shown) == ("", "", False)
+    assert (whole.chosen, whole.candidate, whole.front, whole.is_shown) == ("", "", (), False)
     assert sentence(whole, 4.0, "ar").startswith("ar does not solve these tasks (15 % of its episodes succeed)")
     assert "does not solve" in short_sentence(reach)
 

@@ -11,9 +11,11 @@ from loaded import of_target
 from typer.testing import CliRunner
 
 from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.files import read_json
 from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
+from kerv_cli.cli.prepare import unsolved_by
 from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.episodes.resolve import resolve
@@ -26,11 +28,13 @@ from kerv_cli.methods.context import Context
 from kerv_cli.methods.merged import MergedProposerSettings
 from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.methods.scout.drafter import ScoutDrafter, ScoutNetwork, ScoutProposer, check_sees
+from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.methods.streak import AlwaysSkip, StreakSkip, StreakSkipSettings
 from kerv_cli.report.certificate import folder_of
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.training.settings import PrepareSettings
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.settings import CameraSettings
 
@@ -194,7 +198,10 @@ def test_a_certified_task_gets_its_rule_and_any_other_a_streak(target, scout):
         where.built["prefill_draft"] = scoped(drafts, where)
         assert where.built["prefill_draft"].name == source
         assert isinstance(certified(CertifiedSkipSettings(most=4), where), rule)
-    assert "rule 1: not more than 5 points below AR on these 1 instructions" in artifacts["certificate"].sentence()
+    assert (
+        "rule 1: not more than 5 points below AR on these 1 instruction, 90 % confidence"
+        in artifacts["certificate"].sentence()
+    )
     nothing = {**artifacts, "certificate": certificate(target, None)}
     assert certified(CertifiedSkipSettings(), context(target, nothing, TASK)) is None  # verified always
     first = {**artifacts, "certificate": certificate(target, 0)}
@@ -226,7 +233,7 @@ def test_a_certificate_of_another_draft_method_chunk_format_or_world_is_refused(
         CertificateArtifact().check_use(issued, Use({}, "float32", "metaworld", world={**world, "horizon": 120}))
 
 
-def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results):
+def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results, monkeypatch):
     study = results / "tiny.yaml"
     study.write_text(
         "common: method=early_unverified prefill_draft=hold proposer=none threshold.r=9 "
@@ -235,6 +242,11 @@ def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results):
     )
     words = ["calibrate", "success", f"study={study}", "study.repeats=2", f"results={results}"]
     words += ["margin=99", "delta=0.5"]
+    unsolved = CliRunner().invoke(app, words)
+    assert "nothing is certified: AR solved 0 of 2 episodes" in unsolved.stdout, unsolved.output
+    prepared = PrepareSettings(results=str(results), policy=PolicySettings(target="nano-vision"))
+    assert "autoregressive decoding does not solve these tasks (0 % of its" in unsolved_by(prepared)
+    monkeypatch.setattr("kerv_cli.report.certificate.SOLVED_BY_AR", 0.0)
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
     path = results / "artifacts/target/nano-vision"  # beside the target
@@ -256,9 +268,28 @@ def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results):
     assert refused.exit_code == 2
     assert "with a policy of metaworld: the certificate is of elsewhere" in refused.stderr
     written.write_text(issued)
-    few = CliRunner().invoke(app, [*words[:-2], "margin=1", "policy.artifacts.certificate=few", "--json"])
-    assert few.exit_code == 0, few.output
-    assert "nothing is certified" in few.stdout
+    assert CliRunner().invoke(app, words).exit_code == 0  # the same test again is no second test
+    assert read_json(written)["earlier"] == []
+    few = [*words[:-2], "margin=1", "delta=0.5", "policy.artifacts.certificate=few"]
+    rollout = ["rollout", "method=ar", "policy.target=nano-vision", f"task={TASK}", "seed=50510", "episodes=1"]
+    used = CliRunner().invoke(app, [*rollout, "record=0", "world.horizon=8", f"results={results}"])
+    assert used.exit_code == 0, used.output
+    for more, says in (
+        ([], "again=true to test on other seeds at delta=0.25"),
+        (["again=true"], "seeds 50500-50501 served an earlier test"),
+        (["again=true", "seed=50509"], "ran this policy on some of these seeds"),
+    ):
+        refused = CliRunner().invoke(app, [*few, *more])
+        assert refused.exit_code == 2, refused.output
+        assert says in refused.stderr
+    second = CliRunner().invoke(app, [*few, "again=true", "seed=50520", "--json"])
+    assert second.exit_code == 0, second.output
+    assert "nothing is certified" in second.stdout
+    issued = read_json(results / "artifacts/certificate/few/certificate.json")
+    (earlier,) = issued["earlier"]
+    assert (issued["delta"], issued["seeds"]) == (0.25, "50520-50521")
+    assert (earlier["seeds"], earlier["delta"], earlier["margin"]) == ("50500-50501", 0.5, 99.0)
+    assert (earlier["order"], earlier["pairs"], earlier["certified"]) == (["half", "all"], 2, "all")
     wrong = CliRunner().invoke(app, [*words, "seed=100000"])
     assert wrong.exit_code == 2, wrong.output
 

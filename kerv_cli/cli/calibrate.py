@@ -57,7 +57,7 @@ OF_TEST = {at.name for at in fields(CalibrateSuccessSettings)} - {at.name for at
     keys="study margin delta task episodes policy.target policy.artifacts runtime.workers results",
     examples=(
         "kerv calibrate success policy.target=mine",
-        "kerv calibrate success policy.artifacts.certificate=mine margin=3 episodes=50 --plan",
+        "kerv calibrate success policy.artifacts.certificate=mine margin=3 episodes=50 seed=50600 again=true --plan",
     ),
     each="rollout",
 )
@@ -69,7 +69,7 @@ def success(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_
     from kerv_cli.cli.work import planned_study, print_settings, print_study_plan, run_study
     from kerv_cli.episodes.resolve import resolve
     from kerv_cli.lab.runs import making
-    from kerv_cli.report.certificate import candidate_rows, certify, folder_of, write
+    from kerv_cli.report.certificate import candidate_rows, certify, folder_of, planned_certificate, write
 
     of_test = [word for word in overrides if word.split("=")[0] in OF_TEST]
     of_study = [word for word in overrides if word not in of_test]
@@ -85,17 +85,18 @@ def success(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_
         return
     folder = folder_of(resolved)
     planned = planned_study(resolved, ["calibrate", "success", *overrides])
+    certificate = planned_certificate(resolved, planned.store, planned.study.episodes, settings)
     if plan:
         print_study_plan(planned, as_json)
         return
     with making(settings.results, "certificate", folder):
         if run_study(resolved, planned).failed:
             raise typer.Exit(1)
-        certificate = certify(resolved, planned.store, planned.study.episodes, settings.margin, settings.delta)
+        certificate = certify(certificate, planned.store, planned.study.episodes, resolved.study.baseline)
         path = write(folder, certificate)
     rows = candidate_rows(certificate)
     if as_json:
         end_with_json({"certificate": path, "sentence": certificate.sentence(), "candidates": rows})
-    title = f"not more than {settings.margin:g} points below AR? tested in this order, each at {settings.delta:g}"
+    title = f"not more than {settings.margin:g} points below AR? tested in this order, each at {certificate.delta:g}"
     print_rows(rows, title)
     typer.echo(f"{certificate.sentence()}\n{path}")

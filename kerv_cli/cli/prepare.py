@@ -50,7 +50,26 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
         if step.state != THERE:
             typer.echo(f"\nkerv {line(step)}")
             run(shlex.split(line(step)))
+    if failing := unsolved_by(settings):
+        typer.echo(f"\n{name}: {failing}")
+        return
     typer.echo(f"\n{name} is ready: kerv sweep study=own policy.target={name}{results_word(overrides)}")
+
+
+def unsolved_by(settings: PrepareSettings) -> str:
+    """Say that the policy does not solve its tasks, if the test for its certificate has shown it. Else return ""."""
+    from kerv_cli.methods.artifacts import Artifacts
+    from kerv_cli.methods.certified.certificate import CertificateArtifact
+    from kerv_cli.report.matched import SOLVED
+    from kerv_cli.report.verdict import unsolved
+
+    artifact = CertificateArtifact()
+    path = Artifacts(settings.results, settings.policy).path(artifact.kind)
+    if not artifact.json(path).is_file():
+        return ""
+    first = artifact.read(path).candidates[0]
+    success = first.ar / first.pairs if first.pairs else 1.0
+    return unsolved("autoregressive decoding", success) if success < SOLVED else ""
 
 
 def run(line: Sequence[str]) -> None:

@@ -89,7 +89,8 @@ def _print_choice(settings: ReportSettings, as_json: bool) -> None:
         groups = choices(data.table, data.per_task, settings.loss)
         answers[name] = [choice.as_dict() for choice in groups]
         if not as_json:
-            typer.echo(f"{name}, not beaten in speed and success at once: {', '.join(groups[0].front)}")
+            front = f", not beaten in speed and success at once: {', '.join(groups[0].front)}"
+            typer.echo(f"{name}{front if groups[0].front else ''}")
             typer.echo(f"  {sentence(groups[0], settings.loss, data.study.baseline)}")
             for choice in groups[1:]:
                 typer.echo(f"  {short_sentence(choice)}")

@@ -17,24 +17,30 @@ import pandas as pd
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_json
+from kerv_cli.base.places import results_dir
 from kerv_cli.base.registry import METHOD_KINDS
 from kerv_cli.episodes.identity import ENGINE
 from kerv_cli.episodes.policy import artifacts_of
 from kerv_cli.episodes.resolve import ResolvedStudy
 from kerv_cli.episodes.settings import WAITS, RolloutSettings
+from kerv_cli.lab.database import now
 from kerv_cli.lab.plan import Episode, seeds_text
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.methods.certified.betting import more_to_decide, p_value
 from kerv_cli.methods.certified.certificate import Candidate, Certificate, CertificateArtifact
 from kerv_cli.methods.compose import Method
+from kerv_cli.report.attempts import charged
 from kerv_cli.report.measures import paired
 from kerv_cli.report.statistics import MOST_PAIRS
 from kerv_cli.report.tables import load_study
-from kerv_cli.targets.folders import check_not_shipped
+from kerv_cli.targets.folders import beside, check_not_shipped
 from kerv_cli.targets.provenance import provenance
+from kerv_cli.training.settings import CalibrateSuccessSettings
 from kerv_cli.worlds import resolve_tasks, spec_of
 
 POINTS = 100.0
+SOLVED_BY_AR = 0.5
+"""Smallest success rate of AR for which a certificate is issued."""
 
 _VARIED = ("prefill_draft", "skip")
 """Kinds of parts in which the candidates may differ."""
@@ -93,36 +99,25 @@ def _check_conditions(resolved: ResolvedStudy) -> None:
         raise UsageError(f"rollout.clock={first.rollout.clock}: a certificate is of a world that waits, leave it out")
 
 
-def certify(
-    resolved: ResolvedStudy, store: StudyStore, wanted: Sequence[Episode], margin: float, delta: float
+def planned_certificate(
+    resolved: ResolvedStudy, store: StudyStore, wanted: Sequence[Episode], settings: CalibrateSuccessSettings
 ) -> Certificate:
-    """Test the study's settings in their order, each at level delta, up to the first that fails.
-
-    By fixed-sequence testing, the probability that any certified setting loses more than `margin` points is at most
-    delta.
+    """Return the certificate of a test that has not run: it says what will be tested, in which order and how.
 
     Args:
         resolved: The study.
-        store: Its stored episodes.
-        wanted: Episodes to use.
-        margin: Largest acceptable loss of success against AR, in points.
-        delta: Probability of a wrong certificate.
+        store: Where its episodes are stored.
+        wanted: Episodes that the test will use.
+        settings: Settings of the test.
+
+    Raises:
+        UsageError: The policy was tested before, or the seeds served something else.
+        CheckpointError: An artifact of a candidate is missing or damaged.
     """
     baseline, first = _settings(resolved)[:2]
-    episodes = load_study(store, wanted).episodes
-    episodes = episodes[episodes["repeat"] == 0]  # a repeat measures the same world again: it is no further pair
-    ar = episodes[episodes["label"] == resolved.study.baseline]
-    candidates: list[Candidate] = []
-    chosen, testing = None, True
-    for label, settings in resolved.settings.items():
-        if label != resolved.study.baseline:
-            pairs = paired(episodes[episodes["label"] == label], ar)
-            candidates.append(_candidate(label, settings, pairs, margin, delta, testing))
-            testing = candidates[-1].p is not None and candidates[-1].p <= delta
-            chosen = len(candidates) - 1 if testing else chosen
     artifacts, tasks = artifacts_of(first), resolve_tasks(baseline.task)
     hashes = artifacts.check(need for settings in _settings(resolved)[1:] for need in Method.of(settings).needs)
-    return Certificate(
+    certificate = Certificate(
         target=hashes.pop("target"),
         actions=artifacts.description.actions,
         chunk=first.chunk or artifacts.description.chunk,
@@ -132,22 +127,54 @@ def certify(
         method={kind: dataclasses.asdict(getattr(first, kind)) for kind in METHOD_KINDS if kind not in _VARIED},
         world={"camera": dataclasses.asdict(first.world.camera), "horizon": first.world.horizon},
         dtype=first.runtime.dtype,
-        margin=margin,
-        delta=delta,
+        margin=settings.margin,
+        delta=settings.delta,
         seeds=seeds_text(one.seed for one in wanted),
-        candidates=candidates,
-        chosen=chosen,
+        candidates=[
+            Candidate(label, skip=dataclasses.asdict(one.skip), draft=dataclasses.asdict(one.prefill_draft))
+            for label, one in resolved.settings.items()
+            if label != resolved.study.baseline
+        ],
+        chosen=None,
         provenance={"command": "kerv calibrate success", "engine": ENGINE, **provenance(first.runtime.device)},
+        made=now(),
     )
+    folders = {*(results_dir(first.results) / "artifacts/certificate").glob("*")}
+    folders |= {artifacts.path(CertificateArtifact.kind), beside(artifacts.folder, CertificateArtifact.kind)}
+    return charged(certificate, store, wanted, sorted(folders), settings.again)
 
 
-def _candidate(
-    label: str, settings: RolloutSettings, pairs: pd.DataFrame, margin: float, delta: float, testing: bool
-) -> Candidate:
+def certify(certificate: Certificate, store: StudyStore, wanted: Sequence[Episode], baseline: str) -> Certificate:
+    """Test the candidates in their order, each at level delta, up to the first that fails.
+
+    By fixed-sequence testing, the probability that any certified setting loses more than `margin` points is at most
+    delta. Nothing is tested if AR solves less than half of its episodes.
+
+    Args:
+        certificate: The planned certificate.
+        store: The stored episodes of its study.
+        wanted: Episodes to use.
+        baseline: Label of AR.
+    """
+    episodes = load_study(store, wanted).episodes
+    episodes = episodes[episodes["repeat"] == 0]  # a repeat measures the same world again: it is no further pair
+    ar = episodes[episodes["label"] == baseline]
+    testing = bool(ar["success"].mean() >= SOLVED_BY_AR)
+    candidates: list[Candidate] = []
+    chosen = None
+    for planned in certificate.candidates:
+        pairs = paired(episodes[episodes["label"] == planned.label], ar)
+        candidates.append(_candidate(planned, pairs, certificate.margin, certificate.delta, testing))
+        testing = candidates[-1].p is not None and candidates[-1].p <= certificate.delta
+        chosen = len(candidates) - 1 if testing else chosen
+    return dataclasses.replace(certificate, candidates=candidates, chosen=chosen)
+
+
+def _candidate(planned: Candidate, pairs: pd.DataFrame, margin: float, delta: float, testing: bool) -> Candidate:
     """Test one setting against AR.
 
     Args:
-        label: The setting's label.
+        planned: The candidate without results.
         settings: The setting.
         pairs: Its episodes paired with AR's, from `paired`.
         margin: Largest acceptable loss of success, in points.
@@ -160,10 +187,8 @@ def _candidate(
     values, bound = np.random.default_rng(seed).permutation((1 + ar - own) / 2), (1 + margin / POINTS) / 2
     p = p_value(values, bound, delta) if testing else None
     needed = more_to_decide(values, bound, delta) if p is not None and p > delta else 0.0
-    return Candidate(
-        label=label,
-        skip=dataclasses.asdict(settings.skip),
-        draft=dataclasses.asdict(settings.prefill_draft),
+    return dataclasses.replace(
+        planned,
         pairs=len(pairs),
         ar=int(ar.sum()),
         successes=int(own.sum()),

@@ -91,7 +91,7 @@ def _choice(where: str, rows: Sequence[Row], loss: float) -> Choice:
         where,
         pairs=max((int(row["pairs"]) for row in rows if not is_baseline(row)), default=0),
         baseline_success=success,
-        front=tuple(str(row["label"]) for row in pareto(rows)),
+        front=() if success < SOLVED else tuple(str(row["label"]) for row in pareto(rows)),
         chosen=str(best["label"]) if best else "",
         loss_at_most=-POINTS * float(best["difference_low"]) if best else math.nan,
         candidate=label,

@@ -101,16 +101,21 @@ def sentence(choice: Choice, loss: float, baseline: str) -> str:
         baseline: Label of the baseline.
     """
     if choice.is_unsolved:
-        return (
-            f"{baseline} does not solve these tasks ({100 * choice.baseline_success:.0f} % of its episodes succeed), "
-            "so no setting is recommended"
-        )
+        return unsolved(baseline, choice.baseline_success)
     bound = f"loses less than {loss:g} points of success against {baseline}"
     if choice.chosen:
         return f"{choice.chosen} {bound} (95 % confidence, {choice.pairs} pairs){_speed(choice)}"
     if not choice.tested:
         return f"no setting is shown to be faster per episode than {baseline} ({choice.pairs} pairs)"
     return f"{choice.pairs} pairs do not show a setting that is faster and {bound}; {_missing(choice)}"
+
+
+def unsolved(baseline: str, success: float) -> str:
+    """Return the sentence for a baseline whose success rate, from 0 to 1, is too low for a recommendation."""
+    return (
+        f"{baseline} does not solve these tasks ({100 * success:.0f} % of its episodes succeed), so no setting is "
+        "recommended"
+    )
 
 
 def short_sentence(choice: Choice) -> str:

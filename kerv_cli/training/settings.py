@@ -211,3 +211,4 @@ class CalibrateSuccessSettings(SweepSettings):
 
     margin: float = number(5.0, above=0, most=99.9, help="points of success that may be lost against AR")
     delta: float = number(0.1, above=0, most=0.5, help="the certificate holds with probability 1 - delta")
+    again: bool = setting(False, "test a policy once more, on other seeds, at half of delta for each earlier test")

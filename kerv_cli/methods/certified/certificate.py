@@ -5,6 +5,8 @@ A certificate covers some tasks. Each decoder is built for one task, so this is 
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -43,12 +45,12 @@ class Candidate:
 
     label: str
     skip: dict[str, Any]
-    pairs: int
-    ar: int
-    successes: int
-    lost: int
-    won: int
-    p: float | None
+    pairs: int = 0
+    ar: int = 0
+    successes: int = 0
+    lost: int = 0
+    won: int = 0
+    p: float | None = None
     needed: int = 0
     draft: dict[str, Any] = field(default_factory=lambda: {"kind": "scout"})
 
@@ -68,6 +70,37 @@ def _part_settings(kind: str, plain: dict[str, Any]) -> Any:
 
 
 @dataclass(frozen=True)
+class Attempt:
+    """One test of a policy, as a later certificate of the policy records it.
+
+    Attributes:
+        made: When, ISO 8601. Empty: not recorded.
+        test: Hash of what was tested: `Certificate.test`.
+        order: Labels of the candidates in the order of the tests.
+        seeds: Seeds of the episodes, as text.
+        margin: Percentage points of success that may be lost.
+        delta: Level of the test.
+        pairs: Number of pairs of episodes.
+        certified: Label of the boldest certified candidate. Empty if there was none.
+    """
+
+    made: str
+    test: str
+    order: list[str]
+    seeds: str
+    margin: float
+    delta: float
+    pairs: int
+    certified: str
+
+    @property
+    def seeds_served(self) -> set[int]:
+        """Seeds of the episodes."""
+        ends = ([int(end) for end in part.split("-")] for part in self.seeds.split(";"))
+        return {seed for part in ends for seed in range(part[0], part[-1] + 1)}
+
+
+@dataclass(frozen=True)
 class Certificate:
     """A certificate: on `tasks`, the chosen candidate loses at most `margin` points of AR's success.
 
@@ -82,11 +115,13 @@ class Certificate:
         world: Camera and horizon (maximum episode length).
         dtype: Number format of the models.
         margin: Percentage points of success that may be lost.
-        delta: Probability that the certificate is wrong, at most.
+        delta: Level of this test: the probability that it certifies falsely, at most.
         seeds: Seeds of the test episodes, as text.
         candidates: All candidates, from cautious to bold.
         chosen: Index of the boldest certified candidate. None: no candidate was certified.
         provenance: How it was made.
+        made: When, ISO 8601. Empty in certificates of older versions.
+        earlier: All earlier tests of the same policy, the first one first.
     """
 
     target: str
@@ -104,6 +139,40 @@ class Certificate:
     candidates: list[Candidate]
     chosen: int | None
     provenance: dict[str, Any] = field(default_factory=dict)
+    made: str = ""
+    earlier: list[Attempt] = field(default_factory=list)
+
+    @property
+    def risk(self) -> float:
+        """Probability that any test of this policy, up to this one, certified falsely, at most."""
+        return self.delta + sum(one.delta for one in self.earlier)
+
+    @property
+    def is_tested(self) -> bool:
+        """Whether any candidate was tested."""
+        return any(one.p is not None for one in self.candidates)
+
+    @property
+    def test(self) -> str:
+        """Hash of everything that was tested, without the results and without delta."""
+        names = ("tasks", "seeds", "margin", "drafts", "method", "chunk", "world", "dtype")
+        order = [(one.label, one.skip, one.draft) for one in self.candidates]
+        text = json.dumps([*(getattr(self, name) for name in names), order], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    @property
+    def attempt(self) -> Attempt:
+        """This test, as a later certificate records it."""
+        return Attempt(
+            self.made,
+            self.test,
+            [one.label for one in self.candidates],
+            self.seeds,
+            self.margin,
+            self.delta,
+            self.candidates[0].pairs,
+            self.certified.label if self.certified else "",
+        )
 
     @property
     def certified(self) -> Candidate | None:
@@ -140,11 +209,19 @@ class Certificate:
     def sentence(self) -> str:
         """Return what the certificate states, as one sentence for the user."""
         chosen = self.certified
+        first, tests = self.candidates[0], len(self.earlier) + 1
+        if not self.is_tested:
+            return (
+                f"nothing is certified: AR solved {first.ar} of {first.pairs} episodes, and a certificate needs half "
+                "of them. Train the policy further"
+            )
         if chosen is None:
             return "nothing is certified: every draft is verified"
+        count = f"{len(self.tasks)} instruction{'s' * (len(self.tasks) != 1)}"
         return (
-            f"{chosen.label}: not more than {self.margin:g} points below AR on these {len(self.tasks)} instructions, "
-            f"{100 * (1 - self.delta):.0f} % confidence, {chosen.pairs} pairs"
+            f"{chosen.label}: not more than {self.margin:g} points below AR on these {count}, "
+            f"{100 * (1 - self.risk):g} % confidence, {chosen.pairs} pairs"
+            + (f"; the confidence is that of all {tests} tests of this policy" if tests > 1 else "")
         )
 
 
