@@ -12,15 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from command import kerv
 from examples.own_target import MockTarget
 from studies_synthetic import episode, swept, threshold_study
 from test_episode import settings
 from test_parallel import some_observation, target
-from typer.testing import CliRunner
 
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.spaces import Observation
-from kerv_cli.cli.app import app
 from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.chunk import EpisodeState
 from kerv_cli.engine.cost import Profile
@@ -374,12 +373,10 @@ def test_a_rollout_in_batches_prints_success_and_goes_on_where_it_was(policies, 
         raise KeyboardInterrupt
 
     monkeypatch.setattr(EpisodeRunner, "together", interrupted)
-    stopped = CliRunner().invoke(app, command)
-    assert stopped.exit_code == 130
+    stopped = kerv(*command, code=130)
     assert "2 of 6 episodes of" in stopped.stderr
     monkeypatch.setattr(EpisodeRunner, "together", original)
-    again = CliRunner().invoke(app, command)
-    assert again.exit_code == 0, again.output
+    again = kerv(*command)
     assert "2 of 6 episodes are there" in again.stderr
     assert "not timed: 4 episodes at a time" in again.stdout
     assert "time by phase" not in again.stdout
@@ -387,8 +384,8 @@ def test_a_rollout_in_batches_prints_success_and_goes_on_where_it_was(policies, 
         assert re.search(rf"{name} .*/[36] .*–", again.stdout), again.stdout
     assert not list(results.glob("rollouts/*/rollouts/*.rrd"))
     single = [word for word in command if word != "rollout.batch=4"]
-    alone = CliRunner().invoke(app, [*single, "--json"])
-    together = CliRunner().invoke(app, [*command, "--json"])
+    alone = kerv(*single, "--json")
+    together = kerv(*command, "--json")
     both = [json.loads(run.stdout) for run in (alone, together)]
     for a, b in zip(both[0]["tasks"], both[1]["tasks"], strict=True):
         assert [a[name] for name in ("task", "successes", "steps", "decodes", "forwards_per_step")] == [

@@ -6,8 +6,8 @@ import json
 import numpy as np
 import pytest
 import torch
+from command import kerv
 from flips import flipped
-from typer.testing import CliRunner
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.bench import phases as measuring
@@ -16,7 +16,6 @@ from kerv_cli.bench.model import layer_weights, open_model
 from kerv_cli.bench.phases import Laps, Phase, costs_of, decoders
 from kerv_cli.bench.results import ceilings, profile_of, projected, shares
 from kerv_cli.bench.settings import BenchSettings
-from kerv_cli.cli.app import app
 from kerv_cli.engine.cost import READ_PHASES, Profile, Work, prices, read_profile, work_of
 
 NANO = BenchSettings(model="nano", dtype="float32")
@@ -172,16 +171,10 @@ def quick(monkeypatch):
     monkeypatch.setattr(measuring, "source_decoders", lambda settings: {})
 
 
-def kerv(*words: str) -> str:
-    done = CliRunner().invoke(app, ["bench", *words])
-    assert done.exit_code == 0, done.output
-    return done.stdout
-
-
 @pytest.mark.usefixtures("quick")
 def test_the_command_ends_with_one_document(tmp_path):
     words = ("target=nano", "dtype=float32", "repeats=3", "tokens=[7]", "projected=vla-150m", f"results={tmp_path}")
-    told = kerv(*words, "--json")
+    told = kerv("bench", *words, "--json").stdout
     document = json.loads(told.splitlines()[-1])
     path = tmp_path / "bench/nano-float32.json"
     assert document == json.loads(path.read_text())
@@ -207,8 +200,7 @@ def test_the_command_ends_with_one_document(tmp_path):
 )
 def test_what_cannot_be_measured_is_refused(words, message, tmp_path, monkeypatch):
     monkeypatch.setattr("kerv_cli.bench.model.free_memory", lambda device: 8e9)
-    done = CliRunner().invoke(app, ["bench", *words, f"results={tmp_path}"])
-    assert done.exit_code == 2
+    done = kerv("bench", *words, f"results={tmp_path}", code=2)
     assert message in done.stderr
     assert done.stderr.count("\n") == 1
 

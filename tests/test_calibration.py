@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
+from command import kerv
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import read_json, sha256_of, write_json
-from kerv_cli.cli.app import app
 from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
 from kerv_cli.engine.record import Round
 from kerv_cli.methods.artifacts import MadeFor
@@ -284,8 +283,7 @@ def test_wrong_requests_get_one_line(results, override, kind, says):
 
 def test_the_command_prints_what_it_found(results):
     words = ["calibrate", "task=reach,drawer-close", "demos=few", "held_out=0.4", "policy.target=nano-state"]
-    done = CliRunner().invoke(app, [*words, f"results={results}", "decodes=0", "name=without"])
-    assert done.exit_code == 0, done.output
+    done = kerv(*words, f"results={results}", "decodes=0", "name=without")
     for said in ("K_S", "held-out error", "damped", "h=4", "decodes=0; left empty\n", "skip levels: no datastore"):
         assert said in done.output
     assert "s_min" not in done.output

@@ -6,18 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import kerv
 from examples.own_target import SEVEN
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from test_calibration import STEPS, TASKS, made_up_episode, quiet, write_dataset
-from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import write_json
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.cli.app import app
 from kerv_cli.methods.calibration import NEVER, Calibration, CalibrationArtifact, Variability
 from kerv_cli.methods.heisd.datastore import Datastore, Manifest, Shard
 from kerv_cli.methods.heisd.rules import BoundaryRanges
@@ -224,10 +223,9 @@ def test_nothing_is_kept_of_another_target_or_a_damaged_file(copy):
 
 
 def test_the_command_prints_ranges_and_levels(copy):
-    done = CliRunner().invoke(app, ["calibrate", *words(copy, "epsilon=1.9", "confidence=0.5")])
-    assert done.exit_code == 0, done.output
+    done = kerv("calibrate", *words(copy, "epsilon=1.9", "confidence=0.5"))
     for word in ("s_min", "would be skipped", "error ≤ 1.9", "144"):
         assert word in done.output
-    assert "skip levels from" in CliRunner().invoke(app, ["calibrate", *words(copy, "--plan")]).output
-    never = CliRunner().invoke(app, ["calibrate", *words(copy, "epsilon=0.0001")])
+    assert "skip levels from" in kerv("calibrate", *words(copy, "--plan")).output
+    never = kerv("calibrate", *words(copy, "epsilon=0.0001"))
     assert never.output.count("never") == 2

@@ -6,15 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from command import kerv
 from examples.own_target import SEVEN
 from hypothesis import given
 from hypothesis import strategies as st
 from loaded import of_target
-from typer.testing import CliRunner
 
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
-from kerv_cli.cli.app import app
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
@@ -214,8 +213,7 @@ def test_a_shape_that_is_too_small_is_refused(policies):
 def test_a_policy_grows_by_command_and_keeps_its_drafter(policies, tmp_path):
     shape = ["grow.width=128", "grow.heads=2", "grow.feed_forward=160", "grow.layers=3", "grow.drafter=true"]
     command = ["build", "target", *shape, "policy.target=nano-vision", f"name={tmp_path}/large"]
-    run = CliRunner().invoke(app, [*command, f"results={policies}", "--json"])
-    assert run.exit_code == 0, run.output
+    kerv(*command, f"results={policies}", "--json")
     folder = tmp_path / "large"
     assert sorted(path.name for path in folder.iterdir()) == ["target.json"], "no weights"
     small = Artifacts(str(policies), PolicySettings(target="nano-vision"))
@@ -238,11 +236,10 @@ def test_a_policy_grows_by_command_and_keeps_its_drafter(policies, tmp_path):
 
 def test_a_grown_target_whose_policy_changed_is_refused(policies, tmp_path):
     command = ["build", "target", "grow=60m", "policy.target=nano-vision", f"name={tmp_path}/large"]
-    assert CliRunner().invoke(app, [*command, f"results={policies}"]).exit_code == 0
+    kerv(*command, f"results={policies}")
     path = tmp_path / "large/target.json"
     content = json.loads(path.read_text())
     content["settings"]["grown"]["sha256"] = "0" * 64
     path.write_text(json.dumps(content))
-    run = CliRunner().invoke(app, ["doctor", f"policy.target={tmp_path}/large", f"results={policies}"])
-    assert run.exit_code == 1
+    run = kerv("doctor", f"policy.target={tmp_path}/large", f"results={policies}", code=1)
     assert "build it again" in run.output

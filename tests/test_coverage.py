@@ -5,12 +5,11 @@ import re
 import shutil
 
 import pytest
+from command import kerv, told
 from test_calibration import write_dataset
-from typer.testing import CliRunner
 
 from kerv_cli.base.config import conf_dir
 from kerv_cli.base.files import read_yaml
-from kerv_cli.cli.app import app
 from kerv_cli.worlds import resolve_tasks
 
 
@@ -22,8 +21,7 @@ from kerv_cli.worlds import resolve_tasks
     ],
 )
 def test_a_missing_artifact_with_a_name_is_answered_with_the_command_that_makes_it(words, command, tmp_path):
-    run = CliRunner().invoke(app, ["rollout", *words.split(), f"results={tmp_path / 'results'}"])
-    assert run.exit_code == 1
+    run = kerv("rollout", *words.split(), f"results={tmp_path / 'results'}", code=1)
     assert f"kerv {command} {words.split()[0]}" in run.stderr
 
 
@@ -33,18 +31,16 @@ def test_drafts_of_seven_tasks_are_made_as_the_note_of_their_study_says(policies
     shutil.copytree(policies, results)
     write_dataset(results / "artifacts/demos/mt10", names=resolve_tasks(["MT10"]))
 
-    def kerv(*words):
-        result = CliRunner().invoke(app, [*words, f"results={results}"])
-        assert result.exit_code == 0, result.output
-        return str(result.output)
+    def run(*words):
+        return told(*words, f"results={results}")
 
     study = read_yaml(conf_dir() / "study/coverage_unseen.yaml")
     making = re.findall(r"kerv (train drafter .*?\])", study["note"])
     few = ("train.steps=2", "train.batch=8", "train.validate_every=2", "drafter.samples=50")
     target = "policy.target=nano-state"
-    kerv(*making[0].split(), target, *few)
+    run(*making[0].split(), target, *few)
     made = json.loads((results / "artifacts/early/seven/early.json").read_text())
     seen = set(made["provenance"]["settings"]["task"])
     assert len(seen) == 7
-    planned = kerv("sweep", "study=coverage_unseen", target, "--plan")
+    planned = run("sweep", "study=coverage_unseen", target, "--plan")
     assert not any(task in planned for task in seen)

@@ -5,11 +5,10 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
+from command import kerv
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.cli.app import app
 from kerv_cli.episodes.policy import decoder_for
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.settings import PolicySettings
@@ -96,8 +95,7 @@ def test_a_target_acts_and_the_expert_labels(tmp_path):
 def test_a_policy_acts_by_its_method(tmp_path):
     words = ("policy=vision", "method=early_unverified", "task=reach", f"name={tmp_path / 'visited'}", "episodes=1")
     short = ("world.horizon=12", "expert_share=0", "frame_stride=4", "runtime.workers=1")
-    done = CliRunner().invoke(app, ["demos", *words, *short])
-    assert done.exit_code == 0, done.output
+    kerv("demos", *words, *short)
     episode = DemoDataset.open(tmp_path / "visited").load(0)
     settings = compose("rollout", ["method=early_unverified"], RolloutSettings)
     decoder, world = decoder_for(settings, "reach-v3"), SPEC.open_world("reach-v3", SHORT)

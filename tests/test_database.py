@@ -10,13 +10,12 @@ import time
 
 import pytest
 import sqlalchemy as sa
+from command import kerv
 from conftest import python
 from studies_synthetic import episode, settings_of, still_episode, study_of, swept, threshold_study
-from typer.testing import CliRunner
 
 from kerv_cli.base.errors import CheckpointError, KervError, StorageError, UsageError
 from kerv_cli.catalogue.folders import import_results
-from kerv_cli.cli.app import app
 from kerv_cli.engine.record import PHASES
 from kerv_cli.episodes.rows import decodes_table, episode_row
 from kerv_cli.lab import database as module
@@ -207,7 +206,7 @@ def test_a_damaged_file_is_one_line(tmp_path, harm):
     if harm != "a folder":
         assert "is damaged" in told(error)
         assert "restore a copy of it, or move it aside" in told(error)
-    result = CliRunner().invoke(app, ["runs", "list", f"results={tmp_path}"])
+    result = kerv("runs", "list", f"results={tmp_path}", code=None)
     assert result.exit_code in (0, 1)
     assert "Traceback" not in result.output
 

@@ -10,15 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from command import kerv
 from examples.own_target import SEVEN
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_calibration import write_dataset
-from typer.testing import CliRunner
 
 from kerv_cli.base.errors import CheckpointError, StorageError, UnknownName, UsageError
 from kerv_cli.base.spaces import Observation
-from kerv_cli.cli.app import app
 from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.methods.heisd.datastore import Datastore, Manifest, Shard, check_seeds, prompt_key
 from kerv_cli.methods.heisd.rules import neighbour_tree
@@ -395,11 +394,10 @@ def test_a_rebuild_replaces_the_whole_datastore_and_is_the_same(copy):
 def test_the_command_builds_and_reports(copy):
     words = ["build", "datastore", "policy.target=nano-state", "demos=few", "task=reach,drawer-close"]
     words.append(f"results={copy}")
-    run = CliRunner().invoke(app, [*words, "--plan"])
+    run = kerv(*words, "--plan")
     assert "6 demonstrations of 2 tasks, 52 control steps" in run.output
     shutil.rmtree(folder_of(copy))
-    run = CliRunner().invoke(app, words)
-    assert run.exit_code == 0, run.output
+    run = kerv(*words)
     assert opened(copy)[0].manifest.rows == 52
 
 

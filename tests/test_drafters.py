@@ -5,15 +5,14 @@ from typing import Any
 
 import pytest
 import torch
+from command import kerv
 from hypothesis import given
 from hypothesis import strategies as st
 from loaded import of_target
 from test_decoding_lossless import random_prompt, random_target
-from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName
-from kerv_cli.cli.app import app
 from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.methods.artifacts import MadeFor
 from kerv_cli.methods.eagle import DrafterSettings
@@ -280,8 +279,7 @@ def test_it_trains_from_the_command_line_and_drafts_for_its_target_alone(results
         "train.steps=4",
         "train.held_out=0.34",
     ]
-    done = CliRunner().invoke(app, [*words, f"results={results}"])
-    assert done.exit_code == 0, done.output
+    done = kerv(*words, f"results={results}")
     assert "accepted_r9" in done.stdout
     target, description = load_target(results / "artifacts/target/nano-vision")
     files, folder = EarlyDrafter(), results / "artifacts/early/whole"

@@ -6,11 +6,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
+from command import kerv
 
 from kerv_cli.base import registry
 from kerv_cli.base.registry import Part
-from kerv_cli.cli.app import app
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "tests/examples"
@@ -55,7 +54,6 @@ def test_an_example_runs_by_its_documented_command(command, kind, tmp_path, monk
     for line in command.split(" && "):
         words = shlex.split(line.replace(f"KERV_PLUGINS={plugins} ", ""))[1:]
         short = SHORT if words[0] == "rollout" else []
-        run = CliRunner().invoke(app, [*words, *short, f"results={tmp_path}"])
-        assert run.exit_code == 0, run.output
+        run = kerv(*words, *short, f"results={tmp_path}")
     if kind == "column":
         assert "longest" in run.output

@@ -14,12 +14,11 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from command import kerv
 from studies_synthetic import swept, threshold_study
-from typer.testing import CliRunner
 
 from kerv_cli.catalogue.evaluations import read_evaluations
 from kerv_cli.catalogue.stored import connect_foreign
-from kerv_cli.cli.app import app
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MACRO
 from kerv_cli.report.tables import CSV_COLUMNS, load_study
@@ -36,13 +35,11 @@ settings:
 
 
 def answer(*words: str) -> Any:
-    result = CliRunner().invoke(app, [*words, "--json"])
-    assert result.exit_code == 0, result.output
-    return json.loads(result.stdout)
+    return json.loads(kerv(*words, "--json").stdout)
 
 
 def refusal(*words: str) -> str:
-    result = CliRunner().invoke(app, list(words))
+    result = kerv(*words, code=None)
     assert (result.exit_code in (1, 2), len(result.stderr.splitlines())) == (True, 1), result.output
     return result.stderr
 

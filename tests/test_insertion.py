@@ -7,16 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from command import kerv
 from examples.insertion import SPEC
 from examples.insertion import SPEC as INSERTION
 from examples.insertion.world import InsertionWorld
 from examples.own_policy import OwnPolicy, Remembered
 from examples.own_target import MockTarget
 from test_decoding_lossless import RandomTrees, decode, plain_greedy
-from typer.testing import CliRunner
 
 from kerv_cli.base.spaces import Observation
-from kerv_cli.cli.app import app
 from kerv_cli.targets.conformance import check_target
 from kerv_cli.worlds.conformance import check_environment
 from kerv_cli.worlds.demos.dataset import DemoDataset
@@ -159,8 +158,7 @@ def test_every_way_of_breaking_it_is_found(name, what):
 
 def test_doctor_checks_a_policy_on_disk(policies):
     for name, code, says in (("nano-state", 0, "tree attention"), ("nothing", 2, "no target 'nothing'")):
-        run = CliRunner().invoke(app, ["doctor", f"target={name}", f"results={policies}"])
-        assert run.exit_code == code, run.output
+        run = kerv("doctor", f"target={name}", f"results={policies}", code=code)
         assert says in run.output
 
 

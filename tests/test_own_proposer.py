@@ -9,19 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from command import told
 from examples.own_proposer_table import FollowDrafter, FollowProposer, FollowTable
 from examples.own_target import SEVEN, MockTarget
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_calibration import write_dataset
 from test_decoding_lossless import assert_adds_up, plain_greedy, random_prompt, random_target
-from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import Observation
 from kerv_cli.catalogue.entries import find_runs, matching
-from kerv_cli.cli.app import app
 from kerv_cli.engine.chunk import ActionHistory, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.episodes.policy import check
@@ -128,17 +127,15 @@ def test_it_is_trained_from_the_command_line_and_drafts_in_a_rollout(results):
     write_dataset(results / "artifacts/demos/few")
     policy = ("policy.target=nano-state", "policy.artifacts.follow=learnt", f"results={results}")
 
-    def kerv(*words):
-        done = CliRunner().invoke(app, [*words, *policy])
-        assert done.exit_code == 0, done.output
-        return done.output
+    def run(*words):
+        return told(*words, *policy)
 
     few = ("demos=few", "drafter.share=0.5", "train.steps=6", "train.batch=8", "train.validate_every=3", "train.lr=0.1")
-    assert "table of" in kerv("train", "drafter", "drafter=follow", *few, "--plan")
-    assert "score" in kerv("train", "drafter", "drafter=follow", *few)
+    assert "table of" in run("train", "drafter", "drafter=follow", *few, "--plan")
+    assert "score" in run("train", "drafter", "drafter=follow", *few)
     described = json.loads((results / "artifacts/follow/learnt/follow.json").read_text())
     assert described["settings"] == {"kind": "follow", "share": 0.5}
-    kerv("rollout", "task=[reach]", "prefill_draft=follow", "episodes=1", "world.horizon=12", "record=0")
+    run("rollout", "task=[reach]", "prefill_draft=follow", "episodes=1", "world.horizon=12", "record=0")
     files = files_of(settings_of(results, name="learnt"))
     assert files.check(["follow"])["follow"] == described["sha256"]
     assert not torch.equal(files.load("follow").logits, FollowTable(4, 255).logits)

@@ -11,24 +11,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from command import told
 from test_calibration import write_dataset
-from typer.testing import CliRunner
 
 from kerv_cli.base import files
-from kerv_cli.cli.app import app
 from kerv_cli.episodes.resolve import resolve, resolve_rollout
 from kerv_cli.targets.folders import RESUME
 from kerv_cli.training.preparation import needs
 
 TASK = "reach-v3"
 MINE = "policy.target=mine"
-
-
-def kerv(*words: str, code: int = 0) -> str:
-    """The output of a command that ends with this code."""
-    run = CliRunner().invoke(app, list(words))
-    assert run.exit_code == code, run.output
-    return run.output
 
 
 @pytest.fixture
@@ -52,31 +44,31 @@ def results(policies, tmp_path, monkeypatch):
 @pytest.mark.usefixtures("results")
 @pytest.mark.parametrize("command", ["build datastore", "calibrate"])
 def test_tasks_and_demonstrations_are_those_of_the_target(command):
-    plan = " ".join(kerv(*command.split(), MINE, "--plan").split())
+    plan = " ".join(told(*command.split(), MINE, "--plan").split())
     assert "1 tasks" in plan
-    assert "2 tasks" in " ".join(kerv(*command.split(), MINE, "task=[reach,push]", "--plan").split())
+    assert "2 tasks" in " ".join(told(*command.split(), MINE, "task=[reach,push]", "--plan").split())
 
 
 def test_a_target_is_trained_on_the_demonstrations_that_are_named(results):
-    planned = kerv("train", "target", "name=new", "demos=few", "--plan")
+    planned = told("train", "target", "name=new", "demos=few", "--plan")
     assert "8 demonstrations of 2 tasks, 6000 steps of 64 samples" in planned
-    refused = kerv("train", "target", "name=new", "demos=few", "task=drawer-open", "--plan", code=1)
+    refused = told("train", "target", "name=new", "demos=few", "task=drawer-open", "--plan", code=1)
     assert "no episode of drawer-open-v3" in refused
     assert "'kerv demos task=drawer-open-v3'" in refused
     (results / "artifacts/demos/few").rename(results / "artifacts/demos/reach")
-    assert "4 demonstrations of 1 tasks" in kerv("train", "target", "name=new", "task=reach", "--plan")
+    assert "4 demonstrations of 1 tasks" in told("train", "target", "name=new", "task=reach", "--plan")
 
 
 def test_missing_demonstrations_are_recorded_by_the_command_that_is_named(results):
     (results / "artifacts/demos/few").rename(results / "artifacts/demos/other")
-    line = kerv("build", "datastore", MINE, code=1)
+    line = told("build", "datastore", MINE, code=1)
     assert "kerv demos name=few task=reach episodes=4'" in line
-    assert "kerv demos name=few task=reach episodes=4'" in kerv("calibrate", MINE, "task=push", code=1)
-    assert "kerv demos task=mt10'" in kerv("calibrate", MINE, "task=push", "demos=mt10", code=1)
+    assert "kerv demos name=few task=reach episodes=4'" in told("calibrate", MINE, "task=push", code=1)
+    assert "kerv demos task=mt10'" in told("calibrate", MINE, "task=push", "demos=mt10", code=1)
     for command in (("train", "target", "name=new"), ("demos", "export")):
-        assert "kerv demos task=drawer-open'" in kerv(*command, "demos=drawer-open", code=1)
+        assert "kerv demos task=drawer-open'" in told(*command, "demos=drawer-open", code=1)
     assert "demos=other" in line
-    assert "kerv demos task=push'" in kerv("train", "target", "name=new", "task=push", code=1)
+    assert "kerv demos task=push'" in told("train", "target", "name=new", "task=push", code=1)
 
 
 @pytest.mark.usefixtures("results")
@@ -96,23 +88,23 @@ def test_a_rollout_and_a_study_run_on_the_tasks_that_the_target_knows():
 
 @pytest.mark.usefixtures("few_validations")
 def test_prepare_makes_what_is_missing_and_skips_what_is_there(results):
-    plan = kerv("prepare", MINE, "--plan")
+    plan = told("prepare", MINE, "--plan")
     words = [line.split() for line in plan.splitlines() if "│" in line]
     assert [(row[1], row[3]) for row in words] == [
         ("drafter", "there"), ("early", "missing"), ("datastore", "missing"), ("calibration", "missing"),
     ]  # fmt: skip
-    missing = kerv("rollout", "method=heisd", MINE, code=1)
+    missing = told("rollout", "method=heisd", MINE, code=1)
     assert f"kerv prepare {MINE}'" in missing
-    done = kerv("prepare", MINE, "for=heisd,one_pass", "steps=2")
+    done = told("prepare", MINE, "for=heisd,one_pass", "steps=2")
     assert "kerv sweep study=own policy.target=mine" in done
     for place in ("early/mine/early.json", "datastore/mine/manifest.json", "calibration/mine/calibration.json"):
         assert (results / "artifacts" / place).is_file()
-    assert kerv("prepare", MINE, "--plan").count("there") == 4
+    assert told("prepare", MINE, "--plan").count("there") == 4
     shutil.rmtree(results / "artifacts/datastore/mine")
-    assert "missing" in kerv("prepare", MINE, "--plan")
+    assert "missing" in told("prepare", MINE, "--plan")
     path = results / "artifacts/drafter/mine/drafter.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"target": "0" * 64}))
-    assert "kerv runs rm drafter/mine'" in kerv("prepare", MINE, "--plan", code=1)
+    assert "kerv runs rm drafter/mine'" in told("prepare", MINE, "--plan", code=1)
 
 
 @pytest.mark.usefixtures("few_validations")
@@ -128,8 +120,8 @@ def test_prepare_ends_with_all_files_after_a_full_disk(results, monkeypatch, fil
     words = ("prepare", MINE, "for=one_pass", "steps=2")
     with monkeypatch.context() as patch:
         patch.setattr(files.os, "replace", full)
-        assert "the disk is full" in kerv(*words, code=1)
-    kerv(*words)
+        assert "the disk is full" in told(*words, code=1)
+    told(*words)
     assert {RESUME, "log.csv", "curves.png"} <= {path.name for path in (results / "artifacts/early/mine").iterdir()}
 
 
@@ -144,19 +136,19 @@ def test_the_remedy_for_weights_of_another_target_works_as_it_is_typed(results):
     fast = ("train.steps=1", "train.batch=2", "drafter.samples=40")
     for path in (results / "artifacts/drafter/mine").iterdir():
         path.unlink()
-    kerv("train", "drafter", MINE, *fast)
+    told("train", "drafter", MINE, *fast)
     path = results / "artifacts/drafter/mine/drafter.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"target": "0" * 64}))
-    remove, train = typed(kerv(*rollout, code=1))
+    remove, train = typed(told(*rollout, code=1))
     assert (remove[:3], train) == (["runs", "rm", "drafter/mine"], ["train", "drafter"])
     train = [*train, MINE]
-    another = kerv(*train, "train.lr=0.5", "--plan", code=1)
+    another = told(*train, "train.lr=0.5", "--plan", code=1)
     assert "choose another policy.artifacts.drafter=, or remove it with 'kerv runs rm drafter/mine'" in another
-    kerv(*remove, "--yes")
-    kerv(*train, *fast)
-    assert "1 task, " in kerv(*rollout)
-    assert "4000 steps of 64" in kerv("train", "drafter", MINE, "policy.artifacts.drafter=b", "--plan")
-    few = kerv("train", "drafter", MINE, "policy.artifacts.drafter=b", "train.steps=400", "--plan")
+    told(*remove, "--yes")
+    told(*train, *fast)
+    assert "1 task, " in told(*rollout)
+    assert "4000 steps of 64" in told("train", "drafter", MINE, "policy.artifacts.drafter=b", "--plan")
+    few = told("train", "drafter", MINE, "policy.artifacts.drafter=b", "train.steps=400", "--plan")
     assert ", 400 steps of 64" in few
 
 
@@ -169,9 +161,9 @@ def test_an_artifact_is_shown_with_the_settings_that_it_was_made_with():
         "calibration/new": ["calibrate", "policy.target=new", *quick[:2], "decodes=0", "held_out=0.5"],
     }
     for name, words in made.items():
-        kerv(*words)
-        assert sorted(json.loads(kerv("runs", "show", name, "--json"))["command"]) == sorted(["kerv", *words])
-    assert "made by   kerv train target target=nano " in kerv("runs", "show", "target/new")
+        told(*words)
+        assert sorted(json.loads(told("runs", "show", name, "--json"))["command"]) == sorted(["kerv", *words])
+    assert "made by   kerv train target target=nano " in told("runs", "show", "target/new")
 
 
 def test_a_certificate_is_made_from_what_its_candidates_read():
@@ -199,10 +191,10 @@ class Tracker:
 
 def test_a_training_is_logged_as_it_runs_and_draws_its_curves(results, monkeypatch):
     words = ("train", "target", "name=short", "demos=few", "target=nano", "target.observation=state", "train.steps=3")
-    assert "pip install 'kerv[trackio]'" in kerv(*words, "log=trackio", code=2)
+    assert "pip install 'kerv[trackio]'" in told(*words, "log=trackio", code=2)
     tracker = Tracker()
     monkeypatch.setitem(sys.modules, "wandb", tracker)
-    kerv(*words, "log=wandb")
+    told(*words, "log=wandb")
     assert tracker.points == [(1, {"training"}), (2, {"training"}), (3, {"training"}), (3, {"validation"})]
     assert tracker.ended
     assert (results / "artifacts/target/short/curves.png").is_file()
@@ -219,10 +211,10 @@ def test_a_training_is_logged_as_it_runs_and_draws_its_curves(results, monkeypat
     ],
 )
 def test_prepare_refuses_what_cannot_be(words, says):
-    assert says in kerv("prepare", *words, code=2)
+    assert says in told("prepare", *words, code=2)
 
 
 @pytest.mark.usefixtures("results")
 @pytest.mark.parametrize("command", ["prepare", "build datastore", "calibrate", "train drafter", "rollout", "serve"])
 def test_a_wrong_target_is_noticed_before_anything_else(command):
-    assert "no target 'min'" in kerv(*command.split(), "policy.target=min", code=2)
+    assert "no target 'min'" in told(*command.split(), "policy.target=min", code=2)

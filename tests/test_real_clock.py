@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command import kerv
 from examples.insertion import SPEC as INSERTION
 from examples.point_mass import SPEC, PointWorld
-from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.spaces import Observation
-from kerv_cli.cli.app import app
 from kerv_cli.engine.cost import Profile
 from kerv_cli.engine.record import DecodeRecord, Delay, EpisodeRecord, Round
 from kerv_cli.episodes import policy as policies_of
@@ -294,8 +293,7 @@ def test_what_cannot_be_is_refused_in_one_line(results, words, message):
 
 def assert_refused(results: Path, words: str, message: str) -> None:
     target = [] if "expert" in words else ["policy.target=nano-state"]
-    done = CliRunner().invoke(app, ["rollout", f"task={TASK}", f"results={results}", *target, *words.split()])
-    assert done.exit_code == 2, done.output
+    done = kerv("rollout", f"task={TASK}", f"results={results}", *target, *words.split(), code=2)
     assert message in done.stderr
     assert done.stderr.splitlines()[-1].startswith("kerv:")
     assert done.stderr.count("kerv:") == 1

@@ -10,19 +10,12 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
+from command import told
 
 from kerv_cli.base.files import sha256_of
-from kerv_cli.cli.app import app
 from kerv_cli.targets import folders
 
 ROOT = Path(__file__).resolve().parents[1]
-
-
-def kerv(*words: str, code: int = 0) -> str:
-    run = CliRunner().invoke(app, list(words))
-    assert run.exit_code == code, run.output
-    return run.output
 
 
 def test_the_hashes_are_those_of_the_shipped_policies():
@@ -48,22 +41,22 @@ def archive(policies, tmp_path, monkeypatch):
 def test_a_policy_that_the_wheel_leaves_out_is_fetched(archive, tmp_path):
     results = f"results={tmp_path}/results"
     words = ("rollout", "policy=mt50", "task=reach", results, "--plan")
-    assert "kerv build policy source=mt50-vision.tar.gz" in kerv(*words, code=2)
+    assert "kerv build policy source=mt50-vision.tar.gz" in told(*words, code=2)
     handler = partial(http.server.SimpleHTTPRequestHandler, directory=str(tmp_path))
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         address = f"http://127.0.0.1:{server.server_address[1]}"
-        assert "pretrained/mt50-vision" in kerv("build", "policy", f"source={address}/{archive.name}", results)
-        assert "cannot be fetched" in kerv("build", "policy", f"source={address}/absent", results, code=1)
+        assert "pretrained/mt50-vision" in told("build", "policy", f"source={address}/{archive.name}", results)
+        assert "cannot be fetched" in told("build", "policy", f"source={address}/absent", results, code=1)
         server.shutdown()
-    assert "is there already" in kerv("build", "policy", f"source={archive}", results, code=2)
-    assert "1 task, 3 episodes" in kerv(*words)
+    assert "is there already" in told("build", "policy", f"source={archive}", results, code=2)
+    assert "1 task, 3 episodes" in told(*words)
     gc.collect()  # a connection that was left open is an error now, in this test
 
 
 def test_another_file_than_the_one_asked_for_is_refused(archive, tmp_path, monkeypatch):
     def refused(*words, code=1):
-        return kerv("build", "policy", f"source={archive}", f"results={tmp_path}/results", *words, code=code)
+        return told("build", "policy", f"source={archive}", f"results={tmp_path}/results", *words, code=code)
 
     assert "not sha256=00" in refused("sha256=00")
     monkeypatch.setitem(folders.RELEASED, "mt50-vision", "0" * 64)

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from command import kerv
 from studies_synthetic import episode, still_episode, swept, threshold_study
-from typer.testing import CliRunner
 
-from kerv_cli.cli.app import app
 from kerv_cli.engine.cost import Profile, prices, work_of_record
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.reprice import NamedProfile, open_profiles, repriced_table
@@ -77,7 +76,7 @@ def test_an_episode_costs_its_decodes_at_the_profiles_costs(results, data):
 
 
 def report(results: Path, *words: str) -> Any:
-    return CliRunner().invoke(app, ["report", "study=threshold", f"results={results}", *words])
+    return kerv("report", "study=threshold", f"results={results}", *words, code=None)
 
 
 def test_a_report_prices_the_study_on_several_machines(results):
@@ -120,8 +119,7 @@ def test_what_is_not_there_is_refused(results):
     done = report(results, "on=nowhere")
     assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
     assert "on=nowhere: no such profile. Make one with 'kerv bench target=TARGET" in done.stderr
-    every = CliRunner().invoke(app, ["report", f"results={results}", "on=there"])
-    assert every.exit_code == 2
+    every = kerv("report", f"results={results}", "on=there", code=2)
     assert "name the study" in every.stderr
 
 

@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from command import kerv
 from loaded import of_target
-from typer.testing import CliRunner
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import read_json
 from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.spaces import Observation
-from kerv_cli.cli.app import app
 from kerv_cli.cli.prepare import unsolved_by
 from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.decoder import Decoder, Parts
@@ -138,8 +137,7 @@ def test_it_is_trained_from_the_command_line_for_its_target_alone(results):
         "train.steps=4",
         "train.scene_steps=2",
     ]
-    done = CliRunner().invoke(app, [*words, "train.held_out=0.34", "train.validate_every=4", f"results={results}"])
-    assert done.exit_code == 0, done.output
+    done = kerv(*words, "train.held_out=0.34", "train.validate_every=4", f"results={results}")
     assert "object_error_cm" in done.stdout
     target, description = load_target(results / "artifacts/target/nano-vision")
     files, folder = ScoutDrafter(), results / "artifacts/scout/mine"
@@ -149,9 +147,8 @@ def test_it_is_trained_from_the_command_line_for_its_target_alone(results):
         check_sees(state)
     rollout = ["rollout", "method=scout_unverified", f"task={TASK}", "episodes=1", "record=0", "world.horizon=12"]
     rollout += ["policy.target=nano-vision", f"results={results}"]
-    assert CliRunner().invoke(app, [*rollout, "policy.artifacts.scout=mine"]).exit_code == 0
-    missing = CliRunner().invoke(app, rollout)
-    assert missing.exit_code == 1
+    kerv(*rollout, "policy.artifacts.scout=mine")
+    missing = kerv(*rollout, code=1)
     assert "no scout in" in missing.stderr
     assert "kerv prepare policy.target=nano-vision" in missing.stderr
 
@@ -242,56 +239,47 @@ def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results, mon
     )
     words = ["calibrate", "success", f"study={study}", "study.repeats=2", f"results={results}"]
     words += ["margin=99", "delta=0.5"]
-    unsolved = CliRunner().invoke(app, words)
-    assert "nothing is certified: AR solved 0 of 2 episodes" in unsolved.stdout, unsolved.output
+    unsolved = kerv(*words)
+    assert "nothing is certified: AR solved 0 of 2 episodes" in unsolved.stdout
     prepared = PrepareSettings(results=str(results), policy=PolicySettings(target="nano-vision"))
     assert "autoregressive decoding does not solve these tasks (0 % of its" in unsolved_by(prepared)
     monkeypatch.setattr("kerv_cli.report.certificate.SOLVED_BY_AR", 0.0)
-    done = CliRunner().invoke(app, words)
-    assert done.exit_code == 0, done.output
+    done = kerv(*words)
     path = results / "artifacts/target/nano-vision"  # beside the target
     assert "0/2" in done.stdout  # a repeat is no pair
     written = next(results.rglob("certificate.json"))
     assert written.is_file(), path
     serve = ["serve", "--plan", "policy.target=nano-vision", f"results={results}", "port=0"]
     serve += ["prefill_draft=scoped", "prefill_draft.outside=hold", "skip=certified"]
-    assert CliRunner().invoke(app, serve).exit_code == 0
+    kerv(*serve)
     deploy = ["rollout", "--plan", "method=one_pass_certified", "prefill_draft.outside=hold"]
     deploy += ["policy.target=nano-vision", f"task={TASK}", "threshold.r=9", "world.horizon=8", f"results={results}"]
-    other = CliRunner().invoke(app, deploy)
-    assert other.exit_code == 2  # before anything runs
+    other = kerv(*deploy, code=2)  # before anything runs
     assert "with proposer.kind=drafter: the certificate is of none" in other.stderr
-    assert CliRunner().invoke(app, [*deploy, "proposer=none"]).exit_code == 0
+    kerv(*deploy, "proposer=none")
     issued = written.read_text()
     written.write_text(issued.replace('"environment": "metaworld"', '"environment": "elsewhere"'))
-    refused = CliRunner().invoke(app, serve)
-    assert refused.exit_code == 2
+    refused = kerv(*serve, code=2)
     assert "with a policy of metaworld: the certificate is of elsewhere" in refused.stderr
     written.write_text(issued)
-    assert CliRunner().invoke(app, words).exit_code == 0  # the same test again is no second test
+    kerv(*words)  # the same test again is no second test
     assert read_json(written)["earlier"] == []
     few = [*words[:-2], "margin=1", "delta=0.5", "policy.artifacts.certificate=few"]
     rollout = ["rollout", "method=ar", "policy.target=nano-vision", f"task={TASK}", "seed=50510", "episodes=1"]
-    used = CliRunner().invoke(app, [*rollout, "record=0", "world.horizon=8", f"results={results}"])
-    assert used.exit_code == 0, used.output
+    kerv(*rollout, "record=0", "world.horizon=8", f"results={results}")
     for more, says in (
         ([], "again=true to test on other seeds at delta=0.25"),
         (["again=true"], "seeds 50500-50501 served an earlier test"),
         (["again=true", "seed=50509"], "ran this policy on some of these seeds"),
     ):
-        refused = CliRunner().invoke(app, [*few, *more])
-        assert refused.exit_code == 2, refused.output
-        assert says in refused.stderr
-    second = CliRunner().invoke(app, [*few, "again=true", "seed=50520", "--json"])
-    assert second.exit_code == 0, second.output
-    assert "nothing is certified" in second.stdout
+        assert says in kerv(*few, *more, code=2).stderr
+    assert "nothing is certified" in kerv(*few, "again=true", "seed=50520", "--json").stdout
     issued = read_json(results / "artifacts/certificate/few/certificate.json")
     (earlier,) = issued["earlier"]
     assert (issued["delta"], issued["seeds"]) == (0.25, "50520-50521")
     assert (earlier["seeds"], earlier["delta"], earlier["margin"]) == ("50500-50501", 0.5, 99.0)
     assert (earlier["order"], earlier["pairs"], earlier["certified"]) == (["half", "all"], 2, "all")
-    wrong = CliRunner().invoke(app, [*words, "seed=100000"])
-    assert wrong.exit_code == 2, wrong.output
+    kerv(*words, "seed=100000", code=2)
 
 
 @pytest.mark.parametrize(

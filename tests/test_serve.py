@@ -20,13 +20,12 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from command import kerv
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from kerv_cli.base.config import compose as compose_settings
 from kerv_cli.base.spaces import Observation
-from kerv_cli.cli.app import app
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.settings import PolicySettings
@@ -251,7 +250,7 @@ def test_grippers(policy, gripper, values):
 )
 def test_a_server_that_cannot_start_says_so(policies, words, said):
     target = [] if "policy.target=nobody" in words else ["policy.target=nano-vision"]
-    run = CliRunner().invoke(app, ["serve", *target, f"results={policies}", *words])
+    run = kerv("serve", *target, f"results={policies}", *words, code=None)
     assert run.exit_code in (1, 2)
     assert said in run.output
 

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command import told
 from test_calibration import write_dataset
 from test_training import quadratic
-from typer.testing import CliRunner
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.cli.app import app
 from kerv_cli.lab.command import STORE
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import Curve, making, run_rows
@@ -34,15 +33,8 @@ with making(results, "demos", results / "artifacts/demos/mine") as record:
 """
 
 
-def kerv(*words: str, code: int = 0) -> str:
-    """Return the output of a command that ends with this code."""
-    run = CliRunner().invoke(app, list(words))
-    assert run.exit_code == code, run.output
-    return run.output
-
-
 def listed(results: Path) -> list[dict[str, Any]]:
-    return json.loads(kerv("runs", "list", f"results={results}", "--json"))
+    return json.loads(told("runs", "list", f"results={results}", "--json"))
 
 
 def test_a_name_in_use_is_refused_and_a_killed_command_is_listed_with_how_to_go_on(tmp_path):
@@ -52,22 +44,22 @@ def test_a_name_in_use_is_refused_and_a_killed_command_is_listed_with_how_to_go_
         [sys.executable, "-c", HOLD, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout.readline() == "begun\n"
-        line = kerv("demos", "name=mine", "task=reach", f"results={tmp_path}", code=2)
+        line = told("demos", "name=mine", "task=reach", f"results={tmp_path}", code=2)
         assert f"demos mine is being made by process {process.pid}" in line
         assert listed(tmp_path)[0]["state"] == "running, 3 of 7"
-        assert "is running" in kerv("runs", "rm", "demos/mine", "--yes", f"results={tmp_path}", code=2)
+        assert "is running" in told("runs", "rm", "demos/mine", "--yes", f"results={tmp_path}", code=2)
         process.kill()
     with pytest.raises(UsageError), making(tmp_path, "demos", place, ["demos", "name=mine", "episodes=8"]):
         raise UsageError("these are others")
     (row,) = listed(tmp_path)
     assert (row["id"], row["state"], row["command"][:2]) == ("demos/mine", "interrupted, 3 of 7", ["kerv", "demos"])
-    assert again in kerv("runs", "show", "demos/mine", f"results={tmp_path}")
-    assert again in kerv("runs", "rerun", "demos/mine", f"results={tmp_path}", code=2)
+    assert again in told("runs", "show", "demos/mine", f"results={tmp_path}")
+    assert again in told("runs", "rerun", "demos/mine", f"results={tmp_path}", code=2)
     place.mkdir(parents=True)
     (place / "recording.json").write_text("{}")
     with pytest.raises(CheckpointError, match=again):
         open_demos(str(tmp_path), "mine")
-    kerv("runs", "rm", "demos/mine", "--yes", f"results={tmp_path}")
+    told("runs", "rm", "demos/mine", "--yes", f"results={tmp_path}")
     assert listed(tmp_path) == []
 
 
@@ -78,9 +70,9 @@ def test_every_command_that_makes_something_has_a_row(policies, tmp_path):
     shutil.copytree(policies / "artifacts", tmp_path / "artifacts")
     write_dataset(tmp_path / "artifacts/demos/few", episodes=4)
     where = (f"results={tmp_path}", "policy.target=nano-state", "demos=few")
-    kerv("build", "datastore", *where)
-    kerv("calibrate", *where, "decodes=0")
-    kerv("train", "target", "name=mine", "target=nano", "target.observation=state", "train.steps=2",
+    told("build", "datastore", *where)
+    told("calibrate", *where, "decodes=0")
+    told("train", "target", "name=mine", "target=nano", "target.observation=state", "train.steps=2",
          "train.validate_every=1", *where[::2])  # fmt: skip
     rows = {(row.kind, row.name): row for row in run_rows(Database(tmp_path))}
     assert {key: row.status for key, row in rows.items()} == dict.fromkeys(
@@ -91,7 +83,7 @@ def test_every_command_that_makes_something_has_a_row(policies, tmp_path):
     folder = tmp_path / "artifacts/target/mine"
     (folder / "log.csv").write_text("step,score\n1,0\n")
     assert read_log(folder)["step"].tolist() == [1, 2]
-    (csv,) = kerv("runs", "export", "target/mine", where[0]).splitlines()[:1]
+    (csv,) = told("runs", "export", "target/mine", where[0]).splitlines()[:1]
     assert len(Path(csv).read_text().splitlines()) == 3
 
 
@@ -109,14 +101,14 @@ def test_a_curve_has_each_validation_once(tmp_path):
 def test_a_store_is_used_by_one_command_and_no_password_is_kept(tmp_path, monkeypatch):
     monkeypatch.delenv(STORE, raising=False)
     other, where = Database(tmp_path, f"sqlite:///{tmp_path}/other.db"), f"results={tmp_path}"
-    kerv("build", "target", f"checkpoint={tmp_path}", f"store={other.url}", where, code=1)
+    told("build", "target", f"checkpoint={tmp_path}", f"store={other.url}", where, code=1)
     assert [row.status for row in run_rows(other)] == ["failed"]
     assert run_rows(Database(tmp_path)) == []
     assert STORE not in os.environ
     store = "store=postgresql://me:secret@127.0.0.1:1/kerv"
-    assert "store: postgresql://me@127.0.0.1:1/kerv" in kerv("build", "target", store, "--cfg")
-    line = kerv("runs", "list", store, where, code=1)
+    assert "store: postgresql://me@127.0.0.1:1/kerv" in told("build", "target", store, "--cfg")
+    line = told("runs", "list", store, where, code=1)
     assert "does not answer" in line
     assert "secret" not in line
     for url in ("nonsense", "mysql://server/kerv", "postgresql://kerv@host:port/kerv"):
-        assert "postgresql://USER@HOST/DB" in kerv("runs", "list", f"store={url}", where, code=2)
+        assert "postgresql://USER@HOST/DB" in told("runs", "list", f"store={url}", where, code=2)

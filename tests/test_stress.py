@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command import kerv
 from examples.insertion import SPEC as INSERTION
-from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.cli.app import app
 from kerv_cli.episodes.identity import stress_of, work_of
 from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.runner import Runner, close_worlds
@@ -252,7 +251,6 @@ def test_what_an_environment_cannot_do_is_refused():
 
 def test_the_command_line_stresses_and_records_it_in_every_row(tmp_path):
     words = ["rollout", "-m", "policy=expert", "task=insert-peg", "episodes=2", "record=0", f"results={tmp_path}"]
-    run = CliRunner().invoke(app, [*words, "world.stress.kind=push", "world.stress.level=0,2", "--json"])
-    assert run.exit_code == 0, run.stderr
+    run = kerv(*words, "world.stress.kind=push", "world.stress.level=0,2", "--json")
     rows = json.loads(run.stdout)["settings"]
     assert [(row["stress"], row["stress_level"]) for row in rows] == [("none", 0), ("push", 2)]

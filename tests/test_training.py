@@ -12,14 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from command import kerv
 from safetensors.torch import load_file
 from torch import nn
-from typer.testing import CliRunner
 
 from kerv_cli.base import files
 from kerv_cli.base.errors import CheckpointError, Interrupted
 from kerv_cli.base.files import sha256_of
-from kerv_cli.cli.app import app
 from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.settings import TargetSettings
@@ -221,8 +220,7 @@ def test_waypoints_are_where_the_gripper_changes_next_and_where_the_episode_ends
 
 def train(results: Path, *arguments: str) -> str:
     """What the command prints."""
-    done = CliRunner().invoke(app, ["train", *arguments, f"results={results}", "demos=few"])
-    assert done.exit_code == 0, done.output
+    done = kerv("train", *arguments, f"results={results}", "demos=few")
     return done.stdout
 
 
@@ -257,8 +255,7 @@ def test_training_counts_subnormal_numbers_as_zero_and_this_thread_nothing_later
 
     monkeypatch.setattr(Imitation, "loss", watched)
     words = ["target=nano", "task=drawer-close", "train.batch=2", "train.steps=2", "train.validate_every=2"]
-    result = CliRunner().invoke(app, ["train", "target", "name=flushed", *words, "demos=few", f"results={results}"])
-    assert result.exit_code == 0, result.output
+    kerv("train", "target", "name=flushed", *words, "demos=few", f"results={results}")
     assert halves == [0.0, 0.0]
     assert float(torch.tensor(1e-39) * 0.5) > 0
 

@@ -18,11 +18,11 @@ import msgpack
 import numpy as np
 import pytest
 import vla_eval
+from command import kerv, told
 from examples.tiny_openvla import write_checkpoint
 from PIL import Image
 from studies_synthetic import swept, threshold_study
 from test_serve import serving
-from typer.testing import CliRunner
 from vla_eval.benchmarks.base import StepBenchmark, StepResult
 from vla_eval.model_servers.predict import PredictModelServer
 from vla_eval.orchestrator import Orchestrator
@@ -42,7 +42,6 @@ from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import Observation
 from kerv_cli.catalogue.evaluations import labelled, read_evaluations, read_served
-from kerv_cli.cli.app import app
 from kerv_cli.episodes.runner import Runner
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.serve.policy import Policy
@@ -84,12 +83,6 @@ def evaluated(policy: Policy, config: Mapping[str, Any], folder: Path, name: str
 
 def run(config: Mapping[str, Any], url: str, folder: Path, name: str) -> list[dict[str, Any]]:
     return vla_eval.run(dict(config), server_url=url, output_dir=folder, eval_id=name)
-
-
-def kerv(*words: str) -> str:
-    result = CliRunner().invoke(app, list(words))
-    assert result.exit_code == 0, result.output
-    return result.output
 
 
 # --- kerv's policies as a model server
@@ -327,7 +320,7 @@ def recordings(results, tmp_path_factory):
 
 
 def test_evaluations_of_the_same_episodes_are_paired(results, recordings):
-    said = kerv("runs", "import", *map(str, recordings.values()), "name=three", f"results={results}", "--json")
+    said = told("runs", "import", *map(str, recordings.values()), "name=three", f"results={results}", "--json")
     rows = {r["label"]: r for r in json.loads(said)["settings"] if r["averaging"].startswith("micro")}
     assert list(rows) == ["ar", "naive_sd", "Scripted"]
     assert rows["naive_sd"]["pairs"] == rows["Scripted"]["pairs"] == rows["Scripted"]["only_method"] == 3
@@ -338,23 +331,22 @@ def test_evaluations_of_the_same_episodes_are_paired(results, recordings):
     assert len({episode.start for episode in scripted.episodes}) == 3
     assert rows["naive_sd"]["speedup"] is None, "the evaluations did not take turns"
     assert rows["ar"]["target_sha256"]
-    report = kerv("report", "study=three", f"results={results}")
+    report = told("report", "study=three", f"results={results}")
     assert "Scripted" in report
-    assert "three" in kerv("runs", "list", f"results={results}")
-    assert "success" in kerv("runs", "compare", "three:ar", "three:Scripted", f"results={results}")
-    assert "three" in kerv("report", "--choose", "study=three", "loss=50", f"results={results}")
+    assert "three" in told("runs", "list", f"results={results}")
+    assert "success" in told("runs", "compare", "three:ar", "three:Scripted", f"results={results}")
+    assert "three" in told("report", "--choose", "study=three", "loss=50", f"results={results}")
     about = json.loads((results / "report/tables/three.json").read_text())["labels"].values()
     assert {one["provenance"]["executor"] for one in about} == {"vla-eval"}
-    refused = CliRunner().invoke(app, ["runs", "rerun", "three", f"results={results}"])
-    assert (refused.exit_code, "was imported: run vla-eval again" in refused.output) == (2, True)
+    assert "was imported: run vla-eval again" in told("runs", "rerun", "three", f"results={results}", code=2)
 
 
 def test_an_import_again_replaces_the_study_and_no_other(results, recordings):
     for _ in range(2):
-        kerv("runs", "import", str(recordings["ar"]), "name=again", "labels=mine", f"results={results}")
-    assert "mine" in kerv("runs", "show", "again", f"results={results}")
+        told("runs", "import", str(recordings["ar"]), "name=again", "labels=mine", f"results={results}")
+    assert "mine" in told("runs", "show", "again", f"results={results}")
     swept(results, threshold_study(["reach-v3"], name="own"))
-    refused = CliRunner().invoke(app, ["runs", "import", str(recordings["ar"]), "name=own", f"results={results}"])
+    refused = kerv("runs", "import", str(recordings["ar"]), "name=own", f"results={results}", code=2)
     assert "study 'own' exists and was not imported" in refused.output
 
 
@@ -381,11 +373,11 @@ def test_a_killed_shard_leaves_episodes_that_are_missing_until_it_ran_again(resu
         anyio.run(Orchestrator(config, 0, 2, "shards").run)
         patch.undo()
         words = ["runs", "import", str(tmp_path), "name=shards", f"results={results}"]
-        assert "ar: 1 of 4 episodes of MetaWorld are missing" in kerv(*words)
-        assert "3 of 4 episodes" in kerv("runs", "show", "shards", f"results={results}")
+        assert "ar: 1 of 4 episodes of MetaWorld are missing" in told(*words)
+        assert "3 of 4 episodes" in told("runs", "show", "shards", f"results={results}")
         anyio.run(Orchestrator(config, 1, 2, "shards").run)
-    assert "missing" not in kerv(*words)
-    assert re.search(r"state +complete", kerv("runs", "show", "shards", f"results={results}"))
+    assert "missing" not in told(*words)
+    assert re.search(r"state +complete", told("runs", "show", "shards", f"results={results}"))
 
 
 def _cut(path: Path) -> None:
@@ -409,7 +401,7 @@ def test_a_harmed_recording_is_refused_in_one_line(recordings, tmp_path, harm, s
     path = tmp_path / "recording-x.sqlite"
     shutil.copy(recordings["ar"], path)
     harm(path)
-    refused = CliRunner().invoke(app, ["runs", "import", str(path), f"results={tmp_path}"])
+    refused = kerv("runs", "import", str(path), f"results={tmp_path}", code=None)
     assert refused.exit_code in (1, 2)
     assert said in refused.output
     assert refused.output.count("\n") == 1
@@ -486,7 +478,7 @@ def test_openvla_on_liberos_interface_from_checkpoint_to_paired_table(tmp_path):
     results = tmp_path / "results"
     checkpoint = write_checkpoint(tmp_path / "checkpoint")
     built = ["target=openvla", f"checkpoint={checkpoint}", "name=libero", "camera=agentview", "control_hz=20"]
-    kerv("build", "target", *built, "crop=true", "libero=true", "prompt_tokens=120", f"results={results}")
+    told("build", "target", *built, "crop=true", "libero=true", "prompt_tokens=120", f"results={results}")
     config = config_of(f"{__name__}:Stand", 2, suite="libero_spatial")
     recordings = []
     for method in ("ar", "jacobi"):
@@ -496,7 +488,7 @@ def test_openvla_on_liberos_interface_from_checkpoint_to_paired_table(tmp_path):
         pair = own["action_spec"], stand.get_action_spec(), own["observation_spec"], stand.get_observation_spec()
         assert check_specs(*pair) == []
         recordings.append(str(evaluated(policy, config, tmp_path / method, method)))
-    said = kerv("runs", "import", *recordings, "name=libero", f"results={results}", "--json")
+    said = told("runs", "import", *recordings, "name=libero", f"results={results}", "--json")
     rows = {row["label"]: row for row in json.loads(said)["settings"] if row["averaging"].startswith("micro")}
     assert rows["jacobi"]["pairs"] == 4
     assert rows["jacobi"]["difference"] == 0

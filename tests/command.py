@@ -1,0 +1,18 @@
+"""The command line in this process, which has loaded the libraries already."""
+
+from click.testing import Result
+from typer.testing import CliRunner
+
+from kerv_cli.cli.app import app
+
+
+def kerv(*words: str, code: int | None = 0) -> Result:
+    """Run a command and check its exit code; None allows any."""
+    run = CliRunner().invoke(app, list(words))
+    assert code in (None, run.exit_code), run.output
+    return run
+
+
+def told(*words: str, code: int | None = 0) -> str:
+    """Return all that a command prints."""
+    return str(kerv(*words, code=code).output)
