@@ -13,6 +13,8 @@ import pytest
 from loaded import module_of
 from packaging.requirements import Requirement
 
+from kerv_cli.targets import provenance
+
 ROOT = Path(__file__).resolve().parents[1]
 STAMP = Path(".venv/.kerv-installed")
 TOOLS = ("awk", "bash", "cat", "chmod", "dirname", "env", "grep", "make", "mkdir", "rm", "sleep", "touch")
@@ -323,3 +325,21 @@ def test_the_graphics_check_agrees_that_this_machine_can_draw():
     check = subprocess.run(command, capture_output=True, text=True, check=False)
     assert check.returncode == 0
     assert check.stdout.strip() in {"egl", "osmesa"}
+
+
+def test_a_change_anywhere_in_the_checkout_marks_the_commit(tmp_path):
+    package, config = tmp_path / "kerv/package", tmp_path / "kerv/conf/method.yaml"
+    for path in (package / "__init__.py", config):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("r: 1\n")
+    git = ["git", "-C", str(tmp_path / "kerv"), "-c", "user.name=a", "-c", "user.email=a@b"]
+    assert provenance.git_commit(package) == "none"
+    provenance.git_commit.cache_clear()
+    for words in (["init", "-q"], ["add", "."], ["commit", "-qm", "first"]):
+        subprocess.run([*git, *words], check=True)
+    commit = provenance.git_commit(package)
+    assert len(commit) == 40
+    provenance.git_commit.cache_clear()
+    config.write_text("r: 2\n")
+    assert provenance.git_commit(package) == f"{commit}+changes"
+    provenance.git_commit.cache_clear()

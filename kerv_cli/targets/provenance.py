@@ -72,14 +72,18 @@ def device_name(device: str) -> str:
 
 
 @functools.cache
-def git_commit() -> str:
-    """Return the git commit of kerv, with `+changes` if files were modified. `none` if this is no checkout of kerv."""
-    if shutil.which("git") is None or not _git("ls-files", "--error-unmatch", "__init__.py"):
+def git_commit(folder: Path = _HERE) -> str:
+    """Return the git commit of kerv, with `+changes` if tracked files of the whole checkout were modified.
+
+    Args:
+        folder: A folder of kerv's source code. The result is `none` if it is not part of a checkout.
+    """
+    if shutil.which("git") is None or not _git(folder, "ls-files", "--error-unmatch", "__init__.py"):
         return "none"  # an installed copy may be inside another project's repository
-    changes = _git("status", "--porcelain", "--untracked-files=no", "--", ".")
-    return _git("rev-parse", "HEAD") + ("+changes" if changes else "")
+    changes = _git(folder, "status", "--porcelain", "--untracked-files=no", "--", ":/")
+    return _git(folder, "rev-parse", "HEAD") + ("+changes" if changes else "")
 
 
-def _git(*arguments: str) -> str:
-    process = subprocess.run(["git", "-C", str(_HERE), *arguments], capture_output=True, text=True, check=False)
+def _git(folder: Path, *arguments: str) -> str:
+    process = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=False)
     return process.stdout.strip() if process.returncode == 0 else ""
