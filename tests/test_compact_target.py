@@ -203,6 +203,28 @@ def test_grown_layers_compute_the_same(policies, width, heads, units, layers):
         torch.testing.assert_close(target.trunk(x, positions), expected, rtol=1e-3, atol=1e-5)
 
 
+@given(st.integers(0, 9999), st.integers(1, 20), st.integers(0, 6), st.integers(1, 80), st.booleans())
+def test_a_padded_prompt_changes_no_output(seed, prompt, draft, padding, fixed):
+    torch.manual_seed(seed)
+    trunk, tokens = Trunk(32, 2, 2, 48).eval().requires_grad_(False), prompt + draft
+    seen = np.tri(tokens, dtype=bool)
+    seen[prompt:, prompt:] &= np.random.default_rng(seed).random((draft, draft)) < 0.5
+    seen[np.diag_indices(tokens)] = True
+    x, batch = torch.randn(2, tokens + 3, 32), 1 if fixed else 2
+    x, positions, outputs = x[:batch], torch.arange(tokens + 3), []
+    for trunk.padding in (0, padding):
+        for compiled in (False, True):
+            trunk.packed = trunk.pack_weights() if compiled else None
+            cache = trunk.new_cache(batch, tokens + 3, fixed)
+            with torch.inference_mode():
+                first = trunk(x[:, :tokens], positions[:tokens], cache, seen if draft else None)
+                rest = trunk(x[:, tokens:], positions[tokens:], cache)
+            assert cache.length == tokens + 3
+            outputs.append(torch.cat([first, rest], 1))
+    for output in outputs[1:]:
+        torch.testing.assert_close(output, outputs[0], rtol=1e-4, atol=1e-5)
+
+
 def test_a_shape_that_is_too_small_is_refused(policies):
     target, _ = load_target(find_target(str(policies), "nano-vision"))
     for shape in (GrowSettings(width=16, heads=2, feed_forward=64), GrowSettings(width=72, heads=3, feed_forward=64)):
@@ -212,6 +234,7 @@ def test_a_shape_that_is_too_small_is_refused(policies):
 
 def test_a_policy_grows_by_command_and_keeps_its_drafter(policies, tmp_path):
     shape = ["grow.width=128", "grow.heads=2", "grow.feed_forward=160", "grow.layers=3", "grow.drafter=true"]
+    shape.append("grow.prompt=70")
     command = ["build", "target", *shape, "policy.target=nano-vision", f"name={tmp_path}/large"]
     kerv(*command, f"results={policies}", "--json")
     folder = tmp_path / "large"

@@ -2,8 +2,9 @@
 
 It shows how a method behaves at the speed of a larger model (docs/methods.md §0.2). Only the layers grow. They get
 additional channels that stay zero, additional heads and hidden units whose output weights are zero, and additional
-layers that add nothing. The outputs are equal except for rounding, but every weight is read and multiplied. The folder
-of a grown target contains a recipe. The weights are made when it is loaded.
+layers that add nothing. A longer prompt consists of masked tokens, which a prefill computes and drops. The outputs are
+equal except for rounding, but every weight is read and multiplied. The folder of a grown target contains a recipe. The
+weights are made when it is loaded.
 """
 
 from __future__ import annotations
@@ -154,10 +155,17 @@ def build(folder: Path, description: TargetDescription, device: str, dtype: torc
     recipe = recipe_of(description)
     base = Path(recipe.base)
     target = build_compact(base, checkpoint.read_target(base), device, dtype)
-    grow_stack(target.trunk, recipe, recipe.layers)
+    _grow(target, recipe)
     target.sha256, target.grown_drafter = description.sha256, recipe if recipe.drafter else None
     pack(target)
     return target
+
+
+def _grow(target: CompactTarget, shape: GrowSettings) -> None:
+    if 0 < shape.prompt < target.max_prompt:
+        raise UsageError(f"grow.prompt={shape.prompt}: the policy's prompt has {target.max_prompt} tokens already")
+    grow_stack(target.trunk, shape, shape.layers)
+    target.trunk.padding = max(0, shape.prompt - target.max_prompt)
 
 
 def grow(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
@@ -175,8 +183,11 @@ def grow(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
         raise UsageError(f"policy.target={settings.base} is of family {description.family}: only compact ones grow")
     recipe = Recipe(**asdict(settings.grow), base=str(base), sha256=description.sha256)
     target = build_compact(base, description, "cpu", torch.float32)
-    grow_stack(target.trunk, recipe, recipe.layers)
-    digest = hashlib.sha256(json.dumps(asdict(recipe) | {"base": ""}, sort_keys=True).encode()).hexdigest()
+    _grow(target, recipe)
+    identity = asdict(recipe) | {"base": ""}
+    if not recipe.prompt:
+        del identity["prompt"]  # targets that were grown before this setting existed keep their hash
+    digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
     written = checkpoint.target_fields(
         "grown", {**description.settings, "grown": asdict(recipe)}, description.environment, description.actions,
         description.observation, cameras=description.cameras, words=description.words,

@@ -18,6 +18,7 @@ class GrowSettings:
     feed_forward: int = number(0, 0, 262_144, help="hidden units of a layer")
     layers: int = number(0, 0, 1024, help="decoder layers")
     drafter: bool = setting(False, "enlarge the drafter's layers too, to the same shape")
+    prompt: int = number(0, 0, 4096, help="prompt tokens that a prefill pays for; 0: as many as there are")
 
 
 @dataclass

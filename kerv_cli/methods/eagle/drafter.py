@@ -319,6 +319,7 @@ class EagleDrafter(TrainableDrafter):
         network: EagleNetwork = super().load(path, artifacts)
         if (shape := getattr(artifacts.target, "grown_drafter", None)) is not None:
             grow_stack(network, shape, layers=network.depth)
+            network.padding = artifacts.target.trunk.padding
             pack(network)
         return network
 

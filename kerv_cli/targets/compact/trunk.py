@@ -19,6 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from kerv_cli.engine.transfer import upload
 from kerv_cli.targets.attention import Cache, Slots, attention_mask, rotate, write
 from kerv_cli.targets.compact.bfloat16 import Bfloat16Layers, multiplies_bfloat16
 from kerv_cli.targets.compact.captured import CapturedCache
@@ -116,9 +117,11 @@ class LayerStack(Packable):
         outer: E, width of inputs and outputs. Equals `width` unless the stack was enlarged (`targets/grown.py`).
         heads: Number of attention heads.
         depth: Number of layers.
+        padding: Number of masked tokens that a forward without cached tokens computes in vain (`targets/grown.py`).
     """
 
     inputs = 1
+    padding = 0
 
     def __init__(self, width: int, layers: int, heads: int, feed_forward: int) -> None:
         super().__init__()
@@ -151,7 +154,7 @@ class LayerStack(Packable):
         like: Tensor = self.norm.weight
         if isinstance(self.packed, Bfloat16Layers):
             like = like.float()
-        sizes = self.depth, batch, self.heads, capacity, self.width // self.heads
+        sizes = self.depth, batch, self.heads, capacity + self.padding, self.width // self.heads
         fixed = like.is_cuda if fixed is None else fixed
         return CapturedCache(*sizes, like) if fixed else Cache(*sizes, like)
 
@@ -178,6 +181,13 @@ class LayerStack(Packable):
             cache: Keys and values of earlier tokens. None: there are none.
             seen: Which tokens each new one attends to, as in `attention_mask`. None: attention is causal.
         """
+        tokens, padding = inputs[0].shape[1], 0 if cache is not None and cache.length else self.padding
+        if padding:
+            inputs = [F.pad(x, (0, 0, 0, padding)) for x in inputs]
+            positions = F.pad(positions, (0, padding))
+            if seen is not None:  # padding sees every token, and no other token sees it
+                seen = seen if isinstance(seen, Tensor) else upload(seen, positions.device)
+                seen = F.pad(F.pad(seen, (0, padding)), (0, 0, 0, padding), value=True)
         x = inputs[0]
         mask = attention_mask(seen, x.shape[1], cache, x)
         packed = self.packed if self.is_packed(x) and (cache is None or not cache.fixed) else None
@@ -191,8 +201,8 @@ class LayerStack(Packable):
             layers = self.run_layers if packed is None else packed
             hidden = self.finish(layers(self.begin(*inputs), positions, cache, slots, mask))
         if cache is not None:
-            cache.length += x.shape[1]
-        return hidden
+            cache.length += tokens  # the next forward overwrites the padding
+        return hidden[:, :tokens]
 
     def captures(self, x: Tensor) -> bool:
         """Return whether a forward of x (B, T, E) can run in a captured graph: batch 1 on CUDA, without gradients."""
