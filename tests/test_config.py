@@ -145,8 +145,7 @@ def test_what_is_wrong_or_out_of_range_is_refused_in_one_line(command, override,
 
 
 @pytest.mark.parametrize(
-    "override",
-    ["boundary.f_star=nan", "boundary.window=2", "boundary.alpha=1.5", "boundary.alpha=nan", "skip.up=inf"],
+    "override", ["boundary.f_star=nan", "boundary.window=2", "boundary.alpha=1.5", "boundary.alpha=nan", "skip.up=inf"]
 )
 def test_a_parts_numbers_have_ranges_too(override):
     with pytest.raises(UsageError, match=override.partition("=")[0]):

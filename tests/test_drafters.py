@@ -18,13 +18,7 @@ from kerv_cli.methods.artifacts import MadeFor
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.early import EarlySettings
-from kerv_cli.methods.early.drafter import (
-    EarlyDrafter,
-    EarlyExamples,
-    EarlyNetwork,
-    choose,
-    choose_with_odds,
-)
+from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyExamples, EarlyNetwork, choose, choose_with_odds
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.settings import TargetSettings

@@ -194,8 +194,7 @@ class Greedy(InsertionWorld):
 
 
 @pytest.mark.parametrize(
-    ("world", "what"),
-    [(Noisy, "same seed, same episode"), (Blank, "frames"), (Greedy, "another seed, another start")],
+    ("world", "what"), [(Noisy, "same seed, same episode"), (Blank, "frames"), (Greedy, "another seed, another start")]
 )
 def test_a_broken_environment_is_found(monkeypatch, world, what):
     monkeypatch.setattr(sys.modules[__name__], "Chosen", world, raising=False)

@@ -439,13 +439,7 @@ def test_weights_that_changed_after_the_import_are_refused(checkpoint, tmp_path)
     assert f"no longer in {copy}" in kerv(*run)[1]
 
 
-@pytest.mark.parametrize(
-    ("image", "words"),
-    [
-        (None, "open"),
-        (np.zeros((56, 56, 3), np.uint8), "turn " * 90),
-    ],
-)
+@pytest.mark.parametrize(("image", "words"), [(None, "open"), (np.zeros((56, 56, 3), np.uint8), "turn " * 90)])
 def test_a_wrong_observation_is_refused(target, image, words):
     images = {} if image is None else {"primary": image}
     with pytest.raises(KervError):

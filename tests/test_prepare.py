@@ -32,10 +32,7 @@ def results(policies, tmp_path, monkeypatch):
         shutil.copytree(policies / "artifacts" / kind / "nano-state", folder / "artifacts" / kind / "mine")
     path = folder / "artifacts/target/mine/target.json"
     described = json.loads(path.read_text())
-    described["provenance"] |= {
-        "settings": {"task": ["reach"], "demos": "few"},
-        "demos": {"config": {"episodes": 4}},
-    }
+    described["provenance"] |= {"settings": {"task": ["reach"], "demos": "few"}, "demos": {"config": {"episodes": 4}}}
     path.write_text(json.dumps(described))
     write_dataset(folder / "artifacts/demos/few", episodes=4, names=(TASK, "push-v3"))
     return folder

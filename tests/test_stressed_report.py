@@ -92,13 +92,7 @@ def test_sums_count_every_stressed_world_once(table):
     sums = ["light", "push", "level 1", "level 4", "all"]
     assert list(found) == [f"{name} {one}" for one in sums for name in ("ar", "bold")]
     counted = {one: (found[f"bold {one}"]["successes"], found[f"bold {one}"]["episodes"]) for one in sums}
-    assert counted == {
-        "light": (60, 80),
-        "push": (60, 80),
-        "level 1": (80, 80),
-        "level 4": (40, 80),
-        "all": (120, 160),
-    }
+    assert counted == {"light": (60, 80), "push": (60, 80), "level 1": (80, 80), "level 4": (40, 80), "all": (120, 160)}
     assert (found["ar all"]["successes"], found["ar all"]["baseline"]) == (140, "ar all")
     lost = found["bold all"]
     assert (lost["only_baseline"], lost["only_method"], lost["pairs"]) == (20, 0, 160)

@@ -27,15 +27,7 @@ from vla_eval.benchmarks.base import StepBenchmark, StepResult
 from vla_eval.model_servers.predict import PredictModelServer
 from vla_eval.orchestrator import Orchestrator
 from vla_eval.recording import RecordingStore
-from vla_eval.specs import (
-    GRIPPER_CLOSE_POS,
-    IMAGE_RGB,
-    LANGUAGE,
-    POSITION_DELTA,
-    ROTATION_AA,
-    DimSpec,
-    check_specs,
-)
+from vla_eval.specs import GRIPPER_CLOSE_POS, IMAGE_RGB, LANGUAGE, POSITION_DELTA, ROTATION_AA, DimSpec, check_specs
 from websockets.sync.client import connect
 
 from kerv_cli.base.config import compose
