@@ -4,6 +4,7 @@ import contextlib
 import gc
 import os
 import secrets
+import shutil
 import socket
 import subprocess
 import sys
@@ -94,6 +95,12 @@ def policies(tmp_path_factory):
     write_policy(results, "nano-state", "state")
     write_policy(results, "nano-vision", "vision", seed=1)
     return results
+
+
+@pytest.fixture
+def results(policies, tmp_path):
+    """A results folder with a copy of the policies, which a test may change."""
+    return Path(shutil.copytree(policies, tmp_path / "results"))
 
 
 @pytest.fixture

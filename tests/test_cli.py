@@ -71,9 +71,7 @@ def test_help_is_fast(words):
     assert min(seconds(asked) for _ in range(5)) < max(0.5, 6 * typer)
 
 
-def test_what_is_missing_or_damaged_gets_one_line_and_exit_code_1(policies, tmp_path):
-    results = tmp_path / "results"
-    shutil.copytree(policies, results)
+def test_what_is_missing_or_damaged_gets_one_line_and_exit_code_1(results):
     common = ["task=reach-v3", *FAST, f"results={results}"]
     assert "no target 'absent'" in one_line(kerv("rollout", *common, "policy.target=absent"), 2)
     weights = results / "artifacts/target/nano-state/model.safetensors"
@@ -85,9 +83,7 @@ def test_what_is_missing_or_damaged_gets_one_line_and_exit_code_1(policies, tmp_
     assert "demonstrations" in one_line(kerv("train", "target", "name=new", f"results={results}"), 1)
 
 
-def test_no_graphics_gets_the_command_that_brings_them(policies, tmp_path):
-    results = tmp_path / "results"
-    shutil.copytree(policies, results)
+def test_no_graphics_gets_the_command_that_brings_them(results):
     run = process(
         "rollout",
         "task=reach-v3",
@@ -100,9 +96,7 @@ def test_no_graphics_gets_the_command_that_brings_them(policies, tmp_path):
     assert "MUJOCO_GL" in one_line(run, 1) or "apt-get install" in one_line(run, 1)
 
 
-def test_rollout_prints_figures_and_writes_a_recording(policies, tmp_path):
-    results = tmp_path / "results"
-    shutil.copytree(policies, results)
+def test_rollout_prints_figures_and_writes_a_recording(results):
     run = kerv(
         "rollout", "method=spec_vla", "task=drawer-open", "episodes=1", "world.horizon=10", "policy.target=nano-vision",
         f"results={results}",
@@ -114,9 +108,7 @@ def test_rollout_prints_figures_and_writes_a_recording(policies, tmp_path):
     assert recording.stat().st_size > 10_000
 
 
-def test_sweep_resumes_and_report_writes_tables(policies, tmp_path):
-    results = tmp_path / "results"
-    shutil.copytree(policies, results)
+def test_sweep_resumes_and_report_writes_tables(results, tmp_path):
     study = tmp_path / "small.yaml"
     study.write_text(
         "title: Small\nbaseline: ar\naxis: threshold.r\n"

@@ -1,24 +1,34 @@
-"""The scripted expert in the policy's place: closed loop on real Meta-World, and every reader of its records."""
+"""Scripted experts in the policy's place: every reader of their records, our own experts, and a world without one."""
 
 import dataclasses
 import math
+import warnings
+from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
 import pytest
+from examples.point_mass import SPEC as POINT
 from rerun_synthetic import read_recording
 
-from kerv_cli.base.errors import KervError, UnknownName
+from kerv_cli.base import registry
+from kerv_cli.base.config import compose
+from kerv_cli.base.errors import KervError, UnknownName, UsageError
+from kerv_cli.base.registry import Part
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.record import PHASES
 from kerv_cli.episodes.episode import run_episode
-from kerv_cli.episodes.policy import ExpertDecoder
+from kerv_cli.episodes.policy import ExpertDecoder, check
 from kerv_cli.episodes.rows import decodes_table, episode_row, read_decodes, table_blob
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.report.measures import MACRO, MICRO, measure
 from kerv_cli.report.viewing import save_recording
 from kerv_cli.report.viewing.token_outcomes import summary
+from kerv_cli.worlds.demos.recording import DemoConfig, _identity
+from kerv_cli.worlds.metaworld.experts import VERSION, HandlePullSide
 from kerv_cli.worlds.metaworld.spec import SPEC
-from kerv_cli.worlds.settings import EVALUATION_SEED
+from kerv_cli.worlds.settings import EVALUATION_SEED, CameraSettings
+from kerv_cli.worlds.spec import World
 
 NAME = "window-close-v3"
 STAMPS = {"device": "cpu", "device_name": "x", "dtype": "float32", "threads": 1, "run": "r"}
@@ -109,3 +119,119 @@ def test_it_follows_the_task_and_refuses_what_it_cannot_answer():
         decoder.decode(seen(np.full(39, np.nan)))
     with pytest.raises(UnknownName, match="window-close"):
         decoder.reset("window-clos", 0, np.zeros(3))
+
+
+# --- own experts
+
+HANDLE = "handle-pull-side-v3"
+PEG = "peg-insert-side-v3"
+SEEDS = range(50_000, 50_005)
+Acts = Callable[[Observation], np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def handle_world():
+    with SPEC.open_world(HANDLE) as opened:
+        yield opened
+
+
+def metaworlds(name: str) -> Acts:
+    """Meta-World's expert of a task."""
+    from metaworld.policies import ENV_POLICY_MAP
+
+    policy = ENV_POLICY_MAP[name]()
+
+    def act(observation):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return np.clip(policy.get_action(observation.state), -1.0, 1.0)
+
+    return act
+
+
+def solve(handle_world: World, observation: Observation, expert: Acts) -> tuple[int, float]:
+    """Control steps of an expert until the episode ends, and how far it pressed the handle down in them, metres."""
+    begin, height, pressed = handle_world.steps, observation.state[6], 0.0
+    while not handle_world.done:
+        observation = handle_world.step(expert(observation))
+        pressed = max(pressed, height - observation.state[6])
+    return handle_world.steps - begin, pressed
+
+
+def slip(handle_world: World, seed: int) -> Observation:
+    """The observation behind a slip: the handle half way up, the closed fingers above it."""
+
+    class Hasty(HandlePullSide):
+        low, lift = 0.03, 1.0
+
+    hasty, observation = Hasty(), handle_world.reset(seed)
+    start = observation.state[6]
+    while observation.state[6] < start + 0.01 or observation.state[2] - observation.state[6] < 0.055:
+        observation = handle_world.step(np.clip(hasty.get_action(observation.state), -1.0, 1.0))
+    assert not handle_world.done
+    return observation
+
+
+def test_the_handle_is_pulled_sooner_than_by_metaworlds_expert(handle_world):
+    for seed in SEEDS:
+        ours, pressed = solve(handle_world, handle_world.reset(seed), SPEC.expert(HANDLE))
+        assert handle_world.success
+        assert pressed < 0.01
+        assert ours < solve(handle_world, handle_world.reset(seed), metaworlds(HANDLE))[0]
+
+
+def test_after_a_slip_it_grips_again_instead_of_pressing(handle_world):
+    steps, pressed = solve(handle_world, slip(handle_world, SEEDS[0]), SPEC.expert(HANDLE))
+    assert handle_world.success
+    assert steps < 100
+    assert pressed < 0.01
+    steps, pressed = solve(handle_world, slip(handle_world, SEEDS[0]), metaworlds(HANDLE))
+    assert steps > 200
+    assert pressed > 0.04
+
+
+def test_the_peg_is_carried_without_being_dragged():
+    fails = 5  # Meta-World's expert drops the peg there
+    with SPEC.open_world(PEG) as opened:
+        solve(opened, opened.reset(fails), metaworlds(PEG))
+        assert not opened.success
+        for seed in (fails, *SEEDS):
+            steps, _ = solve(opened, opened.reset(seed), SPEC.expert(PEG))
+            assert opened.success
+            assert steps < 150
+
+
+def test_what_ours_did_is_told_from_what_metaworlds_did():
+    """In the identity of an expert's cells, and in a recording's configuration; of other tasks nothing changes."""
+    peg, reach = (compose("rollout", ["policy=expert", f"task={task}"], RolloutSettings) for task in (PEG, "reach"))
+    assert check(peg)["expert"] == f"{PEG} {VERSION}"
+    assert "expert" not in check(reach)
+    configs = [_identity(DemoConfig((task,), episodes=1))["config"] for task in (PEG, "reach-v3")]
+    assert [config.get("experts") for config in configs] == [{PEG: VERSION}, None]
+
+
+# --- example environment
+
+
+def test_an_episode_runs_and_is_recorded(tmp_path, monkeypatch):
+    part = Part("environment", POINT.name, "examples.point_mass:SPEC")
+    monkeypatch.setitem(registry._PARTS, "environment", {**registry.parts("environment"), POINT.name: part})
+    with POINT.open_world("push-point") as world:
+        record = run_episode(world, ExpertDecoder(), 100_000, CameraSettings(size=24))
+        world.reset(100_000)
+        assert record.initial_state.tolist() == world.initial_state.tolist()
+        with pytest.raises(KervError, match="2 finite numbers"):
+            world.step([0.0, 0.0, 0.0])
+    assert record.success
+    assert (record.environment, record.space) == ("point-mass", POINT.actions)
+    assert record.actions.shape == (record.steps, 2)
+    assert np.abs(record.actions).max() <= np.float32(0.05)
+    assert record.gripper.tolist() == [1.0] * (record.steps + 1)
+    assert record.frames[0].shape == (24, 24, 3)
+    found = read_recording(save_recording(record, tmp_path / "point.rrd", method="expert"))
+    assert found["timelines"]["time"] == (0, record.steps * 100_000_000)
+
+
+def test_an_environment_may_have_no_experts():
+    with pytest.raises(UsageError, match="point-mass has no scripted experts"):
+        dataclasses.replace(POINT, expert_class="").expert("push-point")

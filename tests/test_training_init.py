@@ -1,26 +1,39 @@
-"""train.init: a run that begins with another target's weights, at another chunk length."""
+"""Data and weights that a training begins with: another target's, balanced batches, joined datasets, DAgger."""
 
 import dataclasses
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from command import kerv
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.episodes.policy import decoder_for
+from kerv_cli.episodes.settings import RolloutSettings
+from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.training.dagger import PolicyActs
+from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.drafter import DrafterRun
-from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
+from kerv_cli.training.imitation import task_weights
+from kerv_cli.training.loop import draw_samples
+from kerv_cli.training.settings import DemosSettings, TrainDrafterSettings, TrainTargetSettings
 from kerv_cli.training.target import TargetRun
+from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, DemoEntry
 from kerv_cli.worlds.demos.files import DemoEpisode
+from kerv_cli.worlds.demos.recording import DemoConfig, record, run_expert
 from kerv_cli.worlds.metaworld.spec import SPEC
+from kerv_cli.worlds.settings import CameraSettings, WorldSettings
+from kerv_cli.worlds.spec import EnvironmentSpec
 
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
@@ -44,63 +57,63 @@ class Demos:
 
 
 @pytest.fixture
-def results(tmp_path, monkeypatch):
+def with_old(tmp_path, monkeypatch):
     """A results folder with the target `old` (H = 4), whose statistics and words no fresh run would have."""
     monkeypatch.setattr(DemoDataset, "open", classmethod(lambda cls, folder: Demos()))
     save_old(tmp_path, 3)
     return tmp_path
 
 
-def save_old(results: Path, seed: int) -> None:
+def save_old(with_old: Path, seed: int) -> None:
     torch.manual_seed(seed)
     shapes = compose("train_target", ["target=nano", "target.observation=state"], TrainTargetSettings).target
-    save_target(results / "artifacts/target/old", CompactTarget(shapes, OLD, OBSERVATION, WORDS), "metaworld", {})
+    save_target(with_old / "artifacts/target/old", CompactTarget(shapes, OLD, OBSERVATION, WORDS), "metaworld", {})
 
 
-def settings(results: Path, *overrides: str) -> TrainTargetSettings:
+def init_settings(with_old: Path, *overrides: str) -> TrainTargetSettings:
     common = ["name=new", "target=nano", "target.observation=state", "target.chunk=8", "task=drawer-open"]
-    common += ["train.init=old", "train.batch=4", "train.steps=4", "train.validate_every=2", f"results={results}"]
+    common += ["train.init=old", "train.batch=4", "train.steps=4", "train.validate_every=2", f"results={with_old}"]
     given = {override.split("=")[0] for override in overrides}
     common = [override for override in common if override.split("=")[0] not in given]
     return compose("train_target", [*common, *overrides], TrainTargetSettings)
 
 
-def trained(results: Path, *overrides: str, stop: int | None = None) -> Path:
-    run = TargetRun(settings(results, *overrides))
+def trained(with_old: Path, *overrides: str, stop: int | None = None) -> Path:
+    run = TargetRun(init_settings(with_old, *overrides))
     run.load(lambda done, total: None)
-    run.train(lambda step, metrics: interrupt() if step == stop else None)
+    run.train(lambda step, metrics: stop_here() if step == stop else None)
     return run.folder
 
 
-def interrupt() -> None:
+def stop_here() -> None:
     raise KeyboardInterrupt
 
 
 @pytest.mark.bits
-def test_a_run_begins_with_the_weights_statistics_and_words(results):
-    folder = trained(results, "train.lr=0", "train.weight_decay=0")
-    old, _ = load_target(results / "artifacts/target/old")
+def test_a_run_begins_with_the_weights_statistics_and_words(with_old):
+    folder = trained(with_old, "train.lr=0", "train.weight_decay=0")
+    old, _ = load_target(with_old / "artifacts/target/old")
     new, description = load_target(folder)
     assert all(torch.equal(new.state_dict()[k], v) for k, v in old.state_dict().items())
     assert new.chunk == 8
     assert dataclasses.replace(new.settings, chunk=old.settings.chunk) == old.settings
     assert new.actions == OLD
     assert new.words == WORDS
-    assert description.provenance["init"] == read_target(results / "artifacts/target/old").sha256
+    assert description.provenance["init"] == read_target(with_old / "artifacts/target/old").sha256
 
 
-def test_the_weights_belong_to_the_runs_identity_and_their_name_does_not(results):
-    trained(results)
-    shutil.copytree(results / "artifacts/target/old", results / "artifacts/target/renamed")
-    trained(results, "train.init=renamed", "train.steps=5")
-    save_old(results, 4)
+def test_the_weights_belong_to_the_runs_identity_and_their_name_does_not(with_old):
+    trained(with_old)
+    shutil.copytree(with_old / "artifacts/target/old", with_old / "artifacts/target/renamed")
+    trained(with_old, "train.init=renamed", "train.steps=5")
+    save_old(with_old, 4)
     for other in ("train.init=old", "train.init=null"):
         with pytest.raises(CheckpointError, match="other settings or data"):
-            trained(results, other)
+            trained(with_old, other)
 
 
-def test_scores_with_and_without_success_are_of_different_runs(results):
-    alone, some, more = (TargetRun(settings(results, f"train.closed_loop={n}")).hash for n in (0, 1, 2))
+def test_scores_with_and_without_success_are_of_different_runs(with_old):
+    alone, some, more = (TargetRun(init_settings(with_old, f"train.closed_loop={n}")).hash for n in (0, 1, 2))
     assert some == more != alone
 
 
@@ -108,10 +121,10 @@ def test_scores_with_and_without_success_are_of_different_runs(results):
     ("override", "shape"),
     [("target.width=64", "width"), ("target.observation=vision", "observation"), ("target.layers=1", "layers")],
 )
-def test_another_shape_is_refused_by_its_name(results, override, shape):
-    old = read_target(results / "artifacts/target/old").settings[shape]
+def test_another_shape_is_refused_by_its_name(with_old, override, shape):
+    old = read_target(with_old / "artifacts/target/old").settings[shape]
     with pytest.raises(UsageError, match=rf"{shape}={old}, the run {override}"):
-        TargetRun(settings(results, override))
+        TargetRun(init_settings(with_old, override))
 
 
 @pytest.mark.parametrize(
@@ -123,9 +136,9 @@ def test_another_shape_is_refused_by_its_name(results, override, shape):
         (["train.places=path"], "train.places=path needs images"),
     ],
 )
-def test_what_cannot_be_trained_is_refused(results, overrides, says):
+def test_what_cannot_be_trained_is_refused(with_old, overrides, says):
     with pytest.raises(UsageError, match=says):
-        TargetRun(settings(results, *overrides))
+        TargetRun(init_settings(with_old, *overrides))
 
 
 @pytest.mark.parametrize("setting", ["init=old", "colour=0.3", "places=path", "balance=0.5", "closed_loop=2"])
@@ -134,8 +147,116 @@ def test_settings_of_targets_are_refused_for_a_drafter(setting):
         DrafterRun(compose("train_drafter", [f"train.{setting}"], TrainDrafterSettings))
 
 
-def test_demonstrations_without_places_are_refused(results, monkeypatch):
+def test_demonstrations_without_places_are_refused(with_old, monkeypatch):
     nameless = SimpleNamespace(**{**vars(Demos.manifest), "observation": dataclasses.replace(OBSERVATION, places=())})
     monkeypatch.setattr(Demos, "manifest", nameless)
     with pytest.raises(UsageError, match="no places"):
-        TargetRun(settings(results))
+        TargetRun(init_settings(with_old))
+
+
+# --- dagger
+
+SHORT = CameraSettings()
+
+
+@pytest.fixture(scope="module")
+def datasets(tmp_path_factory):
+    """Two small datasets of real demonstrations: `few` of one task, `more` of another."""
+    folder = tmp_path_factory.mktemp("datasets")
+    for name, task in (("few", "drawer-close-v3"), ("more", "reach-v3")):
+        record(DemoConfig((task,), 4, camera=SHORT, frame_stride=8, workers=1), folder / "artifacts/demos" / name)
+    return folder
+
+
+def test_balanced_tasks_are_drawn_alike():
+    tasks = torch.tensor([0] * 900 + [1] * 100)
+    generator = torch.Generator().manual_seed(0)
+
+    def share(balance):
+        weights = task_weights(tasks, balance)
+        drawn = draw_samples(1000, 20_000, generator, None if weights is None else weights.cumsum(0))
+        return float(tasks[drawn].double().mean())
+
+    assert share(0.0) == pytest.approx(0.1, abs=0.01)
+    assert share(1.0) == pytest.approx(0.5, abs=0.02)
+    assert share(0.5) == pytest.approx(0.25, abs=0.02)  # 1 : 3, the root of 1 : 9
+
+
+def test_datasets_add_up(datasets):
+    few, more, both = (open_demos(str(datasets), name) for name in ("few", "more", "few+more"))
+    assert [e.path for e in both.episodes] == [e.path for e in (*few.episodes, *more.episodes)]
+    assert set(both.manifest.tasks) == {"drawer-close-v3", "reach-v3"}
+    assert len({few.sha256, more.sha256, both.sha256, open_demos(str(datasets), "more+few").sha256}) == 4
+    assert both.load(5).task == "reach-v3"
+
+
+def test_datasets_of_other_cameras_do_not_add_up(datasets, tmp_path):
+    other = DemoConfig(("reach-v3",), 1, camera=CameraSettings(size=48), frame_stride=50, workers=1)
+    record(other, tmp_path / "other")
+    with pytest.raises(CheckpointError, match="another camera"):
+        DemoDataset.joined([open_demos(str(datasets), "few"), DemoDataset.open(tmp_path / "other")])
+
+
+def acts_of(target: str, spec: EnvironmentSpec, world: WorldSettings | None = None) -> PolicyActs:
+    return PolicyActs.of(DemosSettings(policy=PolicySettings(target=target), world=world or WorldSettings()), spec)
+
+
+@pytest.mark.bits
+def test_a_target_acts_and_the_expert_labels(tmp_path):
+    acts = acts_of("mt10-state", SPEC)
+    tasks, share = ("reach-v3",), 0.5
+    config = DemoConfig(tasks, 2, camera=SHORT, frame_stride=20, workers=1, horizon=60, expert_share=share)
+    config = DemoConfig(**(vars(config) | {"policy": acts.sha256}))
+    record(config, tmp_path / "visited", make_actor=acts)
+    dataset = DemoDataset.open(tmp_path / "visited")
+    assert dataset.manifest.config["policy"] == acts.sha256
+    assert [entry.seed for entry in dataset.episodes] == [0, 1]  # no seed is replaced, whether it succeeds or not
+    episode = dataset.load(0)
+    same = (episode.labels[: episode.steps] == episode.executed).all(1)
+    assert 0 < same.mean() < 1  # the expert's chunks, and the target's
+    world = SPEC.open_world("reach-v3", SHORT)
+    again = run_expert(world, 0, config, acts(config))
+    np.testing.assert_array_equal(again.executed, episode.executed)
+    expert, observation = world.spec.expert("reach-v3"), world.reset(0)
+    for action, label in zip(episode.executed, episode.labels, strict=False):
+        np.testing.assert_allclose(expert(observation), label, atol=1e-6)
+        observation = world.step(action)
+    world.close()
+
+
+def test_a_policy_acts_by_its_method(tmp_path):
+    words = ("policy=vision", "method=early_unverified", "task=reach", f"name={tmp_path / 'visited'}", "episodes=1")
+    short = ("world.horizon=12", "expert_share=0", "frame_stride=4", "runtime.workers=1")
+    kerv("demos", *words, *short)
+    episode = DemoDataset.open(tmp_path / "visited").load(0)
+    settings = compose("rollout", ["method=early_unverified"], RolloutSettings)
+    decoder, world = decoder_for(settings, "reach-v3"), SPEC.open_world("reach-v3", SHORT)
+    world.reset(0)
+    decoder.reset("reach-v3", 0, world.end_effector)
+    first = decoder.decode(world.observe(decoder.cameras)).actions
+    world.close()
+    np.testing.assert_allclose(episode.executed[: len(first)], first, atol=1e-6)
+
+
+@pytest.mark.parametrize("method", ["ar", "early_unverified"])
+def test_the_chunk_counts_and_is_executed(method):
+    words = ["policy=vision", f"method={method}"]
+    whole, two = (PolicyActs.of(compose("demos", [*words, f"chunk={n}"], DemosSettings), SPEC) for n in (0, 2))
+    assert whole.sha256 != two.sha256
+    decoder = two(DemoConfig(("reach-v3",), 1, camera=SHORT)).decoder_of("reach-v3")
+    assert (decoder.steps, decoder.target.chunk > 2) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("target", "spec", "camera", "says"),
+    [
+        ("mt10-vision", SPEC, CameraSettings(name="corner4+gripperPOV:75"), ""),
+        ("mt10-vision", SPEC, CameraSettings(name="corner"), "world.camera.name"),
+        ("mt10-vision", SPEC, CameraSettings(name="corner4:60"), "world.camera.name"),
+        ("mt10-vision", SPEC, CameraSettings(size=48), "world.camera.size=48"),
+        ("mt10-state", spec_of("insert-peg"), CameraSettings(), "target 'mt10-state'"),
+    ],
+)
+def test_only_further_views_may_differ_from_what_the_target_was_trained_on(target, spec, camera, says):
+    with pytest.raises((UsageError, CheckpointError), match=says) if says else nullcontext():
+        assert acts_of(target, spec, WorldSettings(camera=camera)).sha256

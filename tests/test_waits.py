@@ -1,6 +1,9 @@
-"""A round waits for the device once: counted on a pretended device, for every family of proposers."""
+"""A round waits for the device once, for every family of proposers; and what a stopwatch on a device measures."""
+
+from __future__ import annotations
 
 import functools
+import time
 from typing import Any
 
 import numpy as np
@@ -11,6 +14,8 @@ from test_decoding_lossless import random_prompt, random_target
 from test_proposers import HELD, D, situation, stored
 
 from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.record import PHASES
+from kerv_cli.engine.stopwatch import Stopwatch
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter, EagleNetwork
 from kerv_cli.methods.early import EarlySettings
@@ -129,3 +134,37 @@ def parts_of_device(parts: Parts) -> Parts:
         if isinstance(part, DrafterProposer):
             part.cache = part.drafter.new_cache(1, part.cache.capacity)
     return parts
+
+
+# --- stopwatch
+
+
+class Event:
+    """Stands in for a CUDA event: the host's time when it was recorded."""
+
+    def __init__(self, enable_timing: bool) -> None:
+        assert enable_timing
+
+    def record(self) -> None:
+        """Notes the time."""
+        self.at = time.perf_counter()
+
+    def elapsed_time(self, later: Event) -> float:
+        """Milliseconds."""
+        return 1000.0 * (later.at - self.at)
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_phases_add_up_to_the_decode(device, monkeypatch):
+    waits: list[str] = []
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: waits.append("wait"))
+    monkeypatch.setattr(torch.cuda, "Event", Event)
+    clock = Stopwatch(torch.device(device))
+    for phase in ("vision", "prefill", "verify", "verify"):
+        time.sleep(0.002)
+        clock.lap(phase)
+    seconds = clock.stop()
+    assert len(waits) == (2 if device == "cuda" else 0)
+    assert set(clock.phases) == set(PHASES)
+    assert sum(clock.phases.values()) == pytest.approx(seconds, abs=1e-4)
+    assert clock.phases["verify"] >= 0.004 > clock.phases["other"]

@@ -1,0 +1,217 @@
+"""Reports of stressed worlds and of worlds that go on: what a setting is compared with, figures, sentences."""
+
+import dataclasses
+from dataclasses import replace
+
+import pytest
+from studies_synthetic import episode, settings_of, study_of, swept
+
+from kerv_cli.base.config import compose
+from kerv_cli.engine.record import Delay
+from kerv_cli.episodes.identity import stress_of
+from kerv_cli.episodes.resolve import resolve
+from kerv_cli.episodes.settings import RolloutSettings, SweepSettings, TimingSettings
+from kerv_cli.lab.execute import RunEpisode
+from kerv_cli.lab.plan import Setting
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.report.decide import verdict_of
+from kerv_cli.report.plots import latency_figure, study_figures
+from kerv_cli.report.report import report
+from kerv_cli.report.stressed import by_kind, is_stressed, summed_table
+from kerv_cli.report.summary import summary_frame
+from kerv_cli.report.tables import latency_table, load_study, rows_of
+from kerv_cli.worlds.settings import StressSettings
+
+TASKS = ["reach-v3", "push-v3"]
+EPISODES = 20
+
+
+def stressed_settings() -> dict[str, RolloutSettings]:
+    found: dict[str, RolloutSettings] = {}
+    for name, method, r in (("ar", "ar", 0), ("bold", "spec_vla", 9)):
+        found[name] = settings_of(method, r, EPISODES)
+        for kind in ("push", "light"):
+            for level in (1, 4):
+                stressed = settings_of(method, r, EPISODES)
+                stressed.world.stress = StressSettings(kind, level)
+                found[f"{name}, kind={kind} level={level}"] = stressed
+    return found
+
+
+def run_stressed(setting: Setting, task: str) -> RunEpisode:
+    """Pushes of level 4 let half of everything fail; light of level 4 only what is bold."""
+    stress = stress_of(setting.settings)
+    fails = stress["level"] == 4 and (stress["kind"] == "push" or setting.settings["method"] != "ar")
+    return lambda seed: replace(episode(setting, task, seed), success=not (fails and seed % 2))
+
+
+@pytest.fixture(scope="module")
+def stressed(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("stress")
+    swept(folder, study_of(stressed_settings(), TASKS, "stress", title="", axis=""), run_stressed)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def stressed_data(stressed):
+    return load_study(StudyStore(stressed, "stress"))
+
+
+@pytest.fixture(scope="module")
+def stressed_table(stressed_data):
+    return stressed_data.table
+
+
+def test_a_stressed_setting_is_compared_with_the_baseline_under_the_same_stress(stressed_data, stressed_table):
+    rows = {row["label"]: row for row in rows_of(stressed_table, "micro over tasks")}
+    assert stressed_data.references["bold"] == "ar"
+    assert rows["bold, kind=push level=4"]["baseline"] == "ar, kind=push level=4"
+    assert rows["bold, kind=push level=4"]["difference"] == 0.0
+    assert rows["bold, kind=light level=4"]["difference"] == -0.5
+    assert rows["bold, kind=light level=4"]["pairs"] == len(TASKS) * EPISODES
+    assert (rows["ar, kind=light level=4"]["stress"], rows["ar, kind=light level=4"]["stress_level"]) == ("light", 4)
+    assert (rows["ar"]["stress"], rows["ar"]["stress_level"]) == ("none", 0)
+
+
+def test_lines_begin_with_the_unstressed_setting(stressed_table):
+    kinds = by_kind(stressed_table)
+    assert list(kinds) == ["push", "light"]
+    assert [row["label"] for row in kinds["light"]["bold"]] == [
+        "bold", "bold, kind=light level=1", "bold, kind=light level=4"
+    ]  # fmt: skip
+
+
+def test_the_figure_has_a_panel_per_kind_and_a_line_per_method(stressed_table):
+    figures = study_figures(stressed_table, "", "Success under stress")
+    assert list(figures) == [""]
+    panels = figures[""].axes
+    assert [panel.get_title(loc="left") for panel in panels] == ["push", "light"]
+    assert [list(bars.lines[0].get_ydata()) for bars in panels[1].containers] == [[100, 100, 100], [100, 100, 50]]
+
+
+def test_sums_count_every_stressed_world_once(stressed_table):
+    """20 seeds x 2 tasks; level 4 of a push fails half of everything, level 4 of light half of what is bold."""
+    found = {row["label"]: row for row in rows_of(summed_table(stressed_table))}
+    sums = ["light", "push", "level 1", "level 4", "all"]
+    assert list(found) == [f"{name} {one}" for one in sums for name in ("ar", "bold")]
+    counted = {one: (found[f"bold {one}"]["successes"], found[f"bold {one}"]["episodes"]) for one in sums}
+    assert counted == {"light": (60, 80), "push": (60, 80), "level 1": (80, 80), "level 4": (40, 80), "all": (120, 160)}
+    assert (found["ar all"]["successes"], found["ar all"]["baseline"]) == (140, "ar all")
+    lost = found["bold all"]
+    assert (lost["only_baseline"], lost["only_method"], lost["pairs"]) == (20, 0, 160)
+    assert lost["difference"] == pytest.approx(-20 / 160)
+    assert lost["difference_low"] < -20 / 160 < lost["difference_high"] < 0
+    assert not lost["non_inferior"]
+    assert found["bold push"]["non_inferior"] is (found["bold push"]["difference_low"] > -0.03)
+
+
+def test_the_report_writes_the_sums(stressed):
+    written = {path.name for path in report(stressed, "stress").files}
+    assert {"stress_summed.csv", "stress.png"} <= written
+
+
+def test_the_verdict_says_who_falls_behind_where(stressed_table):
+    behind, is_shown = verdict_of(stressed_table, 3.0)
+    assert "less successful than ar: bold, kind=light level=4. More successful: no setting" in behind
+    assert not is_shown
+    kept = stressed_table[(stressed_table["stress"] != "light") | (stressed_table["stress_level"] != 4)]
+    assert "less successful than ar: no setting" in verdict_of(kept, 3.0)[0]
+    unsolved = stressed_table.assign(both=0, only_baseline=2)
+    assert "nothing is compared: ar; ar, kind=push level=1" in verdict_of(unsolved, 3.0)[0]
+    assert not is_stressed(stressed_table[stressed_table["stress"] == "none"])
+
+
+def test_the_shipped_study_has_every_method_under_every_kind_and_level():
+    resolved = resolve(["study=stress", "task=reach", "episodes=1"])
+    found = {(s.method, s.world.stress.kind, s.world.stress.level) for s in resolved.settings.values()}
+    methods = {method for method, _, _ in found}
+    kinds = {kind for _, kind, _ in found}
+    assert methods >= {"ar", "one_pass", "one_pass_streak", "early_unverified", "retrieval_unverified"}
+    assert len(kinds) == 8
+    assert len(found) == len(resolved.settings) == len(methods) * 29
+    study = compose("sweep", ["study=stress"], SweepSettings).study
+    assert study.baseline == "ar"
+
+
+# --- latency report
+
+SHARE = {"ar": 1.0, "spec_vla": 0.4}
+
+
+def delayed_setting(method: str, r: int, **timing: object) -> RolloutSettings:
+    chosen = settings_of(method, r)
+    chosen.rollout = TimingSettings(clock="real", latency="profile", profile="p", **timing)  # type: ignore[arg-type]
+    return chosen
+
+
+def run_delayed(delayed_setting: Setting, task: str) -> RunEpisode:
+    """AR takes 30 ms, or what it is asked to; where it takes 100 ms it fails."""
+    timing, method = delayed_setting.settings["rollout"], delayed_setting.settings["method"]
+
+    def run(seed):
+        record = episode(delayed_setting, task, seed)
+        if timing["clock"] == "waits":
+            return record
+        seconds = SHARE[method] * (timing["ar_ms"] or 30.0) / 1000
+        steps = int(seconds * 80) + 1
+        delay = Delay(seconds, steps, 0, min(4, steps), max(0, steps - 4))
+        decodes = tuple(dataclasses.replace(d, delay=delay) for d in record.decodes)
+        fails = method == "ar" and timing["ar_ms"] == 100
+        return dataclasses.replace(record, decodes=decodes, success=not fails)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def delayed(tmp_path_factory):
+    settings = {"ar waits": settings_of("ar")}
+    for method, r in (("ar", 0), ("spec_vla", 9)):
+        for ms in (0.0, 20.0, 100.0):
+            for kind in ("none", "chunk"):
+                settings[f"{method} ar_ms={ms:g} {kind}"] = delayed_setting(
+                    method, r, ar_ms=ms, delay_compensation=kind
+                )
+    about = {"title": "Latency", "baseline": "ar waits", "axis": "rollout.ar_ms"}
+    folder = tmp_path_factory.mktemp("latency")
+    swept(folder, study_of(settings, ["reach-v3", "push-v3"], "latency", **about), run_delayed)
+    return folder
+
+
+def test_every_setting_is_compared_with_ar_at_its_latency(delayed):
+    whole = load_study(StudyStore(delayed, "latency")).table
+    rows = latency_table(whole).set_index("label")
+    assert len(rows) == 12  # not the world that waits
+    fast = rows.loc["spec_vla ar_ms=100 none"]
+    assert fast["ar"] == "ar ar_ms=100 none"
+    assert (fast["ar_latency_ms"], fast["felt_latency_ms"]) == pytest.approx((100.0, 40.0))
+    assert (fast["difference"], fast["only_method"], fast["pairs"]) == (1.0, 8, 8)
+    assert fast["difference_low"] > 0.5
+    own = rows.loc["spec_vla ar_ms=0 chunk"]
+    assert (own["ar_latency_ms"], own["felt_latency_ms"]) == pytest.approx((30.0, 12.0))
+    assert own["difference"] == 0.0
+    assert fast["held_share"] == 0.0 < rows.loc["ar ar_ms=100 none"]["held_share"]  # four steps of its chunk, and nine
+    printed = summary_frame(whole).set_index("setting")
+    assert printed.loc["spec_vla ar_ms=100 none"]["a decode takes, ms"] == "40.0"
+    assert printed.loc["ar waits"]["a decode takes, ms"] == "–"
+    answer, _ = verdict_of(whole, 3.0)
+    assert "do not solve the tasks, nothing is compared: ar ar_ms=100 none" in answer
+    assert latency_table(whole[whole["label"] == "ar waits"]).empty
+
+
+def test_the_figure_has_a_panel_per_compensation_and_a_line_per_method(delayed):
+    table = latency_table(load_study(StudyStore(delayed, "latency")).table)
+    figure = latency_figure(table, "title")
+    panels = figure.axes
+    assert [panel.get_title(loc="left") for panel in panels] == [
+        "delay compensation: none",
+        "delay compensation: chunk",
+    ]
+    ar, _ = (bars.lines[0] for bars in panels[0].containers)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["ar", "spec_vla"]
+    assert list(ar.get_xdata()) == pytest.approx([20.0, 30.0, 100.0])  # 30: its own latency
+    assert list(ar.get_ydata()) == [100.0, 100.0, 0.0]
+
+
+def test_a_report_has_the_table_and_the_figure(delayed):
+    names = {path.name for path in report(delayed, "latency").files}
+    assert {"latency.csv", "latency_latency.csv", "latency_latency.png", "report.html"} <= names
