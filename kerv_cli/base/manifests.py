@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import copy
-import dataclasses
 import functools
 import hashlib
 import json
-import operator
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar
 
 from kerv_cli.base.errors import CheckpointError, KervError
 from kerv_cli.base.files import read_mapping, sha256_of
@@ -18,26 +15,14 @@ from kerv_cli.base.limits import check_settings
 
 T = TypeVar("T")
 
-_UNKNOWN = "unexpected_keyword_argument"
-"""Pydantic's type of error for a field that the dataclass does not have."""
-
 
 @functools.cache
 def _adapter(kind: Any) -> Any:
     from pydantic import TypeAdapter
 
-    _forbid_unknown(kind)
+    # pydantic applies it to the dataclasses inside, too
+    setattr(kind, "__pydantic_config__", {"allow_inf_nan": False})  # noqa: B010
     return TypeAdapter(kind)
-
-
-def _forbid_unknown(kind: Any) -> None:
-    """Make pydantic refuse unknown fields, NaN and infinity in a dataclass and in the dataclasses inside it."""
-    if dataclasses.is_dataclass(kind) and not hasattr(kind, "__pydantic_config__"):
-        setattr(kind, "__pydantic_config__", {"extra": "forbid", "allow_inf_nan": False})  # noqa: B010
-        for hint in get_type_hints(kind).values():
-            _forbid_unknown(hint)
-    for inner in get_args(kind):
-        _forbid_unknown(inner)
 
 
 def read(kind: type[T], value: Any, what: str, tolerant: bool = False) -> T:
@@ -57,25 +42,15 @@ def read(kind: type[T], value: Any, what: str, tolerant: bool = False) -> T:
 
     try:
         adapter: Any = _adapter(kind)  # type: ignore[arg-type]
-        checked: T = adapter.validate_python(value)
+        checked: T = adapter.validate_python(value, extra="ignore" if tolerant else "forbid")
         check_settings(checked)
     except ValidationError as error:
         first = error.errors()[0]
-        if tolerant and any(one["type"] == _UNKNOWN for one in error.errors()):
-            return read(kind, _without(value, [one["loc"] for one in error.errors() if one["type"] == _UNKNOWN]), what)
         where = ".".join(map(str, first["loc"])) or "the whole"
         raise CheckpointError(f"{what} is damaged: {where}: {first['msg'].lower()}") from error
     except KervError as error:  # from the dataclass's own checks, or from check_settings
         raise CheckpointError(f"{what} is damaged: {error}") from error
     return checked
-
-
-def _without(value: Any, fields: list[tuple[int | str, ...]]) -> Any:
-    """Return a copy of a JSON value without some fields. A field is given by the path of keys and indices to it."""
-    value = copy.deepcopy(value)
-    for *path, name in fields:
-        del functools.reduce(operator.getitem, path, value)[name]
-    return value
 
 
 def read_file(kind: type[T], path: Path) -> T:
