@@ -16,7 +16,6 @@ from kerv_cli.base.config import compose
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.registry import Part
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.record import PHASES
 from kerv_cli.episodes.episode import run_episode
 from kerv_cli.episodes.policy import ExpertDecoder, check
 from kerv_cli.episodes.rows import decodes_table, episode_row, read_decodes, table_blob
@@ -54,16 +53,6 @@ def test_the_decoder_executes_the_experts_own_actions(world, episode):
     assert episode.steps == len(actions) > 10
     assert (episode.actions == np.float32(actions)).all()
     assert np.abs(episode.actions).max() == 1.0  # raw outputs reach far beyond
-
-
-def test_a_record_has_one_step_and_no_target(episode):
-    assert episode.decode_steps == tuple(range(episode.steps))
-    for decode in episode.decodes:
-        assert decode.actions.shape == (1, 4)
-        assert decode.actions.dtype == np.float32
-        assert (decode.mode, decode.forwards, decode.tokens, decode.rounds) == ("expert", 0, (), ())
-        assert set(decode.phases) == set(PHASES)
-        assert 0 < decode.seconds == pytest.approx(sum(decode.phases.values()))
 
 
 def test_rows_keep_it_and_measures_are_undefined_instead_of_divided_by_zero(episode):

@@ -133,17 +133,6 @@ def test_what_differs_in_threads_cannot_take_turns_in_one_process():
     assert [len(block.settings) for block in blocks_of(study.episodes, 5)] == [1, 1]
 
 
-def test_a_batch_takes_any_tasks_of_one_setting_in_a_block_per_worker():
-    settings = {"ar": settings_of("ar"), "b": settings_of("spec_vla", 9)}
-    for one in settings.values():
-        one.rollout.batch = 2
-    blocks = blocks_of(study_of(settings, TASKS).episodes, 5, workers=2)
-    assert [(len(block.episodes), [s.label for s in block.settings]) for block in blocks] == [
-        (4, [label]) for label in ("ar", "ar", "b", "b")
-    ]
-    assert [len(block.episodes) for block in blocks_of(study_of(settings, TASKS).episodes, 5)] == [8, 8]
-
-
 def test_a_study_is_counted_before_it_is_planned():
     setting = study_of({"ar": settings_of("ar", episodes=1)}, ["reach-v3"]).settings[0]
     large = dataclasses.replace(setting, settings={**setting.settings, "episodes": 10**7})

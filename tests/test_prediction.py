@@ -128,27 +128,39 @@ class Known(Proposer):
         return Draft.of(self.drafted)
 
 
+PROMPT = prompt_of(3)
+TRUTH = plain_greedy(TARGET, PROMPT)
+
+
+def rejected_at(wrong: int) -> list[int]:
+    """The target's tokens, of which one is far off."""
+    return [(token + 100) % 255 if i == wrong else token for i, token in enumerate(TRUTH)]
+
+
+def decoder_of(drafted: list[int], rectifier: Compensation) -> Decoder:
+    decoder = Decoder(TARGET, Parts(prefill_draft=Known(drafted), rectifier=rectifier))
+    decoder.situation = Situation("t", PAST)
+    return decoder
+
+
 @pytest.mark.parametrize("use_target_token", [True, False])
 @pytest.mark.parametrize("wrong", range(N))
 def test_a_filled_step_drops_nothing(wrong, use_target_token):
     """The target's greedy tokens, given those that were filled; predicted values are executed without rounding."""
-    prompt = prompt_of(3)
-    truth = plain_greedy(TARGET, prompt)
-    drafted = [(t + 100) % 255 if i == wrong else t for i, t in enumerate(truth)]
+    drafted = rejected_at(wrong)
     first = wrong + use_target_token
     filled = range(first, (wrong // D + 1) * D)
     rectifier = compensation(use_target_token=use_target_token, drop=False, min_verified=0, rest=4)
-    decoder = Decoder(TARGET, Parts(prefill_draft=Known(drafted), rectifier=rectifier))
-    decoder.situation = Situation("t", PAST)
-    chunk = decoder.decode_prompt(prompt)
+    decoder = decoder_of(drafted, rectifier)
+    chunk = decoder.decode_prompt(PROMPT)
     if use_target_token and first % D == 0:  # a whole step would follow without a single token of the target
         filled = range(first, min(N, first + D))
     assert tuple(chunk.filled) == tuple(filled)
     assert chunk.closed is None
     assert len(chunk.tokens) == N
-    assert chunk.tokens[:first] == truth[:first]
+    assert chunk.tokens[:first] == TRUTH[:first]
     known = chunk.tokens[: first + len(filled)]
-    rest = plain_greedy(TARGET, torch.cat([prompt, TARGET.embed(torch.tensor([known]))], 1))
+    rest = plain_greedy(TARGET, torch.cat([PROMPT, TARGET.embed(torch.tensor([known]))], 1))
     assert chunk.tokens == [*known, *rest][:N]
     step = first // D
     last = SPACE.values_of(np.array(chunk.tokens[step * D - D : step * D])) if step else PAST.values()[-1]
@@ -161,16 +173,13 @@ def test_a_filled_step_drops_nothing(wrong, use_target_token):
 @pytest.mark.parametrize("wrong", range(N))
 def test_one_forward_whatever_is_rejected(wrong, use_target_token):
     """An in-prefill draft whose token `wrong` is off: one forward, the target's tokens up to it, the rest predicted."""
-    prompt = prompt_of(3)
-    truth = plain_greedy(TARGET, prompt)
-    drafted = [(t + 100) % 255 if i == wrong else t for i, t in enumerate(truth)]
+    drafted = rejected_at(wrong)
     rectifier = compensation(use_target_token=use_target_token)
-    decoder = Decoder(TARGET, Parts(prefill_draft=Known(drafted), rectifier=rectifier))
-    decoder.situation = Situation("t", PAST)
-    chunk = decoder.decode_prompt(prompt)
+    decoder = decoder_of(drafted, rectifier)
+    chunk = decoder.decode_prompt(PROMPT)
     assert chunk.forwards == 1
     known = wrong + use_target_token
-    assert chunk.tokens == truth[:known]
+    assert chunk.tokens == TRUTH[:known]
     assert sum(r.committed for r in chunk.rounds) == known
     # where the target's own token was the last one nothing is missing, and nothing was predicted
     assert (chunk.closed is None) == (known == N)
@@ -178,21 +187,18 @@ def test_one_forward_whatever_is_rejected(wrong, use_target_token):
     actions = chunk.actions()
     assert actions.shape == (steps, D)
     assert chunk.compensated == steps * D - known
-    assert actions.reshape(-1)[:known] == pytest.approx(SPACE.values_of(np.array(truth[:known], dtype=int)), abs=1e-6)
+    assert actions.reshape(-1)[:known] == pytest.approx(SPACE.values_of(np.array(TRUTH[:known], dtype=int)), abs=1e-6)
 
 
 @pytest.mark.parametrize("wrong", range(N - 1))
 def test_what_the_rejected_draft_had_goes_before_the_prediction(wrong):
     """predictor=draft: behind the target's token come the draft's own values; the gripper is held."""
-    prompt = prompt_of(3)
-    truth = plain_greedy(TARGET, prompt)
-    drafted = [(t + 100) % 255 if i == wrong else t if i < wrong else i for i, t in enumerate(truth)]
-    decoder = Decoder(TARGET, Parts(prefill_draft=Known(drafted[:-1]), rectifier=compensation(predictor="draft")))
-    decoder.situation = Situation("t", PAST)
-    chunk = decoder.decode_prompt(prompt)
+    drafted = [*rejected_at(wrong)[: wrong + 1], *range(wrong + 1, N)]
+    decoder = decoder_of(drafted[:-1], compensation(predictor="draft"))
+    chunk = decoder.decode_prompt(PROMPT)
     assert chunk.forwards == 1
     end = -(-(wrong + 1) // D) * D
-    expected = SPACE.values_of(np.array([*truth[: wrong + 1], *drafted[wrong + 1 : end]]))
+    expected = SPACE.values_of(np.array([*TRUTH[: wrong + 1], *drafted[wrong + 1 : end]]))
     if end > wrong + 1:
         # whatever was drafted for the gripper, and whether or not it was: as in the step before
         expected[end - 1] = expected[end - 1 - D] if end > D else PAST.values()[-1][D - 1]
@@ -203,14 +209,12 @@ def test_what_the_rejected_draft_had_goes_before_the_prediction(wrong):
 @pytest.mark.parametrize("wrong", range(2 * D - 1))
 def test_without_a_gripper_to_hold_the_drafts_is_taken(wrong):
     """predictor=draft at an episode's first decode: one forward all the same."""
-    prompt = prompt_of(3)
-    truth = plain_greedy(TARGET, prompt)
-    drafted = [(t + 100) % 255 if i == wrong else t if i < wrong else i for i, t in enumerate(truth)]
+    drafted = [*rejected_at(wrong)[: wrong + 1], *range(wrong + 1, N)]
     draft = Known(drafted[:-1])
     decoder = Decoder(TARGET, Parts(prefill_draft=draft, rectifier=compensation(predictor="draft")))
-    chunk = decoder.decode_prompt(prompt)
+    chunk = decoder.decode_prompt(PROMPT)
     assert chunk.forwards == 1
-    gripper = drafted[D - 1] if wrong < D - 1 else truth[D - 1]  # the first step's, until it is known
+    gripper = drafted[D - 1] if wrong < D - 1 else TRUTH[D - 1]  # the first step's, until it is known
     assert chunk.closed[-1, D - 1] == pytest.approx(SPACE.values_of(np.array(gripper)))
 
 

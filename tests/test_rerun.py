@@ -175,25 +175,6 @@ def test_drawn_tokens_add_up_with_the_records(kind):
         assert first is None or decode.first_rejected in (first, decode.size)
 
 
-def test_optional_numbers_have_rows_only_where_they_are(tmp_path):
-    record = episode("mixed")
-    path = saved(record, tmp_path)
-    for signal in ("variability", "metric", "similarity"):
-        there = [(s, getattr(d, signal)) for d, s in zip(record.decodes, record.decode_steps, strict=True)]
-        there = [(step, value) for step, value in there if value is not None]
-        assert starts(path, f"/signals/{signal}") == [step for step, _ in there]
-        assert [row[0] for row in column(path, f"/signals/{signal}", "scalars")] == [value for _, value in there]
-    assert "/signals/deviation" not in read_recording(path)["entities"]
-    assert named(path, "/decode/threshold") == ["r dx", "r dy", "r dz", "r gripper"]
-    assert column(path, "/decode/threshold", "scalars")[0] == [9.0, 9.0, 9.0, 0.0]
-    equal = [
-        replace(d, rounds=tuple(replace(r, threshold=(9,) * len(r.threshold)) for r in d.rounds))
-        for d in record.decodes
-    ]
-    path = saved(replace(record, decodes=tuple(equal)), tmp_path)
-    assert named(path, "/decode/threshold") == ["r"]
-
-
 @pytest.mark.parametrize(
     ("kind", "frames", "present", "absent"),
     [

@@ -17,7 +17,7 @@ from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.decide import verdict_of
 from kerv_cli.report.plots import latency_figure, study_figures
 from kerv_cli.report.report import report
-from kerv_cli.report.stressed import by_kind, is_stressed, summed_table
+from kerv_cli.report.stressed import is_stressed, summed_table
 from kerv_cli.report.summary import summary_frame
 from kerv_cli.report.tables import latency_table, load_study, rows_of
 from kerv_cli.worlds.settings import StressSettings
@@ -71,14 +71,6 @@ def test_a_stressed_setting_is_compared_with_the_baseline_under_the_same_stress(
     assert rows["bold, kind=light level=4"]["pairs"] == len(TASKS) * EPISODES
     assert (rows["ar, kind=light level=4"]["stress"], rows["ar, kind=light level=4"]["stress_level"]) == ("light", 4)
     assert (rows["ar"]["stress"], rows["ar"]["stress_level"]) == ("none", 0)
-
-
-def test_lines_begin_with_the_unstressed_setting(stressed_table):
-    kinds = by_kind(stressed_table)
-    assert list(kinds) == ["push", "light"]
-    assert [row["label"] for row in kinds["light"]["bold"]] == [
-        "bold", "bold, kind=light level=1", "bold, kind=light level=4"
-    ]  # fmt: skip
 
 
 def test_the_figure_has_a_panel_per_kind_and_a_line_per_method(stressed_table):
