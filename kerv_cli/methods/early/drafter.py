@@ -8,7 +8,7 @@ small forward pass.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kerv_cli.base.registry import NoSettings
-from kerv_cli.base.spaces import ActionSpace, Observation
+from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.proposer import ChainProposer
@@ -265,7 +265,7 @@ class EarlyDrafter(TrainableDrafter):
     ) -> tuple[Decodes, Decodes]:
         """Decode about `settings.samples` observations with the target, spread evenly over all episodes.
 
-        Prompts are pooled right after encoding, so that neither images nor prompts stay in memory.
+        Prompts are pooled after each episode, so that neither images nor prompts stay in memory.
 
         Args:
             target: The loaded target, on the device to train on.
@@ -280,23 +280,33 @@ class EarlyDrafter(TrainableDrafter):
         Raises:
             CheckpointError: The images have another size than the target takes.
         """
-        sees = bool(target.cameras)
-        share, columns = share_of(dataset, settings.samples, sees), list[dict[str, Tensor]]()
+        sees, count = bool(target.cameras), len(dataset.episodes)
+        share, parts = share_of(dataset, settings.samples, sees), list[Decodes]()
+        for index in range(count):
+            episode = dataset.load(index)
+            steps = evenly(steps_of(episode, sees), share)
+            shared = {"episodes": index, "perturbed": episode.perturbed}
+            columns = {name: torch.full((len(steps),), value) for name, value in shared.items()}
+            parts.append(self.decoded(target, episode, steps, dataset.manifest.observation, columns))
+            progress(index + 1, count)
+        return split(type(parts[0]).joined(parts), held_out)
 
-        def observations() -> Iterator[Observation]:
-            for index in range(len(dataset.episodes)):
-                episode = dataset.load(index)
-                steps = evenly(steps_of(episode, sees), share)
-                columns.append(columns_of(episode, index, len(steps)))
-                yield from observations_of(target, episode, steps, dataset.manifest.observation)
-                progress(index + 1, len(dataset.episodes))
+    def decoded(
+        self, target: Any, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace, columns: dict[str, Tensor]
+    ) -> Decodes:
+        """Decode some observations of an episode with the target.
 
-        features, tokens = [], []
-        for prompt in prompts_of(target, observations()):
-            features.append(target.pooled(prompt).half().cpu())
-            tokens.append(greedy(target, prompt)[0].cpu())
-        joined = {name: torch.cat([column[name] for column in columns]) for name in columns[0]}
-        return split(EarlyExamples(features=torch.cat(features), tokens=torch.cat(tokens), **joined), held_out)
+        Args:
+            target: The loaded target.
+            episode: The episode.
+            steps: (n,) control steps of the observations.
+            space: Observation space of the demonstrations.
+            columns: The columns `episodes` and `perturbed` of the result.
+        """
+        prompts = list(prompts_of(target, observations_of(target, episode, steps, space)))
+        features = torch.cat([target.pooled(prompt).half().cpu() for prompt in prompts])
+        tokens = torch.cat([greedy(target, prompt)[0].cpu() for prompt in prompts])
+        return EarlyExamples(features=features, tokens=tokens, **columns)
 
     def prepare(self, network: Any, examples: Any) -> None:
         """Set the mean and the spread by which the network standardises its input features."""
@@ -362,17 +372,6 @@ def evenly(steps: np.ndarray, share: float) -> np.ndarray:
     """Return an evenly spread share of the steps (n,). The first step is always included."""
     order = np.arange(len(steps))
     return steps[np.ceil((order + 1) * share - 1e-9) > np.ceil(order * share - 1e-9)]
-
-
-def columns_of(episode: DemoEpisode, index: int, count: int) -> dict[str, Tensor]:
-    """Return the columns `episodes` and `perturbed` of `Decodes`, for `count` observations of one episode.
-
-    Args:
-        episode: The episode.
-        index: Its index in the dataset.
-        count: Number of observations.
-    """
-    return {"episodes": torch.full((count,), index), "perturbed": torch.full((count,), episode.perturbed)}
 
 
 def measure(logits: Tensor, examples: Decodes, strict: Tensor) -> Metrics:

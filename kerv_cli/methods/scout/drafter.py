@@ -23,16 +23,7 @@ from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.drafters import Metrics, Training
-from kerv_cli.methods.early.drafter import (
-    Decodes,
-    EarlyDrafter,
-    EarlyNetwork,
-    EarlyProposer,
-    columns_of,
-    evenly,
-    radius_of,
-    share_of,
-)
+from kerv_cli.methods.early.drafter import Decodes, EarlyDrafter, EarlyNetwork, EarlyProposer, radius_of
 from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.targets.compact.features import hand_features, mlp, scene_features, scene_width
 from kerv_cli.targets.compact.packable import Packable, wants_gradient
@@ -40,8 +31,8 @@ from kerv_cli.targets.compact.program import Program
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.vision import VisionEncoder
 from kerv_cli.targets.losses import position_loss
-from kerv_cli.targets.observations import BATCH, Observations, read_observations, split
-from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
+from kerv_cli.targets.observations import BATCH, Observations, read_observations
+from kerv_cli.worlds.demos.files import DemoEpisode
 
 
 class ScoutNetwork(Packable):
@@ -192,41 +183,22 @@ class ScoutDrafter(EarlyDrafter):
         """Build the part that the setting `proposer=scout` chooses."""
         return ScoutProposer(context.artifact(cls.kind), context.target)
 
-    @torch.inference_mode()
-    def examples(
-        self, target: Any, dataset: DemoDataset, settings: ScoutSettings, held_out: float, progress: OnProgress
-    ) -> tuple[ScoutExamples, ScoutExamples]:
-        """Decode about `settings.samples` observations with the target, spread evenly over all episodes.
-
-        Args:
-            target: The loaded target, on the device to train on.
-            dataset: The demonstrations.
-            settings: Settings of the drafter.
-            held_out: Share of the episodes to hold out.
-            progress: Called with the amounts of work done and of all.
-
-        Returns:
-            The training examples, and the held-out examples, which come from other episodes.
+    def decoded(
+        self, target: Any, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace, columns: dict[str, Tensor]
+    ) -> ScoutExamples:
+        """Decode some observations of an episode with the target; arguments as `EarlyDrafter.decoded`.
 
         Raises:
             CheckpointError: The target has no camera, or the images have another size than the target takes.
         """
-        check_sees(target)
-        share = share_of(dataset, settings.samples, sees=True)
-        parts: list[ScoutExamples] = []
-        for index in range(len(dataset.episodes)):
-            episode = dataset.load(index)
-            chosen = evenly(np.arange(len(episode.frame_steps)), share)
-            rows = read_observations(episode, target.settings, target.observation, target.words, chosen)
-            columns = columns_of(episode, index, len(rows))
-            tokens, places = [], []
-            for indices in torch.arange(len(rows)).split(BATCH):
-                prompt, located = target.encode_batch(rows.inputs(indices, target.device))
-                tokens.append(greedy(target, prompt)[0].cpu())
-                places.append(located.float().cpu())
-            parts.append(ScoutExamples(**(vars(rows) | columns), tokens=torch.cat(tokens), places=torch.cat(places)))
-            progress(index + 1, len(dataset.episodes))
-        return split(ScoutExamples.joined(parts), held_out)
+        settings, chosen = check_sees(target).settings, np.searchsorted(episode.frame_steps, steps)
+        rows = read_observations(episode, settings, space, target.words, chosen)
+        tokens, places = [], []
+        for indices in torch.arange(len(rows)).split(BATCH):
+            prompt, located = target.encode_batch(rows.inputs(indices, target.device))
+            tokens.append(greedy(target, prompt)[0].cpu())
+            places.append(located.float().cpu())
+        return ScoutExamples(**(vars(rows) | columns), tokens=torch.cat(tokens), places=torch.cat(places))
 
     def prepare(self, network: Any, examples: Any) -> None:
         """Do nothing. The features cannot be standardised, because they change while the vision encoder is trained."""
