@@ -9,7 +9,6 @@ Shapes: B batch, p numbers of proprioception, K places, s numbers of privileged 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -18,8 +17,6 @@ from kerv_cli.base.spaces import ObservationSpace, Place
 
 COARSE, FINE = 0.1, 0.02  # metres: a vector is divided by COARSE, and before a tanh by FINE
 STEP = 0.01  # metres (or units of the state) per control step: velocities are divided by it
-
-Saturate = Callable[[Tensor], Tensor]
 
 
 def mlp(*widths: int) -> nn.Sequential:
@@ -30,14 +27,9 @@ def mlp(*widths: int) -> nn.Sequential:
     return nn.Sequential(*parts[:-1])
 
 
-def relative(vector: Tensor, saturate: Saturate = torch.tanh) -> Tensor:
-    """Return the features (…, 6) of vectors (…, 3) in metres: vector / 0.1 m, then tanh(vector / 0.02 m).
-
-    Args:
-        vector: The vectors.
-        saturate: Replaces tanh.
-    """
-    return torch.cat([vector / COARSE, saturate(vector / FINE)], -1)
+def relative(vector: Tensor) -> Tensor:
+    """Return the features (…, 6) of vectors (…, 3) in metres: vector / 0.1 m, then tanh(vector / 0.02 m)."""
+    return torch.cat([vector / COARSE, torch.tanh(vector / FINE)], -1)
 
 
 def hand_features(proprioception: Tensor, centre: Tensor) -> Tensor:
@@ -50,32 +42,24 @@ def hand_features(proprioception: Tensor, centre: Tensor) -> Tensor:
     return torch.cat([(proprioception[:, :3] - centre) / COARSE, proprioception[:, 3:]], -1)
 
 
-def scene_features(proprioception: Tensor, places: Tensor, centre: Tensor, saturate: Saturate = torch.tanh) -> Tensor:
+def scene_features(proprioception: Tensor, places: Tensor, centre: Tensor) -> Tensor:
     """Return the scene features (B, p + 15 K − 6).
 
-    They hold all positions, the vectors from the hand to every place, and the vectors from each place to the next. They
-    are affine functions of the inputs, except for the columns that `saturate` computes.
+    They hold all positions, the vectors from the hand to every place, and the vectors from each place to the next.
 
     Args:
         proprioception: (B, p).
         places: (B, K, 3) positions in metres.
         centre: (3,) middle of the workspace in metres.
-        saturate: Replaces the tanh of `relative`.
     """
     vectors = torch.cat([places - proprioception[:, None, :3], places[:, 1:] - places[:, :-1]], 1)
     positions = ((places - centre) / COARSE).flatten(1)
-    return torch.cat([hand_features(proprioception, centre), positions, relative(vectors, saturate).flatten(1)], -1)
+    return torch.cat([hand_features(proprioception, centre), positions, relative(vectors).flatten(1)], -1)
 
 
 def scene_width(space: ObservationSpace) -> int:
     """Return the number of columns of `scene_features`."""
     return len(space.proprioception) + 15 * len(space.places) - 6
-
-
-def saturating_columns(space: ObservationSpace) -> list[int]:
-    """Return the indices of the columns of `scene_features` that a tanh limits."""
-    first = len(space.proprioception) + 3 * len(space.places)
-    return [first + 6 * vector + 3 + axis for vector in range(2 * len(space.places) - 1) for axis in range(3)]
 
 
 def privileged_features(proprioception: Tensor, states: Tensor, space: ObservationSpace) -> Tensor:

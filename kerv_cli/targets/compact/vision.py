@@ -6,7 +6,10 @@ The vision tokens are a coarse grid for the trunk. The K image points are found 
 
 from __future__ import annotations
 
+import io
+import warnings
 from collections.abc import Callable
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -66,8 +69,6 @@ class VisionEncoder(Packable):
 
     def pack_weights(self) -> Callable[[Tensor], list[Tensor]] | None:
         """Return this encoder in ONNX Runtime, for one image at a time. None if the weights are not float32."""
-        from kerv_cli.targets.compact.vision_graph import PackedVision  # loads ONNX Runtime, needed only on a CPU
-
         return PackedVision(self, 2 * len(self.columns)) if self.columns.dtype == torch.float32 else None
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -99,3 +100,42 @@ class VisionEncoder(Packable):
         x = (weight.sum(2) * self.columns).sum(-1)
         y = (weight.sum(3) * self.columns).sum(-1)
         return torch.cat([x, y], -1)
+
+
+class PackedVision:
+    """A vision encoder for one image, in ONNX Runtime, which is faster than torch on a CPU for small convolutions.
+
+    torch calls oneDNN for each convolution, and a call takes 19 µs before it computes anything. The encoder of the
+    smallest drafter has eleven convolutions. Measured on an AMD EPYC, 96 × 96 pixels, 8 channels: 607 µs in torch,
+    270 µs here.
+
+    An ONNX session cannot be copied, so copies and pickles hold None in its place. It uses as many threads as torch has
+    at the time of the export.
+    """
+
+    def __init__(self, encoder: nn.Module, size: int) -> None:
+        """Export an encoder.
+
+        Args:
+            encoder: Maps images (1, 3, size, size) uint8 to tokens and points.
+            size: Pixels per side of an image.
+        """
+        import onnxruntime  # needed only on a CPU
+
+        exported, options = io.BytesIO(), onnxruntime.SessionOptions()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # this exporter is deprecated, but the new one takes ten seconds
+            frame = torch.zeros(1, 3, size, size, dtype=torch.uint8)
+            names: Any = {"f": exported, "input_names": ["frame"], "opset_version": 17, "dynamo": False}
+            torch.onnx.export(encoder, (frame,), **names)
+        options.intra_op_num_threads, options.inter_op_num_threads = torch.get_num_threads(), 1
+        options.log_severity_level = 3
+        providers = ["CPUExecutionProvider"]
+        self.session = onnxruntime.InferenceSession(exported.getvalue(), options, providers=providers)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(None), ()
+
+    def __call__(self, images: Tensor) -> list[Tensor]:
+        """Return the vision tokens (1, grid², E) and K image points (1, 2K) of an image (1, 3, size, size) uint8."""
+        return [torch.from_numpy(found) for found in self.session.run(None, {"frame": images.numpy()})]
