@@ -281,7 +281,9 @@ class EarlyDrafter(TrainableDrafter):
             CheckpointError: The images have another size than the target takes.
         """
         sees, count = bool(target.cameras), len(dataset.episodes)
-        share, parts = share_of(dataset, settings.samples, sees), list[Decodes]()
+        stride = int(dataset.manifest.config["frame_stride"]) if sees else 1  # control steps per stored image
+        share = min(1.0, settings.samples * stride / sum(episode.steps for episode in dataset.episodes))
+        parts: list[Decodes] = []
         for index in range(count):
             episode = dataset.load(index)
             steps = evenly(steps_of(episode, sees), share)
@@ -354,18 +356,6 @@ class EarlyDrafter(TrainableDrafter):
 @functools.lru_cache(maxsize=1)
 def _labels(tokens: int, sigma: float, device: torch.device) -> Tensor:
     return soft_labels(tokens, sigma).to(device)
-
-
-def share_of(dataset: DemoDataset, samples: int, sees: bool) -> float:
-    """Return which share of the observations gives about `samples` observations.
-
-    Args:
-        dataset: The demonstrations.
-        samples: Number of observations wanted.
-        sees: Whether the target has cameras. Then only control steps with a stored image count.
-    """
-    stride = int(dataset.manifest.config["frame_stride"]) if sees else 1
-    return min(1.0, samples * stride / sum(e.steps for e in dataset.episodes))
 
 
 def evenly(steps: np.ndarray, share: float) -> np.ndarray:
