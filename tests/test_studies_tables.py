@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import sqlalchemy as sa
 from rich.console import Console
 from studies_synthetic import settings_of, still_episode, study_of, swept, threshold_study
 
 from kerv_cli.engine.record import DecodeRecord, Round
+from kerv_cli.lab import database as tables
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.execute import RunEpisode
 from kerv_cli.lab.plan import Episode, Setting, Study
@@ -22,7 +24,7 @@ from kerv_cli.lab.store import StudyStore, plan_study
 from kerv_cli.report.measures import MACRO, MICRO
 from kerv_cli.report.report import Unpublishable, refusals, report
 from kerv_cli.report.statistics import PairedCounts, mean_of, paired_difference, speedup, wilson
-from kerv_cli.report.summary import SummaryTable, not_in_turn, summary_frame
+from kerv_cli.report.summary import SummaryTable, not_in_turn, of_runs, summary_frame
 from kerv_cli.report.tables import StudyData, load_study
 
 PREFILL = Round("prefill", "none", 0, (), (1,), 0, 1, 0, ())
@@ -310,6 +312,28 @@ def test_the_page_stands_alone(results):
     assert {"All tasks", "By task", "Settings", "Tables"} <= set(re.findall(r"<h2>(.*?)</h2>", page))
     assert 'href="../../report/tables/threshold_per_task.csv"' in page
     assert len(re.findall(r"<thead><tr>", page)) == 2
+
+
+def test_the_interval_of_a_ratio_takes_the_run_as_a_cluster_from_three_runs_on(tmp_path):
+    """Two further runs, in which the method takes 1.2 and 1.5 times as long, widen it by Student's t over the runs."""
+    study, said, before = threshold_study(["reach-v3", "push-v3"]), [], math.nan
+    for slower in (1.0, 1.2, 1.5):
+        store, _ = swept(tmp_path, study, rerun="all")
+        with store.database.writing() as connection:
+            mine = tables.SETTINGS.c.label == "naive_sd"
+            newest = sa.select(tables.WANTED.c.episode_id).join(tables.SETTINGS).where(mine)
+            seconds = {"seconds": tables.EPISODES.c.seconds * slower}
+            connection.execute(sa.update(tables.EPISODES).where(tables.EPISODES.c.id.in_(newest)).values(seconds))
+        data = load_study(store)
+        row = row_of(data.table, averaging=MICRO, label="naive_sd")
+        said.append((row["runs"], of_runs(data.table)))
+        before = row["episode_speedup"] if slower == 1 else before
+    assert [runs for runs, _ in said] == [1, 1, 3]
+    assert ["alone" in text for _, text in said] == [True, True, False]
+    logs = np.log([1, 1 / 1.2, 1 / 1.5])
+    assert row["episode_speedup"] == pytest.approx(before * np.exp(logs.mean()))
+    reach = np.log(row["episode_speedup_high"] / row["episode_speedup"])
+    assert reach > 4.3027 * logs.std(ddof=1) / np.sqrt(3) > 0  # 4.3027: Student's t with two degrees of freedom, 97.5 %
 
 
 # --- studies publish

@@ -26,13 +26,11 @@ from kerv_cli.base.manifests import content_of
 from kerv_cli.base.registry import parts
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.episodes.identity import OBSERVATION
-from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.settings import settings_from
 from kerv_cli.lab.database import EPISODES, SETTINGS, STUDIES, WANTED, Database
 from kerv_cli.lab.plan import ALL, Episode, Setting
 from kerv_cli.lab.runs import COMPLETE, RUNNING, RunRow, forget, run_rows, unfinished
 from kerv_cli.lab.store import IMPORT, ROLLOUT, SWEEP, Plan, StudyStore, plan_study
-from kerv_cli.lab.study import new_name
 from kerv_cli.targets.folders import shipped_dir
 
 LOG, WEIGHTS = "log.csv", "model.safetensors"
@@ -397,6 +395,8 @@ def plan_of(run: RunEntry, results: str) -> Plan:
     if row is not None:
         name = row.name
     elif study.kind == ROLLOUT:
+        from kerv_cli.lab.study import new_name  # imports torch, which listing runs does not need
+
         name = new_name(database, study)
     else:
         names = (f"{run.id}-again{number if number > 1 else ''}" for number in itertools.count(1))
@@ -407,6 +407,8 @@ def plan_of(run: RunEntry, results: str) -> Plan:
 
 def _checked(setting: Setting, tasks: list[str], results: str) -> Setting:
     """Return a stored setting for this results folder. Refuse it if its weights or data have changed."""
+    from kerv_cli.episodes.policy import check  # imports torch
+
     stored = {**setting.settings, "results": results}
     identity = check(settings_from({**stored, "task": tasks}))
     for kind in setting.identity.keys() | identity.keys():

@@ -250,6 +250,7 @@ class _Sweep:
         self.attempts: list[_Attempt] = []
         self.is_here = self.runtime.executor == "local" and self.runtime.workers == 1
         self.spool = temporary_beside(self.database.results / "spool")
+        self.load = round(os.getloadavg()[0] / (os.cpu_count() or 1), 2)  # per core, at the start
 
     def run(self) -> events.Outcome:
         clock, to_run = time.perf_counter(), self.plan.to_run
@@ -373,6 +374,7 @@ class _Sweep:
         work, task, seed, repeat = one.key
         row = {"work": work, "task": task, "seed": seed, "repeat": repeat, "block": attempt.id, **message.row}
         about = {"engine": ENGINE, "executor": self.runtime.executor, "workers": self.runtime.workers}
+        about["load"] = self.load
         with self.database.writing() as connection:
             if not attempt.ended:
                 here = sa.update(BLOCKS).where(BLOCKS.c.id == attempt.id)

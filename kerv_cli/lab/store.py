@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -38,7 +39,7 @@ SWEEP, ROLLOUT, IMPORT = "sweep", "rollout", "import"
 _FOLDERS = {SWEEP: "studies", ROLLOUT: "rollouts", IMPORT: "studies"}
 _AT_ONCE = 500  # most values in one SQL IN (…)
 _ABOUT = ("title", "baseline", "axis", "note", "block")
-PROVENANCE = ("host", "device_name", "git_commit", "engine", "executor", "workers")
+PROVENANCE = ("host", "device_name", "git_commit", "engine", "executor", "workers", "load")
 """Facts about the machine and code that ran an episode, which tables show beside the versions."""
 
 
@@ -65,6 +66,13 @@ class ImportedEpisode:
     run: str = ""
     seeds: str = ""
     code: str = ""
+
+
+def _same_episode() -> sa.ColumnElement[bool]:
+    """Return the condition that joins SETTINGS and WANTED to every stored run of an episode."""
+    return sa.and_(
+        EPISODES.c.work == SETTINGS.c.work, *(EPISODES.c[name] == WANTED.c[name] for name in ("task", "seed", "repeat"))
+    )
 
 
 class StudyStore:
@@ -209,7 +217,18 @@ class StudyStore:
             ).one()
         return int(row[0]), int(row[1])
 
-    def frame(self, episodes: Iterable[Episode] | None = None) -> pd.DataFrame:
+    def whole_runs(self) -> list[str]:
+        """Return the ids of the commands that each ran all episodes of the study, oldest first."""
+        wanted = WANTED.join(SETTINGS).join(STUDIES).join(EPISODES, _same_episode()).join(BLOCKS)
+        keys = [WANTED.c[name] for name in ("setting_id", "task", "seed", "repeat")]
+        with self.database.reading() as connection:
+            rows = connection.execute(
+                sa.select(BLOCKS.c.run, *keys).distinct().select_from(wanted).where(STUDIES.c.name == self.name)
+            ).all()
+        counts = collections.Counter(row.run for row in rows)
+        return sorted(run for run, count in counts.items() if run and count == self.counts()[1])
+
+    def frame(self, episodes: Iterable[Episode] | None = None, run: str | None = None) -> pd.DataFrame:
         """Return the existing episodes as a table, in the study's order: one row per label, task, seed and repeat.
 
         It has the columns of the table `episodes`, with `decode_seconds` as an array. Further columns are `run`,
@@ -217,11 +236,13 @@ class StudyStore:
 
         Args:
             episodes: Only these episodes; None for all.
+            run: Only episodes that the command with this id ran; None for the study's present ones.
         """
         import numpy as np
         import pandas as pd
 
         keys = ("label", "task", "seed", "repeat")
+        which = WANTED.c.episode_id == EPISODES.c.id if run is None else _same_episode()
         circumstances = [EPISODES.c[name] for name in ("block", "order", "started", "decode_seconds")]
         with self.database.reading() as connection:
             query = (
@@ -229,8 +250,8 @@ class StudyStore:
                     SETTINGS.c.label, WANTED.c.task, WANTED.c.seed, WANTED.c.repeat, EPISODES.c.id.label("episode"),
                     *measures_in(connection), *circumstances, BLOCKS.c.run, BLOCKS.c.code, BLOCKS.c.about,
                 )
-                .select_from(WANTED.join(EPISODES).join(BLOCKS).join(SETTINGS).join(STUDIES))
-                .where(STUDIES.c.name == self.name)
+                .select_from(WANTED.join(SETTINGS).join(STUDIES).join(EPISODES, which).join(BLOCKS))
+                .where(STUDIES.c.name == self.name, *([] if run is None else [BLOCKS.c.run == run]))
                 .order_by(WANTED.c.position)
             )  # fmt: skip
             frame = pd.DataFrame(connection.execute(query).mappings().all())

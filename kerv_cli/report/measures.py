@@ -70,12 +70,14 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, all_
     timed = pairs if all_pairs else pairs[pairs["same_block"]]
     success = _averaged(once, macro, lambda group: stats.wilson(int(group["success"].sum()), len(group)))
     difference = _averaged(worlds, macro, lambda group: stats.paired_difference(pair_counts(group)))
-    has_times = decodes(episodes) and is_timed(timed, "time_method") and is_timed(timed, "time_baseline")
+    speedups = [_speedup(timed, time, macro) for time in ("time", "seconds")]
+    if not (decodes(episodes) and is_timed(timed, "time_method") and is_timed(timed, "time_baseline")):
+        speedups = [stats.NO_ESTIMATE] * 2
     return {
         "successes": int(once["success"].sum()),
         **columns_of("success", success),
-        **columns_of("speedup", _speedup(timed, "time", macro) if has_times else stats.NO_ESTIMATE),
-        **columns_of("episode_speedup", _speedup(timed, "seconds", macro) if has_times else stats.NO_ESTIMATE),
+        **columns_of("speedup", speedups[0]),
+        **columns_of("episode_speedup", speedups[1]),
         **(_mean_of_groups(episodes) if macro else _means(episodes)),
         **paired_columns(pair_counts(worlds), difference),
         "pairs_to_settle": stats.pairs_to_settle(pair_counts(worlds), MARGIN),

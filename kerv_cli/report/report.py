@@ -22,7 +22,7 @@ from kerv_cli.report.measures import MACRO, MICRO, Row
 from kerv_cli.report.plots import about, latency_figure, png, study_figures
 from kerv_cli.report.reprice import ASSUMES, open_profiles, repriced_summary, repriced_table
 from kerv_cli.report.stressed import is_stressed, summed_table
-from kerv_cli.report.summary import NOTE, SPEEDS, summary_frame
+from kerv_cli.report.summary import NOTE, SPEEDS, of_runs, summary_frame
 from kerv_cli.report.tables import (
     CSV_COLUMNS,
     StudyData,
@@ -187,7 +187,7 @@ def render(
         is_shown=is_shown,
         caution=caution(data.table),
         about=f"{about(data.table)} · kerv {first['kerv_version']} at {str(first['git_commit'])[:12]}",
-        columns=NOTE,
+        columns=f"{NOTE} {of_runs(data.table)}",
         absent=list(dict.fromkeys(f"{one.setting.label} on {one.task}" for one in data.absent)),
         missing=len(data.absent),
         where=where,

@@ -159,11 +159,17 @@ class SummaryTable:
         yield Text(title, style="bold", overflow="fold")
         yield _printed(frame)
         several = ", under the same stress and clock" if rows["baseline"].nunique() > 1 else ""
-        yield Text(f"{NOTE} Baseline: {first['baseline']}{several}.")
+        yield Text(f"{NOTE} {of_runs(self.table)} Baseline: {first['baseline']}{several}.")
         if frame[SPEEDS["episode_speedup"]].str.endswith(APART).any():
             yield Text(f"{APART} only from pairs that were measured in turn")
         if untimed := list(rows.loc[rows["time_per_step_ms"].isna(), "label"]):
             yield Text(f"not timed, for success alone: {', '.join(untimed)}")
+
+
+def of_runs(table: pd.DataFrame) -> str:
+    """Return one sentence that says how many runs the intervals of speed cover."""
+    runs = int(table["runs"].min()) if "runs" in table else 1
+    return f"Intervals of speed: of {runs} runs." if runs > 2 else "Intervals of speed: of this run alone."
 
 
 def _printed(frame: pd.DataFrame) -> Table:

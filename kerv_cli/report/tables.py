@@ -17,7 +17,8 @@ from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, flat
 from kerv_cli.lab.plan import Episode, Setting, Study, seeds_text
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.matched import with_matched_speed
-from kerv_cli.report.measures import MACRO, MICRO, Row, measure
+from kerv_cli.report.measures import MACRO, MICRO, Row, columns_of, measure
+from kerv_cli.report.statistics import Estimate, over_runs
 from kerv_cli.targets.provenance import PACKAGES
 from kerv_cli.worlds import specs
 
@@ -35,8 +36,12 @@ CSV_COLUMNS = (
 _RUNTIME = ("device", "dtype", "threads")
 _PROVENANCE = (
     "executor", "workers", "device_name", "host", *(f"{name}_version" for name in PACKAGES), "python_version",
-    "git_commit", "engine", "code", "run",
+    "git_commit", "engine", "code", "run", "load",
 )  # fmt: skip
+
+
+_ONE_STATE = ("code", "git_commit", "device_name")
+"""Columns in which runs must agree, to be averaged."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +52,12 @@ class StudyData:
         study: The settings, and the episodes that the study asks for.
         episodes: One row per stored episode (label, task, seed and repeat). Columns: those of `StudyStore.frame`, with
             difficulty, device, number format and threads.
+        runs: The same table for each command that ran all of the episodes, if there are at least three.
     """
 
     study: Study
     episodes: pd.DataFrame
+    runs: tuple[pd.DataFrame, ...] = ()
 
     @functools.cached_property
     def settings(self) -> dict[str, Setting]:
@@ -138,7 +145,10 @@ def load_study(store: StudyStore, wanted: Sequence[Episode] | None = None) -> St
     frame = store.frame(wanted)
     if frame.empty:
         raise UsageError(f"study '{store.name}' has no episode yet: {store.how_to_run()}")
-    return StudyData(study, _labelled(study, frame))
+    frames = [store.frame(run=run) for run in store.whole_runs()] if wanted is None else []
+    alike = [one for one in frames if all(set(one[name]) == set(frame[name]) for name in _ONE_STATE)]
+    runs = [_labelled(study, one) for one in alike] if len(alike) > 2 else []
+    return StudyData(study, _labelled(study, frame), tuple(runs))
 
 
 def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
@@ -211,6 +221,7 @@ def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataF
         "episodes": len(episodes),
         "baseline": data.references[label],
         **measure(episodes, baseline, averaging),
+        **_over_runs(data, label, tasks, averaging),
         "overrides": setting.overrides,
         **flatten(without(setting.settings, NOT_DETERMINING - {"policy"})),
         "observation": setting.identity.get(OBSERVATION, ""),
@@ -219,6 +230,20 @@ def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataF
         "stress_level": stress["level"],
         **{key: _joined(episodes[key].dropna()) if key in episodes else "" for key in _PROVENANCE},
     }
+
+
+def _over_runs(data: StudyData, label: str, tasks: list[str], averaging: str) -> Row:
+    """Return the number of runs and, from three on, the speeds over all of them (docs/methods.md §7)."""
+    parts: list[Row] = []
+    for run in data.runs:
+        here = run[run["task"].isin(tasks)]
+        method, baseline = (here[here["label"] == one] for one in (label, data.references[label]))
+        parts.append(measure(method, baseline, averaging))
+    row: Row = {"runs": max(1, len(parts))}
+    for name in ("speedup", "episode_speedup") if parts else ():
+        estimates = [Estimate(*(part[f"{name}{end}"] for end in ("", "_low", "_high"))) for part in parts]
+        row |= columns_of(name, over_runs(estimates))
+    return row
 
 
 def flatten(settings: Plain) -> Row:
