@@ -146,7 +146,8 @@ def load_study(store: StudyStore, wanted: Sequence[Episode] | None = None) -> St
     if frame.empty:
         raise UsageError(f"study '{store.name}' has no episode yet: {store.how_to_run()}")
     frames = [store.frame(run=run) for run in store.whole_runs()] if wanted is None else []
-    alike = [one for one in frames if all(set(one[name]) == set(frame[name]) for name in _ONE_STATE)]
+    names = [name for name in _ONE_STATE if name in frame]  # imported episodes may lack some
+    alike = [one for one in frames if all(set(one[name]) == set(frame[name]) for name in names)]
     runs = [_labelled(study, one) for one in alike] if len(alike) > 2 else []
     return StudyData(study, _labelled(study, frame), tuple(runs))
 
