@@ -213,7 +213,7 @@ def find(kind: str, name: str, what: str = "") -> Part:
 
 
 def part_of(group: str, name: str) -> Part:
-    """Return the part that a group of settings chooses.
+    """Return the part with this name in a group of settings.
 
     Args:
         group: Name of the group, such as `acceptance`. Parts of the group `prefill_draft` are proposers.

@@ -17,7 +17,7 @@ S = TypeVar("S")
 
 
 def chosen(kind: str, name: str = "none") -> Callable[[], Any]:
-    """Return a function that makes the default settings of a part, as the default of a dataclass field."""
+    """Return a `default_factory` for a dataclass field: it makes the default settings of the part `name`."""
     return lambda: find(kind, name).default
 
 

@@ -83,7 +83,7 @@ def check_policy(settings: DoctorSettings) -> list[Finding]:
 
 
 def check_environment_of(settings: DoctorSettings) -> list[Finding]:
-    """Check on its first task whether an environment behaves as kerv requires.
+    """Check on an environment's first task whether it behaves as kerv requires.
 
     Returns an empty list if no environment is to be checked.
     """

@@ -59,7 +59,7 @@ def planned_study(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
 
 
 def planned_rollout(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
-    """Plan a rollout as `planned_study` plans a study. If it continues an interrupted rollout, print that."""
+    """Return the plan of a rollout: its episodes, and which are done. Say so if it continues another."""
     planned = _planned(resolved, command, is_rollout=True)
     if planned.existing:
         there, wanted = len(planned.existing), len(planned.study.episodes)

@@ -133,7 +133,7 @@ class Chunk:
     """The N tokens of one decode, filled step by step.
 
     Parts of a method may read it. They change it only through its methods. The cache holds the prompt and all committed
-    tokens except `uncached`, which is the last one unless a rectifier has filled several.
+    tokens but `uncached`: the last token, or several if a rectifier has filled a control step.
     """
 
     encoding: Tensor | Callable[[], Tensor]  # the prompt, or a function that encodes it

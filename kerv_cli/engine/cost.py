@@ -29,7 +29,7 @@ _LEVELS = 5  # assumed depth of such a tree
 
 
 def source_costs() -> dict[str, list[str]]:
-    """Return the proposers by kind of cost: kind -> names.
+    """Return, for each kind of cost, the names of the proposers whose drafts it prices.
 
     A proposer that is not listed costs the seconds that were recorded for its drafts.
     """

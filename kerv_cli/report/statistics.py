@@ -88,7 +88,7 @@ def mean_of(groups: Sequence[Estimate]) -> Estimate:
 
 
 def paired_counts(baseline: np.ndarray, method: np.ndarray) -> PairedCounts:
-    """Count the four outcomes of pairs.
+    """Count the pairs that succeeded in both episodes, in the baseline's alone, in the method's alone, and in none.
 
     Args:
         baseline: (pairs,) bool. Whether the baseline's episode succeeded.

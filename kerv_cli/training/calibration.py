@@ -161,7 +161,7 @@ class CalibrationRun:
         return calibration
 
     def skip(self, stage: Stage) -> SkipSection | None:
-        """Return the similarities from which verification is skipped, per task; None without a datastore."""
+        """Return per task the lowest similarity at which verification is skipped. None without a datastore."""
         if not self.has_datastore:
             return None
         store = self.artifacts.load("datastore")

@@ -60,7 +60,7 @@ add("datastore", "qdrant", _DATASTORE + "QdrantIndex", QdrantSearchSettings)
 class HybridProposerSettings:
     """HeiSD: draft by retrieval or with the drafter, as the boundary chooses (docs/methods.md §4.4).
 
-    The paper uses five neighbours. They need about 50 nodes, which cost more than they gain on our targets.
+    The paper's five neighbours make a tree of about 50 nodes, which costs more than it gains on a CPU.
     """
 
     kind: str = "hybrid"

@@ -343,7 +343,7 @@ class Datastore:
         return self.manifest.content
 
     def pooled(self, prompt: Tensor, target: ReadableTarget) -> Tensor:
-        """Average the prompt's tokens per segment, to make a search key with `key_of`.
+        """Average the prompt's tokens per part (scene, vision, proprioception), to make a search key with `key_of`.
 
         Args:
             prompt: (1, P, E) encoded prompt.

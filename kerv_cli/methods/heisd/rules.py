@@ -232,7 +232,7 @@ class HybridProposer(Proposer):
 
     @classmethod
     def build(cls, settings: HybridProposerSettings, context: Context) -> HybridProposer:
-        """Build the part that the setting `proposer=hybrid` chooses."""
+        """Build the hybrid proposer, which `proposer=hybrid` chooses."""
         return cls(EagleDrafter.proposer(settings, context), RetrievalProposer.build(settings, context))
 
     def prepare(self, chunk: Chunk) -> None:

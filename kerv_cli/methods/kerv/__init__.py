@@ -117,8 +117,8 @@ class RadiusRange:
 class KinematicThresholdSettings(RadiusRange):
     """KERV: the acceptance radius r depends on the variability K, the mean distance of the last drafts to the target.
 
-    With `kinematic`, r is large if K is small (docs/methods.md §3.2). With `change`, an ablation, r shrinks if K grows.
-    With `quoted`, the paper's formula, r only grows.
+    With `kinematic`, r is large where K is small (docs/methods.md §3.2). With `change`, an ablation, r shrinks when K
+    has risen since the last decode. With `quoted`, the paper's formula, r never shrinks.
     """
 
     kind: str = "kinematic"
