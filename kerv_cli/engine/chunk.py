@@ -311,8 +311,6 @@ class Chunk:
         """Return the actions (steps, D) of the complete chunk, float32, environment units."""
         values = self.closed
         if values is None:
-            if not self.filled:
-                return actions_of(self.space, self.tokens)
             values = self.space.values_of(np.array(self.tokens))
             values[list(self.filled)] = list(self.filled.values())
         return self.space.unnormalise(values.reshape(-1, self.dofs)).astype(np.float32)

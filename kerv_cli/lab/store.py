@@ -225,8 +225,8 @@ class StudyStore:
             rows = connection.execute(
                 sa.select(BLOCKS.c.run, *keys).distinct().select_from(wanted).where(STUDIES.c.name == self.name)
             ).all()
-        counts = collections.Counter(row.run for row in rows)
-        return sorted(run for run, count in counts.items() if run and count == self.counts()[1])
+        counts, (_, total) = collections.Counter(row.run for row in rows), self.counts()
+        return sorted(run for run, count in counts.items() if run and count == total)
 
     def frame(self, episodes: Iterable[Episode] | None = None, run: str | None = None) -> pd.DataFrame:
         """Return the existing episodes as a table, in the study's order: one row per label, task, seed and repeat.

@@ -67,17 +67,14 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, all_
     macro = averaging == MACRO
     worlds = pairs[pairs["repeat"] == 0]  # a repeat measures the same world again
     once = episodes[episodes["repeat"] == 0]
-    timed = pairs if all_pairs else pairs[pairs["same_block"]]
     success = _averaged(once, macro, lambda group: stats.wilson(int(group["success"].sum()), len(group)))
     difference = _averaged(worlds, macro, lambda group: stats.paired_difference(pair_counts(group)))
-    speedups = [_speedup(timed, time, macro) for time in ("time", "seconds")]
-    if not (decodes(episodes) and is_timed(timed, "time_method") and is_timed(timed, "time_baseline")):
-        speedups = [stats.NO_ESTIMATE] * 2
+    speeds = speedups(episodes, pairs, macro, all_pairs)
     return {
         "successes": int(once["success"].sum()),
         **columns_of("success", success),
-        **columns_of("speedup", speedups[0]),
-        **columns_of("episode_speedup", speedups[1]),
+        **columns_of("speedup", speeds["speedup"]),
+        **columns_of("episode_speedup", speeds["episode_speedup"]),
         **(_mean_of_groups(episodes) if macro else _means(episodes)),
         **paired_columns(pair_counts(worlds), difference),
         "pairs_to_settle": stats.pairs_to_settle(pair_counts(worlds), MARGIN),
@@ -169,6 +166,21 @@ def is_timed(episodes: pd.DataFrame, column: str = "seconds") -> bool:
     Episodes that ran in a batch have no times (docs/measuring.md).
     """
     return bool(episodes[column].notna().all())
+
+
+def speedups(episodes: pd.DataFrame, pairs: pd.DataFrame, macro: bool, all_pairs: bool = False) -> dict[str, Estimate]:
+    """Return `speedup` and `episode_speedup` of a setting, as `measure` defines them.
+
+    Args:
+        episodes: Episodes of the setting.
+        pairs: Table made by `paired`.
+        macro: Whether to average times over difficulty groups.
+        all_pairs: Whether to use pairs that were not measured in one block, too.
+    """
+    timed = pairs if all_pairs else pairs[pairs["same_block"]]
+    usable = decodes(episodes) and is_timed(timed, "time_method") and is_timed(timed, "time_baseline")
+    times = {"speedup": "time", "episode_speedup": "seconds"}
+    return {name: _speedup(timed, time, macro) if usable else stats.NO_ESTIMATE for name, time in times.items()}
 
 
 def _speedup(pairs: pd.DataFrame, time: str, macro: bool) -> Estimate:

@@ -17,7 +17,7 @@ from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, flat
 from kerv_cli.lab.plan import Episode, Setting, Study, seeds_text
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.matched import with_matched_speed
-from kerv_cli.report.measures import MACRO, MICRO, Row, columns_of, measure
+from kerv_cli.report.measures import MACRO, MICRO, Row, columns_of, measure, paired, speedups
 from kerv_cli.report.statistics import Estimate, over_runs
 from kerv_cli.targets.provenance import PACKAGES
 from kerv_cli.worlds import specs
@@ -145,7 +145,8 @@ def load_study(store: StudyStore, wanted: Sequence[Episode] | None = None) -> St
     frame = store.frame(wanted)
     if frame.empty:
         raise UsageError(f"study '{store.name}' has no episode yet: {store.how_to_run()}")
-    frames = [store.frame(run=run) for run in store.whole_runs()] if wanted is None else []
+    whole = store.whole_runs() if wanted is None else []
+    frames = [store.frame(run=run) for run in whole] if len(whole) > 2 else []
     names = [name for name in _ONE_STATE if name in frame]  # imported episodes may lack some
     alike = [one for one in frames if all(set(one[name]) == set(frame[name]) for name in names)]
     runs = [_labelled(study, one) for one in alike] if len(alike) > 2 else []
@@ -235,15 +236,14 @@ def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataF
 
 def _over_runs(data: StudyData, label: str, tasks: list[str], averaging: str) -> Row:
     """Return the number of runs and, from three on, the speeds over all of them (docs/methods.md §7)."""
-    parts: list[Row] = []
+    parts: list[dict[str, Estimate]] = []
     for run in data.runs:
         here = run[run["task"].isin(tasks)]
         method, baseline = (here[here["label"] == one] for one in (label, data.references[label]))
-        parts.append(measure(method, baseline, averaging))
+        parts.append(speedups(method, paired(method, baseline), averaging == MACRO))
     row: Row = {"runs": max(1, len(parts))}
-    for name in ("speedup", "episode_speedup") if parts else ():
-        estimates = [Estimate(*(part[f"{name}{end}"] for end in ("", "_low", "_high"))) for part in parts]
-        row |= columns_of(name, over_runs(estimates))
+    for name in parts[0] if parts else ():
+        row |= columns_of(name, over_runs([part[name] for part in parts]))
     return row
 
 

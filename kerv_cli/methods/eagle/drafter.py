@@ -340,15 +340,7 @@ class EagleDrafter(TrainableDrafter):
     ) -> tuple[StatesByLength, StatesByLength]:
         """Decode the demonstrations' observations greedily with the target. The expert's actions are not used.
 
-        Args:
-            target: The loaded target, on the device to train on.
-            dataset: The demonstrations.
-            settings: Settings of the drafter.
-            held_out: Share of the episodes to hold out.
-            progress: Called with the amounts of work done and of all.
-
-        Returns:
-            The training examples, and the held-out examples, which come from other episodes.
+        The arguments and the result are those of `TrainableDrafter.examples`.
 
         Raises:
             CheckpointError: There is only one episode, or an episode is damaged.

@@ -267,15 +267,7 @@ class EarlyDrafter(TrainableDrafter):
 
         Prompts are pooled after each episode, so that neither images nor prompts stay in memory.
 
-        Args:
-            target: The loaded target, on the device to train on.
-            dataset: The demonstrations.
-            settings: Settings of the drafter.
-            held_out: Share of the episodes to hold out.
-            progress: Called with the amounts of work done and of all.
-
-        Returns:
-            The training examples, and the held-out examples, which come from other episodes.
+        The arguments and the result are those of `TrainableDrafter.examples`.
 
         Raises:
             CheckpointError: The images have another size than the target takes.
