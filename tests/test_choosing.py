@@ -34,6 +34,7 @@ def row(
         "episode_speedup_high": speedup + 0.1,
         "forwards_per_step": forwards,
         "unverified_share": unverified,
+        "runs": 1,
         "success": (counts.both + counts.only_method) / pairs,
         "pairs": pairs,
         "difference_low": found.low,
@@ -62,7 +63,7 @@ def test_the_fastest_setting_before_the_first_that_fails_is_chosen(table):
     assert (whole.chosen, whole.front, whole.is_shown) == ("r=9", ("unverified",), True)
     assert sentence(whole, 4.0, "ar") == (
         "r=9 loses less than 4 points of success against ar (95 % confidence, 200 pairs) and is faster: "
-        "1.50 (1.40–1.60) times as fast per episode on this machine"
+        "1.50 (1.40–1.60 of this run) times as fast per episode on this machine"
     )
     assert short_sentence(reach) == "reach: r=9"
 

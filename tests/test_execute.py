@@ -42,6 +42,7 @@ from kerv_cli.lab.executors import check_executor
 from kerv_cli.lab.plan import Setting, Study, blocks_of
 from kerv_cli.lab.store import StudyStore, plan_study
 from kerv_cli.lab.study import estimate
+from kerv_cli.report.tables import further_of, load_study
 
 STUDY = threshold_study(["reach-v3"])
 TWO = threshold_study(["reach-v3", "push-v3"])
@@ -310,6 +311,17 @@ def test_progress_without_a_terminal_is_plain_lines(tmp_path, capsys):
     assert re.fullmatch(r"episodes 12/12, reach-v3 100001-100003: 4 settings in turn", lines[-1])
     assert any(re.match(r"episodes \d+/12, about \d+ s left, ", line) for line in lines)
     assert "\x1b" not in written
+
+
+@pytest.mark.parametrize(("load", "lines"), [(2.0, 0), (3.0, 1)])
+def test_a_busy_machine_is_said_once_and_kept(load, lines, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("os.getloadavg", lambda: (load, 0.0, 0.0))
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    with progress_bar("episodes") as show:
+        store, _ = swept(tmp_path, STUDY, on_event=event_printer(show))
+    assert capsys.readouterr().err.count("the load average is 1.5 per core") == lines
+    (told,) = {about["provenance"]["load"] for about in further_of(load_study(store))["labels"].values()}
+    assert told == str(load / 2)
 
 
 def runtime(executor: str, **options: Any) -> RuntimeSettings:

@@ -92,6 +92,7 @@ def test_it_is_reported_as_it_was(older):
             "steps_to_success",
             "near_contact_failure",
             "matched_success_speed",
+            "runs",
         }
         pd.testing.assert_frame_equal(text.loc[rows, columns], before.loc[rows, columns])
 

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 SECONDS_PER_EPISODE = 1.0
 """Guess that is used before anything was measured. MT10 takes 0.5 to 1.5 s per episode on one core."""
+BUSY = 1.2
+"""Load average per core above which a line says that other programs disturb the measured times."""
 
 
 def planned_study(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
@@ -167,6 +169,8 @@ def event_printer(show: Callable[[int, int, str], None]) -> Callable[[Event], No
         nonlocal total, ended, title
         line = ""
         if isinstance(event, Started):
+            if event.load > BUSY and not total:  # until=decided starts several times
+                typer.echo(f"the load average is {event.load:g} per core: other programs slow these times", err=True)
             total, ended = event.to_run, 0
             line = f"{count(event.reused, 'episode')} there already" if event.reused else ""
         elif isinstance(event, BlockStarted):

@@ -16,10 +16,12 @@ class Started:
     Attributes:
         to_run: Number of episodes to run.
         reused: Number of episodes that are in the database already.
+        load: Load average per core at the start. 0 if no episode is timed.
     """
 
     to_run: int
     reused: int
+    load: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -257,7 +257,8 @@ class _Sweep:
         options = check_executor(self.runtime)
         clean(self.database.results)  # remove messages to processes that were killed
         self.record.beat(0, len(to_run))
-        self.on_event(events.Started(len(to_run), len(self.plan.existing)))
+        is_timed = any(block.batch == 1 for block in self.waiting)
+        self.on_event(events.Started(len(to_run), len(self.plan.existing), self.load if is_timed else 0.0))
         if to_run:
             threads = max(one.setting.settings["runtime"]["threads"] for one in to_run)
             part = find("executor", self.runtime.executor)

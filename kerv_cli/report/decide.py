@@ -97,6 +97,7 @@ def _choice(where: str, rows: Sequence[Row], loss: float) -> Choice:
         candidate=label,
         candidate_pairs=reached.get(label, math.nan),
         tested=len(order),
+        runs=int(best["runs"]) if best else 0,
         **{f"{SPEED}{end}": float(best[f"{SPEED}{end}"]) if best else math.nan for end in ("", "_low", "_high")},
     )
 

@@ -24,12 +24,12 @@ from kerv_cli.worlds import specs
 
 CSV_COLUMNS = (
     "study", "averaging", "label", "method", "stress", "stress_level", "task", "seeds", "episodes", "baseline",
-    "successes", "success", "success_low", "success_high", "speedup", "speedup_low", "speedup_high",
+    "successes", "success", "success_low", "success_high", "runs", "speedup", "speedup_low", "speedup_high",
     "episode_speedup", "episode_speedup_low", "episode_speedup_high", "time_per_step_ms",
     "time_per_episode_ms", "latency_p50_ms", "latency_p95_ms", "AL", "forwards_per_step",
     "skip_rate", "unverified_share", "compensation_rate", "retrieval_share", "deviation", "pairs", "only_baseline",
     "only_method", "mcnemar_p", "difference", "difference_low", "difference_high", "non_inferior", "pairs_to_settle",
-    "steps", "decodes", "steps_to_success", "near_contact_failure", "matched_success_speed",
+    "steps", "steps_to_success", "near_contact_failure", "matched_success_speed",
 )  # fmt: skip
 """Columns of a study's CSV files. The remaining values are in tables/<study>.json (`further_of`)."""
 

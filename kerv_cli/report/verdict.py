@@ -39,6 +39,7 @@ class Choice:
         episode_speedup: Speed per episode of the chosen setting against the baseline. NaN if it was not timed.
         episode_speedup_low: Lower end of its 95 % interval.
         episode_speedup_high: Upper end of its 95 % interval.
+        runs: Number of runs that this interval covers.
     """
 
     where: str
@@ -53,6 +54,7 @@ class Choice:
     episode_speedup: float
     episode_speedup_low: float
     episode_speedup_high: float
+    runs: int
 
     @property
     def is_shown(self) -> bool:
@@ -134,7 +136,8 @@ def _speed(choice: Choice) -> str:
     if not is_number(choice.episode_speedup):
         return "; its speed was not measured"
     shown = "and is faster" if choice.is_shown else "but is not shown to be faster"
-    interval = f"({choice.episode_speedup_low:.2f}–{choice.episode_speedup_high:.2f})"
+    runs = f"of {choice.runs} runs" if choice.runs > 2 else "of this run"
+    interval = f"({choice.episode_speedup_low:.2f}–{choice.episode_speedup_high:.2f} {runs})"
     return f" {shown}: {choice.episode_speedup:.2f} {interval} times as fast per episode on this machine"
 
 
