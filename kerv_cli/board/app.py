@@ -1,0 +1,101 @@
+"""Assemble the web app from the routes of its modules, and serve it on this machine alone."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import Mount
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from kerv_cli.base.errors import KervError, UsageError
+from kerv_cli.board import episodes, runs, studies, training
+from kerv_cli.board.pages import render
+from kerv_cli.lab.database import Database
+
+HOST = "127.0.0.1"
+_HOSTS = [HOST, "localhost"]
+_READS = ("GET", "HEAD")
+
+
+class SameOrigin:
+    """Refuse requests that change something, if the page of another site sends them.
+
+    Browsers send the header Origin with every such request. Programs such as curl do not, and may pass.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer 403, or pass the request on."""
+        if scope["type"] == "http" and scope["method"] not in _READS:
+            headers = Request(scope).headers
+            if urlsplit(headers.get("origin", f"http://{headers['host']}")).netloc != headers["host"]:
+                await PlainTextResponse("refused: another site's page sent this", 403)(scope, receive, send)
+                return
+        await self.app(scope, receive, send)
+
+
+def make_app(results: str | Path) -> Starlette:
+    """Return the web app that shows a results folder.
+
+    Pages find the database in `request.app.state.database`.
+    """
+    static = Mount("/static", StaticFiles(packages=[("kerv_cli.board", "static")]), name="static")
+    app = Starlette(
+        routes=[*runs.ROUTES, *studies.ROUTES, *episodes.ROUTES, *training.ROUTES, static],
+        middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=_HOSTS), Middleware(SameOrigin)],
+        exception_handlers={KervError: _failed, HTTPException: _failed},
+    )
+    app.state.database = Database(results)
+    return app
+
+
+async def _failed(request: Request, error: Exception) -> Response:
+    """Return the page for an error: 404 if something does not exist, 500 if something is damaged."""
+    if isinstance(error, HTTPException):
+        return render(request, "error.html", error.status_code, reason=error.detail)
+    return render(request, "error.html", 404 if isinstance(error, UsageError) else 500, reason=str(error))
+
+
+def serve(results: str | Path, port: int, opened: Callable[[str], None], browser: bool) -> None:
+    """Serve the web app until Ctrl-C.
+
+    Args:
+        results: The results folder.
+        port: Port to listen on; 0: a free one.
+        opened: Called with the address as soon as the port is open.
+        browser: Whether to open the address in the browser.
+
+    Raises:
+        UsageError: The port is taken.
+    """
+    server = uvicorn.Server(uvicorn.Config(make_app(results), log_level="error", timeout_graceful_shutdown=1))
+    with socket.socket() as listening:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listening.bind((HOST, port))
+        except OSError as error:
+            raise UsageError(
+                f"port {port} cannot be used ({error.strerror}): port=0 takes a free one", "port"
+            ) from None
+        listening.listen()
+        address = f"http://{HOST}:{listening.getsockname()[1]}/"
+        opened(address)
+        if browser:
+            webbrowser.open(address)
+        with contextlib.suppress(KeyboardInterrupt):
+            server.run(sockets=[listening])

@@ -1,0 +1,51 @@
+"""Helpers of all pages: render a template, answer polls, and find files in the results folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import HTMLResponse
+
+from kerv_cli.lab.database import Database
+
+TEMPLATES = Environment(
+    loader=ChoiceLoader([PackageLoader("kerv_cli.board"), PackageLoader("kerv_cli.report", ".")]),
+    autoescape=True,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+
+
+def database_of(request: Request) -> Database:
+    """Return the database of the results folder that the app shows."""
+    database: Database = request.app.state.database
+    return database
+
+
+def render(request: Request, template: str, status: int = 200, **values: Any) -> HTMLResponse:
+    """Return a page.
+
+    Args:
+        request: The request. Templates can read it, for example `request.url.path`.
+        template: File in `templates/`.
+        status: HTTP status.
+        **values: Values that the template shows. They are escaped.
+    """
+    return HTMLResponse(TEMPLATES.get_template(template).render(request=request, **values), status)
+
+
+def inside(request: Request, path: Path) -> Path:
+    """Return a path if it lies in the results folder, symbolic links followed.
+
+    Raises:
+        HTTPException: There is no such file, or it is outside.
+    """
+    resolved = path.resolve()
+    if not resolved.is_relative_to(database_of(request).results.resolve()) or not resolved.exists():
+        raise HTTPException(404, "no such file in the results folder")
+    return resolved
