@@ -14,13 +14,15 @@ from kerv_cli.base.config import _composed, compose, conf_dir, expand, groups, s
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import check_label, check_settings, description
 from kerv_cli.base.places import artifact
-from kerv_cli.base.registry import PART_GROUPS, SETTINGS_GROUPS, part_of, parts
+from kerv_cli.base.registry import PART_GROUPS, SETTINGS_GROUPS, NoSettings, part_of, parts
 from kerv_cli.cli.common import settings_yaml
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.targets.folders import find_target
 
-SCHEMAS = {name.replace(" ", "_"): part.settings for name, part in parts("command").items()}
+SCHEMAS = {
+    name.replace(" ", "_"): part.settings for name, part in parts("command").items() if part.settings is not NoSettings
+}
 # which command each group belongs to
 HOMES = {"target": "train_target", "grow": "build_target", "drafter": "train_drafter", "study": "sweep"}
 

@@ -77,7 +77,7 @@ def test_a_documented_command_runs(command, folder, monkeypatch):
     monkeypatch.setenv("HOME", str(folder))
     words = [_OPEN.get(word, word) for word in words]  # what a page leaves to the reader
     runner = CliRunner()
-    if words[0] in ("runs", "--version"):
+    if words[0] in ("runs", "--version", "compare", "power"):
         result = runner.invoke(app, [*words[:2], "--help"] if words[0] == "runs" else words)
         options = [word for word in words if word.startswith("--")]
         assert all(option in result.output for option in options if words[0] == "runs"), command

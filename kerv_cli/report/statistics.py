@@ -131,6 +131,50 @@ def paired_difference(counts: PairedCounts, confidence: float = 0.95) -> Estimat
     return Estimate(difference, low, high)
 
 
+def difference(first: Estimate, second: Estimate) -> Estimate:
+    """Estimate the second of two independent success rates minus the first.
+
+    With Wilson intervals this is Newcombe's hybrid score interval (Statistics in Medicine 17, 1998, page 873, method
+    10): each end is as far away as the root of the sum of the two rates' squared distances.
+
+    Args:
+        first: A rate with its interval.
+        second: The other rate, with an interval of the same confidence. The result has it, too.
+    """
+    value = second.value - first.value
+    low = value - math.hypot(second.value - second.low, first.high - first.value)
+    return Estimate(value, low, value + math.hypot(second.high - second.value, first.value - first.low))
+
+
+def pairs_for_power(lost: float, won: float, power: float = 0.8) -> float:
+    """Return about how many pairs McNemar's exact test needs to show a difference at the 5 % level.
+
+    The power is that of the unconditional test: the number of discordant pairs (exactly one success) is random, too.
+
+    Args:
+        lost: Expected share of pairs in which only the baseline succeeds.
+        won: Expected share of pairs in which only the method succeeds.
+        power: Probability with which the test shows the difference.
+
+    Returns:
+        The number of pairs. Infinite if it is above MOST_PAIRS.
+    """
+    from scipy.special import bdtr, bdtrik
+
+    discordant = np.arange(MOST_PAIRS + 1)
+    limit = np.floor(bdtrik(0.025, discordant, 0.5))  # of the rarer outcome; the test rejects up to here
+    limit -= bdtr(limit, discordant, 0.5) > 0.025
+    share = won / (lost + won)
+    tails = bdtr(limit, discordant, share) + bdtr(limit, discordant, 1 - share)
+    rejects = np.where(limit >= 0, tails, 0.0)
+
+    def reached(pairs: int) -> float:
+        return float(np.diff(bdtr(discordant[: pairs + 1], pairs, lost + won), prepend=0.0) @ rejects[: pairs + 1])
+
+    found = bisect.bisect_left(range(MOST_PAIRS + 1), True, key=lambda pairs: reached(pairs) >= power)
+    return found if found <= MOST_PAIRS else math.inf
+
+
 def pairs_to_settle(counts: PairedCounts, margin: float) -> float:
     """Estimate how many pairs in all would show that the method loses less than `margin` of success (non-inferiority).
 

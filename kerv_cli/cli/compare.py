@@ -1,0 +1,135 @@
+"""`kerv compare` and `kerv power`: compare two success counts, and say how many pairs a comparison needs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from fractions import Fraction
+from typing import Any
+
+import typer
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.registry import NoSettings
+from kerv_cli.cli.command import command
+from kerv_cli.cli.common import AsJson, end_with_json, print_table
+
+COUNTS = (
+    "NAME: two success counts, such as 17/20. If both sides ran the same seeds, lost=N and won=N say in how many pairs "
+    "only the first and only the second succeeded."
+)
+RATES = (
+    "NAME: the success rate that you have and the one that you want to tell from it, such as 0.90 or 18/20. lost=SHARE "
+    "says in which share of pairs only the first succeeds; without it, both ends are shown."
+)
+
+
+@command(
+    "compare", NoSettings, names=COUNTS, examples=("kerv compare 17/20 14/20", "kerv compare 17/20 14/20 lost=4 won=1")
+)
+def compare(names: list[str], as_json: AsJson = False) -> None:
+    """Compare two success counts: the difference with its 95 % interval; no run is needed."""
+    from kerv_cli.report.statistics import PairedCounts, difference, mcnemar, paired_difference, wilson
+
+    words, given = _options(names)
+    if len(words) != 2:
+        raise UsageError("name two success counts, as in kerv compare 17/20 14/20")
+    (a, first_of), (b, second_of) = map(_counts, words)
+    first, second, p = wilson(a, first_of), wilson(b, second_of), None
+    if given:
+        lost, won = (int(given.get(name, 0)) for name in ("lost", "won"))
+        is_whole = all(number.denominator == 1 for number in given.values())
+        if not is_whole or first_of != second_of or a - lost + won != b or not 0 <= lost <= a:
+            raise UsageError(
+                f"{' '.join(names)}: the counts do not agree; {words[0]} less lost= plus won= is the second"
+            )
+        counts = PairedCounts(a - lost, lost, won, first_of - a - won)
+        change, p = paired_difference(counts), mcnemar(counts)
+    else:
+        change = difference(first, second)
+    if as_json:
+        end_with_json({"first": first._asdict(), "second": second._asdict(), "difference": change._asdict(), "p": p})
+    name = "difference, unpaired (Newcombe)" if p is None else "difference, paired (Newcombe)"
+    rows = [(words[0], *_percent(*first)), (words[1], *_percent(*second)), (name, *_points(*change))]
+    print_table(("", "success", "95 % interval"), rows)
+    if p is not None:
+        typer.echo(f"McNemar's exact test: p = {p:.2g}")
+    low, high = _points(*change)[1].split(" to ")
+    if change.low <= 0 <= change.high:
+        typer.echo(f"No difference is shown: anything from {low} to {high} points agrees with these counts.")
+    elif p is not None and p >= 0.05:
+        typer.echo("No difference is shown: the interval excludes 0, but the exact test does not confirm it.")
+    else:
+        way = "more" if change.value > 0 else "less"
+        typer.echo(f"The second succeeds {way} often: the difference is between {low} and {high} points.")
+
+
+@command("power", NoSettings, names=RATES, examples=("kerv power 0.90 0.95", "kerv power 18/20 0.95 lost=0.02"))
+def power(names: list[str], as_json: AsJson = False) -> None:
+    """Say how many pairs of episodes show a difference of success with a probability of 80 %."""
+    from kerv_cli.report.statistics import MOST_PAIRS, pairs_for_power
+
+    words, given = _options(names)
+    if len(words) != 2:
+        raise UsageError("name two success rates, as in kerv power 0.90 0.95")
+    first, second = map(_number, words)
+    if not (0 <= first <= 1 and 0 <= second <= 1) or first == second:
+        raise UsageError(f"{' '.join(words)}: name two different success rates from 0 to 1, as in kerv power 0.90 0.95")
+    gain = second - first
+    least, most = max(Fraction(0), -gain), min(first, 1 - second)
+    assumed = {"no more than they must": least, "as often as independent episodes": first * (1 - second)}
+    if given:
+        assumed = {"lost= as given": given["lost"]}
+        if not least <= given["lost"] <= most:
+            raise UsageError(f"lost= with these rates is a number from {float(least):.3g} to {float(most):.3g}")
+    shares = {name: (float(lost), float(lost + gain)) for name, lost in assumed.items()}
+    plans: list[dict[str, Any]] = [
+        {"assumption": name, "lost": lost, "won": won, "pairs": pairs_for_power(lost, won)}
+        for name, (lost, won) in shares.items()
+    ]
+    if as_json:
+        end_with_json(plans)
+    shown = [f"{row['pairs']}" if row["pairs"] <= MOST_PAIRS else f"more than {MOST_PAIRS:,}" for row in plans]
+    rows = (
+        (row["assumption"], f"{row['lost']:.1%}", f"{row['won']:.1%}", pairs)
+        for row, pairs in zip(plans, shown, strict=True)
+    )
+    print_table(("in a pair, only one side succeeds", "only the first", "only the second", "pairs needed"), rows)
+    needed = " to ".join(dict.fromkeys(shown))
+    typer.echo(
+        f"{needed} pairs on the same seeds show a change from {float(first):.1%} to {float(second):.1%} with a "
+        "probability of 80 % (McNemar's exact test at 5 %), if only one side of a pair succeeds as often as assumed."
+    )
+
+
+def _options(names: list[str]) -> tuple[list[str], Mapping[str, Fraction]]:
+    """Split the arguments into counts or rates, and the numbers given as `key=number`."""
+    pairs = [word.partition("=") for word in names if "=" in word]
+    return [word for word in names if "=" not in word], {key: _number(value, f"{key}=") for key, _, value in pairs}
+
+
+def _number(text: str, key: str = "") -> Fraction:
+    try:
+        value = Fraction(text)
+    except (ValueError, ZeroDivisionError):
+        raise UsageError(f"{key}{text} is no number: write it as 0.90 or 18/20") from None
+    return value
+
+
+def _counts(text: str) -> tuple[int, int]:
+    """Return successes and episodes of a text such as `17/20`."""
+    found = re.fullmatch(r"(\d+)/(\d+)", text)
+    if not found:
+        raise UsageError(f"'{text}' is no success count such as 17/20; for runs: kerv runs compare")
+    successes, episodes = map(int, found.groups())
+    if not 0 < episodes >= successes:
+        raise UsageError(f"{text}: successes come first, then episodes, as in 17/20")
+    return successes, episodes
+
+
+def _percent(value: float, low: float, high: float) -> tuple[str, str]:
+    return f"{value:.1%}", f"{low:.1%} to {high:.1%}"
+
+
+def _points(value: float, low: float, high: float) -> tuple[str, str]:
+    return f"{100 * value:+.1f} points", f"{100 * low:+.1f} to {100 * high:+.1f}"
