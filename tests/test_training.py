@@ -23,9 +23,10 @@ from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.targets.folders import RESUME
 from kerv_cli.targets.losses import soft_labels, token_loss
 from kerv_cli.training.imitation import Imitation, lit, vocabulary, waypoints
-from kerv_cli.training.loop import Loop, Metrics, digest, read_state, write_state
+from kerv_cli.training.loop import Loop, Metrics, read_state
 from kerv_cli.training.settings import TrainSettings
 from kerv_cli.worlds.demos.files import DemoEpisode
 from kerv_cli.worlds.demos.recording import DemoConfig, record
@@ -105,24 +106,16 @@ def test_one_request_that_arrives_twice_is_one_and_a_run_without_validation_says
         over.run()
 
 
-def test_a_damaged_or_senseless_resume_file_is_one_line(tmp_path):
-    quadratic(tmp_path).run()
-    path = tmp_path / "resume.safetensors"
-    whole = path.read_bytes()
-    for index in (len(whole) - 1, len(whole) // 2, 40):
-        path.write_bytes(whole[:index] + bytes([whole[index] ^ 1]) + whole[index + 1 :])
+def test_a_damaged_resume_file_is_one_line(tmp_path):
+    loop = quadratic(tmp_path)
+    loop.run()
+    whole = (tmp_path / RESUME).read_bytes()
+    index = whole.index(loop.module.weight.detach().numpy().tobytes())
+    for damaged in (whole[:index] + bytes([whole[index] ^ 1]) + whole[index + 1 :], whole[:-100], b"", b"{}"):
+        (tmp_path / RESUME).write_bytes(damaged)
         with pytest.raises(CheckpointError, match=r"training state at .* damaged") as caught:
             quadratic(tmp_path).run()
         assert "\n" not in str(caught.value)
-    path.write_bytes(whole)
-    tensors, progress = read_state(path)
-    first = next(name for name in tensors if name.startswith("ema."))
-    write_state(path, {**tensors, first: tensors[first] * torch.nan}, progress)
-    with pytest.raises(CheckpointError, match="not finite"):
-        quadratic(tmp_path).run()
-    save_tensors(path, tensors, {"state": json.dumps({"progress": "{}", "sha256": digest(tensors, "{}")})})
-    with pytest.raises(CheckpointError, match="identity"):
-        quadratic(tmp_path).run()
 
 
 def test_a_kill_between_the_weights_and_the_resume_file_keeps_the_right_best(tmp_path, monkeypatch):
@@ -234,11 +227,11 @@ def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results
     killed = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     folder = results / "artifacts/target/cut"
     deadline = time.monotonic() + 100
-    while not (folder / "resume.safetensors").exists() and time.monotonic() < deadline:
+    while not (folder / RESUME).exists() and time.monotonic() < deadline:
         time.sleep(0.02)
     os.kill(killed.pid, signal.SIGKILL)
     killed.wait()
-    assert 4 <= read_state(folder / "resume.safetensors")[1].step <= 16
+    assert 4 <= read_state(folder / RESUME)["step"] <= 16
     train(results, "target", "name=cut", *settings)
     a, b = (load_file(results / f"artifacts/target/{n}/model.safetensors") for n in ("whole", "cut"))
     assert a.keys() == b.keys()

@@ -16,7 +16,7 @@ RELEASED = {
 }
 """Name of each shipped policy -> SHA-256 of its target's weights. The wheel contains one policy, a checkout all."""
 
-RESUME = "resume.safetensors"
+RESUME = "resume.pt"
 """File in the folder of a trained artifact from which its training can resume. Shipped artifacts do not have it."""
 
 

@@ -7,33 +7,30 @@ state and the metrics of all validations.
 
 from __future__ import annotations
 
-import hashlib
-import json
+import io
 import math
+import pickle
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+import zipfile
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError, Interrupted, KervError
-from kerv_cli.base.files import write_text
-from kerv_cli.base.manifests import read
-from kerv_cli.targets.checkpoint import load_tensors, save_tensors
+from kerv_cli.base.files import write_bytes, write_text
 from kerv_cli.targets.folders import RESUME
 from kerv_cli.training.settings import TrainSettings
 
 Metrics = dict[str, float]
-_UNREADABLE = (SafetensorError, OSError, KeyError, TypeError, ValueError)
+_UNREADABLE = (OSError, EOFError, RuntimeError, KeyError, TypeError, ValueError, pickle.PickleError, zipfile.BadZipFile)
 SAME_REQUEST = 2.0
 """A second signal within this many seconds counts as the same request.
 
@@ -69,7 +66,7 @@ class Loop:
         objective: The network, its training samples and its loss.
         save: Called with the module and its metrics after each validation with the best score so far.
         settings: Optimisation settings.
-        folder: Folder for `resume.safetensors` and `log.csv`.
+        folder: Folder for the resume file and `log.csv`.
         identity: Hash of everything that determines the training. It goes into the resume file.
         keep: Called with the metrics of all validations so far, after each validation and when a training resumes.
     """
@@ -179,11 +176,17 @@ class Loop:
 
     def store(self) -> None:
         """Write the resume file with the present state, then `log.csv`."""
-        tensors = {f"model.{k}": v for k, v in self.module.state_dict().items()}
-        tensors |= {f"ema.{k}": v for k, v in self.ema.items()}
-        for i, moments in self.optimiser.state_dict()["state"].items():
-            tensors |= {f"optimiser.{i}.{k}": v for k, v in moments.items()}
-        write_state(self.folder / RESUME, tensors, Progress(self.identity, self.step, self.history))
+        state = {
+            "identity": self.identity,
+            "step": self.step,
+            "history": self.history,
+            "model": self.module.state_dict(),
+            "ema": self.ema,
+            "optimiser": self.optimiser.state_dict(),
+        }
+        buffer = io.BytesIO()
+        torch.save(state, buffer)
+        write_bytes(self.folder / RESUME, buffer.getvalue())
         self.log()
 
     def log(self) -> None:
@@ -207,17 +210,12 @@ class Loop:
         if not path.is_file():
             self.keep([])  # forget the curve of an earlier training in this folder
             return
-        tensors, progress = read_state(path)
-        self.module.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("model.")})
-        self.ema = {k[4:]: v.to(self.ema[k[4:]].device) for k, v in tensors.items() if k.startswith("ema.")}
-        state: dict[int, dict[str, Tensor]] = {}
-        for name, tensor in tensors.items():
-            if name.startswith("optimiser."):
-                _, index, key = name.split(".")
-                state.setdefault(int(index), {})[key] = tensor
-        groups = self.optimiser.state_dict()["param_groups"]
-        self.optimiser.load_state_dict({"state": state, "param_groups": groups})
-        self.step, self.history = progress.step, progress.history
+        state = read_state(path)
+        self.module.load_state_dict(state["model"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        for name, average in self.ema.items():
+            average.copy_(state["ema"][name])
+        self.step, self.history = state["step"], state["history"]
         self.log()  # the process may have ended before it wrote the log
 
 
@@ -269,21 +267,18 @@ def without_subnormals() -> Iterator[None]:
 def until_interrupted() -> Iterator[threading.Event]:
     """Turn the first Ctrl-C (SIGINT) or SIGTERM into an event, so that the training can finish its step.
 
-    A second signal of the same kind raises KeyboardInterrupt. A signal that the process ignores stays ignored. Outside
-    the main thread, signals are not caught.
+    A later signal raises KeyboardInterrupt. A signal that the process ignores stays ignored.
 
     Yields:
         The event. The first signal sets it.
     """
     stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    first_times: dict[int, float] = {}
+    first = math.inf
 
     def handle(number: int, frame: FrameType | None) -> None:
-        now = time.monotonic()
-        if now - first_times.setdefault(number, now) > SAME_REQUEST:
+        nonlocal first
+        first = min(first, time.monotonic())
+        if time.monotonic() - first > SAME_REQUEST:
             raise KeyboardInterrupt
         if not stop.is_set():
             again = "Ctrl-C again" if number == signal.SIGINT else "a second one"
@@ -300,70 +295,27 @@ def until_interrupted() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
-@dataclass(frozen=True)
-class Progress:
-    """Progress of a training, as stored in its resume file.
-
-    Attributes:
-        identity: Hash of everything that determines the training.
-        step: Number of steps done.
-        history: Metrics of every validation so far.
-    """
-
-    identity: str
-    step: int
-    history: list[Metrics]
-
-
 def stored_identity(folder: Path) -> str | None:
-    """Return the identity hash in the folder's resume file, without reading the tensors.
-
-    None means that there is no resume file, or that it cannot be read.
-    """
+    """Return the identity hash in the folder's resume file; None if there is no file that can be read."""
     try:
-        return str(json.loads(_state(folder / RESUME)["progress"])["identity"])
+        return str(torch.load(folder / RESUME, "cpu", mmap=True, weights_only=True)["identity"])
     except _UNREADABLE:
         return None
 
 
-def write_state(path: Path, tensors: Mapping[str, Tensor], progress: Progress) -> None:
-    """Write the tensors and the progress of a training into one resume file."""
-    text = json.dumps(asdict(progress), allow_nan=False)
-    # one metadata key: safetensors orders several keys at random, and equal states must give equal bytes
-    save_tensors(path, tensors, {"state": json.dumps({"progress": text, "sha256": digest(tensors, text)})})
-
-
-def read_state(path: Path) -> tuple[dict[str, Tensor], Progress]:
-    """Read a resume file that `write_state` wrote.
-
-    Returns:
-        The tensors by name, and the progress.
+def read_state(path: Path) -> dict[str, Any]:
+    """Return the state in a resume file: identity, step, history of metrics, weights, their average and optimiser.
 
     Raises:
-        CheckpointError: The file is damaged, or holds numbers that are not finite.
+        CheckpointError: The file is damaged.
     """
     try:
-        state = _state(path)
-        tensors, text = load_tensors(path, "training state"), state["progress"]
-        if state["sha256"] != digest(tensors, text):
-            raise ValueError("its hash does not fit")
-        return tensors, read(Progress, json.loads(text), str(path), tolerant=True)
+        with zipfile.ZipFile(path) as archive:
+            if archive.testzip() is not None:  # torch itself does not compare the checksums
+                raise ValueError("a checksum is wrong")
+        state: dict[str, Any] = torch.load(path, "cpu", weights_only=True)
     except _UNREADABLE as error:
         remedy = f"move {path.parent} aside to begin again"
-        raise CheckpointError(f"training state at {path} is damaged ({error}): {remedy}") from error
-
-
-def _state(path: Path) -> dict[str, str]:
-    with safe_open(path, "pt") as file:
-        state: dict[str, str] = json.loads((file.metadata() or {})["state"])
+        reason = " ".join(str(error).split())
+        raise CheckpointError(f"training state at {path} is damaged ({reason}): {remedy}") from error
     return state
-
-
-def digest(tensors: Mapping[str, Tensor], text: str) -> str:
-    """Return the SHA-256 of `text` and of the tensors' names, number formats, shapes and bytes."""
-    hasher = hashlib.sha256(text.encode())
-    for name in sorted(tensors):
-        tensor = tensors[name].detach().cpu().contiguous()
-        hasher.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
-        hasher.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
-    return hasher.hexdigest()
