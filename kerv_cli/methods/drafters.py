@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sized
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from kerv_cli.base.manifests import read
-from kerv_cli.base.spaces import ActionSpace
+from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.methods.artifacts import Artifact, Artifacts, MadeFor, removal
 from kerv_cli.methods.context import Context
 from kerv_cli.targets import checkpoint
 from kerv_cli.targets.compact.packable import load_packed
+from kerv_cli.targets.observations import Rows, split, steps_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
+from kerv_cli.worlds.demos.files import DemoEpisode
 
 Metrics = dict[str, float]
 
@@ -76,6 +79,27 @@ class Training:
         return self.drafter.validate(self, module)
 
 
+@dataclass(frozen=True)
+class Decodes(Rows):
+    """The target's greedy decodes of n observations, in the order of episodes. A drafter adds what its network reads.
+
+    Attributes:
+        tokens: (n, N) int64, the target's tokens.
+        episodes: (n,) int64, index of the observation's episode.
+        perturbed: (n,) bool, whether the observation's episode was executed with noise.
+    """
+
+    tokens: Tensor
+    episodes: Tensor
+    perturbed: Tensor
+
+
+def evenly(steps: np.ndarray, share: float) -> np.ndarray:
+    """Return an evenly spread share of the steps (n,). The first step is always included."""
+    order = np.arange(len(steps))
+    return steps[np.ceil((order + 1) * share - 1e-9) > np.ceil(order * share - 1e-9)]
+
+
 class TrainableDrafter(Artifact[DrafterDescription]):
     """Base of the kinds of drafters with weights. `registry.add_drafter` registers a subclass.
 
@@ -99,27 +123,52 @@ class TrainableDrafter(Artifact[DrafterDescription]):
     def network(self, settings: Any, target: Any) -> nn.Module:
         """Return a network with initial weights, for drafting for `target`."""
 
-    @abstractmethod
+    @torch.inference_mode()
     def examples(
-        self,
-        target: Any,
-        dataset: DemoDataset,
-        settings: Any,
-        held_out: float,
-        progress: OnProgress,
-    ) -> tuple[Sized, Sized]:
-        """Decode the demonstrations' observations with the target, to make examples.
+        self, target: Any, dataset: DemoDataset, settings: Any, held_out: float, progress: OnProgress
+    ) -> tuple[Any, Any]:
+        """Decode about `settings.samples` observations with the target, spread evenly over all episodes.
 
         Args:
             target: The loaded target, on the device to train on.
-            dataset: The demonstrations.
+            dataset: The demonstrations. The expert's actions are not used.
             settings: Settings of the drafter.
             held_out: Share of the episodes to hold out.
-            progress: Called with the amounts of work done and of all.
+            progress: Called with the numbers of episodes done and of all.
 
         Returns:
             The training examples, and the held-out examples, which come from other episodes.
+
+        Raises:
+            CheckpointError: There is only one episode, an episode is damaged, or its images have another size than the
+                target takes.
         """
+        sees, count = bool(target.cameras), len(dataset.episodes)
+        stride = int(dataset.manifest.config["frame_stride"]) if sees else 1  # control steps per stored image
+        share = min(1.0, settings.samples * stride / sum(episode.steps for episode in dataset.episodes))
+        parts: list[Decodes] = []
+        for index in range(count):
+            episode = dataset.load(index)
+            steps = evenly(steps_of(episode, sees), share)
+            shared = {"episodes": index, "perturbed": episode.perturbed}
+            columns = {name: torch.full((len(steps),), value) for name, value in shared.items()}
+            parts.append(self.decoded(target, episode, steps, dataset.manifest.observation, columns))
+            progress(index + 1, count)
+        return split(type(parts[0]).joined(parts), held_out)
+
+    def decoded(
+        self, target: Any, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace, columns: dict[str, Tensor]
+    ) -> Decodes:
+        """Decode some observations of an episode greedily with the target.
+
+        Args:
+            target: The loaded target.
+            episode: The episode.
+            steps: (n,) control steps of the observations.
+            space: Observation space of the demonstrations.
+            columns: The columns `episodes` and `perturbed` of the result.
+        """
+        raise NotImplementedError
 
     def prepare(self, network: Any, examples: Any) -> None:
         """Set what a network must know of the training examples before training, such as their mean and spread."""

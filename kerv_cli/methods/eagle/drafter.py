@@ -8,9 +8,7 @@ prompt's beginning.
 
 from __future__ import annotations
 
-import itertools
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +20,7 @@ from torch import Tensor, nn
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.runtime import set_up
-from kerv_cli.base.spaces import Observation
+from kerv_cli.base.spaces import ObservationSpace
 from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
@@ -34,7 +32,7 @@ from kerv_cli.engine.transfer import upload
 from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.drafters import DrafterDescription, Metrics, TrainableDrafter, Training
+from kerv_cli.methods.drafters import Decodes, DrafterDescription, Metrics, TrainableDrafter, Training
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.public import Convention, PublicDrafter, PublicShape, load_public, read_public
 from kerv_cli.methods.spec_vla import RelaxedRule
@@ -44,9 +42,9 @@ from kerv_cli.targets.compact.program import Program
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import LayerStack
 from kerv_cli.targets.grown import grow_stack
-from kerv_cli.targets.observations import Rows, held_out_every, observations_of, prompts_of, steps_of
+from kerv_cli.targets.observations import observations_of, prompts_of
 from kerv_cli.targets.provenance import provenance_of
-from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
+from kerv_cli.worlds.demos.files import DemoEpisode
 
 VALIDATED = 60
 """Maximum number of held-out observations that a validation decodes."""
@@ -223,68 +221,18 @@ def _best(tokens: Tensor, parents: Tensor, scores: Tensor, nodes: int, depth: in
 
 
 @dataclass(frozen=True)
-class TeacherStates(Rows):
-    """The target's greedy decodes of n observations with prompts of equal length P. A chunk has N tokens."""
+class EagleExamples(Decodes):
+    """The n training examples of an EAGLE-style drafter. Prompts may have different lengths, so zeros follow them.
 
-    prompt: Tensor  # (n, P, E) float16, encoded prompts
-    hidden: Tensor  # (n, P + N − 1, E) float16, the target's last hidden states
-    tokens: Tensor  # (n, N) int64, greedy tokens
-
-
-@dataclass(frozen=True)
-class StatesByLength:
-    """The target's greedy decodes, in one group per prompt length. Row indices count through all groups."""
-
-    groups: tuple[TeacherStates, ...]
-
-    def __len__(self) -> int:
-        return sum(map(len, self.groups))
-
-    def parts(self, indices: Tensor) -> list[TeacherStates]:
-        """Return the rows `indices` (B,), as one batch per prompt length."""
-        batches, first = [], 0
-        for group in self.groups:
-            rows = indices[(indices >= first) & (indices < first + len(group))] - first
-            if len(rows):
-                batches.append(group.where(rows))
-            first += len(group)
-        return batches
-
-    def prompts(self) -> list[Tensor]:
-        """Return all encoded prompts, each (1, P, E)."""
-        return [prompt for group in self.groups for prompt in group.prompt.split(1)]
-
-
-def _decodes(
-    target: Target,
-    dataset: DemoDataset,
-    rows: Sequence[tuple[int, int]],
-    limit: int,
-    on_progress: OnProgress,
-) -> StatesByLength:
-    """Decode observations greedily with the target.
-
-    Args:
-        target: The target.
-        dataset: The demonstrations.
-        rows: (index of the episode, control step) of each observation.
-        limit: Maximum number of observations, evenly spread over `rows`.
-        on_progress: Called with the numbers of observations done and of all.
+    Attributes:
+        lengths: (n,) int64, number of prompt tokens P.
+        prompt: (n, longest prompt, E) float16, encoded prompts.
+        hidden: (n, longest prompt + N − 1, E) float16, the target's last hidden states.
     """
-    chosen = [rows[i] for i in torch.linspace(0, len(rows) - 1, min(limit, len(rows))).long().tolist()]
-    groups, done = defaultdict[int, list[TeacherStates]](list), 0
 
-    def observations() -> Iterator[Observation]:
-        for index, group in itertools.groupby(chosen, lambda row: row[0]):
-            steps = np.array([step for _, step in group])
-            yield from observations_of(target, dataset.load(index), steps, dataset.manifest.observation)
-
-    for prompt in prompts_of(target, observations()):
-        tokens, hidden = greedy(target, prompt)
-        groups[prompt.shape[1]].append(TeacherStates(prompt.half().cpu(), hidden.half().cpu(), tokens.cpu()))
-        done += len(prompt)
-        on_progress(done, len(chosen))
-    return StatesByLength(tuple(map(TeacherStates.joined, groups.values())))
+    lengths: Tensor
+    prompt: Tensor
+    hidden: Tensor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -329,29 +277,18 @@ class EagleDrafter(TrainableDrafter):
         top_k, nodes = (settings.top_k, settings.nodes) if settings.shape == "tree" else (1, settings.depth)
         return DrafterProposer(context.artifact(cls.kind), context.target, settings.depth, top_k, nodes)
 
-    @torch.inference_mode()
-    def examples(
-        self,
-        target: Target,
-        dataset: DemoDataset,
-        settings: DrafterSettings,
-        held_out: float,
-        progress: OnProgress,
-    ) -> tuple[StatesByLength, StatesByLength]:
-        """Decode the demonstrations' observations greedily with the target. The expert's actions are not used.
-
-        The arguments and the result are those of `TrainableDrafter.examples`.
-
-        Raises:
-            CheckpointError: There is only one episode, or an episode is damaged.
-        """
-        every = held_out_every(len(dataset.episodes), held_out)
-        rows: tuple[list[tuple[int, int]], ...] = ([], [])
-        for index in range(len(dataset.episodes)):
-            steps = steps_of(dataset.load(index), bool(target.cameras))
-            rows[index % every == every - 1].extend((index, int(t)) for t in steps)
-        states = _decodes(target, dataset, rows[0], settings.samples, progress)
-        return states, _decodes(target, dataset, rows[1], VALIDATED, lambda done, total: None)
+    def decoded(
+        self, target: Any, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace, columns: dict[str, Tensor]
+    ) -> EagleExamples:
+        """Decode observations of an episode, and keep their prompts and the target's hidden states."""
+        lengths, kept = [], []
+        for prompt in prompts_of(target, observations_of(target, episode, steps, space)):
+            tokens, hidden = greedy(target, prompt)
+            lengths += [prompt.shape[1]] * len(prompt)
+            zeros = 0, 0, 0, target.max_prompt - prompt.shape[1]
+            kept.append((tokens.cpu(), *(F.pad(x, zeros).half().cpu() for x in (prompt, hidden))))
+        tokens, prompts, hidden = map(torch.cat, zip(*kept, strict=True))
+        return EagleExamples(tokens, **columns, lengths=torch.tensor(lengths), prompt=prompts, hidden=hidden)
 
     def loss(self, training: Training, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
         """Return the mean loss over the `unroll` passes, and the token loss of each pass to log.
@@ -363,32 +300,40 @@ class EagleDrafter(TrainableDrafter):
         """
         losses: list[Tensor] = []
         metrics: Metrics = {}
-        for states in training.examples.parts(indices):
-            loss, measured = self.unrolled(training, states)
-            losses.append(loss * len(states) / len(indices))
+        lengths = training.examples.lengths[indices]
+        for length in lengths.unique().tolist():
+            rows = indices[lengths == length]
+            loss, measured = self.unrolled(training, rows, length)
+            losses.append(loss * len(rows) / len(indices))
             metrics |= measured
         return torch.stack(losses).sum(), metrics
 
-    def unrolled(self, training: Training, states: TeacherStates) -> tuple[Tensor, Metrics]:
-        """Return the loss and the metrics to log, for decodes with prompts of one length.
+    def unrolled(self, training: Training, rows: Tensor, length: int) -> tuple[Tensor, Metrics]:
+        """Return the loss and the metrics to log, for examples with prompts of one length.
 
         The first pass reads the target's hidden states. Each later pass reads the drafter's own predictions of the pass
         before, as in drafting.
+
+        Args:
+            training: The training.
+            rows: (B,) indices of the training examples.
+            length: Number of their prompt tokens.
         """
-        settings, device = training.settings.drafter, training.target.device
-        prompt, hidden = states.prompt.to(device).float(), states.hidden.to(device).float()
-        tokens, start = states.tokens.to(device), prompt.shape[1]
+        settings, device, examples = training.settings.drafter, training.target.device, training.examples
+        tokens = examples.tokens[rows].to(device)
+        prompt = examples.prompt[rows, :length].to(device).float()
+        hidden = examples.hidden[rows, : length + tokens.shape[1] - 1].to(device).float()
         following = torch.cat([prompt[:, 1:], training.target.embed(tokens[:, :-1])], 1)
         positions = torch.arange(hidden.shape[1] - 1, device=device)
         total, metrics = hidden.new_zeros(()), {}
         inputs = hidden[:, :-1]
         for number in range(settings.unroll):
             predicted = training.module(following, inputs, positions)
-            state_loss, token_loss = self.compare(training, predicted[:, start - 1 :], hidden[:, start:])
+            state_loss, token_loss = self.compare(training, predicted[:, length - 1 :], hidden[:, length:])
             total = total + settings.state_weight * state_loss + settings.token_weight * token_loss
             metrics[f"token_loss_{number}"] = float(token_loss.detach())
             # after the first drafted position the next pass reads its own predictions, as in drafting
-            inputs = torch.cat([inputs[:, :start], predicted[:, start - 1 : -1]], 1)
+            inputs = torch.cat([inputs[:, :length], predicted[:, length - 1 : -1]], 1)
         return total / settings.unroll, metrics
 
     def compare(self, training: Training, predicted: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
@@ -409,8 +354,9 @@ class EagleDrafter(TrainableDrafter):
 
     def validate(self, training: Training, module: EagleNetwork) -> Metrics:
         """Decode held-out observations. Return the tokens committed per verification, strict and within 9 bins."""
-        target = training.target
-        prompts = [prompt.to(target.device).float() for prompt in training.held_out.prompts()]
+        target, held_out = training.target, training.held_out
+        chosen = torch.linspace(0, len(held_out) - 1, min(VALIDATED, len(held_out))).long().tolist()
+        prompts = [held_out.prompt[i, : held_out.lengths[i]][None].to(target.device).float() for i in chosen]
         strict, relaxed = (acceptance_length(target, module, prompts, r) for r in (0, 9))
         return {"score": relaxed + strict, "acceptance_length_strict": strict, "acceptance_length_r9": relaxed}
 

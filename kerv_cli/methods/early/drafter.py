@@ -25,13 +25,12 @@ from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.engine.transfer import read
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.drafters import Metrics, TrainableDrafter, Training
+from kerv_cli.methods.drafters import Decodes, Metrics, TrainableDrafter, Training
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.targets.compact.packable import Packable
 from kerv_cli.targets.compact.program import Program
 from kerv_cli.targets.losses import soft_labels, token_loss
-from kerv_cli.targets.observations import Rows, observations_of, prompts_of, split, steps_of
-from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
+from kerv_cli.targets.observations import observations_of, prompts_of
 from kerv_cli.worlds.demos.files import DemoEpisode
 
 SURE = 0.05
@@ -229,15 +228,6 @@ class EarlyProposer(ChainProposer):
 
 
 @dataclass(frozen=True)
-class Decodes(Rows):
-    """The target's greedy decodes of n observations, in the order of episodes."""
-
-    tokens: Tensor  # (n, N) int64
-    episodes: Tensor  # (n,) int64, index of the observation's episode
-    perturbed: Tensor  # (n,) bool, whether the observation's episode was executed with noise
-
-
-@dataclass(frozen=True)
 class EarlyExamples(Decodes):
     """The n training examples of an early drafter."""
 
@@ -259,44 +249,10 @@ class EarlyDrafter(TrainableDrafter):
         """Build the part that the setting `proposer=early` chooses."""
         return EarlyProposer(context.artifact(cls.kind), context.target)
 
-    @torch.inference_mode()
-    def examples(
-        self, target: Any, dataset: DemoDataset, settings: Any, held_out: float, progress: OnProgress
-    ) -> tuple[Decodes, Decodes]:
-        """Decode about `settings.samples` observations with the target, spread evenly over all episodes.
-
-        Prompts are pooled after each episode, so that neither images nor prompts stay in memory.
-
-        The arguments and the result are those of `TrainableDrafter.examples`.
-
-        Raises:
-            CheckpointError: The images have another size than the target takes.
-        """
-        sees, count = bool(target.cameras), len(dataset.episodes)
-        stride = int(dataset.manifest.config["frame_stride"]) if sees else 1  # control steps per stored image
-        share = min(1.0, settings.samples * stride / sum(episode.steps for episode in dataset.episodes))
-        parts: list[Decodes] = []
-        for index in range(count):
-            episode = dataset.load(index)
-            steps = evenly(steps_of(episode, sees), share)
-            shared = {"episodes": index, "perturbed": episode.perturbed}
-            columns = {name: torch.full((len(steps),), value) for name, value in shared.items()}
-            parts.append(self.decoded(target, episode, steps, dataset.manifest.observation, columns))
-            progress(index + 1, count)
-        return split(type(parts[0]).joined(parts), held_out)
-
     def decoded(
         self, target: Any, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace, columns: dict[str, Tensor]
     ) -> Decodes:
-        """Decode some observations of an episode with the target.
-
-        Args:
-            target: The loaded target.
-            episode: The episode.
-            steps: (n,) control steps of the observations.
-            space: Observation space of the demonstrations.
-            columns: The columns `episodes` and `perturbed` of the result.
-        """
+        """Decode observations of an episode, and pool their prompts at once: whole prompts would fill the memory."""
         prompts = list(prompts_of(target, observations_of(target, episode, steps, space)))
         features = torch.cat([target.pooled(prompt).half().cpu() for prompt in prompts])
         tokens = torch.cat([greedy(target, prompt)[0].cpu() for prompt in prompts])
@@ -348,12 +304,6 @@ class EarlyDrafter(TrainableDrafter):
 @functools.lru_cache(maxsize=1)
 def _labels(tokens: int, sigma: float, device: torch.device) -> Tensor:
     return soft_labels(tokens, sigma).to(device)
-
-
-def evenly(steps: np.ndarray, share: float) -> np.ndarray:
-    """Return an evenly spread share of the steps (n,). The first step is always included."""
-    order = np.arange(len(steps))
-    return steps[np.ceil((order + 1) * share - 1e-9) > np.ceil(order * share - 1e-9)]
 
 
 def measure(logits: Tensor, examples: Decodes, strict: Tensor) -> Metrics:

@@ -22,8 +22,8 @@ from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.drafters import Metrics, Training
-from kerv_cli.methods.early.drafter import Decodes, EarlyDrafter, EarlyNetwork, EarlyProposer, radius_of
+from kerv_cli.methods.drafters import Decodes, Metrics, Training
+from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyNetwork, EarlyProposer, radius_of
 from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.targets.compact.features import hand_features, mlp, scene_features, scene_width
 from kerv_cli.targets.compact.packable import Packable, wants_gradient
@@ -186,7 +186,7 @@ class ScoutDrafter(EarlyDrafter):
     def decoded(
         self, target: Any, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace, columns: dict[str, Tensor]
     ) -> ScoutExamples:
-        """Decode some observations of an episode with the target; arguments as `EarlyDrafter.decoded`.
+        """Decode observations of an episode, and keep them with the positions that the target estimates.
 
         Raises:
             CheckpointError: The target has no camera, or the images have another size than the target takes.
