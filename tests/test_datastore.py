@@ -86,10 +86,11 @@ def copy(results, tmp_path):
     return Path(shutil.copytree(results, tmp_path / "results"))
 
 
-def asked(results: Path, target: str = "nano-state", **changes: Any) -> BuildDatastoreSettings:
-    chosen = BuildDatastoreSettings(
-        policy=PolicySettings(target=target), demos="few", task=list(TASKS), results=str(results)
-    )
+def asked(
+    results: Path, target: str = "nano-state", named: str | None = None, **changes: Any
+) -> BuildDatastoreSettings:
+    policy = PolicySettings(target=target, artifacts={"datastore": named})
+    chosen = BuildDatastoreSettings(policy=policy, demos="few", task=list(TASKS), results=str(results))
     return replace(chosen, **changes)
 
 
@@ -215,7 +216,7 @@ def test_the_key_pools_the_named_parts_of_the_prompt(results):
 
 
 def test_the_first_episodes_and_tasks_can_be_asked_for(copy):
-    store = DatastoreBuild(asked(copy, task=["reach"], episodes=2, name="small", key=["proprioception"])).build()
+    store = DatastoreBuild(asked(copy, task=["reach"], episodes=2, key=["proprioception"])).build()
     assert set(entries(store)) == {("reach-v3", s, t) for s in (0, 1) for t in range(LENGTHS[s])}
     assert store.manifest.tasks == {"reach-v3": Shard((0, 15), (0, 1))}
 
@@ -322,14 +323,14 @@ def test_a_datastore_that_is_damaged_or_not_of_this_target_is_refused(copy, harm
 @pytest.mark.parametrize(
     ("changes", "error", "says"),
     [
-        ({"key": ["scen"]}, UnknownName, "unknown key 'scen': did you mean scene"),
+        ({"key": ["scen"]}, UnknownName, "unknown part of the prompt 'scen': did you mean scene"),
         ({"key": []}, UsageError, "name at least one part"),
         ({"task": ["push"]}, CheckpointError, "hold no episode of push-v3"),
     ],
 )
-def test_what_cannot_be_built_is_refused_at_once(results, changes, error, says):
+def test_what_cannot_be_built_is_refused(results, changes, error, says):
     with pytest.raises(error) as caught:
-        DatastoreBuild(asked(results, **changes))
+        DatastoreBuild(asked(results, **changes)).build()
     assert says in str(caught.value)
 
 
@@ -346,12 +347,12 @@ def test_demonstrations_that_do_not_fit_the_target_are_refused(copy):
 def test_only_a_datastore_is_ever_replaced(copy):
     other = copy / "artifacts/datastore/other"
     other.mkdir()
-    assert DatastoreBuild(asked(copy, name="other")).folder == other
+    assert DatastoreBuild(asked(copy, named="other")).folder == other
     (other / "thesis.tex").write_text("years of work")
     with pytest.raises(UsageError):
-        DatastoreBuild(asked(copy, name="other"))
+        DatastoreBuild(asked(copy, named="other"))
     with pytest.raises(UsageError):
-        DatastoreBuild(asked(copy, name=str(copy / "artifacts/target/nano-state")))
+        DatastoreBuild(asked(copy, named=str(copy / "artifacts/target/nano-state")))
 
 
 def refusing(real: Callable[..., Any]) -> Callable[..., Any]:

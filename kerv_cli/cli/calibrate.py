@@ -25,8 +25,11 @@ from kerv_cli.training.settings import CalibrateSettings, CalibrateSuccessSettin
 @command(
     "calibrate",
     CalibrateSettings,
-    keys="policy.target demos task name episodes decodes proposer window boundary_windows epsilon",
-    examples=("kerv calibrate demos=mt10 name=mine", "kerv calibrate policy.target=mine demos=mine decodes=20 --plan"),
+    keys="policy.target demos task policy.artifacts episodes decodes proposer window boundary_windows epsilon",
+    examples=(
+        "kerv calibrate demos=mt10 policy.artifacts.calibration=mine",
+        "kerv calibrate policy.target=mine demos=mine decodes=20 --plan",
+    ),
 )
 def calibrate(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
     """Fit the constants of KERV and HeiSD: predictors, variability per task, boundary ranges and skip levels."""

@@ -183,10 +183,6 @@ class Artifact(Generic[T]):
             CheckpointError: Something that the method reads is missing in the artifact.
         """
 
-    def command_beside(self, kinds: Collection[str]) -> tuple[str, ...]:
-        """Return the command that makes the artifact, for a target with artifacts of these `kinds`."""
-        return self.command
-
     def is_complete(self, description: T, kinds: Collection[str]) -> bool:
         """Return whether the artifact holds everything that its command would make from artifacts of these `kinds`."""
         return True
@@ -260,6 +256,10 @@ class Artifacts:
         beside = Path(self.description.origin.get("base", self.folder))
         return kind_of(kind).path(self.results, self.policy.artifacts.get(kind), beside)
 
+    def exists(self, kind: str) -> bool:
+        """Return whether the policy has an artifact of this kind."""
+        return kind_of(kind).json(self.path(kind)).is_file()
+
     def check(self, kinds: Iterable[str], use: Use | None = None) -> dict[str, str]:
         """Check artifacts without loading their weights.
 
@@ -280,7 +280,7 @@ class Artifacts:
             if kind in hashes:
                 continue
             files, path = kind_of(kind), self.path(kind)
-            if files.command and not files.json(path).is_file():
+            if files.command and not self.exists(kind):
                 line = " ".join(self._making(files))
                 raise CheckpointError(f"no {files.noun} in {path}: run 'kerv {line}', or name a folder that holds one")
             description = files.checked(path, self.description)

@@ -39,21 +39,13 @@ class Demonstrations:
 class Variability:
     """The kinematic variability K of a task: the mean distance between draft and target tokens of a decode (§3.2).
 
-    All numbers are in normalised action units.
-
     Attributes:
-        k_s: Reference level K_S: the median K over the decodes that were measured.
+        k_s: Reference level K_S: the median K over the decodes that were measured, in normalised action units.
         decodes: Number of decodes that were measured.
-        p25: 25th percentile of K.
-        p75: 75th percentile of K.
-        p90: 90th percentile of K.
     """
 
     k_s: float
     decodes: int
-    p25: float
-    p75: float
-    p90: float
 
 
 @dataclass(frozen=True)
@@ -121,7 +113,7 @@ class Calibration:
         window: Number of control steps of history that a predictor sees.
         noise: Kalman filter (`kalman`, `damped`) -> its noise per DoF.
         errors: Errors of all predictors on held-out episodes.
-        variability: Task -> reference level K_S and distribution of the kinematic variability K.
+        variability: Task -> reference level K_S of the kinematic variability K.
         boundary: Ranges of the hybrid boundary.
         skip: Similarities from which verification is skipped.
         provenance: How it was made.
@@ -229,10 +221,6 @@ class CalibrationArtifact(Artifact[Calibration]):
         if getattr(use.method["threshold"], "k_s", 0.0) is None:
             for task in use.tasks:
                 description.k_s(task)
-
-    def command_beside(self, kinds: Collection[str]) -> tuple[str, ...]:
-        """Return the command that makes a calibration. Without a drafter in `kinds` it leaves K_S out."""
-        return self.command if "drafter" in kinds else (*self.command, "decodes=0")
 
     def is_complete(self, description: Calibration, kinds: Collection[str]) -> bool:
         """Return whether K_S was measured if `kinds` has a drafter, and skip levels if `kinds` has a datastore."""

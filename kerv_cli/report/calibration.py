@@ -26,12 +26,11 @@ def tables(calibration: Calibration, path: Path) -> Iterator[Table]:
     """
     errors = partial(moving_errors, calibration.errors, space=calibration.target.actions)
     kalman, hold = errors("kalman"), errors("hold")
-    columns: tuple[str, ...] = ("task", "fitted on", "tested on", "decodes", "K_S", "K p25", "K p75")
-    columns += ("Kalman, h=1", "hold, h=1")
+    columns: tuple[str, ...] = ("task", "fitted on", "tested on", "decodes", "K_S", "Kalman, h=1", "hold, h=1")
     rows: list[tuple[object, ...]] = []
     for number, (name, counts) in enumerate(calibration.demos.tasks.items()):
         row = calibration.variability.get(name)
-        levels = [row.decodes, *(f"{x:.3f}" for x in (row.k_s, row.p25, row.p75))] if row else ["-"] * 4
+        levels = [row.decodes, f"{row.k_s:.3f}"] if row else ["-"] * 2
         ahead = (f"{error[number, 0]:.4f}" for error in (kalman, hold))
         rows.append((name, counts["training"], counts["held_out"], *levels, *ahead))
     yield columns, rows, f"calibration in {path}"

@@ -20,7 +20,6 @@ import numpy as np
 
 from kerv_cli.base.errors import CheckpointError, KervError
 from kerv_cli.base.files import read_mapping, write_json
-from kerv_cli.base.places import artifact
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.episodes.settings import RolloutSettings
@@ -96,34 +95,32 @@ class CalibrationRun:
         self.description = self.artifacts.description
         self.description.check_autoregressive("kerv calibrate", "there is no draft to calibrate")
         self.path = self.artifacts.path("calibration")
-        if settings.name is not None:
-            self.path = artifact(settings.results, "calibration", settings.name) / self.path.name
         self.chosen = choose_episodes(self.dataset, self.tasks, settings.episodes, settings.held_out)
-        self.datastore = self.artifacts.path("datastore")
-        self.has_datastore = (self.datastore / "manifest.json").is_file()
-        if self.has_datastore:
+        parts = {"proposer": settings.proposer, "acceptance": settings.acceptance, "threshold": settings.threshold}
+        self.method = Method.of(RolloutSettings(**parts))
+        self.missing = [kind for kind in (*self.method.needs, "datastore") if not self.artifacts.exists(kind)]
+        if "datastore" not in self.missing:
             self.artifacts.check(["datastore"])
-        if not (self.has_datastore and self.path.is_file() and read_mapping(self.path).get("skip") is None):
-            check_not_shipped(self.path, "name")  # a shipped calibration may only be filled with missing skip levels
+        fills = self.path.is_file() and read_mapping(self.path).get("skip") is None
+        if "datastore" in self.missing or not fills:  # skip levels may be added to a shipped calibration
+            check_not_shipped(self.path, "policy.artifacts.calibration")
         self.notes: list[str] = []
 
     def plan(self) -> str:
         """Return one line that `--plan` prints: demonstrations, decodes, boundary windows, skip levels and the file."""
-        held_out, proposer = sum(self.chosen.values()), self.settings.proposer.kind
-        skip = f"skip levels from {self.datastore}"
-        if not self.has_datastore:
-            skip = f"no skip levels: no datastore {self.datastore}"
+        held_out, settings = sum(self.chosen.values()), self.settings
+        without = f"; without {' and '.join(self.missing)}" if self.missing else ""
         return (
             f"{self.path}: predictors fitted on {len(self.chosen) - held_out} demonstrations of {len(self.tasks)} "
-            f"tasks, tested on {held_out}; {self.settings.decodes} decodes per task with {proposer} drafts; boundary "
-            f"over {', '.join(map(str, self.settings.boundary_windows))} positions; {skip}"
+            f"tasks, tested on {held_out}; {settings.decodes} decodes per task with {settings.proposer.kind} drafts; "
+            f"boundary over {', '.join(map(str, settings.boundary_windows))} positions{without}"
         )
 
     def run(self, stage: Stage) -> Calibration:
         """Measure everything and write the calibration.
 
-        K_S is not measured if `decodes` is 0, and skip levels are not measured without a datastore. Both are then taken
-        from an earlier calibration of the same target, if there is one.
+        K_S is not measured if `decodes` is 0 or the drafter is missing. Skip levels are not measured without a
+        datastore. Both are then taken from an earlier calibration of the same target, if there is one.
 
         Args:
             stage: Called with the title of each part of the work, to show its progress.
@@ -143,26 +140,43 @@ class CalibrationRun:
                 ranges[str(window)] = BoundaryRanges.fit(windows.paths, window)
                 progress(number, len(settings.boundary_windows))
         with stage("fitting the predictors"):
-            noise = fit_filters(windows, chunk, space.is_strict)
+            noise = fit_filters(windows, space.is_strict)
             errors = prediction_errors(windows, noise, space)
-        provenance = provenance_of("kerv calibrate", settings, settings.runtime.device)
-        sections, kept = self._with_earlier({"variability": variability, "skip": skip})
+        if not variability:
+            drafter = "".join(f", no {kind}" for kind in self.missing if kind != "datastore")
+            variability = self.kept("variability", f"reference levels K_S: decodes={settings.decodes}{drafter}") or {}
+        skip = skip or self.kept("skip", "skip levels: no datastore of these tasks (kerv build datastore)")
         calibration = Calibration(
             target=MadeFor.of(self.description),
             demos=Demonstrations(self.dataset.sha256, windows.episodes),
             window=settings.window,
             noise=noise,
             errors=errors,
+            variability=variability,
             boundary=BoundarySection(len(windows.paths), ranges),
-            **sections,
-            provenance={**provenance, "kept": kept} if kept else provenance,
+            skip=skip,
+            provenance=provenance_of("kerv calibrate", settings, settings.runtime.device),
         )
         write_json(self.path, asdict(calibration))
         return calibration
 
+    def kept(self, section: str, reason: str) -> Any:
+        """Return a section of an earlier calibration of the same target, if there is one. Note why it was needed.
+
+        Args:
+            section: Field of `Calibration` that was not measured.
+            reason: Why it was not measured, for the note.
+        """
+        try:
+            earlier = getattr(CalibrationArtifact().checked(self.path, self.description), section)
+        except CheckpointError:  # the file is missing, damaged or of another target
+            earlier = None
+        self.notes.append(f"{reason}; {'kept from the earlier run' if earlier else 'left empty'}")
+        return earlier
+
     def skip(self, stage: Stage) -> SkipSection | None:
         """Return per task the lowest similarity at which verification is skipped. None without a datastore."""
-        if not self.has_datastore:
+        if "datastore" in self.missing:
             return None
         store = self.artifacts.load("datastore")
         with stage("skip levels") as progress:
@@ -172,13 +186,13 @@ class CalibrationRun:
         """Measure how far drafts are from the target's tokens, by decoding observations of training episodes.
 
         Returns:
-            Task -> its reference level K_S (the median K) and percentiles of K. Empty if `decodes` is 0.
+            Task -> its reference level K_S, the median K. Empty if `decodes` is 0 or the drafter is missing.
         """
         decodes = self.settings.decodes
-        if not decodes:
+        if not decodes or not set(self.missing).isdisjoint(self.method.needs):
             return {}
-        decoder, actions = self.decoder(), self.description.actions
-        # the smallest possible K above 0: one token of a chunk is off by one bin
+        decoder, actions = self.method.decoder(self.artifacts.target, self.artifacts.load), self.description.actions
+        # decoding divides by K_S, so it is at least the smallest K above 0: one token of a chunk is off by one bin
         least = 2.0 / actions.tokens / (self.description.chunk * int((~actions.is_strict).sum()))
         variability = {}
         with stage("pre-sampling") as progress:
@@ -190,15 +204,9 @@ class CalibrationRun:
                         levels += self.episode_levels(decoder, index, budget)
                 if not levels:
                     raise KervError(f"{name}: no decode compared a draft with a target token, so there is no K_S")
-                variability[name] = distribution(levels, least)
+                variability[name] = Variability(max(float(np.median(levels)), least), len(levels))
                 progress(number, len(self.tasks))
         return variability
-
-    def decoder(self) -> Decoder:
-        """Return the decoder whose drafts are compared with the target, as the settings choose it."""
-        s = self.settings
-        method = RolloutSettings(proposer=s.proposer, acceptance=s.acceptance, threshold=s.threshold)
-        return Method.of(method).decoder(self.artifacts.target, self.artifacts.load)
 
     def episode_levels(self, decoder: Decoder, index: int, decodes: int) -> list[float]:
         """Decode observations that are spread evenly over one demonstration, and return the K of each decode.
@@ -225,44 +233,6 @@ class CalibrationRun:
                 levels.append(record.variability)
         return levels
 
-    def _with_earlier(self, sections: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Fill empty sections from an earlier calibration in the same file, and write `notes` about them.
-
-        Args:
-            sections: Name of a section -> its content; empty or None if it was not measured now.
-
-        Returns:
-            The filled sections, and name -> provenance of each section that was kept from an earlier calibration.
-        """
-        try:
-            earlier = CalibrationArtifact().checked(self.path, self.description)
-        except CheckpointError:  # the file is missing, damaged or of another target: keep nothing
-            earlier = None
-        reasons = {
-            "variability": f"reference levels K_S: decodes={self.settings.decodes}",
-            "skip": f"skip levels: no datastore of these tasks in {self.datastore} (kerv build datastore)",
-        }
-        kept = {}
-        for name in [name for name, value in sections.items() if not value]:
-            section = getattr(earlier, name) if earlier else None
-            if earlier and section:
-                sections[name] = section
-                before = earlier.provenance.get("kept", {})
-                kept[name] = before.get(name) or {k: v for k, v in earlier.provenance.items() if k != "kept"}
-            self.notes.append(f"{reasons[name]}; {'kept from the earlier run' if section else 'left empty'}")
-        return sections, kept
-
-
-def distribution(levels: Sequence[float], least: float) -> Variability:
-    """Return the median K_S and percentiles of a task's measured K.
-
-    Args:
-        levels: The K of each decode, normalised action units.
-        least: Minimum of K_S, because decoding divides by K_S.
-    """
-    low, high, top = np.percentile(levels, [25, 75, 90]).tolist()
-    return Variability(max(float(np.median(levels)), least), len(levels), low, high, top)
-
 
 @dataclass(frozen=True)
 class Windows:
@@ -277,9 +247,7 @@ class Windows:
     paths: list[np.ndarray]  # end effector in each training episode, (T, 3) metres
 
 
-def episode_windows(
-    episode: DemoEpisode, actions: ActionSpace, window: int, horizon: int
-) -> tuple[np.ndarray, np.ndarray]:
+def episode_windows(episode: DemoEpisode, actions: ActionSpace, window: int, horizon: int) -> np.ndarray:
     """Cut an episode into windows: one for each control step with `window` control steps before it.
 
     Args:
@@ -289,19 +257,17 @@ def episode_windows(
         horizon: Number of control steps after the moment.
 
     Returns:
-        The expert's undisturbed actions before each moment (n, window, D), and after it (n, horizon, D).
+        The expert's undisturbed actions around each moment (n, window + horizon, D), oldest first.
 
     Raises:
         CheckpointError: The recording holds too few labels after the episode's end.
     """
-    steps = len(episode.executed)
+    steps, length = len(episode.executed), window + horizon
     check_tail(episode, horizon, f"predictions of {horizon} steps")
-    labels = actions.normalise(episode.labels)
+    labels = actions.normalise(episode.labels[: steps + horizon - 1]).astype(np.float32)
     if steps <= window:
-        return np.zeros((0, window, labels.shape[1])), np.zeros((0, horizon, labels.shape[1]))
-    past = np.lib.stride_tricks.sliding_window_view(labels[: steps - 1], window, axis=0)
-    future = np.lib.stride_tricks.sliding_window_view(labels[window : steps + horizon - 1], horizon, axis=0)
-    return past.swapaxes(1, 2), future.swapaxes(1, 2)
+        return np.zeros((0, length, labels.shape[1]), np.float32)
+    return np.lib.stride_tricks.sliding_window_view(labels, length, axis=0).swapaxes(1, 2)
 
 
 def read_windows(
@@ -330,17 +296,17 @@ def read_windows(
     columns, paths = [], []
     for done, (index, held_out) in enumerate(chosen.items(), 1):
         episode = dataset.load(index)
-        past, future = (x.astype(np.float32) for x in episode_windows(episode, actions, window, horizon))
-        columns.append((past, future, np.full(len(past), tasks.index(episode.task)), np.full(len(past), held_out)))
+        cut = episode_windows(episode, actions, window, horizon)
+        columns.append((cut, np.full(len(cut), tasks.index(episode.task)), np.full(len(cut), held_out)))
         if not held_out:
             paths.append(episode.end_effector.copy())
-        counts[episode.task]["held_out" if held_out else "training"] += bool(len(past))
+        counts[episode.task]["held_out" if held_out else "training"] += bool(len(cut))
         progress(done, len(chosen))
     short = [task for task, count in counts.items() if not all(count.values())]
     if short:
         raise KervError(f"{', '.join(short)}: no training or no held-out episode is longer than a window of {window}")
-    past, future, task, held = map(np.concatenate, zip(*columns, strict=True))
-    return Windows(past, future, task, held, tasks, counts, paths)
+    around, task, held = map(np.concatenate, zip(*columns, strict=True))
+    return Windows(around[:, :window], around[:, window:], task, held, tasks, counts, paths)
 
 
 def choose_episodes(dataset: DemoDataset, tasks: Sequence[str], limit: int, share: float) -> dict[int, bool]:
@@ -391,12 +357,11 @@ def fit_noise(past: np.ndarray, future: np.ndarray, dampings: Sequence[float]) -
     return min(((float(q), damping) for damping in dampings for q in RATIOS), key=error)
 
 
-def fit_filters(windows: Windows, steps: int, held: np.ndarray) -> dict[str, Noise]:
+def fit_filters(windows: Windows, held: np.ndarray) -> dict[str, Noise]:
     """Fit the Kalman filters `kalman` and `damped` on the training episodes.
 
     Args:
-        windows: Actions before and after each moment.
-        steps: Number of actions after each moment that a filter should predict well.
+        windows: Actions before and after each moment. The filters should predict the latter.
         held: (D,) bool. True: predictions hold this DoF at its last value, so it is not fitted.
 
     Returns:
@@ -407,8 +372,8 @@ def fit_filters(windows: Windows, steps: int, held: np.ndarray) -> dict[str, Noi
     for kind in FILTERS:
         dampings = DAMPINGS if kind == "damped" else (1.0,)
         fits = [
-            (0.0, 1.0) if held[dof] else fit_noise(past[..., dof], future[:, :steps, dof], dampings)
-            for dof in range(past.shape[2])
+            (0.0, 1.0) if is_held else fit_noise(past[..., dof], future[..., dof], dampings)
+            for dof, is_held in enumerate(held)
         ]
         noise[kind] = Noise(tuple(q for q, _ in fits), (1.0,) * len(fits), tuple(d for _, d in fits))
     return noise
@@ -444,26 +409,28 @@ def moving_errors(errors: Errors, kind: str, space: ActionSpace) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Matches:
-    """n datastore entries of one task, each compared with the most similar entry of another episode."""
+    """n datastore entries of one task, each compared with the most similar entry of another episode.
+
+    A match is good if executing the similar entry's chunk would have been: its error is small, and all its tokens of
+    strict DoFs are equal. Strict DoFs count separately, because a wrong gripper hardly changes the mean error but drops
+    the object.
+    """
 
     similarity: np.ndarray  # (n,) float32, cosine
     error: np.ndarray  # (n,) mean absolute difference of the two chunks, normalised action units
-    strict: np.ndarray  # (n,) bool, whether a token of a strict DoF differs
-
-    def good(self, epsilon: float) -> np.ndarray:
-        """Return (n,) bool: whether executing the similar entry's chunk would have been good.
-
-        A chunk is good if its error is at most `epsilon` and all its tokens of strict DoFs are equal. Strict DoFs count
-        separately, because a wrong gripper hardly changes the mean error but drops the object.
-        """
-        return (self.error <= epsilon) & ~self.strict
+    good: np.ndarray  # (n,) bool
 
 
-def match(store: Datastore, task: str) -> Matches:
+def match(store: Datastore, task: str, epsilon: float) -> Matches:
     """Look up each of up to ENTRIES entries of a task in the task's other episodes (docs/methods.md §4.3).
 
     The best neighbour's chunk is the one that would be executed without verification. It is compared with the entry's
     own chunk, the expert's next actions. With a single episode of the task there are no matches.
+
+    Args:
+        store: The datastore.
+        task: Full name of the task.
+        epsilon: Largest mean absolute error of a good match, in normalised action units.
     """
     shard = store.shards[task]
     count = min(ENTRIES, shard.stop - shard.start) if len(np.unique(store.seeds[shard])) > 1 else 0
@@ -474,31 +441,30 @@ def match(store: Datastore, task: str) -> Matches:
         similarity[i], drafts[i] = neighbours.similarity[0], neighbours.chunks[0]
     space, expert = store.manifest.actions, store.tokens[rows].astype(np.int64)
     error = np.abs(space.values_of(drafts) - space.values_of(expert)).mean(1)
-    strict = (drafts != expert)[:, space.strict_tokens(expert.shape[1])].any(1)
-    return Matches(similarity, error, strict)
+    same_strict = (drafts == expert)[:, space.strict_tokens(expert.shape[1])].all(1)
+    return Matches(similarity, error, (error <= epsilon) & same_strict)
 
 
-def lowest_level(similarity: np.ndarray, good: np.ndarray, confidence: float, least: int = LEAST) -> float | None:
-    """Find the lowest similarity s such that enough of the entries with similarity ≥ s are good.
+def lowest_level(matches: Matches, confidence: float, least: int = LEAST) -> float | None:
+    """Find the lowest similarity s such that enough of the matches with similarity ≥ s are good.
 
     Args:
-        similarity: (n,) similarity of each entry to its best neighbour.
-        good: (n,) bool, whether the neighbour's chunk is good.
-        confidence: Minimum share of good entries among those with similarity ≥ s.
-        least: Minimum number of entries with similarity ≥ s.
+        matches: The task's matches.
+        confidence: Minimum share of good matches among those with similarity ≥ s.
+        least: Minimum number of matches with similarity ≥ s.
 
     Returns:
         The similarity s; None if there is none.
     """
-    order = np.argsort(-similarity, kind="stable")
-    ranked = similarity[order]
+    order = np.argsort(-matches.similarity, kind="stable")
+    ranked = matches.similarity[order]
     above = np.arange(1, len(ranked) + 1)
-    enough = (np.cumsum(good[order]) / above >= confidence) & (above >= least)
+    enough = (np.cumsum(matches.good[order]) / above >= confidence) & (above >= least)
     enough[:-1] &= ranked[:-1] > ranked[1:]
     return float(ranked[enough][-1]) if enough.any() else None
 
 
-def task_levels(matches: Matches, epsilon: float, confidence: float) -> SkipLevel:
+def task_levels(matches: Matches, confidence: float) -> SkipLevel:
     """Return a task's s_min, the similarity from which verification is skipped, and the bounds of its feedback.
 
     Feedback after each episode may move s_min between `low` and `high`. `low` allows twice the share of wrong chunks
@@ -507,23 +473,22 @@ def task_levels(matches: Matches, epsilon: float, confidence: float) -> SkipLeve
     are NEVER, and the task never skips.
 
     Args:
-        matches: The task's entries and their best neighbours.
-        epsilon: Largest mean absolute error of a good chunk, in normalised action units.
+        matches: The task's matches.
         confidence: Minimum share of good chunks among the skipped ones.
     """
-    good, wrong = matches.good(epsilon), 1 - confidence
-    s_min = lowest_level(matches.similarity, good, confidence)
+    similarity, wrong = matches.similarity, 1 - confidence
+    s_min = lowest_level(matches, confidence)
     if s_min is None:
-        return SkipLevel(NEVER, NEVER, NEVER, share=0.0, entries=len(matches.similarity))
-    low, high = (lowest_level(matches.similarity, good, 1 - wrong * factor) for factor in (LOW, HIGH))
-    skipped = matches.similarity >= s_min
+        return SkipLevel(NEVER, NEVER, NEVER, share=0.0, entries=len(similarity))
+    low, high = (lowest_level(matches, 1 - wrong * factor) for factor in (LOW, HIGH))
+    skipped = similarity >= s_min
     return SkipLevel(
         s_min,
         low=s_min if low is None else min(low, s_min),
-        high=float(matches.similarity.max()) if high is None else max(high, s_min),
+        high=float(similarity.max()) if high is None else max(high, s_min),
         share=float(skipped.mean()),
-        entries=len(matches.similarity),
-        within=float(good[skipped].mean()),
+        entries=len(similarity),
+        within=float(matches.good[skipped].mean()),
         error=float(matches.error[skipped].mean()),
     )
 
@@ -546,6 +511,6 @@ def skip_section(
     levels = {}
     for done, task in enumerate(tasks, 1):
         if task in store.shards:
-            levels[task] = task_levels(match(store, task), epsilon, confidence)
+            levels[task] = task_levels(match(store, task, epsilon), confidence)
         progress(done, len(tasks))
     return SkipSection(store.content, epsilon, confidence, levels) if levels else None

@@ -13,9 +13,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
 
-from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import read_mapping, sha256_of, visible, write_folder, write_json
-from kerv_cli.base.places import artifact
 from kerv_cli.base.runtime import set_up
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.heisd.datastore import (
@@ -40,11 +39,6 @@ from kerv_cli.worlds.demos.files import DemoEpisode
 
 BATCH = 128
 """Maximum number of observations that are encoded together."""
-KEYS = ("vision", "scene", "proprioception")
-"""Parts of the prompt from which a search key can be made.
-
-The instruction is not among them, because all entries of a task share it.
-"""
 
 
 class DatastoreBuild:
@@ -53,7 +47,7 @@ class DatastoreBuild:
     Raises:
         CheckpointError: The target or the demonstrations do not exist. Or the demonstrations are of another
             environment, contain evaluation seeds, or have no episode of a task.
-        UsageError: `key` names an unknown part of the prompt. Or the folder holds something else than a datastore.
+        UsageError: `key` is empty. Or the folder holds something else than a datastore.
     """
 
     def __init__(self, settings: BuildDatastoreSettings) -> None:
@@ -63,18 +57,11 @@ class DatastoreBuild:
         self.device, _ = set_up(settings.runtime)
         self.artifacts = Artifacts(settings.results, settings.policy, device=self.device, dtype=settings.runtime.dtype)
         if not settings.key:
-            raise UsageError(f"key=[]: name at least one part of the prompt: {', '.join(KEYS)}")
-        parts = [name for name in KEYS if name != "vision" or self.artifacts.description.cameras]
-        for name in settings.key:
-            if name not in parts:
-                raise UnknownName("key", name, parts)
+            raise UsageError("key=[]: name at least one part of the prompt: scene, vision, proprioception")
         self.folder = self.artifacts.path("datastore")
-        if settings.name:
-            self.folder = artifact(settings.results, "datastore", settings.name)
-        check_not_shipped(self.folder, "name")
-        entries = self.dataset.episodes
+        check_not_shipped(self.folder, "policy.artifacts.datastore")
+        entries, most = self.dataset.episodes, settings.episodes or None
         by_seed = sorted(range(len(entries)), key=lambda i: entries[i].seed)
-        most = settings.episodes or None
         self.chosen = {name: [i for i in by_seed if entries[i].task == name][:most] for name in tasks}
         self.seeds = {name: [entries[i].seed for i in chosen] for name, chosen in self.chosen.items()}
         check_seeds(self.seeds, self.dataset.path)
@@ -100,15 +87,18 @@ class DatastoreBuild:
 
         Raises:
             CheckpointError: An episode has too few labels, or images of another size than the target takes.
+            UnknownName: `key` names an unknown part of the prompt.
             StorageError: The disk cannot be written.
         """
-        total, parts, shards, rows = sum(map(len, self.chosen.values())), list[dict[str, np.ndarray]](), {}, 0
+        parts: list[dict[str, np.ndarray]] = []
+        shards: dict[str, Shard] = {}
+        rows = 0
         for name, chosen in self.chosen.items():
             first = rows
             for index in chosen:
                 parts.append(self._entries(self.dataset.load(index)))
                 rows += len(parts[-1]["step"])
-                progress(len(parts), total)
+                progress(len(parts), sum(map(len, self.chosen.values())))
             shards[name] = Shard((first, rows), tuple(self.seeds[name]))
         files = self._contents({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, shards)
         write_folder(self.folder, lambda folder: self._write(folder, files, shards), replace=True)

@@ -56,7 +56,7 @@ def plan(settings: PrepareSettings) -> list[Step]:
     steps: list[Step] = []
     for kind in kinds:
         files = kind_of(kind)
-        command = files.command_beside(kinds)
+        command = files.command
         if isinstance(files, TrainableDrafter) and settings.steps:
             command = (*command, f"train.steps={settings.steps}")
         steps.append(Step(kind, _state(artifacts, kind, kinds), command))
@@ -115,11 +115,11 @@ def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
         CheckpointError: The artifact is a trained drafter of another target or made from other artifacts.
     """
     files, path = kind_of(kind), artifacts.path(kind)
-    if not files.json(path).is_file():
+    if not artifacts.exists(kind):
         return MISSING
     try:
         described = files.checked(path, artifacts.description)
-        present = [one for one in kinds if kind_of(one).json(artifacts.path(one)).is_file()]
+        present = [one for one in kinds if artifacts.exists(one)]
         artifacts.check(present[: present.index(kind) + 1])
     except CheckpointError as error:
         if isinstance(files, TrainableDrafter):

@@ -153,7 +153,6 @@ class BuildDatastoreSettings(DemonstrationSettings):
 
     groups: ClassVar = {"policy": "vision", "runtime": "cpu"}
 
-    name: str | None = setting(None, "name of the datastore; default: the one beside the target")
     episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)
     stride: int = number(1, 1, 10_000, help="store every n-th observation")
     half: bool = setting(False, "store keys in float16, half the size")
@@ -169,7 +168,6 @@ class CalibrateSettings(DemonstrationSettings):
     that scale the hybrid boundary, and the similarities from which a retrieved draft is executed without verification.
     """
 
-    name: str | None = setting(None, "name of the calibration; default: the one beside the target")
     episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)
     held_out: float = number(0.1, above=0, most=0.5, help="share of episodes kept for measuring the predictors' errors")
     window: int = number(10, 4, 10_000, help="control steps of history that the predictors see")

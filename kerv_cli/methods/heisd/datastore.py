@@ -328,7 +328,19 @@ class Datastore:
             UsageError: The search is unknown, its packages are not installed, or its server does not answer.
         """
         manifest = DatastoreArtifact().checked(folder, description)
-        store = cls(manifest, **_arrays(folder, manifest), search=search)
+        rows, size = manifest.rows, manifest.chunk * manifest.actions.dofs
+        try:
+            vectors = np.load(folder / VECTORS).astype(np.float32, copy=False)
+            projection = np.load(folder / PROJECTION) if PROJECTION in manifest.files else None
+            payload = _read_payload(folder / PAYLOAD)
+            if vectors.shape != (rows, manifest.width) or payload["tokens"].shape != (rows, size):
+                raise ValueError("its files do not fit its manifest")
+            if not np.isfinite(vectors).all():
+                raise ValueError("its keys are not finite")
+        except (OSError, KeyError, TypeError, ValueError, MemoryError) as error:  # pyarrow's errors are ValueErrors
+            raise CheckpointError(f"the datastore in {folder} is damaged ({error}): build it again") from error
+        shards = {task: slice(*shard.rows) for task, shard in manifest.tasks.items()}
+        store = cls(manifest, vectors, **payload, shards=shards, projection=projection, search=search)
         _ = store.index  # open the search now, so that a search that cannot work is refused at once
         return store
 
@@ -376,31 +388,6 @@ class Datastore:
         rows, similarity = best(self.vectors, self.index.candidates(key, task, k, without), key, k)
         chunks = self.tokens[rows].astype(np.int64)
         return Neighbours(similarity, chunks, self.seeds[rows], self.steps[rows], self.left[rows])
-
-
-def _arrays(folder: Path, manifest: Manifest) -> dict[str, Any]:
-    """Read the files of a datastore, and check that their shapes are those of the manifest.
-
-    Returns:
-        Name of a field of `Datastore` -> its value.
-
-    Raises:
-        CheckpointError: A file is damaged.
-    """
-    try:
-        vectors = np.load(folder / VECTORS).astype(np.float32, copy=False)
-        payload = _read_payload(folder / PAYLOAD)
-        projection = np.load(folder / PROJECTION) if PROJECTION in manifest.files else None
-        rows, size = manifest.rows, manifest.chunk * manifest.actions.dofs
-        fits = vectors.shape == (rows, manifest.width) and payload["tokens"].shape == (rows, size)
-    except (OSError, KeyError, TypeError, ValueError, MemoryError) as error:  # pyarrow's errors are ValueErrors
-        raise CheckpointError(f"the datastore in {folder} is damaged ({error}): build it again") from error
-    if not fits or not np.isfinite(vectors).all():
-        raise CheckpointError(
-            f"the datastore in {folder} is damaged: its files do not fit its manifest, build it again"
-        )
-    shards = {task: slice(*shard.rows) for task, shard in manifest.tasks.items()}
-    return {"vectors": vectors, "shards": shards, "projection": projection, **payload}
 
 
 def _read_payload(path: Path) -> dict[str, np.ndarray]:
