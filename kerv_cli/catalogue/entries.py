@@ -35,8 +35,6 @@ from kerv_cli.targets.folders import shipped_dir
 
 LOG, WEIGHTS = "log.csv", "model.safetensors"
 """Names of a training's files: validation results, weights."""
-POLICY = "policy"
-"""Kind of a policy that `kerv build policy` installs. It is listed only while it is unfinished."""
 LAST = "last"
 """Stands for the newest entry, as an argument of commands."""
 _STUDIES = (SWEEP, ROLLOUT, IMPORT)
@@ -55,7 +53,7 @@ class RunEntry:
 
     Attributes:
         id: Name in commands.
-        kind: sweep, rollout, import, policy, or a kind of artifact.
+        kind: sweep, rollout, import, or a kind of artifact.
         folder: Folder of its files.
         started: Start time in UTC (ISO 8601). For an artifact, the time when its newest file changed.
         state: For example `complete`, `2 of 6 episodes`, `step 300 of 600`, `begun` or `damaged`.
@@ -106,8 +104,7 @@ def find_runs(results: str | Path) -> list[RunEntry]:
             continue
         entry = made.get(f"{kind}/{name}")
         if row.status != COMPLETE:
-            place = database.results / "pretrained" if kind == POLICY else folder / kind
-            entry = entry or RunEntry(f"{kind}/{name}", kind, place / name, "", "", (kind,))
+            entry = entry or RunEntry(f"{kind}/{name}", kind, folder / kind / name, "", "", (kind,))
             state = f"{row.status}, {row.done} of {row.total}" if row.total else row.status
             entry = replace(entry, started=row.started[:23], state=state)
         if entry is not None:
@@ -155,7 +152,7 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
     for key in filters:
         if key not in _FILTERS:
             raise UnknownName("filter", key, _FILTERS)
-    kinds = (*_STUDIES, POLICY, *artifact_kinds())
+    kinds = (*_STUDIES, *artifact_kinds())
     if filters.get("kind", SWEEP) not in kinds:
         raise UnknownName("kind of run", filters["kind"], kinds)
     state, since, task = filters.get("state", ""), filters.get("since", ""), filters.get("task", "*")

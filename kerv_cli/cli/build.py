@@ -1,17 +1,13 @@
-"""`kerv build target`, `policy`, `drafter` and `datastore`."""
+"""`kerv build target`, `drafter` and `datastore`."""
 
 from __future__ import annotations
-
-from pathlib import Path
-
-import typer
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.places import artifact
 from kerv_cli.base.registry import find, load, parts
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, end_with_plan, print_figures, progress_bar
-from kerv_cli.targets.settings import BuildPolicySettings, BuildTargetSettings
+from kerv_cli.targets.settings import BuildTargetSettings
 from kerv_cli.training.settings import BuildDatastoreSettings, BuildDrafterSettings
 
 
@@ -38,26 +34,6 @@ def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
     with making(settings.results, "target", artifact(settings.results, "target", settings.name)):
         folder, figures = load(importers[settings.family].traits["importer"])(settings)
     print_figures("target", figures, folder, as_json)
-
-
-@command(
-    "build policy",
-    BuildPolicySettings,
-    keys="source sha256 results",
-    examples=(
-        "kerv build policy source=mt50-vision.tar.gz",
-        "kerv build policy source=https://example.org/mine.tar.gz sha256=0123abcd",
-    ),
-)
-def policy(settings: BuildPolicySettings) -> None:
-    """Download and install a released policy that is not part of the installed package; its hashes are checked."""
-    from kerv_cli.lab.database import Database
-    from kerv_cli.lab.runs import Run
-    from kerv_cli.targets.release import install
-
-    with Run(Database(settings.results), "policy", Path(settings.source).name):
-        folder = install(settings)
-    typer.echo(f"policy in {folder}")
 
 
 @command(

@@ -7,14 +7,8 @@ from pathlib import Path
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.places import artifact, as_path, results_dir
 
-RELEASED = {
-    "mt10-state": "074e70fddd4f9a41885d7af9e93d81c722b3e470e23a2f560facf1556442f050",
-    "mt10-vision": "d2bda555360bfcd04b9d3c77a665623b23c1c9fedff1229838ade1f5cfca47de",
-    "mt10-vision-parallel": "096ce2dae9793b7f2efa3fbf020bebaf9ec6b664e650ab8ef97efc503db1e7f4",
-    "mt50-plain": "c2455773de37ced5e7a6db9bfda64a36375c27a7c62a8c2b354a9af55e548f54",
-    "mt50-vision": "11cbcfd366f20df05355e5715afc4bb0d032547815b0e3821dd8ee66ea46727b",
-}
-"""Name of each shipped policy -> SHA-256 of its target's weights. The wheel contains one policy, a checkout all."""
+RELEASED = ("mt10-state", "mt10-vision", "mt10-vision-parallel", "mt50-plain", "mt50-vision")
+"""Names of the shipped policies. A checkout contains all of them, the wheel only `mt10-vision`."""
 
 RESUME = "resume.pt"
 """File in the folder of a trained artifact from which its training can resume. Shipped artifacts do not have it."""
@@ -41,18 +35,17 @@ def find_target(results: str, name: str) -> Path:
     Raises:
         UsageError: There is no such target. The message lists the existing ones.
     """
+    policies = results_dir(results) / "pretrained"
+    folders = [artifact(results, "target", name), policies / name / "target", shipped_dir() / name / "target"]
     if "/" in name:
         folders = [as_path(name)]
-    else:
-        policies = results_dir(results) / "pretrained" / name, shipped_dir() / name
-        folders = [artifact(results, "target", name), *(policy / "target" for policy in policies)]
     for folder in folders:
         if (folder / "target.json").is_file():
             return folder
     if name in RELEASED:
         raise UsageError(
-            f"policy '{name}' is not in this wheel: fetch {name}.tar.gz of the release, then 'kerv build policy "
-            f"source={name}.tar.gz', or source= its URL"
+            f"policy '{name}' is not in this wheel: fetch {name}.tar.gz of the release, then 'mkdir -p {policies} && "
+            f"tar -xzf {name}.tar.gz -C {policies}'"
         )
     names = target_names(results)
     raise UsageError(

@@ -1,4 +1,4 @@
-"""Settings of `kerv build target` and `kerv build policy`, which install targets that kerv did not train here."""
+"""Settings of `kerv build target`, which makes targets that are not trained."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from kerv_cli.base.limits import choice, number, setting
-from kerv_cli.base.settings import CommandSettings, RunSettings
+from kerv_cli.base.settings import RunSettings
 
 
 @dataclass
@@ -45,11 +45,3 @@ class BuildTargetSettings(RunSettings):
     )
     int8: bool = setting(False, "store the language model's layers with one byte per weight")
     prompt_tokens: int = number(64, 1, 65_536, help="longest prompt in tokens, without the vision tokens")
-
-
-@dataclass
-class BuildPolicySettings(CommandSettings):
-    """Settings of `kerv build policy`, which installs a released policy that is not part of the wheel."""
-
-    source: str = setting("", "archive of the policy's folder (.tar.gz), URL or path")
-    sha256: str = setting("", "SHA-256 of the archive; not needed for kerv's own policies")
