@@ -10,9 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor
 
-from kerv_cli.targets.compact.bfloat16 import BlockedLinear, multiplies_bfloat16
 from kerv_cli.targets.compact.program import Program
 
 _BUFFER = 64 * 2**20  # float32 numbers, 256 MiB: larger than the caches of a server, which hold 100 MB and more
@@ -81,24 +79,13 @@ def measure_machine(device: torch.device, dtype: torch.dtype) -> Machine:
     def rate(numbers: int) -> float:
         return 4.0 * numbers / float(timed(buffer[:numbers].sum, device, REPEATS).min())
 
-    buffer, width = torch.ones(_BUFFER, device=device), _WIDTH if device.type == "cuda" else _WIDTH // 4
-    bandwidth, caches = rate(_BUFFER), [(size, rate(size // 4)) for size in _LEVELS if device.type == "cpu"]
-    x, product = torch.ones(_ROWS, width, dtype=dtype, device=device), torch.ones(width, width, device=device)
-    best = timed(functools.partial(product_with(product, dtype), x), device, REPEATS).min()
+    on_cpu = device.type == "cpu"
+    buffer, width = torch.ones(_BUFFER, device=device), _WIDTH // 4 if on_cpu else _WIDTH
+    bandwidth, caches = rate(_BUFFER), [(size, rate(size // 4)) for size in _LEVELS if on_cpu]
+    x = torch.ones(_ROWS, width, dtype=dtype, device=device)
+    weight = torch.ones(width, width, dtype=dtype, device=device)
+    multiply: Callable[..., object] = functools.partial(F.linear, weight=weight)
+    if on_cpu and dtype == torch.float32:  # as in a target's forward
+        multiply = Program(multiply, (1, width))
+    best = timed(lambda: multiply(x), device, REPEATS).min()
     return Machine(bandwidth, 2.0 * _ROWS * width**2 / float(best), tuple(caches))
-
-
-def product_with(weight: Tensor, dtype: torch.dtype) -> Callable[[Tensor], Tensor]:
-    """Return a function that multiplies rows with a weight matrix, by the kernel that a target's forward would use.
-
-    Args:
-        weight: (outputs, inputs) float32. Its device decides about the kernel.
-        dtype: Number format of the multiplication.
-    """
-    if weight.device.type == "cpu" and dtype == torch.bfloat16 and multiplies_bfloat16():
-        return BlockedLinear(weight)
-    if weight.device.type == "cpu" and dtype == torch.float32:
-        compiled = Program(lambda rows: F.linear(rows, weight), (1, weight.shape[1]))
-        return lambda rows: compiled(rows)[0]
-    plain = weight.to(dtype)
-    return lambda rows: rows @ plain

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import functools
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
 
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.runtime import DTYPES, set_up
 from kerv_cli.base.spaces import Observation
-from kerv_cli.bench.machine import REPEATS, product_with, timed
 from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.episodes.policy import still_observation
@@ -24,7 +19,6 @@ from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import EagleDrafter, EagleNetwork
 from kerv_cli.methods.settings import PolicySettings
-from kerv_cli.targets.compact.bfloat16 import Bfloat16Layers, multiplies_bfloat16
 from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.program import Program, stored_bytes
 from kerv_cli.targets.compact.settings import TargetSettings
@@ -36,6 +30,7 @@ from kerv_cli.training.settings import TrainTargetSettings
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 _SPARE = 1.15  # free memory that is needed, relative to the weights: also for encoder, caches, a copy of one layer
+_COMPILED = 2  # bytes of a weight in a compiled network, which holds them a second time
 
 
 @dataclass(frozen=True)
@@ -131,59 +126,30 @@ class Model:
         return dtype
 
 
-class ShapeTarget(CompactTarget):
-    """A compact target with random weights.
+def random_target(shape: TargetSettings, device: torch.device, dtype: torch.dtype) -> CompactTarget:
+    """Return a compact target with random weights, for inference.
 
-    It is built layer by layer in its final number format, so that memory never holds 7 B weights twice. On a CPU the
-    prompt's encoder stays float32, because only then it is compiled. All layers have the same random numbers, shifted
-    by a few rows. Each has its own memory, so a forward reads as much as in a trained target.
+    Its layers are made one after the other, so that memory never holds 7 B weights twice. Half precision can hold all
+    weights without loss, like those of the shipped policies.
 
     Args:
-        settings: Shapes.
+        shape: Shapes of the target.
         device: Device of the weights.
-        dtype: Number format of the trunk's weights.
+        dtype: Number format of the weights.
     """
-
-    def __init__(self, settings: TargetSettings, device: torch.device, dtype: torch.dtype) -> None:
-        super().__init__(replace(settings, layers=0), SPEC.actions, SPEC.observation, vocabulary(SPEC.name), "corner4")
-        self.requires_grad_(False).eval()
-        layers, compiled = shifted_layers(settings, device, dtype), device.type == "cpu" and dtype == torch.float32
-        if device.type == "cpu" and not compiled:
-            pack(self)
-            self.packed = self.packed and self.packed._replace(step=None)
-        self.settings, self.trunk.depth = settings, settings.layers
-        if device.type == "cpu" and dtype == torch.bfloat16 and multiplies_bfloat16():
-            self.trunk.packed = Bfloat16Layers(self.trunk.rotary(slice(None)), layers)
-        else:
-            self.trunk.layers = torch.nn.ModuleList(layers)
-            self.trunk.to(dtype=dtype)
-        for part in (self.embedding, self.head, self.trunk.norm):
-            part.to(device=device, dtype=dtype)
-        if device.type == "cuda":
-            self.to(device=device, dtype=dtype)
-        elif compiled:
-            pack(self)
-
-    def encode(self, observation: Observation) -> Tensor:
-        """Return the prompt (1, P, E) of an observation in the trunk's number format."""
-        return super().encode(observation).to(self.dtype)
-
-
-def shifted_layers(settings: TargetSettings, device: torch.device, dtype: torch.dtype) -> Iterator[Layer]:
-    """Yield the decoder layers of a `ShapeTarget` one after the other; arguments as for that class."""
     torch.manual_seed(0)
-    first = Layer(settings.width, settings.heads, settings.feed_forward).requires_grad_(False)
-    for parameter in first.parameters():
-        if parameter.dim() == 2:
-            parameter.normal_(std=0.02)
-    for shift in range(settings.layers):
-        with torch.device("meta"):
-            layer = Layer(settings.width, settings.heads, settings.feed_forward)
-        for name, part in first.named_children():
-            weight: Any = part.weight
-            values = weight.roll(shift, 0).to(device=device, dtype=dtype)
-            layer.get_submodule(name).register_parameter("weight", torch.nn.Parameter(values, False))
-        yield layer
+    target = CompactTarget(replace(shape, layers=0), SPEC.actions, SPEC.observation, vocabulary(SPEC.name), "corner4")
+    for parameter in target.parameters():
+        parameter.data = parameter.data.half()
+    target.to(device=device, dtype=dtype)
+    for _ in range(shape.layers):
+        with device:
+            layer = Layer(shape.width, shape.heads, shape.feed_forward)
+        target.trunk.layers.append(layer.half().to(dtype))
+    target.settings, target.trunk.depth = shape, shape.layers
+    target.eval().requires_grad_(False)
+    pack(target)
+    return target
 
 
 def layer_weights(settings: TargetSettings) -> int:
@@ -220,17 +186,18 @@ def open_model(settings: BenchSettings) -> Model:
 
 def _shape(settings: BenchSettings) -> Model:
     shape = shape_of(settings.model, max(settings.tokens))
-    device, _ = set_up(settings.runtime)
-    dtype = DTYPES[settings.dtype] if settings.dtype != "auto" else fastest(torch.device(device))
-    needed = _SPARE * dtype.itemsize * layer_weights(shape) * (shape.layers + 1)
-    free = free_memory(torch.device(device))
-    if needed > free:
+    device = torch.device(set_up(settings.runtime)[0])
+    on_cpu = device.type == "cpu"
+    dtype = DTYPES[{"auto": "float32" if on_cpu else "bfloat16"}.get(settings.dtype, settings.dtype)]
+    size = dtype.itemsize + _COMPILED * on_cpu
+    needed, most = _SPARE * size * layer_weights(shape) * (shape.layers + 1), memory_of(device)
+    if needed > most:
         raise UsageError(
-            f"target={settings.model} needs {needed / 1e9:.1f} GB in {str(dtype).removeprefix('torch.')}, "
-            f"{free / 1e9:.1f} GB are free on {device}: take a smaller shape, e.g. target=vla-150m"
+            f"target={settings.model} needs {needed / 1e9:.1f} GB in {str(dtype).removeprefix('torch.')}, {device} has "
+            f"{most / 1e9:.1f} GB: take a smaller shape, e.g. target=vla-150m"
         )
     with torch.inference_mode():
-        target = ShapeTarget(shape, torch.device(device), dtype)
+        target = random_target(shape, device, dtype)
         return Model(settings.model, target, _drafter(target), blank(target), True)
 
 
@@ -252,30 +219,8 @@ def blank(target: Any) -> Observation:
     return still_observation(target, target.observation, target.settings.image_size)
 
 
-def fastest(device: torch.device) -> torch.dtype:
-    """Return the faster number format on this device, float32 or bfloat16.
-
-    On a CPU this is measured by multiplying one row with a large matrix. On CUDA it is bfloat16.
-    """
-    if device.type == "cuda":
-        return torch.bfloat16
-    if not multiplies_bfloat16():
-        return torch.float32
-    row = torch.ones(1, 4096)
-    seconds = {}
-    for dtype in (torch.bfloat16, torch.float32):
-        product = product_with(torch.ones(8192, 4096), dtype)
-        seconds[dtype] = np.median(timed(functools.partial(product, row.to(dtype)), device, REPEATS))
-    return min(seconds, key=seconds.__getitem__)
-
-
-def free_memory(device: torch.device) -> float:
-    """Return the bytes of free memory on a device."""
+def memory_of(device: torch.device) -> float:
+    """Return the bytes of memory that are free on a GPU, or that this machine has."""
     if device.type == "cuda":
         return float(torch.cuda.mem_get_info(device)[0])
-    try:
-        with open("/proc/meminfo", encoding="ascii") as file:
-            fields = dict(line.split(":", 1) for line in file)
-        return 1024.0 * int(fields["MemAvailable"].split()[0])
-    except (OSError, KeyError):
-        return float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))

@@ -17,12 +17,7 @@ class BenchSettings(RunSettings):
 
     model: str = setting("mt10-vision", "a policy, or a shape of conf/target with random weights")
     dtype: str = choice(
-        "auto",
-        "auto",
-        "float32",
-        "bfloat16",
-        "float16",
-        help="number format of a shape; auto: the faster one",
+        "auto", "auto", "float32", "bfloat16", "float16", help="number format of a shape; auto: bfloat16 on a GPU"
     )
     repeats: int = number(30, 3, 100_000, help="repeats of every measurement, for medians and 95th percentiles")
     tokens: list[int] = setting([7, 16], "N, tokens of a chunk; a shape decodes the largest", **limits(4, 256))

@@ -18,7 +18,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Also print the whole resul
     "bench",
     BenchSettings,
     keys="target dtype tokens repeats projected runtime.device runtime.dtype runtime.threads results",
-    examples=("kerv bench", "kerv bench target=vla-150m dtype=bfloat16 projected=openvla-7b"),
+    examples=("kerv bench", "kerv bench target=vla-150m projected=openvla-7b"),
     typed={"target": "model"},  # renamed, because Hydra would take target= as a choice among the files of conf/target
 )
 def bench(settings: BenchSettings, as_json: AsJson = False) -> None:

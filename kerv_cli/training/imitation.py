@@ -21,7 +21,6 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import TargetDescription
-from kerv_cli.targets.compact.bfloat16 import has_tiles
 from kerv_cli.targets.compact.features import places_of
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
@@ -198,7 +197,7 @@ class Imitation:
         backward pass takes four times as long.
         """
         gpu = self.device.type != "cpu"
-        bf16 = self.settings.bf16 and (gpu or has_tiles())
+        bf16 = self.settings.bf16 and (gpu or torch.cpu._is_amx_tile_supported())
         kernels = [SDPBackend.MATH]
         if gpu or not bf16:
             kernels += [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION]
