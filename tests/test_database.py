@@ -15,7 +15,7 @@ from conftest import python
 from studies_synthetic import episode, settings_of, still_episode, study_of, swept, threshold_study
 
 from kerv_cli.base.errors import CheckpointError, KervError, StorageError, UsageError
-from kerv_cli.catalogue.folders import import_results
+from kerv_cli.catalogue.imports import import_results
 from kerv_cli.episodes.rows import decodes_table, episode_row
 from kerv_cli.lab import database as module
 from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, FILE, RUNS, STUDIES, Database

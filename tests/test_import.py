@@ -18,7 +18,7 @@ from command import kerv
 from studies_synthetic import swept, threshold_study
 
 from kerv_cli.catalogue.evaluations import read_evaluations
-from kerv_cli.catalogue.stored import connect_foreign
+from kerv_cli.catalogue.imports import connect_foreign
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MACRO
 from kerv_cli.report.tables import CSV_COLUMNS, load_study

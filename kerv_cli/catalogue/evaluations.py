@@ -1,8 +1,8 @@
 """Imports evaluations that vla-eval or lerobot-eval ran. They become one study, with one setting per imported path.
 
 A vla-eval recording is a SQLite file. If a kerv server decoded the episodes, their decodes are imported too
-(served.py). Of other servers only success and number of steps are known. lerobot-eval writes `eval_info.json`, which
-only has successes.
+(`read_served`). Of other servers only success and number of steps are known. lerobot-eval writes `eval_info.json`,
+which only has successes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import pyarrow as pa
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import atomic_path, read_mapping, visible
-from kerv_cli.catalogue.stored import connect_foreign
+from kerv_cli.catalogue.imports import connect_foreign
 from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.episodes.identity import ENGINE, OBSERVATION, flat
 from kerv_cli.episodes.rows import DECODE_SCHEMA, EPISODE_SCHEMA, INT, decodes_table, episode_row

@@ -9,7 +9,7 @@ import shlex
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -166,17 +166,6 @@ def _refuse(message: str, code: int, error: BaseException | None) -> None:
         sys.unraisablehook = lambda unraisable: None
     typer.echo(f"kerv: {' '.join(message.split())}", err=True)
     raise typer.Exit(code)
-
-
-@contextmanager
-def at_work(what: str) -> Iterator[None]:
-    """Show a spinner on a terminal while the block runs, for example while weights load.
-
-    Args:
-        what: Text beside the spinner.
-    """
-    with console(stderr=True).status(what) if sys.stderr.isatty() else nullcontext():
-        yield
 
 
 @contextmanager

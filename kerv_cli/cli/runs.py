@@ -265,7 +265,7 @@ def export(
 def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False) -> None:
     """Import the runs of another results folder, or evaluations of vla-eval or lerobot as a study."""
     from kerv_cli.catalogue.evaluations import import_evaluations
-    from kerv_cli.catalogue.folders import import_results, is_results
+    from kerv_cli.catalogue.imports import import_results, is_results
     from kerv_cli.lab.database import Database
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.summary import SummaryTable

@@ -10,7 +10,7 @@ from kerv_cli.base.config import compose, expand, groups, split
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UsageError
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan, at_work, end_with_json, print_rows
+from kerv_cli.cli.common import AsJson, ShowPlan, end_with_json, print_rows
 from kerv_cli.cli.work import planned_study, print_settings, print_study, print_study_plan, print_verdict, run_study
 from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 
@@ -92,11 +92,10 @@ def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, planned: Plan, as_
         typer.echo(f"{count(len(outcome.done), 'episode')} in {minutes:.1f} min: {rate:.0f} per minute")
     typer.echo(", ".join(f"{number} {what}" for what, number in counts.items()))
     if data is not None and not failed:
-        with at_work("writing the page"):
-            from kerv_cli.report.report import write_study
+        from kerv_cli.report.report import write_study
 
-            # the study in the database may have more tasks, from earlier sweeps
-            is_whole = store.counts()[1] == len(data.study.episodes)
-            write_study(store, data if is_whole else load_study(store), resolved.sweep.loss)
+        # the study in the database may have more tasks, from earlier sweeps
+        is_whole = store.counts()[1] == len(data.study.episodes)
+        write_study(store, data if is_whole else load_study(store), resolved.sweep.loss)
         print_verdict(data.table, store, resolved.sweep.loss)
     raise typer.Exit(int(bool(failed)))

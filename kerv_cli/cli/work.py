@@ -11,7 +11,6 @@ import typer
 
 from kerv_cli.base.durations import about, count
 from kerv_cli.cli.common import (
-    at_work,
     console,
     end_with_json,
     end_with_plan,
@@ -76,11 +75,10 @@ def _planned(resolved: ResolvedStudy, command: Sequence[str], is_rollout: bool) 
     number = len(settings) * len(tasks) * resolved.first.episodes * resolved.study.repeats
     # printed before torch and the simulator load
     typer.echo(f"{what} of {whose} on {_few(tasks, 'tasks')}: {count(number, 'episode')}", err=True)
-    with at_work("loading the policy"):
-        from kerv_cli.episodes.policy import unseen_tasks
-        from kerv_cli.lab.study import plan, plan_rollout
+    from kerv_cli.episodes.policy import unseen_tasks
+    from kerv_cli.lab.study import plan, plan_rollout
 
-        planned = (plan_rollout if is_rollout else plan)(resolved, command)
+    planned = (plan_rollout if is_rollout else plan)(resolved, command)
     for target, names in dict.fromkeys((s.policy.target, tuple(unseen_tasks(s, tasks))) for s in settings.values()):
         if names:
             typer.echo(f"kerv: warning: policy {target} was never trained on {', '.join(names)}", err=True)

@@ -19,6 +19,7 @@ import sqlalchemy as sa
 from kerv_cli.base.errors import CheckpointError, KervError, StorageError, UsageError
 from kerv_cli.base.files import storage_errors
 from kerv_cli.base.places import results_dir
+from kerv_cli.episodes.rows import EPISODE_SCHEMA, FLAG, FLOAT, INT
 from kerv_cli.lab.command import STORE
 
 FILE = "kerv.db"
@@ -88,24 +89,9 @@ BLOCKS = _table(
     *_required(sa.Text, "run", "seeds", "started", "code"),  # code: hash of the source code
     *_required(_JSON, "about"),  # machine, versions, commit, executor, workers
 )
-_INTEGERS = (
-    "steps", "decodes", "forwards", "verifications", "tokens", "committed", "accepted", "first_rejected_sum",
-    "first_rejected_count", "compensated_tokens", "compensated_decodes", "skipped_decodes", "unverified_tokens",
-    "executed_tokens", "retrieval_decodes", "deviation_count", "delay_decodes", "delay_steps", "carried_steps",
-    "held_steps", "dropped_steps",
-)  # fmt: skip
-_NUMBERS = (
-    "seconds", "seconds.vision", "seconds.prefill", "seconds.propose", "seconds.verify", "seconds.accept",
-    "seconds.rectify", "seconds.other", "deviation_sum", "delay_seconds", "path_length", "jerk", "closest_approach",
-    "wall_seconds",
-)  # fmt: skip
-MEASURES: tuple[sa.Column[Any], ...] = (
-    sa.Column("success", sa.Boolean),
-    *(sa.Column(name, sa.BigInteger) for name in _INTEGERS),
-    *(sa.Column(name, sa.Double) for name in _NUMBERS),
-    sa.Column("initial_state", _JSON),
-)
-"""Columns from an episode's record, equal to rows.EPISODE_SCHEMA. Listed here because rows.py imports pyarrow."""
+_TYPES = {FLAG: sa.Boolean, INT: sa.BigInteger, FLOAT: sa.Double}
+MEASURES = tuple(sa.Column(field.name, _TYPES.get(field.type, _JSON)) for field in EPISODE_SCHEMA)
+"""Columns from an episode's record."""
 EPISODES = _table(
     "episodes",
     sa.Column("id", sa.Integer, primary_key=True),

@@ -17,7 +17,7 @@ import pandas as pd
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.files import atomic_path, write_text
 from kerv_cli.catalogue.entries import RunEntry, description_of, store_of
-from kerv_cli.catalogue.stored import export_database
+from kerv_cli.catalogue.imports import export_database
 from kerv_cli.episodes.rows import DECODE_SCHEMA
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MICRO
