@@ -279,10 +279,10 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
     if folders:
         if len(folders) < len(paths):
             raise UsageError("import results folders and evaluations one after the other")
-        imported = import_results(Database(results), folders, settings.name)
+        studies, notes = import_results(Database(results), folders, settings.name)
         if as_json:
-            end_with_json({"studies": imported.names, "notes": imported.notes})
-        for line in [*imported.notes, f"imported {', '.join(imported.names) or 'nothing'}: kerv runs list"]:
+            end_with_json({"studies": studies, "notes": notes})
+        for line in [*notes, f"imported {', '.join(studies) or 'nothing'}: kerv runs list"]:
             typer.echo(line)
         return
     words = ["runs", "import", *names]

@@ -1,4 +1,4 @@
-"""The database of a results folder: tables of runs, studies, episodes and training curves (docs/formats.md).
+"""The database of a results folder: tables of runs, studies and episodes (docs/formats.md).
 
 By default it is SQLite in `<results>/kerv.db`. With `store=postgresql://USER@HOST/DB`, or the variable KERV_STORE, the
 same tables are on a server. Only the process that runs a command writes. Its workers send their episodes to it.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -24,12 +24,10 @@ from kerv_cli.lab.command import STORE
 
 FILE = "kerv.db"
 SCHEMA = 1
-"""Version of the tables. Increase it whenever they change, and add the SQL statements to MIGRATIONS.
+"""Version of the tables. A database with a larger version is refused.
 
-A new column in MEASURES needs neither: it is added at the next write, and until then it reads as null.
+A new column in MEASURES needs no new version: it is added at the next write, and until then it reads as null.
 """
-MIGRATIONS: dict[int, Sequence[str]] = {}
-"""Version -> SQL statements that turn its tables into those of the next version."""
 LOCK_SECONDS = 60
 """Longest time to wait for another process's transaction, seconds."""
 
@@ -118,12 +116,6 @@ WANTED = _table(
     sa.Column("episode_id", sa.ForeignKey("episodes.id", ondelete="SET NULL"), index=True),
     sa.Column("error", sa.Text),  # traceback, if the last attempt failed
 )
-METRICS = _table(
-    "metrics",  # validation curves of trainings
-    *(sa.Column(name, sa.Text, primary_key=True) for name in ("kind", "name", "metric")),
-    sa.Column("step", sa.Integer, primary_key=True),
-    *_required(sa.Double, "value"),
-)
 
 
 def now() -> str:
@@ -204,9 +196,9 @@ class Database:
             engine = _server(self._url) if self.file is None else _file(self.file)
             with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
                 version = _version(connection)
-            if version is None or version < SCHEMA:
+            if version is None:
                 with engine.execution_options(kerv_writes=True).begin() as connection:
-                    version = _migrated(connection)
+                    version = _created(connection)
             if version > SCHEMA:
                 engine.dispose()
                 raise newer(self.shown, version)
@@ -223,19 +215,13 @@ class Database:
     def _explained(self, error: sa.exc.DBAPIError) -> KervError:
         why = " ".join(str(error.orig).split())[:160]
         if self.file is None:
-            if isinstance(error, sa.exc.OperationalError):
-                return StorageError(
-                    f"store={self.shown} does not answer ({why}): start the server, or leave out store="
-                )
-            return StorageError(f"store={self.shown} refused a statement: {why}")
+            return StorageError(f"store={self.shown} failed ({why}): check that the server runs, or leave out store=")
         if "malformed" in why or "not a database" in why:
             return CheckpointError(f"{self.file} is damaged ({why}): restore a copy of it, or move it aside")
-        if "lock" in why:
-            return StorageError(
-                f"{self.file} stays locked ({why}): put results= on a local disk, or the tables on a server with "
-                "store=postgresql://USER@HOST/DB"
-            )
-        return StorageError(f"cannot use {self.file}: {why}")
+        hint = (
+            ": put results= on a local disk, or use a server, store=postgresql://USER@HOST/DB" if "lock" in why else ""
+        )
+        return StorageError(f"cannot use {self.file}: {why}{hint}")
 
 
 @functools.cache
@@ -285,18 +271,13 @@ def _version(connection: sa.Connection) -> int | None:
     return None if row is None else int(row.value)
 
 
-def _migrated(connection: sa.Connection) -> int:
-    """Create the tables, or update tables of an older version of kerv. Return their new version."""
-    version = _version(connection)  # another process may have done so in the meantime
+def _created(connection: sa.Connection) -> int:
+    """Create the tables, if no other process has done so in the meantime. Return their version."""
+    version = _version(connection)
     if version is None:
         _META.create_all(connection)
         connection.execute(sa.insert(ABOUT).values(key="schema_version", value=str(SCHEMA)))
-        return SCHEMA
-    for step in range(version, SCHEMA):
-        for statement in MIGRATIONS[step]:
-            connection.execute(sa.text(statement))
-    connection.execute(sa.update(ABOUT).where(ABOUT.c.key == "schema_version").values(value=str(max(version, SCHEMA))))
-    return max(version, SCHEMA)
+    return SCHEMA if version is None else version
 
 
 def measures_in(connection: sa.Connection) -> list[sa.ColumnElement[Any]]:

@@ -11,7 +11,7 @@ import secrets
 import socket
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -24,7 +24,7 @@ from kerv_cli.base.errors import Interrupted, KervError, StorageError, UsageErro
 from kerv_cli.base.leftovers import is_alive
 from kerv_cli.base.places import results_dir
 from kerv_cli.lab.command import current_command
-from kerv_cli.lab.database import METRICS, RUNS, Database, now
+from kerv_cli.lab.database import RUNS, Database, now
 from kerv_cli.targets.provenance import git_commit
 
 RUNNING, COMPLETE, FAILED, INTERRUPTED = "running", "complete", "failed", "interrupted"
@@ -222,48 +222,6 @@ def command_to_go_on(results: str | Path, kind: str, folder: Path) -> tuple[str,
     return rows[0].command if rows and rows[0].status != COMPLETE else ()
 
 
-@dataclass(frozen=True)
-class Curve:
-    """The validation results of a training, stored as rows of the database."""
-
-    database: Database
-    kind: str
-    name: str
-
-    @staticmethod
-    def of(folder: Path, results: str | Path | None = None) -> Curve:
-        """Return the curve of a training.
-
-        Args:
-            folder: Folder of the artifact.
-            results: The results folder. None: the folder that contains the artifact's `artifacts` folder.
-        """
-        results, kind = results or folder.parents[2], folder.parent.name
-        return Curve(Database(results), kind, name_in(results, kind, folder))
-
-    def write(self, history: Sequence[Mapping[str, float]]) -> None:
-        """Replace the stored validations with these. Each maps names of metrics to values, and has a `step`."""
-        rows = [
-            {"kind": self.kind, "name": self.name, "step": int(one["step"]), "metric": metric, "value": float(value)}
-            for one in history
-            for metric, value in one.items()
-            if metric != "step"
-        ]
-        with self.database.writing() as connection:
-            connection.execute(sa.delete(METRICS).where(METRICS.c.kind == self.kind, METRICS.c.name == self.name))
-            if rows:
-                connection.execute(sa.insert(METRICS), rows)
-
-    def read(self) -> list[dict[str, float]]:
-        """Return the validations, ordered by step."""
-        query = sa.select(METRICS).where(METRICS.c.kind == self.kind, METRICS.c.name == self.name)
-        history: dict[int, dict[str, float]] = {}
-        with self.database.reading() as connection:
-            for row in connection.execute(query.order_by(METRICS.c.step)):
-                history.setdefault(row.step, {"step": row.step})[row.metric] = row.value
-        return list(history.values())
-
-
 def unfinished(database: Database, kind: str, command: Sequence[str]) -> RunRow | None:
     """Return the newest row with these command-line arguments. None if it is complete, or if there is no row."""
     row = next((row for row in run_rows(database, kind) if row.command == tuple(command)), None)
@@ -271,10 +229,9 @@ def unfinished(database: Database, kind: str, command: Sequence[str]) -> RunRow 
 
 
 def forget(database: Database, kind: str, name: str) -> None:
-    """Delete all rows of commands that made this study or artifact (weights or data), and its validation curve."""
+    """Delete all rows of commands that made this study or artifact (weights or data)."""
     with database.writing() as connection:
-        for table in (RUNS, METRICS):
-            connection.execute(sa.delete(table).where(table.c.kind == kind, table.c.name == name))
+        connection.execute(sa.delete(RUNS).where(RUNS.c.kind == kind, RUNS.c.name == name))
 
 
 def interrupted_since(database: Database, kind: str, name: str, command: Sequence[str]) -> str:

@@ -39,8 +39,6 @@ SWEEP, ROLLOUT, IMPORT = "sweep", "rollout", "import"
 _FOLDERS = {SWEEP: "studies", ROLLOUT: "rollouts", IMPORT: "studies"}
 _AT_ONCE = 500  # most values in one SQL IN (…)
 _ABOUT = ("title", "baseline", "axis", "note", "block")
-PROVENANCE = ("host", "device_name", "git_commit", "engine", "executor", "workers", "load")
-"""Facts about the machine and code that ran an episode, which tables show beside the versions."""
 
 
 @dataclass(frozen=True)
@@ -260,13 +258,8 @@ class StudyStore:
         if episodes is not None:
             chosen = {(one.setting.label, one.task, one.seed, one.repeat) for one in episodes}
             frame = frame[[key in chosen for key in zip(*(frame[name] for name in keys), strict=True)]]
-        numbers = [
-            column.name
-            for column in MEASURES
-            if isinstance(column.type, sa.Double)
-            or (isinstance(column.type, sa.BigInteger) and frame[column.name].isna().any())
-        ]
-        frame = frame.astype(dict.fromkeys(numbers, float))
+        unknown = [column.name for column in MEASURES if frame[column.name].isna().all()]
+        frame = frame.astype(dict.fromkeys(unknown, float))
         frame["decode_seconds"] = frame["decode_seconds"].map(lambda blob: np.frombuffer(blob, "<f8"))
         about = pd.DataFrame(list(frame.pop("about")), index=frame.index)
         return pd.concat([frame, about], axis=1).reset_index(drop=True)
@@ -336,14 +329,12 @@ class StudyStore:
 
     def remove(self) -> None:
         """Delete the study, and those of its episodes that no other study uses."""
-        used = sa.select(WANTED.c.episode_id).where(WANTED.c.episode_id.is_not(None))
+        used = sa.select(WANTED.c.episode_id).select_from(WANTED.join(SETTINGS).join(STUDIES))
+        used = used.where(WANTED.c.episode_id.is_not(None))
+        mine, of_others = used.where(STUDIES.c.name == self.name), used.where(STUDIES.c.name != self.name)
         with self.database.writing() as connection:
-            mine = used.select_from(WANTED.join(SETTINGS).join(STUDIES)).where(STUDIES.c.name == self.name)
-            ids = list(connection.scalars(mine))
+            connection.execute(sa.delete(EPISODES).where(EPISODES.c.id.in_(mine), EPISODES.c.id.not_in(of_others)))
             connection.execute(sa.delete(STUDIES).where(STUDIES.c.name == self.name))
-            for first in range(0, len(ids), _AT_ONCE):
-                part = EPISODES.c.id.in_(ids[first : first + _AT_ONCE])
-                connection.execute(sa.delete(EPISODES).where(part, EPISODES.c.id.not_in(used)))
             full = sa.select(EPISODES.c.block)
             connection.execute(sa.delete(BLOCKS).where(BLOCKS.c.id.not_in(full), BLOCKS.c.claim.is_(None)))
 
@@ -467,19 +458,19 @@ def stored_episodes(database: Database, study: Study, newer_than: int = 0) -> di
         newer_than: Return only rows with a larger row number.
     """
     stored: dict[Key, list[StoredEpisode]] = {}
-    works = sorted({setting.work for setting in study.settings})
     columns = (
         EPISODES.c.work, EPISODES.c.task, EPISODES.c.seed, EPISODES.c.repeat, EPISODES.c.id, BLOCKS.c.id,
         BLOCKS.c.started, BLOCKS.c.code, BLOCKS.c.seeds,
     )  # fmt: skip
-    query = sa.select(*columns).join(BLOCKS, EPISODES.c.block == BLOCKS.c.id).where(EPISODES.c.id > newer_than)
+    works = {setting.work for setting in study.settings}
+    query = sa.select(*columns).join(BLOCKS, EPISODES.c.block == BLOCKS.c.id)
+    query = query.where(EPISODES.c.id > newer_than, EPISODES.c.work.in_(works))
     if study.kind != ROLLOUT:
         query = query.outerjoin(RUNS, RUNS.c.id == BLOCKS.c.run)
         query = query.where(sa.func.coalesce(RUNS.c.kind, "") != ROLLOUT)
     with database.reading() as connection:
-        for first in range(0, len(works), _AT_ONCE):
-            for row in connection.execute(query.where(EPISODES.c.work.in_(works[first : first + _AT_ONCE]))):
-                stored.setdefault(tuple(row[:4]), []).append(StoredEpisode(*row[4:]))
+        for row in connection.execute(query):
+            stored.setdefault(tuple(row[:4]), []).append(StoredEpisode(*row[4:]))
     return stored
 
 

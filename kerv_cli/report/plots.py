@@ -17,7 +17,6 @@ from matplotlib.figure import Figure
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import write_bytes
-from kerv_cli.lab.runs import Curve
 from kerv_cli.report.measures import MICRO, Row
 from kerv_cli.report.stressed import by_kind, is_stressed
 from kerv_cli.report.tables import is_baseline, is_number, rows_of
@@ -227,10 +226,7 @@ def read_log(folder: Path) -> pd.DataFrame:
     Raises:
         CheckpointError: The folder has no readable log of a training.
     """
-    rows = Curve.of(folder).read() if folder.parent.parent.name == "artifacts" else []
-    if rows:
-        return pd.DataFrame(rows)
-    path = folder / "log.csv"  # an artifact that was copied without its database still has this file
+    path = folder / "log.csv"
     try:
         return pd.read_csv(path)
     except (OSError, ValueError) as error:

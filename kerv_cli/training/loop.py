@@ -68,7 +68,6 @@ class Loop:
         settings: Optimisation settings.
         folder: Folder for the resume file and `log.csv`.
         identity: Hash of everything that determines the training. It goes into the resume file.
-        keep: Called with the metrics of all validations so far, after each validation and when a training resumes.
     """
 
     def __init__(
@@ -78,10 +77,9 @@ class Loop:
         settings: TrainSettings,
         folder: Path,
         identity: str,
-        keep: Callable[[list[Metrics]], None] = lambda history: None,
     ) -> None:
         self.objective, self.module, self.save, self.settings = objective, objective.module, save, settings
-        self.folder, self.identity, self.keep = folder, identity, keep
+        self.folder, self.identity = folder, identity
         self.step = 0
         self.history: list[Metrics] = []
         matrices = [p for p in self.module.parameters() if p.dim() >= 2]
@@ -190,13 +188,9 @@ class Loop:
         self.log()
 
     def log(self) -> None:
-        """Pass the metrics of all validations to `keep`, and write them to `log.csv`, one row per validation.
-
-        Before the first validation no file is written.
-        """
+        """Write the metrics of all validations to `log.csv`. Before the first validation no file is written."""
         import pandas as pd
 
-        self.keep(self.history)
         if self.history:
             write_text(self.folder / "log.csv", pd.DataFrame(self.history).to_csv(index=False, float_format="%.6g"))
 
@@ -208,7 +202,6 @@ class Loop:
         """
         path = self.folder / RESUME
         if not path.is_file():
-            self.keep([])  # forget the curve of an earlier training in this folder
             return
         state = read_state(path)
         self.module.load_state_dict(state["model"])

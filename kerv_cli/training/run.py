@@ -13,7 +13,6 @@ from typing import Any
 from torch import nn
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.lab.runs import Curve
 from kerv_cli.methods.artifacts import removal
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.loop import Loop, Metrics, Objective, stored_identity
@@ -81,8 +80,7 @@ class TrainingRun(ABC):
             StorageError: The disk cannot be written.
         """
         self.objective.module.train()
-        keep = Curve.of(self.folder, self.settings.results).write
-        return Loop(self.objective, self.save, self.settings.train, self.folder, self.hash, keep).run(on_step)
+        return Loop(self.objective, self.save, self.settings.train, self.folder, self.hash).run(on_step)
 
     @property
     def hash(self) -> str:

@@ -12,13 +12,14 @@ threads, folder)` that returns an instance:
 from __future__ import annotations
 
 import importlib.util
+import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
-from kerv_cli.base.limits import check_settings, number
+from kerv_cli.base.limits import check_settings, choice, number
 from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import add, find
 from kerv_cli.base.settings import RuntimeSettings
@@ -51,20 +52,19 @@ class Executor(Protocol):
         """End the workers. With `abandon`, kill those that are still working."""
 
 
-def settle(
-    future: Future[Any], result: Callable[[], Any], explained: Callable[[Exception], Exception] = lambda error: error
-) -> None:
-    """Complete a future with a function's result, or with its exception.
-
-    Args:
-        future: The future to complete.
-        result: Called to get the result.
-        explained: Converts an exception to the one that is reported. By default it stays as it is.
-    """
+def settle(future: Future[T], work: Callable[[], T]) -> None:
+    """Call a function, and complete a future with its result or its exception."""
     try:
-        future.set_result(result())
+        future.set_result(work())
     except Exception as error:  # noqa: BLE001 - the future holds any exception
-        future.set_exception(explained(error))
+        future.set_exception(error)
+
+
+def in_thread(work: Callable[[], T]) -> Future[T]:
+    """Call a function in a thread of its own, and return the future of its result."""
+    future: Future[T] = Future()
+    threading.Thread(target=settle, args=(future, work), daemon=True).start()
+    return future
 
 
 def check_executor(runtime: RuntimeSettings) -> Any:
@@ -96,7 +96,7 @@ class LocalOptions:
 class SlurmOptions:
     """Options of the Slurm executor, which runs each block of episodes as a job."""
 
-    cluster: str = "slurm"  # slurm | local (submitit's own processes on this machine)
+    cluster: str = choice("slurm", "slurm", "local")  # local: submitit's own processes on this machine
     partition: str = ""  # empty: the cluster's default
     minutes: int = number(120, 1, 100_000)  # time limit of a job
     memory_gb: int = number(8, 1, 100_000)

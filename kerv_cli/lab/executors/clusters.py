@@ -7,64 +7,40 @@ of a cluster must share the results folder. If the cluster ends a job, the job c
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
 import secrets
 import socket
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, TypeVar
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.lab.executors import THREAD_VARIABLES, Executor, RayOptions, SlurmOptions, WorkerLost, settle
+from kerv_cli.lab.executors import THREAD_VARIABLES, Executor, RayOptions, SlurmOptions, WorkerLost, in_thread
 
 T = TypeVar("T")
 
 _CONNECT_SECONDS = 5.0
-_POLL_SECONDS = {"local": 0.2, "slurm": 5.0}
 _MARK = "KERV_GUARD"
 _GUARD = """
-import os, select, signal, sys
-def status(process):
-    try:
-        with open(f"/proc/{process}/stat") as file:
-            fields = file.read().rpartition(")")[2].split()
-        return int(fields[1]), int(fields[19])  # parent, start
-    except OSError:  # it has ended
-        return None, None
+import os, signal, sys
 
-def look():
-    every = {process: status(process) for process in map(int, filter(str.isdigit, os.listdir("/proc")))}
-    before = 0
-    while before < len(below):
-        before = len(below)
-        here = {parent for parent, start in below.items() if every.get(parent, (0, 0))[1] == start}
-        below.update({process: start for process, (parent, start) in every.items() if parent in here})
-
-below = {int(sys.argv[1]): status(sys.argv[1])[1]}  # process -> its start; descendants, also those of ended parents
-look()
-old = set(below)  # of what was there before: it stays
-while not select.select([sys.stdin], [], [], 1)[0]:
-    look()
 def marked(process):
     try:
         with open(f"/proc/{process}/environ", "rb") as file:
-            return mark in file.read()
-    except OSError:
+            return sys.argv[1].encode() in file.read()
+    except OSError:  # it has ended
         return False
 
-mark = sys.argv[2].encode()  # in the environment of what was started since the last look
-look()
-every = map(int, filter(str.isdigit, os.listdir("/proc")))
-below.update({process: status(process)[1] for process in every if marked(process)})
-for process, start in below.items():
-    if process != os.getpid() and status(process)[1] == start and (process not in old or marked(process)):
-        os.kill(process, signal.SIGKILL)
+sys.stdin.read()  # until the block or the process ends
+while found := [int(one) for one in os.listdir("/proc") if one.isdigit() and int(one) != os.getpid() and marked(one)]:
+    for process in found:
+        try:
+            os.kill(process, signal.SIGKILL)
+        except ProcessLookupError:
+            pass
 """
 
 
@@ -72,10 +48,11 @@ for process, start in below.items():
 def guard() -> Iterator[None]:
     """End all processes started inside this `with` block, and their children, when the block or this process ends.
 
-    A separate guard process does this, so that it works even if this process is killed. It reads /proc (Linux).
+    A guard process does this, so that it works even if this process is killed. It finds the processes in /proc (Linux)
+    by an environment variable, which they inherit.
     """
     mark = secrets.token_hex(8)
-    command = [sys.executable, "-S", "-c", _GUARD, str(os.getpid()), mark]
+    command = [sys.executable, "-S", "-c", _GUARD, mark]
     with subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True):  # either end closes the pipe
         os.environ[_MARK] = mark
         try:
@@ -98,8 +75,6 @@ def build_slurm(options: SlurmOptions, slots: int, threads: int, folder: Path) -
     """
     import submitit
 
-    if options.cluster not in _POLL_SECONDS:
-        raise UsageError(f"runtime.executor_options.cluster={options.cluster}: known are {', '.join(_POLL_SECONDS)}")
     try:
         jobs = submitit.AutoExecutor(folder=folder, cluster=options.cluster)
         jobs.update_parameters(
@@ -116,55 +91,45 @@ def build_slurm(options: SlurmOptions, slots: int, threads: int, folder: Path) -
     stack = contextlib.ExitStack()
     if options.cluster == "local":  # submitit's processes would outlive this one
         stack.enter_context(guard())
-    return Jobs(jobs, slots, _POLL_SECONDS[options.cluster], stack)
+    return Jobs(jobs, slots, stack)
 
 
 class Jobs:
-    """Executor that submits Slurm jobs. A single thread checks which jobs have ended."""
+    """Executor that submits Slurm jobs."""
 
-    def __init__(self, jobs: Any, slots: int, poll_seconds: float, stack: contextlib.ExitStack) -> None:
-        self.slots, self._stack = slots, stack
-        self._jobs, self._poll_seconds = jobs, poll_seconds
-        self._open: dict[Future[Any], Any] = {}
-        self._changed = threading.Lock()
-        self._closed = threading.Event()
-        threading.Thread(target=self._watch, daemon=True).start()
+    def __init__(self, jobs: Any, slots: int, stack: contextlib.ExitStack) -> None:
+        self.slots, self._jobs, self._stack = slots, jobs, stack
+        self._submitted: list[Any] = []
 
     def submit(self, work: Callable[[], T], /) -> Future[T]:
         """Queue a function as a job, and return the future of its result."""
-        future: Future[T] = Future()
         job = self._jobs.submit(work)
-        with self._changed:
-            self._open[future] = job
-        return future
-
-    def _watch(self) -> None:
-        while not self._closed.wait(self._poll_seconds):
-            with self._changed:
-                ended = [future for future, job in self._open.items() if job.done()]
-                jobs = [self._open.pop(future) for future in ended]
-            for future, job in zip(ended, jobs, strict=True):
-                settle(future, job.result, functools.partial(_job_error, job))
+        self._submitted.append(job)
+        return in_thread(lambda: _result_of(job))
 
     def close(self, abandon: bool) -> None:
-        """Cancel all jobs that run or wait. With `abandon`, wait up to ten seconds until they have ended."""
-        self._closed.set()
-        with self._changed:
-            jobs = list(self._open.values())
-        for job in jobs:
-            job.cancel()
-        deadline = time.monotonic() + 10
-        while abandon and any(not job.done() for job in jobs) and time.monotonic() < deadline:
-            time.sleep(0.1)
+        """Cancel all jobs that run or wait."""
+        for job in self._submitted:
+            if not job.done():
+                job.cancel(check=False)
         self._stack.close()
 
 
-def _job_error(job: Any, error: Exception) -> Exception:
+def _result_of(job: Any) -> Any:
+    """Wait for a job, and return its result.
+
+    Raises:
+        WorkerLost: The cluster ended the job.
+        RuntimeError: The function raised an exception that cannot be pickled.
+    """
     from submitit.core.utils import FailedJobError, UncompletedJobError
 
-    if isinstance(error, UncompletedJobError):
-        return WorkerLost(f"its job {job.job_id} ended as {job.state}, see {job.paths.stderr}")
-    return RuntimeError(str(error).strip().splitlines()[-1]) if isinstance(error, FailedJobError) else error
+    try:
+        return job.result()
+    except UncompletedJobError:
+        raise WorkerLost(f"its job {job.job_id} ended as {job.state}, see {job.paths.stderr}") from None
+    except FailedJobError as error:
+        raise RuntimeError(str(error).strip().splitlines()[-1]) from None
 
 
 def build_ray(options: RayOptions, slots: int, threads: int, folder: Path) -> Executor:
@@ -219,23 +184,20 @@ class Tasks:
         variables = dict.fromkeys(THREAD_VARIABLES, str(threads))
         options: dict[str, Any] = {"num_cpus": threads, "num_gpus": gpus, "max_retries": 0}
         self._call = ray.remote(_call).options(runtime_env={"env_vars": variables}, **options)
-        self._open: list[Any] = []
+        self._submitted: list[Any] = []
 
     def submit(self, work: Callable[[], T], /) -> Future[T]:
         """Start a function as a task, and return the future of its result."""
         reference = self._call.remote(work)
-        self._open.append(reference)
-        outer: Future[T] = Future()
-        reference.future().add_done_callback(lambda inner: settle(outer, inner.result, _ray_error))
-        return outer
+        self._submitted.append(reference)
+        return in_thread(lambda: _got(reference))
 
     def close(self, abandon: bool) -> None:
         """Leave the cluster. With `abandon`, kill the tasks first."""
         import ray
 
-        if abandon:
-            for reference in self._open:
-                ray.cancel(reference, force=True)
+        for reference in self._submitted if abandon else ():
+            ray.cancel(reference, force=True)
         ray.shutdown()
         self._stack.close()
 
@@ -244,9 +206,14 @@ def _call(work: Callable[[], T]) -> T:
     return work()
 
 
-def _ray_error(error: Exception) -> Exception:
+def _got(reference: Any) -> Any:
+    """Wait for a task, and return its result; raises WorkerLost if its process has ended."""
+    import ray
     from ray.exceptions import NodeDiedError, RayTaskError, WorkerCrashedError
 
-    if isinstance(error, RayTaskError):
-        return error.cause
-    return WorkerLost("its worker process was lost") if isinstance(error, WorkerCrashedError | NodeDiedError) else error
+    try:
+        return ray.get(reference)
+    except RayTaskError as error:
+        raise error.cause from None
+    except (WorkerCrashedError, NodeDiedError):
+        raise WorkerLost("its worker process was lost") from None

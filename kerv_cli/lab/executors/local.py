@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from kerv_cli.base.processes import begin_worker, check_workers
-from kerv_cli.lab.executors import THREAD_VARIABLES, Executor, WorkerLost, settle
+from kerv_cli.lab.executors import THREAD_VARIABLES, Executor, WorkerLost, in_thread, settle
 
 T = TypeVar("T")
 
@@ -48,23 +48,18 @@ class Processes:
     def submit(self, work: Callable[[], T], /) -> Future[T]:
         """Give a function to a free worker process, or start a new one. Return the future of its result."""
         pool = self._free.pop() if self._free else self._new_pool()
-        outer: Future[T] = Future()
-        pool.submit(work).add_done_callback(lambda inner: self._settle(outer, inner, pool))
-        return outer
+        return in_thread(lambda: self._result(pool, pool.submit(work)))
 
-    def _settle(self, outer: Future[Any], inner: Future[Any], pool: Any) -> None:
+    def _result(self, pool: Any, future: Future[T]) -> T:
+        """Wait until the worker process of a pool has finished its work, and return the result."""
         from joblib.externals.loky.process_executor import BrokenProcessPool
 
-        error = inner.exception()
-        if isinstance(error, BrokenProcessPool):
-            signals = re.findall(r"SIG[A-Z]+", str(error))
+        if isinstance(error := future.exception(), BrokenProcessPool):
             self._all.remove(pool)
-            outer.set_exception(
-                WorkerLost(f"its worker process was {f'killed by {signals[0]}' if signals else 'lost'}")
-            )
-            return
+            signals = re.findall(r"SIG[A-Z]+", str(error))
+            raise WorkerLost(f"its worker process was {f'killed by {signals[0]}' if signals else 'lost'}")
         self._free.append(pool)
-        settle(outer, inner.result)
+        return future.result()
 
     def _new_pool(self) -> Any:
         from joblib.externals.loky import ProcessPoolExecutor
