@@ -9,7 +9,6 @@ import typer
 from kerv_cli.base.limits import number, setting
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import at_work
 
 
 @dataclass(kw_only=True)
@@ -29,9 +28,8 @@ class BoardSettings(CommandSettings):
 )
 def board(settings: BoardSettings) -> None:
     """Look at runs, studies, trainings and episodes in the browser, until Ctrl-C; only this machine can."""
-    with at_work("starting"):
-        from kerv_cli.board.app import serve
-        from kerv_cli.report.viewing.viewer import has_display
+    from kerv_cli.board.app import serve
+    from kerv_cli.report.viewing.viewer import has_display
 
     serve(
         settings.results,
