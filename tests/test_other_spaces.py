@@ -68,7 +68,7 @@ def test_a_policy_of_seven_dofs_is_trained_and_decodes_with_its_drafters(results
     common.append(f"results={results}")
     words = ["task=insert-peg", "name=arm", "target=nano", "target.observation=state", "world.camera.name=front"]
     assert kerv("train", "target", *words, *common) == (0, "")
-    for kind in ("eagle", "early"):
+    for kind in ("drafter", "early"):
         words = [f"drafter={kind}", "policy.target=arm", "drafter.samples=12"]
         assert kerv("train", "drafter", *words, *common) == (0, "")
     target, description = load_target(results / "artifacts/target/arm")

@@ -53,7 +53,7 @@ PART_GROUPS = (*METHOD_KINDS, "datastore")
 choices."""
 
 SETTINGS_GROUPS = (*PART_GROUPS, "drafter")
-"""All groups of settings that choose a part: those of a rollout, and `drafter=` of `kerv train drafter`."""
+"""All groups of settings that choose a part: those of a rollout, and `drafter=`, the artifact that is trained."""
 
 DRAFTING = "draft"
 """Kind of cost of a proposer that drafts with a drafter layer of the target's shape (docs/measuring.md)."""
@@ -74,8 +74,8 @@ class Part:
     """A registered part: one of the choices of its kind, such as the proposer `drafter`.
 
     Args:
-        kind: proposer, acceptance, threshold, rectifier, boundary, skip, datastore, predictor, artifact, drafter,
-            target, environment, stress, executor, column or command.
+        kind: proposer, acceptance, threshold, rectifier, boundary, skip, datastore, artifact, target, environment,
+            stress, executor, column or command.
         name: The name by which it is chosen.
         build: The code that makes it, as `module:function` or `module:Class.method`. For the parts of a method,
             `methods/context.py` describes the arguments. Empty: choosing this name means having no such part.
@@ -156,25 +156,22 @@ def add_drafter(
     build: str,
     settings: type,
     proposer: type = NoSettings,
-    name: str = "",
     sees: bool = False,
     colour: int | None = None,
     **traits: Any,
 ) -> None:
-    """Register everything about a trained drafter: its artifact, its training and its proposer.
+    """Register both parts of a trained drafter: its artifact and its proposer.
 
     Args:
-        kind: Name of the artifact and of the proposer.
+        kind: Name of the artifact and of the proposer. `kerv train drafter drafter=KIND` trains it.
         build: Subclass of `TrainableDrafter` (`kerv_cli/methods/drafters.py`), as `module:Class`.
         settings: Dataclass of the settings of its shapes and training.
         proposer: Dataclass of the settings of its proposer.
-        name: Its name in `kerv train drafter drafter=NAME`. Empty: the same as `kind`.
         sees: Whether it needs a target that reads images.
         colour: Colour in tables and plots, 0xRRGGBB.
         **traits: Further properties of the proposer. docs/extending.md lists them.
     """
-    add("artifact", kind, build, sees=sees)
-    add("drafter", name or kind, build, settings)
+    add("artifact", kind, build, settings, sees=sees)
     add("proposer", kind, f"{build}.proposer", proposer, (kind,), colour=colour, **traits)
 
 
@@ -226,8 +223,13 @@ def part_of(group: str, name: str) -> Part:
 
 
 def parts(kind: str) -> Mapping[str, Part]:
-    """Return the parts of a kind as a map from name to part, in the order of registration."""
+    """Return the parts of a kind as a map from name to part, in the order of registration.
+
+    For the settings group `drafter` these are the artifacts that have settings: those that are trained.
+    """
     load_plugins()
+    if kind == "drafter":
+        return {name: part for name, part in _PARTS["artifact"].items() if part.settings is not NoSettings}
     return _PARTS.get(kind, {})
 
 

@@ -38,7 +38,7 @@ def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJso
 )
 def drafter(settings: TrainDrafterSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Train a drafter to imitate a target's greedy decodes. drafter=NAME chooses its kind, such as early."""
-    typer.echo(f"{settings.drafter.kind} drafter of {settings.policy.target}: {settings.train.steps} steps", err=True)
+    typer.echo(f"drafter={settings.drafter.kind} of {settings.policy.target}: {settings.train.steps} steps", err=True)
     from kerv_cli.training.drafter import DrafterRun
 
     run_training(DrafterRun(settings), plan, as_json, "the target's greedy decodes", "training the drafter")

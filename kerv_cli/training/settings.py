@@ -108,10 +108,10 @@ class TrainDrafterSettings(DemonstrationSettings):
     """
 
     # drafter comes after train, because drafter=early overrides some of train's settings
-    groups: ClassVar = {"policy": "vision", "train": "drafter", "drafter": "eagle", "runtime": "auto"}
+    groups: ClassVar = {"policy": "vision", "train": "drafter", "drafter": "drafter", "runtime": "auto"}
 
     log: str = choice("none", *TRACKERS, help=LOG)
-    drafter: Any = setting(chosen("drafter", "eagle"), "kind of drafter, with its shapes and loss: eagle, early, scout")
+    drafter: Any = setting(chosen("drafter", "drafter"), "kind, with shapes and loss: drafter (EAGLE-2), early, scout")
     train: TrainSettings = setting(TrainSettings, "optimisation")
 
 

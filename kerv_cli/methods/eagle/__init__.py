@@ -12,7 +12,7 @@ from kerv_cli.base.registry import DRAFTING, STATES, add_drafter
 class DrafterSettings:
     """Shapes and loss of the EAGLE-style drafter, which reads the target's hidden states (docs/methods.md §2.2)."""
 
-    kind: str = "eagle"
+    kind: str = "drafter"
     layers: int = number(1, 0, 1024)  # decoder layers of the target's width
     unroll: int = number(3, 1, 64)  # passes per training step; each later one reads the drafter's own states; paper: 1
     samples: int = number(12_000, 1, 10**8)  # maximum number of observations whose greedy decodes it is trained on
@@ -40,7 +40,6 @@ add_drafter(
     "kerv_cli.methods.eagle.drafter:EagleDrafter",
     DrafterSettings,
     DrafterProposerSettings,
-    name="eagle",
     colour=0x56B4E9,
     when=STATES,
     cost=DRAFTING,
