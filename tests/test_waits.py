@@ -111,7 +111,7 @@ def test_a_round_waits_once(family, captured, monkeypatch):
 
             return run
 
-        for name in ("prefill", "round", "decode_plainly"):
+        for name in ("round", "decode_plainly"):
             monkeypatch.setattr(decoder, name, counted(getattr(decoder, name)))
         decoder.situation = situation(np.random.default_rng(0), 8)
         found = decoder.decode_prompt(prompt.to(DEVICE, non_blocking=True))

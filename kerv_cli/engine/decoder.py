@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -53,7 +54,15 @@ class Verified(NamedTuple):
     target_tokens: list[int]
 
 
-class Decoder(EpisodeState):
+class ActionDecoder(EpisodeState):
+    """Decodes actions from observations, and remembers the running episode."""
+
+    @abstractmethod
+    def decode(self, observation: Observation) -> DecodeRecord:
+        """Return a record with the actions to execute. The observation has the images of `cameras`."""
+
+
+class Decoder(ActionDecoder):
     """Decodes chunks of actions with one target and one method, one episode at a time."""
 
     def __init__(self, target: Target, parts: Parts | None = None, chunk: int = 0) -> None:
@@ -151,64 +160,52 @@ class Decoder(EpisodeState):
             The finished chunk: N committed tokens, or fewer if a rectifier ended it with predicted actions.
         """
         stopwatch = stopwatch or Stopwatch(self.target.device)
-        chunk = self._new_chunk(prompt, observation)
+        chunk, skip = self._new_chunk(prompt, observation), self.parts.skip
         stopwatch.lap("propose")
-        if self._skips(chunk, stopwatch):
-            return chunk
-        self.prefill(chunk, stopwatch)
-        step = self.decode_plainly if self.parts.proposer is None else self.round
+        if skip is not None:
+            taken = skip.take(chunk)
+            stopwatch.lap(skip.phase)
+            if taken:
+                return chunk
+        self.round(chunk, stopwatch)
         while chunk.remaining:
-            step(chunk, stopwatch)
+            (self.round if self.parts.proposer else self.decode_plainly)(chunk, stopwatch)
         return chunk
 
     def _new_chunk(self, prompt: Tensor | Callable[[], Tensor], observation: Observation | None) -> Chunk:
-        choice, boundary = None, self.parts.boundary
+        self.cache.length, choice, boundary = 0, None, self.parts.boundary
         if boundary is not None:
             choice = boundary.choose(np.array(self.situation.path), self.situation.random)
         limits = self.acceptance.limits(self.threshold.radius())
         return Chunk(prompt, self.steps, self.space, self.cache, self.situation, limits, choice, observation)
 
-    def _skips(self, chunk: Chunk, stopwatch: Stopwatch) -> bool:
-        """Let the skip rule complete the chunk without verification, and return whether it did."""
-        skip = self.parts.skip
-        if skip is None:
-            return False
-        taken = skip.take(chunk)
-        stopwatch.lap(skip.phase)
-        return taken
+    def round(self, chunk: Chunk, stopwatch: Stopwatch) -> None:
+        """Run one round: propose, verify, accept, commit, rectify.
 
-    def prefill(self, chunk: Chunk, stopwatch: Stopwatch) -> None:
-        """Run the first round. Its forward reads the prompt and verifies the in-prefill draft, if there is one."""
-        proposer, skip = self.parts.proposer, self.parts.skip
-        chunk.cache.length = 0
-        draft = self.propose(chunk, self.parts.prefill_draft, stopwatch)
-        if proposer is not None and chunk.remaining > 1:
+        The first round is the prefill. Its forward reads the prompt and verifies the prefill draft, if there is one.
+        """
+        parts, is_first, last = self.parts, not chunk.tokens, len(chunk.tokens) - 1
+        drafter, proposer = parts.prefill_draft if is_first else parts.proposer, parts.proposer
+        draft = self.propose(chunk, drafter, stopwatch)
+        if is_first and proposer is not None and chunk.remaining > 1:
             proposer.prepare(chunk)
         verified = self.verify(chunk, draft)
-        stopwatch.lap("prefill")
-        accepted = self.accept(chunk, verified, self.parts.prefill_draft)
-        chunk.hidden = self.commit(chunk, verified, accepted, self.parts.prefill_draft)
-        if skip is not None:
-            skip.verified(chunk)
-        stopwatch.lap("accept")
-        chunk.hidden = self.rectify(chunk, chunk.hidden, stopwatch)
-        if proposer is not None and chunk.remaining > 1:
-            proposer.begin(chunk)
-            stopwatch.lap("propose")
-
-    def round(self, chunk: Chunk, stopwatch: Stopwatch) -> None:
-        """Run a round after the first one: propose, verify, accept, commit, rectify."""
-        proposer, first = self.parts.proposer, len(chunk.tokens) - 1
-        draft = self.propose(chunk, proposer, stopwatch)
-        verified = self.verify(chunk, draft)
-        stopwatch.lap("verify")
-        accepted = self.accept(chunk, verified, proposer)
-        hidden = self.commit(chunk, verified, accepted, proposer)
+        stopwatch.lap("prefill" if is_first else "verify")
+        accepted = self.accept(chunk, verified, drafter)
+        hidden = self.commit(chunk, verified, accepted, drafter)
+        if is_first and parts.skip is not None:
+            parts.skip.verified(chunk)
         stopwatch.lap("accept")
         hidden = self.rectify(chunk, hidden, stopwatch)
-        if proposer is not None and chunk.remaining > 1:
-            proposer.committed(chunk, first, hidden, verified.target_tokens)
-            stopwatch.lap("propose")
+        if is_first:
+            chunk.hidden = hidden
+        if proposer is None or chunk.remaining < 2:
+            return
+        if is_first:
+            proposer.begin(chunk)
+        else:
+            proposer.committed(chunk, last, hidden, verified.target_tokens)
+        stopwatch.lap("propose")
 
     def decode_plainly(self, chunk: Chunk, stopwatch: Stopwatch) -> None:
         """Decode the remaining tokens without drafts: in one call if the target can, else one forward per token."""

@@ -6,50 +6,17 @@ import dataclasses
 import time
 from collections import deque
 from collections.abc import Generator
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.chunk import EpisodeState
+from kerv_cli.engine.decoder import ActionDecoder
 from kerv_cli.engine.record import DecodeRecord, Delay, EpisodeRecord
 from kerv_cli.episodes.clock import RealClock
 from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import World
-
-
-class Follower(Protocol):
-    """Follows an episode: is told when it starts, which actions are executed, and when it ends."""
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras whose images it reads. No other camera is rendered."""
-
-    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
-        """Start a new episode.
-
-        Args:
-            task: Name of the task.
-            seed: Seed of the episode.
-            end_effector: Initial position (3,), metres.
-        """
-
-    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
-        """Note an action that was executed.
-
-        Args:
-            action: (D,), environment units.
-            end_effector: Position (3,) after the action, metres.
-        """
-
-    def finish(self, success: bool) -> None:
-        """End the episode. `success` says whether the task was solved."""
-
-
-class ActionDecoder(Follower, Protocol):
-    """Follows an episode and decodes actions from its observations."""
-
-    def decode(self, observation: Observation) -> DecodeRecord:
-        """Return a record with the actions to execute. The observation has the images of `cameras`."""
 
 
 class _Execution:
@@ -59,7 +26,7 @@ class _Execution:
     Before the first chunk the robot stands still.
     """
 
-    def __init__(self, world: World, follower: Follower, camera: CameraSettings | None) -> None:
+    def __init__(self, world: World, follower: EpisodeState, camera: CameraSettings | None) -> None:
         self.world, self.follower, self.camera = world, follower, camera
         self.chunk: deque[np.ndarray] = deque()
         self.last = world.spec.standstill(world.gripper)
@@ -143,7 +110,7 @@ def run_episode(
 
 def episode(
     world: World,
-    follower: Follower,
+    follower: EpisodeState,
     seed: int,
     camera: CameraSettings | None = None,
     clock: RealClock | None = None,

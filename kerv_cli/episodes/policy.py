@@ -14,12 +14,11 @@ from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.engine.batched import BatchDecoder
-from kerv_cli.engine.decoder import Decoder
+from kerv_cli.engine.decoder import ActionDecoder, Decoder
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.engine.stopwatch import Stopwatch
 from kerv_cli.episodes import clock
 from kerv_cli.episodes.clock import RealClock
-from kerv_cli.episodes.episode import ActionDecoder
 from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.episodes.settings import DEFAULT_TASKS, WAITS, RolloutSettings
 from kerv_cli.methods.artifacts import Artifacts, Use
@@ -28,7 +27,7 @@ from kerv_cli.methods.settings import EXPERT, MethodSettings
 from kerv_cli.targets.checkpoint import TargetDescription, described
 from kerv_cli.targets.folders import find_target
 from kerv_cli.worlds import resolve_tasks, spec_of
-from kerv_cli.worlds.spec import EnvironmentSpec, Expert
+from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.views import frame_shape
 
 PRIVILEGED = "state (privileged)"
@@ -148,7 +147,7 @@ def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
     """
     spec = spec_of(task)
     expert = settings.policy.kind == EXPERT
-    decoder: ActionDecoder = ExpertDecoder() if expert else _method_decoder(settings, task)
+    decoder: ActionDecoder = ExpertDecoder(task) if expert else _method_decoder(settings, task)
     warm_up(decoder, task, spec.observation, settings.world.camera.size)
     return decoder
 
@@ -228,51 +227,28 @@ def warm_up(
             decoder.observe(action, np.array([0.01 * i, 0.0, 0.1]))
 
 
-class ExpertDecoder:
-    """Returns one action at a time from the environment's scripted controller of the task.
+class ExpertDecoder(ActionDecoder):
+    """Returns one action at a time from the environment's scripted controller of a task.
 
     The controller reads the privileged simulator state, as policies with `observation=state` do. It is no neural
     policy: records have no forwards, rounds or tokens, and its time is not compared with a decoding method's.
     """
 
-    cameras: tuple[str, ...] = ()
-
-    def __init__(self) -> None:
-        self.task: str | None = None
-        self.expert: Expert | None = None
-        self.dofs = 0
-
-    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
-        """Start a new episode of `task`. The other arguments are not used."""
-        if self.expert is None or task != self.task:
-            spec = spec_of(task)
-            self.task, self.expert, self.dofs = task, spec.expert(task), spec.actions.dofs
+    def __init__(self, task: str) -> None:
+        spec = spec_of(task)
+        super().__init__(spec.actions, ())
+        self.task, self.expert = task, spec.expert(task)
 
     def decode(self, observation: Observation) -> DecodeRecord:
         """Return a record with the action of one control step, (1, D), environment units.
 
         Raises:
-            KervError: `reset` was not called, or the expert did not return D finite numbers.
+            KervError: The expert did not return D finite numbers.
         """
-        if self.expert is None:
-            raise KervError("the expert does not know its task yet: reset it before decoding")
         stopwatch = Stopwatch(torch.device("cpu"))
         action = self.expert(observation)
         seconds = stopwatch.stop()
-        if action.shape != (self.dofs,) or not np.isfinite(action).all():
+        if action.shape != (self.space.dofs,) or not np.isfinite(action).all():
             raise KervError(f"the expert of {self.task} answered {action} to a state it cannot read")
-        return DecodeRecord(
-            tokens=(),
-            actions=action[None].astype(np.float32),
-            forwards=0,
-            rounds=(),
-            mode=EXPERT,
-            seconds=seconds,
-            phases=stopwatch.phases,
-        )
-
-    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
-        """Do nothing: the expert needs no history."""
-
-    def finish(self, success: bool) -> None:
-        """Do nothing: the expert does not learn."""
+        actions = action[None].astype(np.float32)
+        return DecodeRecord((), actions, 0, (), EXPERT, seconds, stopwatch.phases)

@@ -6,12 +6,12 @@ Shared images would give a setting warm caches, and a skip rule's threshold may 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import time
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -107,10 +107,7 @@ class Request(Generic[K]):
 
 
 EpisodeEnd = tuple[Request[K], EpisodeRecord | Exception]
-"""A request, with the record of its episode or the error that its world raised.
-
-The record's `wall_seconds` contain only the episode's share of a batch: a decode's time divided by its episodes.
-"""
+"""A request, with the record of its episode or the error that its world raised."""
 
 
 def run_together(
@@ -128,27 +125,63 @@ def run_together(
         open_world: Opens a world for a task.
     """
     waiting = list(requests)
-    slots: list[_Slot[K]] = [_Slot(decoder.new_episode(), open_world) for _ in range(min(batch, len(waiting)))]
+    ended: list[EpisodeEnd[K]] = []
+    states = [decoder.new_episode() for _ in range(min(batch, len(waiting)))]
+    places = [_one_after_another(state, waiting, ended, open_world) for state in states]
+    decodes: dict[int, Any] = dict.fromkeys(range(len(places)))  # None starts a place's first episode
     try:
-        while True:
-            for slot in slots:
-                while slot.request is None and waiting:
-                    slot.begin(_take(waiting, slot.task))
-                    yield from slot.advance(None)
-                if slot.request is None:
-                    slot.close()
-            live = [slot for slot in slots if slot.request is not None]
-            if not live:
-                return
-            began = time.perf_counter()
-            decodes = decoder.decode([slot.state for slot in live], [slot.observation for slot in live])
-            share = (time.perf_counter() - began) / len(live)
-            for slot, decode in zip(live, decodes, strict=True):
-                slot.seconds += share
-                yield from slot.advance(decode)
+        while decodes:
+            observations: dict[int, Observation] = {}
+            for place, decode in decodes.items():
+                with contextlib.suppress(StopIteration):
+                    observations[place] = places[place].send(decode)
+                while ended:
+                    request, result = ended.pop(0)
+                    if not isinstance(result, Exception):
+                        result = dataclasses.replace(result, wall_seconds=result.wall_seconds / len(places))
+                    yield request, result
+            decodes = {}
+            if observations:
+                found = decoder.decode([states[place] for place in observations], list(observations.values()))
+                decodes = dict(zip(observations, found, strict=True))
     finally:
-        for slot in slots:
-            slot.close()
+        for running in places:
+            running.close()
+
+
+def _one_after_another(
+    state: EpisodeState, waiting: list[Request[K]], ended: list[EpisodeEnd[K]], open_world: OpenWorld
+) -> Generator[Observation, DecodeRecord, None]:
+    """Run episodes one after another in one place of the batch, as long as some are waiting.
+
+    This is a generator. It yields each observation, and expects the decode's record from `send`.
+
+    Args:
+        state: The running episode, for the batch decoder.
+        waiting: Requests that no place has taken yet. It takes those of its own task first.
+        ended: Gets each request, with the record of its episode or its error.
+        open_world: Opens a world for a task.
+    """
+    world: World | None = None
+    try:
+        while waiting:
+            request = _take(waiting, world.task if world else "")
+            result: EpisodeRecord | Exception
+            try:
+                if world is not None and world.task != request.task:
+                    world.close()
+                    world = None
+                world = world or open_world(request.task)
+                result = yield from episode(world, state, request.seed)
+            except Exception as error:  # noqa: BLE001 - one world's failure of any kind must not end the others
+                result = error
+                if world is not None:
+                    world.close()
+                world = None
+            ended.append((request, result))
+    finally:
+        if world is not None:
+            world.close()
 
 
 def _take(waiting: list[Request[K]], task: str) -> Request[K]:
@@ -156,51 +189,6 @@ def _take(waiting: list[Request[K]], task: str) -> Request[K]:
     counts = Counter(request.task for request in waiting)
     wanted = task if counts[task] else counts.most_common(1)[0][0]
     return waiting.pop(next(i for i, request in enumerate(waiting) if request.task == wanted))
-
-
-class _Slot(Generic[K]):
-    """One place in the batch: an open world and the episode that runs in it."""
-
-    def __init__(self, state: EpisodeState, open_world: OpenWorld) -> None:
-        self.state, self.open_world = state, open_world
-        self.task = ""
-        self.world: World | None = None
-        self.request: Request[K] | None = None
-
-    def begin(self, request: Request[K]) -> None:
-        self.request, self.seconds, self.steps = request, 0.0, self._episode(request)
-
-    def _episode(self, request: Request[K]) -> Generator[Observation, DecodeRecord, EpisodeRecord]:
-        if self.world is None or self.task != request.task:
-            self.close()
-            self.world, self.task = self.open_world(request.task), request.task
-        return (yield from episode(self.world, self.state, request.seed))
-
-    def advance(self, decode: DecodeRecord | None) -> Iterator[EpisodeEnd[K]]:
-        """Execute a decode's actions until the next observation. Yield the request and its result if the episode ends.
-
-        Args:
-            decode: Record with the actions; None to start the episode.
-        """
-        began, request = time.perf_counter(), self.request
-        assert request is not None
-        try:
-            self.observation = self.steps.send(decode)  # type: ignore[arg-type]
-            self.seconds += time.perf_counter() - began
-            return
-        except StopIteration as end:
-            seconds = self.seconds + time.perf_counter() - began
-            result: EpisodeRecord | Exception = dataclasses.replace(end.value, wall_seconds=seconds)
-        except Exception as error:  # noqa: BLE001 - one world's failure of any kind must not end the others
-            result = error
-            self.close()
-        self.request = None
-        yield request, result
-
-    def close(self) -> None:
-        if self.world is not None:
-            self.world.close()
-        self.task, self.world = "", None
 
 
 def run_batch(settings: RolloutSettings, requests: Iterable[Request[K]]) -> Iterator[EpisodeEnd[K]]:

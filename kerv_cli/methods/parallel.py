@@ -34,7 +34,6 @@ class ParallelPass(Skip):
 
     def take(self, chunk: Chunk) -> bool:
         """Commit all tokens of the chunk after one forward of the target. Return True."""
-        chunk.cache.length = 0
         hidden = self.target.parallel_pass(chunk.prompt, chunk.cache)
         chunk.commit_at_once(self.target.head(hidden[0, : chunk.size]).argmax(-1).tolist())
         return True
