@@ -21,7 +21,7 @@ from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.artifacts import Use
 from kerv_cli.methods.certified import CertifiedSkipSettings, ScopedSettings
-from kerv_cli.methods.certified.betting import more_to_decide, p_value, wealth
+from kerv_cli.methods.certified.betting import p_value, wealth
 from kerv_cli.methods.certified.certificate import Candidate, Certificate, CertificateArtifact, certified, scoped
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.merged import MergedProposerSettings
@@ -344,14 +344,3 @@ def test_bets_know_nothing_of_the_values_to_come():
     changed = np.concatenate([values[:20], 1 - values[20:]])
     assert wealth(values, 0.5, 0.1)[:20] == pytest.approx(wealth(changed, 0.5, 0.1)[:20])
     assert p_value(np.zeros(0), 0.5, 0.1) == 1.0
-
-
-def test_how_many_values_more_would_decide():
-    """Pairs that agree: each multiplies the wealth by as much, so that the number is exact up to the first bets."""
-    short = np.full(60, 0.5)
-    more = more_to_decide(short, 0.525, 0.1)
-    growth = math.log1p(0.75 / 0.475 * 0.025)
-    assert more == math.ceil((math.log(10) - math.log(wealth(short, 0.525, 0.1)[-1])) / growth)
-    assert more_to_decide(np.full(200, 0.5), 0.525, 0.1) == 0
-    assert more_to_decide(np.full(60, 0.6), 0.525, 0.1) == math.inf
-    assert more_to_decide(np.zeros(0), 0.525, 0.1) == math.inf

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import math
 from collections.abc import Sequence
 from operator import attrgetter
 from pathlib import Path
@@ -26,12 +25,11 @@ from kerv_cli.episodes.settings import WAITS, RolloutSettings
 from kerv_cli.lab.database import now
 from kerv_cli.lab.plan import Episode, seeds_text
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.methods.certified.betting import more_to_decide, p_value
+from kerv_cli.methods.certified.betting import p_value
 from kerv_cli.methods.certified.certificate import Candidate, Certificate, CertificateArtifact
 from kerv_cli.methods.compose import Method
 from kerv_cli.report.attempts import charged
 from kerv_cli.report.measures import paired
-from kerv_cli.report.statistics import MOST_PAIRS
 from kerv_cli.report.tables import load_study
 from kerv_cli.targets.folders import beside, check_not_shipped
 from kerv_cli.targets.provenance import provenance
@@ -186,7 +184,6 @@ def _candidate(planned: Candidate, pairs: pd.DataFrame, margin: float, delta: fl
     seed = int.from_bytes(hashlib.sha256(str(len(ar)).encode()).digest()[:4], "big")
     values, bound = np.random.default_rng(seed).permutation((1 + ar - own) / 2), (1 + margin / POINTS) / 2
     p = p_value(values, bound, delta) if testing else None
-    needed = more_to_decide(values, bound, delta) if p is not None and p > delta else 0.0
     return dataclasses.replace(
         planned,
         pairs=len(pairs),
@@ -195,7 +192,6 @@ def _candidate(planned: Candidate, pairs: pd.DataFrame, margin: float, delta: fl
         lost=int((ar > own).sum()),
         won=int((ar < own).sum()),
         p=p,
-        needed=int(needed) if math.isfinite(needed) else -1,
     )
 
 
@@ -216,17 +212,9 @@ def candidate_rows(certificate: Certificate) -> list[dict[str, str]]:
             "lost / won": f"{one.lost} / {one.won}",
             "p": "not tested" if one.p is None else f"{one.p:.3g}",
             "certified": "" if one.p is None else "yes" if one.p <= certificate.delta else "no",
-            "more pairs needed": _needed_text(one.needed),
         }
         for one in certificate.candidates
     ]
-
-
-def _needed_text(pairs: int) -> str:
-    """Return how many more pairs a candidate needs, as text. 0 gives no text; −1 stands for "not at these rates"."""
-    if pairs > MOST_PAIRS:
-        return f"more than {MOST_PAIRS:,}"
-    return {0: "", -1: "not at these rates"}.get(pairs, f"about {pairs}")
 
 
 def _settings(resolved: ResolvedStudy) -> list[RolloutSettings]:

@@ -63,25 +63,3 @@ def p_value(values: np.ndarray, bound: float, delta: float) -> float:
         delta: Error probability δ at which the bets aim to reject.
     """
     return float(1 / max(1.0, wealth(values, bound, delta).max(initial=1.0)))
-
-
-def more_to_decide(values: np.ndarray, bound: float, delta: float) -> float:
-    """Estimate how many more values like these the test needs until it rejects the hypothesis.
-
-    The estimate assumes the best constant bet.
-
-    Args:
-        values: (n,) in [0, 1], in the order in which they came.
-        bound: The hypothesis is a mean of at least `bound`, in (0, 1).
-        delta: Error probability δ at which the bets aim to reject.
-
-    Returns:
-        0 if the test rejects already. Infinity if the values are no evidence against the hypothesis.
-    """
-    path = wealth(values, bound, delta)
-    if path.max(initial=1.0) >= 1 / delta:
-        return 0.0
-    shares = np.linspace(0, MOST, 76)[1:, None] / (1 - bound)
-    growth = float(np.log1p(shares * (bound - values)).mean(axis=1).max()) if len(values) else 0.0
-    missing = math.log(1 / delta) - (math.log(path[-1]) if len(path) else 0.0)
-    return math.ceil(missing / growth) if growth > 0 else math.inf

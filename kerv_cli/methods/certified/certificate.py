@@ -39,7 +39,6 @@ class Candidate:
         won: Number of pairs that only the candidate solved.
         p: p-value of the hypothesis that the candidate loses the margin or more. None: not tested, because an earlier
             candidate failed.
-        needed: About how many more pairs, at these rates, would certify it. 0: it is certified. −1: no number would.
         draft: Settings of the prefill draft, which the rule executes. The first certificates all used the scout.
     """
 
@@ -51,7 +50,6 @@ class Candidate:
     lost: int = 0
     won: int = 0
     p: float | None = None
-    needed: int = 0
     draft: dict[str, Any] = field(default_factory=lambda: {"kind": "scout"})
 
     @property
