@@ -21,7 +21,6 @@ from kerv_cli.engine.decoder import Decoder
 from kerv_cli.episodes.identity import hash_of
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.compose import Method
-from kerv_cli.methods.parallel import native_decoder
 from kerv_cli.methods.settings import EXPERT, PolicySettings
 from kerv_cli.training.settings import DemosSettings
 from kerv_cli.worlds import resolve_tasks, spec_of
@@ -81,7 +80,7 @@ class PolicyActs:
 
     Attributes:
         settings: Settings of the recording.
-        sha256: Hash of the target's weights, if no method was chosen. Otherwise hash of the method and all its weights.
+        sha256: Hash of the method and all its weights.
     """
 
     settings: DemosSettings
@@ -112,8 +111,7 @@ class PolicyActs:
                 f"policy.target={name} sees {views[0]}, the recording would show {camera}: set "
                 f"world.camera.name={views[0]}, or add further views after it"
             )
-        if not _is_plain(settings):
-            Method.of(settings).check(description)
+        Method.of(settings).check(description)
         return cls(settings, _hash(settings))
 
     def __call__(self, config: DemoConfig) -> PolicyActor:
@@ -132,14 +130,7 @@ class PolicyActs:
 
     def _decoder(self, task: str) -> Decoder:
         artifacts = _artifacts(self.settings)
-        if _is_plain(self.settings):
-            return native_decoder(artifacts.target)
         return Method.of(self.settings).decoder(artifacts.target, artifacts.load, task)
-
-
-def _is_plain(settings: DemosSettings) -> bool:
-    """Return whether no method and no chunk length was chosen, so that the target decodes as it was trained to."""
-    return not settings.chunk and settings.parts() == DemosSettings().parts()
 
 
 def _artifacts(settings: DemosSettings) -> Artifacts:
@@ -147,8 +138,6 @@ def _artifacts(settings: DemosSettings) -> Artifacts:
 
 
 def _hash(settings: DemosSettings) -> str:
-    if _is_plain(settings):
-        return _artifacts(settings).description.sha256
     hashes = _artifacts(settings).check(Method.of(settings).needs)
     return hash_of([hashes, {kind: asdict(part) for kind, part in settings.parts().items()}, settings.chunk])
 
@@ -161,8 +150,12 @@ def recording_of(settings: DemosSettings) -> tuple[DemoConfig, PolicyActs | None
         UsageError: `policy.target` is set although the expert acts.
         CheckpointError: The policy does not exist.
     """
-    tasks = resolve_tasks(settings.task)
-    actor = _actor(settings, tasks[0])
+    tasks, target = resolve_tasks(settings.task), settings.policy.target
+    actor = None
+    if settings.policy.kind != EXPERT:
+        actor = PolicyActs.of(settings, spec_of(tasks[0]))
+    elif target != PolicySettings().target:
+        raise UsageError(f"policy.target={target}: the expert acts, set policy=vision (or state) too")
     config = DemoConfig(
         tasks=tasks,
         episodes=settings.episodes,
@@ -176,13 +169,3 @@ def recording_of(settings: DemosSettings) -> tuple[DemoConfig, PolicyActs | None
         expert_share=settings.expert_share if actor else 0.0,
     )
     return config, actor
-
-
-def _actor(settings: DemosSettings, task: str) -> PolicyActs | None:
-    """Return the policy that acts instead of the expert; None if the expert acts."""
-    target = settings.policy.target
-    if settings.policy.kind != EXPERT:
-        return PolicyActs.of(settings, spec_of(task))
-    if target != PolicySettings().target:
-        raise UsageError(f"policy.target={target}: the expert acts, set policy=vision (or state) too")
-    return None

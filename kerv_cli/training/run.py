@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -13,6 +11,7 @@ from typing import Any
 from torch import nn
 
 from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.episodes.identity import hash_of
 from kerv_cli.methods.artifacts import removal
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.loop import Loop, Metrics, Objective, stored_identity
@@ -85,9 +84,9 @@ class TrainingRun(ABC):
     @property
     def hash(self) -> str:
         """Hash of everything that determines the weights after a given number of steps."""
-        train = optimisation_identity(self.settings.train)
-        parts = {"train": train, "demos": self.dataset.sha256, **self.identity()}
-        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+        train = {key: value for key, value in asdict(self.settings.train).items() if key not in NOT_IDENTITY}
+        train["closed_loop"] = train["closed_loop"] > 0  # scores with and without success do not compare
+        return hash_of({"train": train, "demos": self.dataset.sha256, **self.identity()})
 
     def check_folder(self, setting: str) -> None:
         """Refuse a folder that holds a training with other settings or data.
@@ -112,13 +111,6 @@ class TrainingRun(ABC):
             "parameters": sum(p.numel() for p in module.parameters()),
         }
         self.write(module, provenance_of(f"kerv train {self.kind}", self.settings, self.device, **figures))
-
-
-def optimisation_identity(train: TrainSettings) -> dict[str, Any]:
-    """Return the optimisation settings that must stay the same when a training resumes."""
-    settings = {key: value for key, value in asdict(train).items() if key not in NOT_IDENTITY}
-    settings["closed_loop"] = train.closed_loop > 0  # scores with and without success do not compare
-    return settings
 
 
 def refuse_unused(train: TrainSettings, keys: Sequence[str], why: str) -> None:

@@ -152,6 +152,10 @@ class Kinematic:
 
     r = r_min + (r_max − r_min) · exp(−(K / K_S)^φ). K is that of the last decode in which drafts were compared. K_S is
     the task's reference level. An episode begins as if K were K_S.
+
+    Attributes:
+        r: The radius of the next decode, in bins, not rounded.
+        last: K of the last decode in which drafts were compared.
     """
 
     def __init__(self, settings: KinematicThresholdSettings, context: Context) -> None:
@@ -162,17 +166,18 @@ class Kinematic:
             CheckpointError: The calibration has no K_S for the task.
         """
         context.check_radius("r_max", settings.r_max)
-        self.r_min, self.r_max, self.phi = settings.r_min, settings.r_max, settings.phi
+        self.settings = settings
         self.k_s = settings.k_s if settings.k_s is not None else context.calibration.k_s(context.task)
         self.reset()
 
     def reset(self) -> None:
-        """Begin an episode: set the radius as if the last decode's variability K was the reference level K_S."""
-        self.r = self.level(self.k_s)
+        """Begin an episode, as if the last decode's variability K was the reference level K_S."""
+        self.r, self.last = self.falling(self.k_s), self.k_s
 
-    def level(self, variability: float) -> float:
-        """Return the radius, not rounded, for a variability K in normalised action units."""
-        return falling(self.r_min, self.r_max, variability / self.k_s, self.phi)
+    def falling(self, x: float) -> float:
+        """Return r_min + (r_max − r_min) · exp(−(x / K_S)^φ), for x in normalised action units."""
+        s = self.settings
+        return falling(s.r_min, s.r_max, x / self.k_s, s.phi)
 
     def radius(self) -> int:
         """Return the acceptance radius r, rounded to whole bins."""
@@ -185,7 +190,12 @@ class Kinematic:
             variability: K of the last decode. None: no draft was compared, and r stays.
         """
         if variability is not None:
-            self.r = self.level(variability)
+            r = self.next(variability)
+            self.r, self.last = min(self.settings.r_max, max(self.settings.r_min, r)), variability
+
+    def next(self, variability: float) -> float:
+        """Return r after a decode with this variability K. `update` limits it to r_min … r_max."""
+        return self.falling(variability)
 
 
 class Change(Kinematic):
@@ -195,29 +205,13 @@ class Change(Kinematic):
     last two decodes in which drafts were compared. An episode begins as if the last K were K_S.
     """
 
-    def reset(self) -> None:
-        """Begin an episode: set the radius as if the last decode's variability K was the reference level K_S.
-
-        The first change of K is measured from K_S, too.
-        """
-        super().reset()
-        self.last = self.k_s
-
-    def update(self, variability: float | None) -> None:
-        """Move r against the change of K.
-
-        Args:
-            variability: K of the last decode. None: no draft was compared, and r stays.
-        """
-        if variability is None:
-            return
-        change = (variability - self.last) / self.k_s
-        move = (self.r_max - self.r_min) - falling(0, self.r_max - self.r_min, abs(change), self.phi)
-        self.r = min(self.r_max, max(self.r_min, self.r - math.copysign(move, change)))
-        self.last = variability
+    def next(self, variability: float) -> float:
+        """Return r, moved against the change of K."""
+        change = variability - self.last
+        return self.r - math.copysign(self.settings.r_max - self.falling(abs(change)), change)
 
 
-class Quoted(Change):
+class Quoted(Kinematic):
     """KERV's formula as printed (arXiv 2603.01581): r ← min(r + (r_max − r_min) · exp(−(|ΔK| / K_S)^φ), r_max).
 
     ΔK is the change of the variability K. The formula never makes r smaller, so r rises from r_min to r_max and stays.
@@ -225,18 +219,11 @@ class Quoted(Change):
 
     def reset(self) -> None:
         """Begin an episode with the smallest radius r_min. The first change of K is measured from K_S."""
-        self.r, self.last = float(self.r_min), self.k_s
+        self.r, self.last = float(self.settings.r_min), self.k_s
 
-    def update(self, variability: float | None) -> None:
-        """Raise r: the larger the change of K, the less.
-
-        Args:
-            variability: K of the last decode. None: no draft was compared, and r stays.
-        """
-        if variability is not None:
-            change = abs(variability - self.last) / self.k_s
-            self.r = min(self.r_max, self.r + falling(0, self.r_max - self.r_min, change, self.phi))
-            self.last = variability
+    def next(self, variability: float) -> float:
+        """Return r, raised the more, the smaller the change of K is."""
+        return self.r + self.falling(abs(variability - self.last)) - self.settings.r_min
 
 
 class Schedule:
@@ -253,8 +240,7 @@ class Schedule:
             UsageError: The largest radius is larger than the distance of any two tokens.
         """
         context.check_radius("r_max", settings.r_max)
-        self.settings = settings
-        self.reset()
+        self.settings, self.decodes = settings, 0
 
     def reset(self) -> None:
         """Begin an episode: set the number t of decodes to 0."""
