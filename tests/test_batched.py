@@ -160,7 +160,7 @@ class Stub:
     def done(self) -> bool:
         return self.steps >= self.length
 
-    end_effector, gripper, initial_state, object_distance = HOME, 1.0, HOME, 0.1
+    end_effector, gripper, initial_state, object_position, object_distance = HOME, 1.0, HOME, HOME, 0.1
 
 
 @pytest.fixture

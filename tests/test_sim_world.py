@@ -70,9 +70,13 @@ def test_reset_and_step_report_what_happened(world):
 
 def test_an_expert_that_grips_the_object_comes_within_two_centimetres_of_it():
     with SPEC.open_world("push-v3") as world:
-        assert run_episode(world, ExpertDecoder(world.task), 0).closest_approach < 0.02
+        record = run_episode(world, ExpertDecoder(world.task), 0)
+        assert record.closest_approach < 0.02
+        assert record.object_moved > 0.05
     with SPEC.open_world("reach-v3") as world:  # it leaves the object where it is
-        assert run_episode(world, ExpertDecoder(world.task), 0).closest_approach > 0.1
+        record = run_episode(world, ExpertDecoder(world.task), 0)
+        assert record.closest_approach > 0.1
+        assert record.object_moved == 0.0
 
 
 @pytest.mark.bits

@@ -146,6 +146,7 @@ class EpisodeRecord:
     initial_state: np.ndarray  # (n,) float64, equal for episodes of a task that start in the same state
     frames: dict[int, np.ndarray] = field(default_factory=dict)  # control step -> (h, w, 3) uint8, if recorded
     closest_approach: float = math.nan  # least distance of fingertips to object, metres; NaN: unknown
+    object_moved: float = math.nan  # largest motion of the object after the fingertips came near, metres; NaN: unknown
     wall_seconds: float = 0.0  # with simulation and rendering; in a batch this episode's share
     places: dict[str, np.ndarray] = field(default_factory=dict)  # object, goal, … -> (T + 1, 3) metres, if recorded
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections import deque
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,25 @@ from kerv_cli.engine.record import DecodeRecord, Delay, EpisodeRecord
 from kerv_cli.episodes.clock import RealClock
 from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import World
+
+AT_OBJECT = 0.05
+"""Distance of the fingertips to the object, in metres, from which on a motion of the object is attributed to them."""
+
+
+def moved_after_approach(distances: Sequence[float], objects: Sequence[np.ndarray]) -> float:
+    """Return how far the object moved, at most, after the fingertips first came within AT_OBJECT of it, in metres.
+
+    Earlier motion does not count, because some objects fall into place at the start. 0 if the fingertips never came so
+    close. NaN if the task has no object.
+
+    Args:
+        distances: Distance between fingertips and object after each step.
+        objects: Position (3,) of the object after each step.
+    """
+    if math.isnan(distances[0]):
+        return math.nan
+    first = next((step for step, distance in enumerate(distances) if distance < AT_OBJECT), None)
+    return 0.0 if first is None else float(np.linalg.norm(np.stack(objects[first:]) - objects[first], axis=1).max())
 
 
 class _Execution:
@@ -34,6 +54,7 @@ class _Execution:
         self.path: list[np.ndarray] = []
         self.gripper: list[float] = []
         self.distances: list[float] = []  # between hand and object, after each step
+        self.objects: list[np.ndarray] = []  # (3,) position of the object, after each step
         self.frames: dict[int, np.ndarray] = {}
         self.places: dict[str, list[np.ndarray]] = {}
         self._collect()
@@ -56,6 +77,7 @@ class _Execution:
         self.actions.append(np.clip(self.last, space.low, space.high).astype(np.float32))
         self._collect()
         self.distances.append(self.world.object_distance)
+        self.objects.append(self.world.object_position)
         self.follower.observe(self.actions[-1], self.path[-1])
 
     def until(self, rest: int) -> None:
@@ -153,6 +175,7 @@ def episode(
         gripper=np.asarray(execution.gripper, dtype=np.float32),
         initial_state=world.initial_state,
         closest_approach=min(execution.distances),
+        object_moved=moved_after_approach(execution.distances, execution.objects),
         frames=execution.frames,
         places={name: np.asarray(path, dtype=np.float32) for name, path in execution.places.items()},
         wall_seconds=time.perf_counter() - began,

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from kerv_cli.base.registry import parts
-from kerv_cli.engine.record import PHASES, DecodeRecord, EpisodeRecord, Round
+from kerv_cli.engine.record import PHASES, DecodeRecord, Delay, EpisodeRecord, Round
 
 INT, FLOAT, TEXT, FLAG = pa.int64(), pa.float64(), pa.string(), pa.bool_()
 Fields = dict[str, tuple[pa.DataType, Callable[..., Any]]]
@@ -77,6 +77,7 @@ _EPISODE: Fields = {
     **{f"{name}_steps": (INT, _summed(_delay(name))) for name in ("carried", "held", "dropped")},
     **_attributes("path_length", "jerk", kind=FLOAT),  # of the end effector: metres; m/s³
     **_attributes("closest_approach", kind=FLOAT),  # least distance of fingertips to object, metres
+    **_attributes("object_moved", kind=FLOAT),  # how far the object moved after they came within 5 cm, metres
     **_attributes("wall_seconds", kind=FLOAT),
     "initial_state": (pa.list_(FLOAT), lambda episode: np.asarray(episode.initial_state, np.float64).ravel().tolist()),
 }
@@ -93,6 +94,7 @@ _ROUND = pa.struct(
 )
 
 
+_DELAYED = ("observed", "carried", "held", "dropped")
 _DECODE: Fields = {
     **_attributes("mode", kind=TEXT),
     **_attributes("forwards"),
@@ -107,7 +109,7 @@ _DECODE: Fields = {
     **_attributes("reason", kind=TEXT),  # given by a skip rule: trusted, streak; null if none
     "delay_seconds": (FLOAT, _delay("seconds")),  # this and the next: null if the world waited
     "delay_steps": (INT, _delay("steps")),
-    **{name: (INT, _delay(name)) for name in ("observed", "carried", "held", "dropped")},
+    **{name: (INT, _delay(name)) for name in _DELAYED},
 }
 # index: position of the decode in its episode; step: control step at which its actions begin
 _POSITION = {"index": INT, "step": INT}
@@ -148,6 +150,38 @@ def read_decodes(blob: bytes, columns: Sequence[str] | None = None) -> pa.Table:
         columns: Columns to read; None for all.
     """
     return pq.read_table(io.BytesIO(blob), columns=columns, use_threads=False)
+
+
+def decode_records(table: pa.Table) -> list[DecodeRecord]:
+    """Return the decodes in a table that `decodes_table` made."""
+    return [_decode_record(row) for row in table.to_pylist()]
+
+
+def _decode_record(row: dict[str, Any]) -> DecodeRecord:
+    rounds = tuple(
+        Round(**{name: tuple(value) if isinstance(value, list) else value for name, value in one.items()})
+        for one in row["rounds"]
+    )
+    verified = {index for one in rounds for index in range(one.start, one.start + one.committed)}
+    actions = np.asarray(row["actions"], np.float32)
+    delay = None
+    if row["delay_steps"] is not None:
+        delay = Delay(row["delay_seconds"], *(row[name] for name in ("delay_steps", *_DELAYED)))
+    return DecodeRecord(
+        tokens=tuple(row["tokens"]),
+        actions=actions,
+        forwards=row["forwards"],
+        rounds=rounds,
+        mode=row["mode"],
+        seconds=math.nan if row["seconds"] is None else row["seconds"],
+        phases={phase: row[f"seconds.{phase}"] for phase in PHASES if row[f"seconds.{phase}"] is not None},
+        compensated=row["compensated"],
+        # a rectifier filled what no round committed
+        filled=tuple(i for i in range(len(row["tokens"])) if i not in verified) if row["compensated"] else (),
+        skipped=row["skipped"],
+        delay=delay,
+        **{name: row[name] for name in ("variability", "similarity", "metric", "reason", "deviation")},
+    )
 
 
 def seconds_blob(seconds: Iterable[float]) -> bytes:

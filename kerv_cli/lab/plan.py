@@ -92,6 +92,12 @@ class Episode:
         """The setting's hash `work`, the task, the seed and the repeat. Equal keys mean the same episode."""
         return self.setting.work, self.task, self.seed, self.repeat
 
+    @property
+    def recording(self) -> str:
+        """File name of its recording. Repeats share it."""
+        label = self.setting.label.replace(" ", "_").replace("=", "")
+        return f"{label}-{self.task}-{self.seed}-{self.setting.work[:6]}.rrd"
+
 
 @dataclass(frozen=True)
 class Study:

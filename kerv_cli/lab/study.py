@@ -57,9 +57,7 @@ class EpisodeRunner:
         def run_episode(seed: int) -> EpisodeRecord:
             record = runner.episode(seed, is_recorded(runner.settings, seed))
             if record.frames:
-                label = setting.label.replace(" ", "_").replace("=", "")
-                path = self.rollouts / f"{label}-{record.task}-{seed}-{setting.work[:6]}.rrd"
-                self.save(record, path, setting.label)
+                self.save(record, self.rollouts / Episode(setting, record.task, seed).recording, setting.label)
             return replace(record, frames={}, places={})
 
         return run_episode

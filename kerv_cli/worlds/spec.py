@@ -312,13 +312,17 @@ class World(ABC):
         return self.end_effector
 
     @property
-    def object_distance(self) -> float:
-        """Distance between `grip_point` and the place `object`, in metres. NaN if the task has no such place."""
+    def object_position(self) -> NDArray[np.float64]:
+        """Position (3,) of the place `object`, in metres. NaN if the task has no such place."""
         for place in self.spec.observation.places:
             if place.name == "object":
-                position = self.observation.state[place.first : place.first + 3]
-                return float(np.linalg.norm(self.grip_point - position))
-        return math.nan
+                return self.observation.state[place.first : place.first + 3].copy()
+        return np.full(3, math.nan)
+
+    @property
+    def object_distance(self) -> float:
+        """Distance between `grip_point` and the place `object`, in metres. NaN if the task has no such place."""
+        return float(np.linalg.norm(self.grip_point - self.object_position))
 
     @property
     def gripper(self) -> float:
