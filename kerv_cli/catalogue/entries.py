@@ -384,7 +384,7 @@ def plan_of(run: RunEntry, results: str) -> Plan:
         UsageError: A setting cannot run.
     """
     database, study = Database(results), store_of(run).load()
-    new = {setting.label: _checked(setting, study.tasks, results) for setting in study.settings}
+    new = {setting.label: checked(setting, study.tasks, results) for setting in study.settings}
     episodes = tuple(Episode(new[one.setting.label], one.task, one.seed, one.repeat) for one in study.episodes)
     study = dataclasses.replace(study, settings=tuple(new.values()), episodes=episodes)
     command = again_words(run, results)
@@ -402,8 +402,12 @@ def plan_of(run: RunEntry, results: str) -> Plan:
     return plan_study(database, study, ALL, row.started if row else "", command=command)
 
 
-def _checked(setting: Setting, tasks: list[str], results: str) -> Setting:
-    """Return a stored setting for this results folder. Refuse it if its weights or data have changed."""
+def checked(setting: Setting, tasks: list[str], results: str) -> Setting:
+    """Return a stored setting for this results folder.
+
+    Raises:
+        CheckpointError: Its weights or data have changed.
+    """
     from kerv_cli.episodes.policy import check  # imports torch
 
     stored = {**setting.settings, "results": results}

@@ -157,11 +157,13 @@ def decode_records(table: pa.Table) -> list[DecodeRecord]:
     return [_decode_record(row) for row in table.to_pylist()]
 
 
+def _round(values: dict[str, Any]) -> Round:
+    plain: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+    return Round(**plain)
+
+
 def _decode_record(row: dict[str, Any]) -> DecodeRecord:
-    rounds = tuple(
-        Round(**{name: tuple(value) if isinstance(value, list) else value for name, value in one.items()})
-        for one in row["rounds"]
-    )
+    rounds = tuple(_round(one) for one in row["rounds"])
     verified = {index for one in rounds for index in range(one.start, one.start + one.committed)}
     actions = np.asarray(row["actions"], np.float32)
     delay = None

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -95,8 +96,8 @@ class Episode:
     @property
     def recording(self) -> str:
         """File name of its recording. Repeats share it."""
-        label = self.setting.label.replace(" ", "_").replace("=", "")
-        return f"{label}-{self.task}-{self.seed}-{self.setting.work[:6]}.rrd"
+        name = f"{self.setting.label.replace('=', '')}-{self.task}-{self.seed}-{self.setting.work[:6]}.rrd"
+        return re.sub(r"[^\w.+-]", "_", name)[-200:]
 
 
 @dataclass(frozen=True)

@@ -375,14 +375,15 @@ def insert_episode(connection: sa.Connection, row: Mapping[str, Any], decodes: b
     return int(number)
 
 
-def _setting_of(row: Any) -> Setting:
+def setting_of(row: Any) -> Setting:
+    """Return the setting that a row of the table `settings` describes."""
     return Setting(check_label(row.label), row.overrides, row.settings, row.identity, row.varies, row.name)
 
 
 def stored_study(connection: sa.Connection, row: Any) -> tuple[Study, dict[int, Setting]]:
     """Return the study that a row of the table `studies` describes, and its settings by their ids."""
     query = sa.select(SETTINGS).where(SETTINGS.c.study_id == row.id).order_by(SETTINGS.c.position)
-    settings = {one.id: _setting_of(one) for one in connection.execute(query)}
+    settings = {one.id: setting_of(one) for one in connection.execute(query)}
     wanted = sa.select(WANTED).where(WANTED.c.setting_id.in_(settings)).order_by(WANTED.c.position)
     episodes = tuple(
         Episode(settings[one.setting_id], one.task, one.seed, one.repeat) for one in connection.execute(wanted)
@@ -480,7 +481,7 @@ def _earlier(database: Database, study: Study) -> dict[str, tuple[Setting, str]]
     query = sa.select(SETTINGS).where(SETTINGS.c.label.in_(study.labels), SETTINGS.c.id.in_(ran))
     with database.reading() as connection:
         rows = connection.execute(query.order_by(SETTINGS.c.id))
-        return {row.label: (_setting_of(row), row.work) for row in rows}
+        return {row.label: (setting_of(row), row.work) for row in rows}
 
 
 def studies(database: Database) -> list[StudyStore]:

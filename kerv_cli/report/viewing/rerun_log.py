@@ -30,6 +30,7 @@ from kerv_cli.report.viewing.token_outcomes import (
     readable,
     summary,
     threshold_of,
+    tokens_hash,
 )
 
 JPEG_QUALITY = 85
@@ -119,7 +120,7 @@ def encode(record: EpisodeRecord, method: str) -> bytes:
     recording.set_log_tick_enabled(False)
     outcome = "success" if record.success else "failure"
     recording.send_recording_name(readable(f"{record.task} · {method} · seed {record.seed} · {outcome}"))
-    recording.send_property("episode", rr.AnyValues(**facts_of(record, method)))
+    recording.send_property("episode", rr.AnyValues(**facts_of(record, method), tokens=tokens_hash(record.decodes)))
     log = _Log(recording, record.space.control_hz)
     log.static("summary", rr.TextDocument(summary(record, method), media_type="text/markdown"))
     _log_camera(log, record)

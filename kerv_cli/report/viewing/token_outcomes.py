@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
+from kerv_cli.episodes.identity import hash_of
 
 
 class OutcomeStyle(NamedTuple):
@@ -157,6 +158,11 @@ def readable(text: str) -> str:
     Such characters crash version 0.41 of the viewer.
     """
     return "".join(c if " " <= c <= "~" or "\xa1" <= c <= "ÿ" or c in _SHOWN_SYMBOLS else "?" for c in text)
+
+
+def tokens_hash(decodes: Sequence[DecodeRecord]) -> str:
+    """Return a hash of all tokens of an episode, decode by decode."""
+    return hash_of([list(decode.tokens) for decode in decodes])
 
 
 def facts_of(record: EpisodeRecord, method: str) -> dict[str, str | float]:

@@ -1,0 +1,274 @@
+"""The page of one episode: its film, what became of every token, its times, and its recording in Rerun's viewer."""
+
+from __future__ import annotations
+
+import functools
+import os
+import re
+import shlex
+import signal
+import socket
+import subprocess
+import time
+import urllib.request
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from urllib.error import URLError
+from urllib.parse import quote
+
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import FileResponse, Response
+from starlette.routing import Route
+
+from kerv_cli.base.errors import KervError
+from kerv_cli.base.spaces import ActionSpace
+from kerv_cli.board.pages import database_of, inside, render
+from kerv_cli.board.recorder import Recorder
+from kerv_cli.catalogue.episodes import FoundEpisode, find_episode, outcomes
+from kerv_cli.engine.record import PHASES, DecodeRecord
+from kerv_cli.episodes.repeat import repeating_words
+from kerv_cli.lab.store import IMPORT
+from kerv_cli.report.viewing.film import Film, animation, film_of
+from kerv_cli.report.viewing.token_outcomes import OUTCOMES, TokenOutcome, chunk_size, outcomes_of, tokens_hash
+from kerv_cli.report.viewing.viewer import viewer_command
+from kerv_cli.worlds import specs
+
+SLOWER = 2
+"""Films play so many times slower than the robot moved."""
+_UNKNOWN_HZ = 20.0  # control steps per second, for tasks of unknown environments
+_RECORDER = Recorder()
+
+
+def _found(request: Request) -> FoundEpisode:
+    return find_episode(database_of(request), request.path_params["id"])
+
+
+def _recording(request: Request, found: FoundEpisode) -> Path | None:
+    """Return the recording of an episode; None if there is none.
+
+    Raises:
+        HTTPException: It is a link to a file outside the results folder.
+    """
+    path = found.store.rollouts / found.episode.recording
+    return inside(request, path) if path.exists() else None
+
+
+def _film(request: Request) -> Film:
+    path = _recording(request, _found(request))
+    if path is None:
+        raise HTTPException(404, "the episode has no recording yet")
+    return film_of(path)
+
+
+def _space(task: str) -> ActionSpace | None:
+    """Return the action space of a task; None if its environment is not known here."""
+    return next((spec.actions for spec in specs().values() if task in spec.tasks), None)
+
+
+def _names(task: str, decodes: Sequence[DecodeRecord]) -> Sequence[str]:
+    """Return the names of the D degrees of freedom of a task, or their numbers if they are not known."""
+    space, dofs = _space(task), decodes[0].actions.shape[1] if decodes else 1
+    return space.names if space is not None and space.dofs == dofs else [str(number) for number in range(dofs)]
+
+
+def _hz(task: str) -> float:
+    """Return the frames per second at which a film of a task plays."""
+    space = _space(task)
+    return (_UNKNOWN_HZ if space is None else space.control_hz) / SLOWER
+
+
+def command_of(found: FoundEpisode) -> tuple[str, str]:
+    """Return the command that repeats an episode, and why there is none. One of the two is empty."""
+    episode, results = found.episode, str(found.store.database.results)
+    if found.store.kind == IMPORT:
+        return "", "it was imported: another program ran it"
+    setting, seeds = episode.setting, [*found.earlier, episode.seed]
+    try:
+        words = repeating_words(setting.settings, setting.identity, setting.overrides, episode.task, seeds)
+    except KervError as error:
+        return "", str(error)
+    return shlex.join(["kerv", *words, *([] if results == "results" else [f"results={results}"])]), ""
+
+
+def _chunks(decodes: Sequence[DecodeRecord], dofs: int) -> list[list[TokenOutcome]]:
+    """Return the outcomes of the tokens of each decode's chunk."""
+    size = chunk_size(decodes, dofs)
+    return [outcomes_of(decode, size, dofs) for decode in decodes]
+
+
+def show_episode(request: Request) -> Response:
+    """Show one episode."""
+    found = _found(request)
+    decodes, steps = found.decodes()
+    episode, names = found.episode, _names(found.episode.task, decodes)
+    chunks = _chunks(decodes, len(names))
+    counts = Counter(one.kind for chunk in chunks for one in chunk)
+    row, command = found.row, command_of(found)
+    phases = {phase: row[f"seconds.{phase}"] for phase in PHASES if row[f"seconds.{phase}"]}
+    number = _number(request.query_params.get("decode", ""), len(decodes))
+    return render(
+        request,
+        "episode.html",
+        decodes=list(zip(decodes, steps, chunks, strict=True)),
+        names=names,
+        counts={kind: counts[kind] for kind in OUTCOMES if counts[kind]},
+        styles=OUTCOMES,
+        phases=phases,
+        others=[one for one in outcomes(found.store, episode.task, episode.seed) if one.episode is not None],
+        command=command[0],
+        why_not=command[1],
+        chosen=number,
+        **_film_values(request, found, steps[number] if steps else 0, decodes),
+    )
+
+
+def _number(text: str, count: int) -> int:
+    """Return the number of a decode as it stands in an address; 0 if there is no such decode."""
+    return int(text) if re.fullmatch(r"\d{1,6}", text) and int(text) < count else 0
+
+
+def show_decode(request: Request) -> Response:
+    """Show the tokens of one decode."""
+    found, number = _found(request), request.path_params["number"]
+    decodes, steps = found.decodes()
+    if number >= len(decodes):
+        raise HTTPException(404, f"the episode has {len(decodes)} decodes, numbered from 0")
+    names = _names(found.episode.task, decodes)
+    return render(
+        request,
+        "episode_decode.html",
+        found=found,
+        chosen=number,
+        decode=decodes[number],
+        step=steps[number],
+        chunk=_chunks(decodes, len(names))[number],
+        names=names,
+        styles=OUTCOMES,
+    )
+
+
+def _film_values(
+    request: Request, found: FoundEpisode, step: int = 0, decodes: Sequence[DecodeRecord] | None = None
+) -> dict[str, Any]:
+    """Return what the template of a film needs."""
+    path = _recording(request, found)
+    job = _RECORDER.job(found.store.rollouts / found.episode.recording)
+    values: dict[str, Any] = {"found": found, "step": step, "job": job, "film": None, "same": None, "rerun": ""}
+    values |= {"hz": _hz(found.episode.task), "imported": found.store.kind == IMPORT}
+    if path is not None and (job is None or job.future.done()):
+        film = film_of(path)
+        if film.facts.get("tokens"):
+            values["same"] = film.facts["tokens"] == tokens_hash(found.decodes()[0] if decodes is None else decodes)
+        address = f"{request.base_url}episodes/{found.id}/recording.rrd"
+        values |= {"film": film, "rerun": f"/rerun/?url={quote(address, safe='')}"}
+    return values
+
+
+def show_film(request: Request) -> Response:
+    """Show the film of an episode, how far its recording is, or the button that records it."""
+    return render(request, "episode_film.html", **_film_values(request, _found(request)))
+
+
+def record(request: Request) -> Response:
+    """Begin to record an episode, unless that is under way."""
+    found = _found(request)
+    if found.store.kind == IMPORT:
+        raise HTTPException(409, "an imported episode cannot be recorded: another program ran it")
+    _RECORDER.record(found, found.store.rollouts / found.episode.recording)
+    return show_film(request)
+
+
+_FOREVER = {"cache-control": "max-age=86400"}
+
+
+def frame(request: Request) -> Response:
+    """Return the image after a control step."""
+    frames, step = _film(request).frames, request.path_params["step"]
+    if step >= len(frames):
+        raise HTTPException(404, f"the film has {len(frames)} frames, numbered from 0")
+    return Response(frames[step], media_type="image/jpeg", headers=_FOREVER)
+
+
+def animated(request: Request) -> Response:
+    """Return the film as a GIF, to show elsewhere."""
+    film, found = _film(request), _found(request)
+    if not film.frames:
+        raise HTTPException(404, "the recording has no camera")
+    name = quote(f"{Path(found.episode.recording).stem}.gif")
+    headers = {"content-disposition": f"inline; filename*=utf-8''{name}"}
+    return Response(animation(film, _hz(found.episode.task), "gif"), media_type="image/gif", headers=headers)
+
+
+def recording(request: Request) -> Response:
+    """Return the recording, a file for Rerun's viewer."""
+    path = _recording(request, _found(request))
+    if path is None:
+        raise HTTPException(404, "the episode has no recording yet")
+    return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+
+
+_VIEWER_FILES = ("", "re_viewer.js", "re_viewer_bg.wasm", "favicon.ico")
+_VIEWER_SECONDS = 20.0
+
+
+@functools.cache
+def viewer_files() -> dict[str, tuple[bytes, str]]:
+    """Return the files of Rerun's web viewer: name -> content and media type.
+
+    The package of Rerun gives them only through its own server. It runs for a moment, for this machine alone.
+
+    Raises:
+        KervError: The server does not start.
+    """
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    # with the address of a recording it serves no data of its own
+    options = ["--serve-web", "--bind", "127.0.0.1", "--web-viewer-port", str(port), "http://127.0.0.1/none.rrd"]
+    nothing = subprocess.DEVNULL
+    with subprocess.Popen([*viewer_command(), *options], stdout=nothing, stderr=nothing, start_new_session=True) as own:
+        try:
+            return {name: _fetched(f"http://127.0.0.1:{port}/{name}") for name in _VIEWER_FILES}
+        finally:
+            os.killpg(own.pid, signal.SIGKILL)
+
+
+def _fetched(address: str) -> tuple[bytes, str]:
+    """Return content and media type of a file, as soon as its server has started."""
+    end = time.monotonic() + _VIEWER_SECONDS
+    while True:
+        try:
+            with urllib.request.urlopen(address, timeout=_VIEWER_SECONDS) as answer:
+                content, kind = answer.read(), answer.headers.get_content_type()
+            break
+        except (URLError, OSError) as error:
+            if time.monotonic() > end:
+                raise KervError(f"Rerun's web viewer does not start: {error}") from error
+            time.sleep(0.1)
+    if kind == "text/html":
+        content = re.sub(rb'<link[^>]*"https://fonts\.[^>]*>', b"", content)  # the board needs no network
+    return content, kind
+
+
+def viewer(request: Request) -> Response:
+    """Return a file of Rerun's web viewer."""
+    name = request.path_params["name"]
+    if name not in _VIEWER_FILES:
+        raise HTTPException(404, "Rerun's viewer has no such file")
+    content, kind = viewer_files()[name]
+    return Response(content, media_type=kind, headers=_FOREVER)
+
+
+ROUTES = [
+    Route("/episodes/{id:int}", show_episode),
+    Route("/episodes/{id:int}/decodes/{number:int}", show_decode),
+    Route("/episodes/{id:int}/film", show_film),
+    Route("/episodes/{id:int}/record", record, methods=["POST"]),
+    Route("/episodes/{id:int}/frames/{step:int}", frame),
+    Route("/episodes/{id:int}/film.gif", animated),
+    Route("/episodes/{id:int}/recording.rrd", recording),
+    Route("/rerun/{name:path}", viewer),
+]

@@ -1,0 +1,105 @@
+"""Record episodes in the background, one after the other, in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+
+from kerv_cli.base.processes import begin_worker
+from kerv_cli.catalogue.episodes import FoundEpisode
+from kerv_cli.lab.plan import Setting
+
+IDLE_SECONDS = 60
+"""The process ends after so many seconds without work, and frees its memory."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A recording that was asked for.
+
+    Attributes:
+        future: Gives the error as text; empty if the recording is written.
+        asked: Time of the click, seconds since 1970.
+    """
+
+    future: Future[str]
+    asked: float
+
+    @property
+    def seconds(self) -> int:
+        """Seconds since the click."""
+        return int(time.time() - self.asked)
+
+    @property
+    def error(self) -> str:
+        """Why the recording failed. Empty if it did not, or not yet."""
+        if not self.future.done():
+            return ""
+        lost = self.future.exception()
+        return f"the recording process ended: {lost}" if lost else self.future.result()
+
+
+class Recorder:
+    """Records episodes. A recording that was asked for twice is made once."""
+
+    def __init__(self) -> None:
+        self._jobs: dict[Path, Job] = {}
+        self._lock = threading.Lock()
+
+    def job(self, path: Path) -> Job | None:
+        """Return the last job that was asked to write this file."""
+        return self._jobs.get(path)
+
+    def record(self, found: FoundEpisode, path: Path) -> None:
+        """Begin to record an episode, unless that is under way.
+
+        Args:
+            found: The episode.
+            path: File to write.
+        """
+        from joblib.externals.loky import get_reusable_executor
+
+        with self._lock:
+            job = self._jobs.get(path)
+            if job is not None and not job.future.done():
+                return
+            pool = get_reusable_executor(
+                max_workers=1, timeout=IDLE_SECONDS, initializer=begin_worker, initargs=(os.getpid(),)
+            )
+            episode, results = found.episode, str(found.store.database.results)
+            seeds = [*found.earlier, episode.seed]
+            work = pool.submit(record_episode, episode.setting, episode.task, seeds, results, path)
+            self._jobs[path] = Job(work, time.time())
+
+
+def record_episode(setting: Setting, task: str, seeds: list[int], results: str, path: Path) -> str:
+    """Run an episode again and write its recording.
+
+    Args:
+        setting: Its setting.
+        task: Its task.
+        seeds: Its seed, after those of the episodes that must run before it.
+        results: The results folder, which has its weights and data.
+        path: File to write.
+
+    Returns:
+        The error in one line. Empty if all went well.
+    """
+    from kerv_cli.catalogue.entries import checked
+    from kerv_cli.episodes.runner import Runner
+    from kerv_cli.episodes.settings import settings_from
+    from kerv_cli.lab.execute import failure_of
+    from kerv_cli.report.viewing import save_recording
+
+    try:
+        runner = Runner(settings_from(checked(setting, [task], results).on(task)), task)
+        for seed in seeds[:-1]:
+            runner.episode(seed)
+        save_recording(runner.episode(seeds[-1], recorded=True), path, setting.label)
+    except Exception as error:  # noqa: BLE001 - the page shows it, whatever it is
+        return failure_of(error).reason
+    return ""

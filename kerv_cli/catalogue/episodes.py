@@ -1,0 +1,130 @@
+"""Find stored episodes: all of a study with their outcomes, or one by its row number."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import sqlalchemy as sa
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.engine.record import DecodeRecord
+from kerv_cli.lab.database import BLOCKS, EPISODES, SETTINGS, STUDIES, WANTED, Database, measures_in
+from kerv_cli.lab.plan import Episode, Setting
+from kerv_cli.lab.store import StudyStore, setting_of
+
+LARGEST_ID = 2**63 - 1
+
+
+def settings_in(store: StudyStore) -> tuple[str, dict[str, Setting]]:
+    """Return the baseline's label and all settings of a study by label, in the study's order.
+
+    Raises:
+        UsageError: There is no such study.
+    """
+    with store.database.reading() as connection:
+        row = connection.execute(sa.select(STUDIES).where(STUDIES.c.name == store.name)).first()
+        if row is None:
+            raise UsageError(f"no study '{store.name}' in {store.database.shown}")
+        query = sa.select(SETTINGS).where(SETTINGS.c.study_id == row.id).order_by(SETTINGS.c.position)
+        return row.about["baseline"], {one.label: setting_of(one) for one in connection.execute(query)}
+
+
+def outcomes(store: StudyStore, task: str = "", seed: int | None = None) -> list[Any]:
+    """Return a row for every episode of a study, in the study's order. Repeats are left out: their outcomes are equal.
+
+    Args:
+        store: The study.
+        task: Only episodes of this task. Empty: all.
+        seed: Only episodes of this seed. None: all.
+
+    Returns:
+        Rows with the columns `label`, `task`, `seed`, `episode` (row number; None if it has not run), `success`,
+        `closest_approach`, `object_moved`, `failed` (whether the last attempt to run it raised an error).
+    """
+    with store.database.reading() as connection:
+        measures = {column.name: column for column in measures_in(connection)}
+        query = (
+            sa.select(
+                SETTINGS.c.label, WANTED.c.task, WANTED.c.seed, WANTED.c.episode_id.label("episode"),
+                *(measures[name] for name in ("success", "closest_approach", "object_moved")),
+                WANTED.c.error.is_not(None).label("failed"),
+            )
+            .select_from(WANTED.join(SETTINGS).join(STUDIES).outerjoin(EPISODES, EPISODES.c.id == WANTED.c.episode_id))
+            .where(STUDIES.c.name == store.name, WANTED.c.repeat == 0)
+            .order_by(WANTED.c.position)
+        )  # fmt: skip
+        query = query if not task else query.where(WANTED.c.task == task)
+        query = query if seed is None else query.where(WANTED.c.seed == seed)
+        return list(connection.execute(query).all())
+
+
+@dataclass(frozen=True)
+class FoundEpisode:
+    """A stored episode, and the newest study that uses it.
+
+    Attributes:
+        id: Its row number.
+        store: The study.
+        episode: Setting, task, seed and repeat.
+        row: Columns of the table `episodes`, without `decode_seconds`.
+        about: Machine and versions that ran it.
+        studies: Names of all studies with this episode.
+        earlier: Seeds that must run before it to give the same tokens, in their order. Empty, unless the setting's skip
+            rule adapts from episode to episode.
+    """
+
+    id: int
+    store: StudyStore
+    episode: Episode
+    row: Mapping[str, Any]
+    about: Mapping[str, Any]
+    studies: tuple[str, ...]
+    earlier: tuple[int, ...]
+
+    def decodes(self) -> tuple[list[DecodeRecord], list[int]]:
+        """Read its decodes, and the control step at which the actions of each begin."""
+        from kerv_cli.episodes.rows import decode_records
+
+        table = self.store.decodes([self.id])
+        return decode_records(table), table["step"].to_pylist()
+
+
+def find_episode(database: Database, number: int) -> FoundEpisode:
+    """Return one stored episode.
+
+    Args:
+        database: The database.
+        number: Its row number.
+
+    Raises:
+        UsageError: There is no such episode, or no study uses it any more.
+    """
+    with database.reading() as connection:
+        measures = measures_in(connection)
+        further = [EPISODES.c[name] for name in ("work", "task", "seed", "repeat", "order", "block", "started")]
+        query = sa.select(*further, *measures, BLOCKS.c.about).join(BLOCKS, BLOCKS.c.id == EPISODES.c.block)
+        row = None
+        if number <= LARGEST_ID:
+            row = connection.execute(query.where(EPISODES.c.id == number)).mappings().first()
+        if row is None:
+            raise UsageError(f"no episode {number} in {database.shown}")
+        uses = (
+            sa.select(SETTINGS, STUDIES.c.name.label("study"), STUDIES.c.kind)
+            .join(STUDIES)
+            .join(WANTED, WANTED.c.setting_id == SETTINGS.c.id)
+            .where(WANTED.c.episode_id == number)
+            .order_by(STUDIES.c.id.desc())
+        )
+        found = connection.execute(uses).all()
+        if not found:
+            raise UsageError(f"episode {number} belongs to no study: it was run again since, or its study was removed")
+        setting = setting_of(found[0])
+        same = [EPISODES.c[name] == row[name] for name in ("work", "task", "repeat", "block")]
+        before = sa.select(EPISODES.c.seed).where(*same, EPISODES.c.order < row["order"]).order_by(EPISODES.c.order)
+        earlier = tuple(connection.scalars(before)) if setting.depends_on_order else ()
+    episode = Episode(setting, row["task"], row["seed"], row["repeat"])
+    store = StudyStore(database, found[0].study, found[0].kind)
+    studies = tuple(dict.fromkeys(one.study for one in found))
+    return FoundEpisode(number, store, episode, dict(row), row["about"], studies, earlier)

@@ -1,0 +1,73 @@
+"""Find the command that repeats a stored episode."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+from kerv_cli.base.config import as_overrides, groups, split
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.registry import PART_GROUPS
+from kerv_cli.episodes.identity import Identity, Plain, effective, flat, work_of
+from kerv_cli.episodes.resolve import resolve_rollout
+from kerv_cli.methods.settings import EXPERT
+
+
+def repeating_words(settings: Plain, identity: Identity, typed: str, task: str, seeds: Sequence[int]) -> list[str]:
+    """Return the arguments of `kerv` that run episodes again with stored settings.
+
+    Args:
+        settings: The stored settings.
+        identity: Hashes of the weights and data that they use.
+        typed: Overrides with which the setting was written in its study.
+        task: Name of the task.
+        seeds: Seeds of the episodes, which must be successive. All are recorded.
+
+    Raises:
+        UsageError: No command gives these settings, because the presets in conf/ have changed or the seeds have gaps.
+    """
+    if list(seeds) != list(range(seeds[0], seeds[0] + len(seeds))):
+        raise UsageError("its skip rule adapts from episode to episode, and the seeds before it have gaps")
+    place = [f"task={task}", f"seed={seeds[0]}", f"episodes={len(seeds)}", *(["record=-1"] if len(seeds) > 1 else [])]
+    words = [_first_word(settings, typed)]
+    composed = asdict(resolve_rollout([*words, *place], multirun=False).first)
+    # parts first: which other keys exist depends on them
+    words += [
+        f"{group}={settings[group]['kind']}"
+        for group in PART_GROUPS
+        if group in settings and settings[group]["kind"] != composed[group]["kind"]
+    ]
+    composed = asdict(resolve_rollout([*words, *place], multirun=False).first)
+    wanted, have = _keys(settings), _keys(composed)
+    words += [f"{key}={_text(value)}" for key, value in wanted.items() if have.get(key) != value]
+    if work_of(asdict(resolve_rollout([*words, *place], multirun=False).first), identity) != work_of(
+        settings, identity
+    ):
+        raise UsageError("the presets in conf/ have changed since: no command gives these settings any more")
+    return ["rollout", *words, *place]
+
+
+def _first_word(settings: Plain, typed: str) -> str:
+    """Return the override that chooses the method. For a method from a file, it is the file's path as typed."""
+    if settings["policy"]["kind"] == EXPERT:
+        return "policy=expert"
+    path = next((word for word in split(typed) if re.fullmatch(r"method=.+\.ya?ml", word)), "")
+    known = settings["method"] in groups()["method"]
+    return path or f"method={settings['method'] if known else 'ar'}"
+
+
+def _keys(settings: Plain) -> dict[str, Any]:
+    """Return the settings that determine a result, and the names of the policy's weights, by dotted key."""
+    policy: Mapping[str, Any] = settings["policy"]
+    return {**flat({"policy": policy}), **flat(effective(settings))}
+
+
+def _text(value: Any) -> str:
+    """Write a value as Hydra reads it."""
+    if isinstance(value, str) and (
+        not re.fullmatch(r"[A-Za-z_./][\w./:+-]*", value) or value in ("null", "true", "false")
+    ):
+        return "'" + value.replace("\\", "\\\\").replace("'", "\\'") + "'"
+    return as_overrides(x=value)[0].removeprefix("x=")

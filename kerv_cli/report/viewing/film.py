@@ -1,0 +1,72 @@
+"""Make films of recorded episodes, from the images in their recordings."""
+
+from __future__ import annotations
+
+import functools
+import io
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from kerv_cli.report.viewing.viewer import read_chunks
+
+FRAMES_PER_SECOND = 20
+"""Frames per second of a film file. More make it large, and few viewers play a GIF faster."""
+
+
+@dataclass(frozen=True)
+class Film:
+    """Images and facts of a recorded episode.
+
+    Attributes:
+        frames: JPEG images, one before the first control step and one after each. Empty if no camera was recorded.
+        facts: Totals of the episode, as `token_outcomes.facts_of` computed them, and `tokens`, a hash of all tokens.
+    """
+
+    frames: tuple[bytes, ...]
+    facts: dict[str, Any]
+
+
+def film_of(path: Path) -> Film:
+    """Read the images of a recording. The latest four recordings are kept in memory.
+
+    Raises:
+        KervError: The recording is missing or damaged.
+    """
+    changed = path.stat().st_mtime_ns if path.exists() else 0
+    return _read(path, changed)
+
+
+@functools.lru_cache(maxsize=4)
+def _read(path: Path, changed: int) -> Film:
+    frames: list[tuple[int, bytes]] = []
+    facts: dict[str, Any] = {}
+    for chunk in read_chunks(path)[1]:
+        batch = chunk.to_record_batch()
+        if chunk.entity_path == "/camera" and not chunk.is_static:
+            images = batch["EncodedImage:blob"].flatten()
+            data, ends = images.values.to_numpy(), images.offsets.to_pylist()
+            blobs = [data[first:last].tobytes() for first, last in itertools.pairwise(ends)]
+            frames += zip(batch["step"].cast("int64").to_pylist(), blobs, strict=True)
+        elif chunk.entity_path == "/__properties/episode":
+            names = [field.name for field in batch.schema if not field.name.startswith("rerun.")]
+            facts |= {name: batch[name][0].as_py()[0] for name in names}
+    return Film(tuple(blob for _, blob in sorted(frames)), facts)
+
+
+def animation(film: Film, hz: float, kind: str = "webp") -> bytes:
+    """Return a film as one animated image, which plays in real time and again from the start.
+
+    Args:
+        film: The film. It must have frames.
+        hz: Control steps per second.
+        kind: `webp`, or `gif`, which is about ten times as large.
+    """
+    each = max(1, round(hz / FRAMES_PER_SECOND))
+    first, *others = [Image.open(io.BytesIO(frame)) for frame in film.frames[::each]]
+    buffer = io.BytesIO()
+    first.save(buffer, kind, save_all=True, append_images=others, duration=round(1000 * each / hz), loop=0, quality=60)
+    return buffer.getvalue()

@@ -1,0 +1,232 @@
+"""The board's pages of episodes and failures, their films and recordings, in a real browser."""
+
+import html
+import shlex
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import rerun_synthetic
+import sqlalchemy as sa
+import uvicorn
+from command import kerv
+from playwright.sync_api import expect, sync_playwright
+from starlette.testclient import TestClient
+from studies_synthetic import episode, settings_of, study_of, swept, threshold_study
+
+from kerv_cli.board.app import make_app
+from kerv_cli.board.episodes import phase_of
+from kerv_cli.catalogue.episodes import find_episode
+from kerv_cli.engine.record import Delay
+from kerv_cli.episodes.rows import decode_records, decodes_table
+from kerv_cli.episodes.runner import Runner, close_worlds
+from kerv_cli.episodes.settings import settings_from
+from kerv_cli.lab.database import WANTED, Database
+from kerv_cli.lab.plan import all_episodes
+from kerv_cli.lab.store import studies
+from kerv_cli.report.viewing.token_outcomes import outcomes_of, tokens_hash
+
+expect.set_options(timeout=30_000)
+HERE = "http://127.0.0.1"
+ROLLOUT = (
+    "method=ar,spec_vla rectifier=compensate rectifier.drop=false task=reach policy=state "
+    "policy.target=nano-state episodes=1 world.horizon=12 record=0"
+)
+
+
+@pytest.fixture(scope="module")
+def rolled(policies, tmp_path_factory):
+    """A results folder with the two short real episodes of a rollout, and its database."""
+    results = tmp_path_factory.mktemp("rolled")
+    (results / "artifacts").symlink_to(policies / "artifacts")
+    kerv("rollout", "-m", *ROLLOUT.split(), f"results={results}")
+    close_worlds()
+    return Database(results)
+
+
+@pytest.fixture
+def client(tmp_path):
+    with TestClient(make_app(tmp_path), base_url=HERE) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def address(rolled):
+    """The address of a board that shows the real episodes."""
+    server = uvicorn.Server(uvicorn.Config(make_app(rolled.results), port=0, log_level="error"))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    while not server.started:
+        time.sleep(0.01)
+    yield f"{HERE}:{server.servers[0].sockets[0].getsockname()[1]}"
+    server.should_exit = True
+    thread.join()
+
+
+@pytest.fixture(scope="module")
+def page():
+    """A page of a real browser."""
+    chromium = Path("/usr/bin/chromium")
+    if not chromium.exists():
+        pytest.skip("no browser here: apt-get install chromium")
+    with sync_playwright() as playwright, playwright.chromium.launch(executable_path=chromium) as browser:
+        page = browser.new_page()
+        page.set_default_timeout(30_000)
+        yield page
+
+
+def rows_of_wanted(database: Database) -> list[int]:
+    with database.reading() as connection:
+        return list(connection.scalars(sa.select(WANTED.c.episode_id).order_by(WANTED.c.position)))
+
+
+def test_a_failure_is_assigned_to_the_phase_in_which_it_happened():
+    assert phase_of(0.3, 0.0) == "before contact"
+    assert phase_of(0.019, 0.0) == "near contact"
+    assert phase_of(0.03, 0.02) == phase_of(0.0, 0.01) == "after contact"  # a door's handle is 3 cm wide
+    assert phase_of(0.019, None) == "near or after contact"
+    assert phase_of(0.02, None) == "before contact"
+    assert phase_of(None, None) == "unknown"
+
+
+def test_the_grid_says_which_episodes_the_baseline_or_the_setting_alone_solved(tmp_path, client):
+    solved = {"ar": (True, True, False, False), "spec_vla r=9": (True, False, True, False)}
+
+    def prepare(setting, task):
+        return lambda seed: replace(
+            episode(setting, task, seed), success=solved[setting.label][seed - 100_000], closest_approach=0.01
+        )
+
+    two = {"ar": settings_of("ar"), "spec_vla r=9": settings_of("spec_vla", 9)}
+    swept(tmp_path, study_of(two, ["reach-v3"]), prepare)
+    text = client.get("/studies/threshold/episodes").text
+    cells = [part.split('"')[0] for part in text.partition("<tbody>")[2].split('title="')[1:]]
+    # seeds that fail most often come first
+    assert cells == [
+        *("100003 failure", "100001 success", "100002 failure", "100000 success"),
+        *("100003 failure", "100001 lost", "100002 won", "100000 success"),
+    ]
+    only = client.get("/studies/threshold/episodes", params={"setting": "spec_vla r=9", "task": "reach-v3"}).text
+    assert only.count('title="1000') == 4
+    failures = client.get("/studies/threshold/failures").text
+    assert "2 of 4 episodes, the baseline solved 1 of them" in " ".join(failures.split())
+    assert client.get("/studies/threshold/failures?setting=none").status_code == 404
+
+
+def test_ten_thousand_episodes_are_shown_in_half_a_second(tmp_path, client):
+    study = threshold_study(["reach-v3"], episodes=2)
+    store, _ = swept(tmp_path, study)
+    many = replace(study, episodes=all_episodes(study.settings, [f"task-{n}" for n in range(50)]))
+    seeds = [replace(one, seed=seed) for one in many.episodes if one.seed == 100_000 for seed in range(50)]
+    numbers = rows_of_wanted(store.database)
+    store.save(replace(many, episodes=tuple(seeds)))
+    with store.database.writing() as connection:
+        connection.execute(sa.update(WANTED).values(episode_id=numbers[0]))
+    began = time.process_time()
+    answer = client.get("/studies/threshold/episodes")
+    assert time.process_time() - began < 0.5
+    assert answer.text.count('href="/episodes/') == 10_000
+
+
+def test_names_are_escaped_and_what_does_not_exist_is_not_found(tmp_path, client):
+    hostile = '<img src=x onerror="alert(1)">/../../../../x'
+    study = study_of({"ar": settings_of("ar"), hostile: settings_of("spec_vla", 9)}, ["reach-v3"])
+    store, _ = swept(tmp_path, study)
+    numbers = rows_of_wanted(store.database)
+    pages = ["/studies/threshold/episodes", "/studies/threshold/failures", *(f"/episodes/{n}" for n in numbers)]
+    for path in pages:
+        answer = client.get(path)
+        assert answer.status_code == 200
+        assert "<img src=x" not in answer.text
+    assert {Path(one.recording).name for one in study.episodes} == {one.recording for one in study.episodes}
+    absent = ("/studies/none/episodes", "/studies/..%2f/failures", "/episodes/0", f"/episodes/{10**30}", "/episodes/x")
+    first = f"/episodes/{numbers[0]}"
+    absent += (f"{first}/decodes/999", f"{first}/film.gif", f"{first}/frames/0", f"{first}/recording.rrd", "/rerun/x")
+    for path in absent:
+        assert client.get(path).status_code == 404, path
+    origin = {"origin": "http://attacker.example"}
+    assert client.post(f"{first}/record", headers=origin).status_code == 403
+
+
+def test_a_recording_that_is_a_link_out_of_the_results_folder_is_refused(tmp_path):
+    results = tmp_path / "results"
+    store, _ = swept(results, threshold_study(["reach-v3"]))
+    found = find_episode(store.database, rows_of_wanted(store.database)[0])
+    secret = tmp_path / "secret.rrd"
+    secret.write_text("secret")
+    store.rollouts.mkdir(parents=True)
+    (store.rollouts / found.episode.recording).symlink_to(secret)
+    with TestClient(make_app(results), base_url=HERE) as client:
+        assert client.get(f"/episodes/{found.id}/recording.rrd").status_code == 404
+
+
+def test_decodes_that_are_read_back_are_those_that_were_written(rolled):
+    found = find_episode(rolled, rows_of_wanted(rolled)[1])
+    real = Runner(settings_from(found.episode.setting.on("reach-v3")), "reach-v3").episode(100_000)
+    close_worlds()
+    assert any(decode.filled for decode in real.decodes)
+    made_up = rerun_synthetic.episode("mixed")
+    late = replace(made_up.decodes[0], delay=Delay(0.1, 8, 4, carried=2, held=6, dropped=1))
+    for record in (real, replace(made_up, decodes=(late, *made_up.decodes[1:]))):
+        read = decode_records(decodes_table(record))
+        for before, after in zip(record.decodes, read, strict=True):
+            assert outcomes_of(after, 16, 4) == outcomes_of(before, 16, 4)
+            assert (after.actions == before.actions).all()
+            for name in ("tokens", "rounds", "filled", "phases", "delay", "metric", "unverified", "skipped", "mode"):
+                assert getattr(after, name) == getattr(before, name), name
+    assert tokens_hash(found.decodes()[0]) == tokens_hash(real.decodes)
+
+
+def test_the_command_on_the_page_repeats_the_episode(rolled):
+    numbers = rows_of_wanted(rolled)
+    with TestClient(make_app(rolled.results), base_url=HERE) as client:
+        text = client.get(f"/episodes/{numbers[1]}").text
+    command = html.unescape(text.partition('<code id="command">')[2].partition("</code>")[0])
+    kerv(*shlex.split(command)[1:], "record=0")
+    close_worlds()
+    newest = studies(rolled)[0]
+    try:
+        assert newest.kind == "rollout"
+        again = newest.frame()["episode"].item()
+        assert again not in numbers
+        assert tokens_hash(find_episode(rolled, again).decodes()[0]) == tokens_hash(
+            find_episode(rolled, numbers[1]).decodes()[0]
+        )
+    finally:
+        newest.remove()
+
+
+def test_a_person_gets_from_the_grid_to_a_decode_a_film_and_rerun(page, address, rolled):
+    (store,) = studies(rolled)
+    page.goto(f"{address}/studies/{store.name}/episodes")
+    page.locator("tr", has_text="spec_vla").get_by_role("link").first.click()
+    expect(page.get_by_role("heading", level=1)).to_contain_text("reach-v3, seed 100000")
+    number = int(page.url.rpartition("/")[2])
+    found = find_episode(rolled, number)
+    # a second click, here from another program, does not record it a second time
+    page.get_by_role("button", name="Record it").click()
+    expect(page.get_by_role("status")).to_be_visible()
+    again = page.request.post(f"{address}/episodes/{number}/record")
+    assert "Record it" not in again.text()
+    expect(page.get_by_text("same tokens as the stored episode")).to_be_visible()
+    path = store.rollouts / found.episode.recording
+    written = path.stat().st_mtime_ns
+    image, output = page.locator("film-player img"), page.locator("film-player output")
+    page.locator(".tokens tbody tr").nth(2).click()
+    expect(output).to_have_text("step 8")
+    expect(page.locator("#decode")).to_contain_text("Decode 2 at step 8")
+    assert page.url.endswith("?decode=2")
+    page.locator(".tokens a").nth(2).press("ArrowUp")
+    expect(page.locator("#decode")).to_contain_text("Decode 1 at step 4")
+    page.get_by_role("button", name="play").click()
+    expect(output).to_have_text("step 12")
+    assert image.evaluate("image => image.complete && image.naturalWidth") == 240
+    with page.context.expect_page() as opened:
+        page.get_by_role("link", name="Open in Rerun").click()
+    with opened.value as viewer:
+        with viewer.expect_response(lambda answer: answer.url.endswith("recording.rrd")) as answer:
+            pass
+        assert answer.value.body() == path.read_bytes()
+    assert path.stat().st_mtime_ns == written
