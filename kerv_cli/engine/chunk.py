@@ -283,8 +283,7 @@ class Chunk:
             values: Normalised actions (steps, D): those of the committed tokens, then predicted ones.
             with_target_token: Whether the target's token at the rejected position stays committed.
         """
-        if not with_target_token:
-            self._remove_bonus()
+        self._remove_bonus(with_target_token)
         del self.tokens[values.size :]
         self.closed = values
 
@@ -297,15 +296,15 @@ class Chunk:
             values: Normalised actions (steps, D): those of the committed tokens, then predicted ones.
             with_target_token: Whether the target's token at the rejected position stays committed.
         """
-        if not with_target_token:
-            self._remove_bonus()
+        self._remove_bonus(with_target_token)
         start = len(self.tokens)
         self.filled |= dict(enumerate(values.flatten()[start:].tolist(), start))
         self.tokens += self.space.bins_of(values).flatten()[start:].tolist()
 
-    def _remove_bonus(self) -> None:
-        del self.tokens[-1]
-        self.rounds[-1] = replace(self.rounds[-1], committed=self.rounds[-1].accepted)
+    def _remove_bonus(self, with_target_token: bool) -> None:
+        if not with_target_token:
+            del self.tokens[-1]
+            self.rounds[-1] = replace(self.rounds[-1], committed=self.rounds[-1].accepted)
 
     def actions(self) -> np.ndarray:
         """Return the actions (steps, D) of the complete chunk, float32, environment units."""

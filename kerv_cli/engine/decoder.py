@@ -252,14 +252,12 @@ class Decoder(ActionDecoder):
 
         In the first round these are the prompt, later the last committed token or those that a rectifier has filled.
         """
-        target, cache = self.target, chunk.cache
-        if chunk.tokens:
-            uncached = chunk.uncached
-            before, x = len(uncached), target.embed(draft.tokens_after(uncached, target.device)[None])
-        else:
-            before, x = chunk.prompt_length, chunk.prompt
-            if len(draft):
-                x = torch.cat([x, target.embed(draft.tokens_on(x.device)[None])], 1)
+        target, cache, uncached = self.target, chunk.cache, chunk.uncached
+        before = len(uncached) or chunk.prompt_length
+        x = chunk.prompt
+        if uncached or len(draft):
+            x = target.embed(draft.tokens_after(uncached, target.device)[None])
+            x = x if uncached else torch.cat([chunk.prompt, x], 1)
         hidden = target.forward(x, draft.positions(cache.length, before, x.device), cache, draft.visible(before))
         return self._read(chunk, draft, hidden, target.head(hidden[0, before - 1 :]).argmax(-1))
 

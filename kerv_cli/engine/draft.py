@@ -78,15 +78,11 @@ class Draft:
         """
         return TokenTree.build(*(vector.astype(np.int64).tolist() for vector in remote)) if remote else self.tree
 
-    def tokens_on(self, device: torch.device) -> Tensor:
-        """Return the tokens (n,) as a tensor on `device`."""
-        return upload(self.tokens, device) if self.tokens.device == HOST else self.tokens
-
     def tokens_after(self, committed: list[int], device: torch.device) -> Tensor:
         """Return k committed tokens and then the draft's n tokens: (k + n,) int64 on `device`."""
         if self.tokens.device == HOST:
-            return upload(np.concatenate([committed, self.tokens.numpy()]), device)
-        return torch.cat([upload(committed, device), self.tokens])
+            return upload(np.concatenate([np.array(committed, dtype=np.int64), self.tokens.numpy()]), device)
+        return torch.cat([upload(committed, device), self.tokens]) if committed else self.tokens
 
     @cached_property
     def ancestors(self) -> np.ndarray | Tensor | None:

@@ -121,31 +121,16 @@ class EarlyNetwork(Packable):
         Returns:
             (B, N + 1) float64: the N tokens, then the estimated probability that all of them are accepted.
         """
-        tokens, odds = choose_with_odds(logits, radius, self.strict)
+        tokens, odds = choose(logits, radius, self.strict)
         return torch.cat([tokens.double(), odds.double()[:, None]], -1)
 
 
-def choose(logits: Tensor, radius: int, strict: Tensor) -> Tensor:
-    """Choose the tokens that are most likely to be accepted within a radius.
+def choose(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tensor, Tensor]:
+    """Choose the tokens that are most likely to be accepted, and estimate how likely it is that all are.
 
     The best bin has the most probability within ±radius around it. That need not be the most probable bin. With a wide
     radius many bins are equally good. Then the probability within a third of the radius, and that of the bin itself,
-    decide, so that accepted tokens are near the target's. A strict token (such as the gripper's) must equal the
-    target's, so the most probable bin is chosen.
-
-    Args:
-        logits: (B, N, V).
-        radius: Acceptance radius, in bins.
-        strict: (N,) bool, whether the token is strict.
-
-    Returns:
-        (B, N) tokens.
-    """
-    return logits.argmax(-1) if not radius else choose_with_odds(logits, radius, strict)[0]
-
-
-def choose_with_odds(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tensor, Tensor]:
-    """Choose the tokens that are most likely to be accepted, and estimate how likely it is that all are.
+    decide, so that accepted tokens are near the target's. For a strict token the most probable bin is chosen.
 
     The estimate treats tokens as independent, and training on soft labels makes it too low. Use it only to compare
     chunks.
@@ -153,7 +138,7 @@ def choose_with_odds(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tenso
     Args:
         logits: (B, N, V).
         radius: Acceptance radius, in bins.
-        strict: (N,) bool, whether the token must equal the target's.
+        strict: (N,) bool, whether the token must equal the target's, as the gripper's must.
 
     Returns:
         The tokens (B, N), and the estimates (B,).
@@ -327,7 +312,7 @@ def measure(logits: Tensor, examples: Decodes, strict: Tensor) -> Metrics:
 
     metrics: Metrics = {}
     for name, r in {"strict": 0, "r3": 3, "r9": 9}.items():
-        right = (choose(logits, r, strict) - examples.tokens).abs() <= torch.where(strict, 0, r)
+        right = (choose(logits, r, strict)[0] - examples.tokens).abs() <= torch.where(strict, 0, r)
         accepted = right.long().cumprod(1).sum(1)
         metrics[f"accepted_{name}"] = balanced(accepted)
         metrics[f"whole_{name}"] = balanced(accepted == logits.shape[1])

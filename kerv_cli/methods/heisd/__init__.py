@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, choice, number
+from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, number
 from kerv_cli.base.registry import DRAFTING, PREFILL, STATES, add
+from kerv_cli.methods.eagle import DrafterProposerSettings
 
 MANIFEST = "manifest.json"
 _DATASTORE, _RULES = "kerv_cli.methods.heisd.datastore:", "kerv_cli.methods.heisd.rules:"
@@ -57,16 +58,13 @@ add("datastore", "qdrant", _DATASTORE + "QdrantIndex", QdrantSearchSettings)
 
 
 @dataclass
-class HybridProposerSettings:
+class HybridProposerSettings(DrafterProposerSettings):
     """HeiSD: draft by retrieval or with the drafter, as the boundary chooses (docs/methods.md §4.4).
 
     The paper's five neighbours make a tree of about 50 nodes, which costs more than it gains on a CPU.
     """
 
     kind: str = "hybrid"
-    shape: str = choice("chain", "chain", "tree", help="the drafter's drafts")
-    depth: int = number(15, 1, MOST_TOKENS)  # drafter: maximum number of tokens on a path
-    top_k: int = number(8, 1, MOST_TOKENS)  # drafter's tree: nodes expanded per depth
     nodes: int = number(24, 1, MOST_TOKENS)  # maximum number of nodes of either tree
     neighbours: int = number(3, 1, MOST_TOKENS)  # retrieval: number of stored chunks in the tree
 
@@ -91,13 +89,11 @@ class SequenceAcceptanceSettings:
 
 
 @dataclass
-class HybridAcceptanceSettings:
+class HybridAcceptanceSettings(SequenceAcceptanceSettings):
     """HeiSD: judge retrieved drafts by acceptance=sequence, and all other drafts by acceptance=relaxed."""
 
     kind: str = "hybrid"
     strict_dofs: bool = True  # relaxed: whether strict DoFs, such as the gripper, must match; paper: false
-    group_limit: int = number(30, 0, MOST_BINS)  # sequence: largest accepted sum of a group's distances, bins
-    token_limit: int = number(15, 0, MOST_BINS)  # sequence: largest accepted distance of one token, bins
 
 
 add("acceptance", "sequence", _RULES + "GroupRule.build", SequenceAcceptanceSettings, reads_threshold=False)

@@ -311,9 +311,7 @@ class HybridRule(RelaxedRule):
 
 def by_proposer(settings: HybridAcceptanceSettings, context: Context) -> HybridRule:
     """Build the part that the setting `acceptance=hybrid` chooses."""
-    space = context.target.actions
-    by_group = GroupRule(space, settings.group_limit, settings.token_limit)
-    return HybridRule(space, settings.strict_dofs, retrieved=by_group)
+    return HybridRule(context.target.actions, settings.strict_dofs, retrieved=GroupRule.build(settings, context))
 
 
 class VerifySkip(Skip):
