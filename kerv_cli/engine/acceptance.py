@@ -60,9 +60,8 @@ def accept_by_group(
     its DoF's limit of the target token after its parent, and if these distances sum to at most `group_limit`. A path
     ends before a group that is rejected or that is only partly in the tree.
 
-    `start` may be inside a group. The group's remaining tokens are then judged alone. Its committed tokens count with
-    distance 0, because they came from the target: accepted paths end with whole groups, so only a bonus token can begin
-    one.
+    `start` may be inside a group, after tokens of the group that the target itself has chosen. These count with
+    distance 0, and the group's remaining tokens are judged without them.
 
     Args:
         tree: The draft, n nodes.
@@ -110,7 +109,7 @@ class DistanceRule:
     space: ActionSpace
 
     def of_drafts_from(self, proposer: str) -> DistanceRule:
-        """Return the rule that judges drafts of this proposer. By default the rule itself, whatever the name."""
+        """Return the rule that judges the drafts of the proposer with this name. By default this rule judges all."""
         return self
 
     def limits(self, r: int) -> tuple[int, ...]:

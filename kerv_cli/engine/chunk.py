@@ -49,7 +49,7 @@ class ActionHistory:
 
         Args:
             pending: Actions (k, D) of the current chunk that are decided but not executed yet. They count as executed,
-                so that a prediction looks one step ahead instead of k + 1. None if there are none.
+                so that a prediction continues after them. None if there are none.
         """
         if pending is None or not len(pending):
             return self._actions
@@ -112,8 +112,8 @@ class Rejection:
 
     Attributes:
         draft: The draft's tokens after the rejected one.
-        target: The target's tokens after the rejected one and after each of `draft`: what it would decode if these had
-            been committed.
+        target: The target's tokens after the rejected one and after each token of `draft`. They would be right if the
+            rejected token had been committed.
     """
 
     draft: tuple[int, ...] = ()

@@ -1,7 +1,7 @@
 """What determines an episode's result: settings that have an effect, weights and data, task, seeds and `ENGINE`.
 
-Code, versions, machine, workers and file layout do not belong to it; they are stored beside the result. So results stay
-valid when something is renamed or added, and studies share the episodes of settings that give the same tokens.
+Two episodes with the same identity have the same tokens, so studies share them. Code, versions, machine and number of
+workers are not part of the identity. They are stored beside the result.
 """
 
 from __future__ import annotations

@@ -214,8 +214,8 @@ def _is_ar(settings: RolloutSettings) -> bool:
 def idle_overrides(resolved: ResolvedStudy) -> dict[str, str]:
     """Return overrides that have no effect, each with the reason.
 
-    An override of a single setting is listed with the setting's label. One of the command line is listed if no setting
-    reads it.
+    An override that the study gives to one setting is listed after the setting's label. An override from the command
+    line is listed only if it has no effect on any setting.
     """
     reasons: dict[str, str] = {}
     for label, settings in resolved.settings.items():

@@ -1,7 +1,7 @@
 """Runs episodes in the worlds (open environments) of this process: one after the other, or several at once.
 
-All settings in a process share weights, datastores and worlds, but each has its own rendered images and decoder.
-Shared images would give a setting warm caches, and a skip rule's threshold may depend on the episodes before it.
+All settings in a process share weights, datastores and worlds. Each setting has its own decoder, because a skip rule
+may depend on the episodes before, and renders its own images, so that no setting finds caches filled by another.
 """
 
 from __future__ import annotations

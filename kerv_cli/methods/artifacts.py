@@ -34,7 +34,7 @@ _LOADED: dict[tuple[Any, ...], Any] = {}
 
 @dataclass(frozen=True)
 class Use:
-    """The use of a method's artifacts, which is checked before anything is loaded.
+    """What a policy's artifacts will be used for. It is checked before anything is loaded.
 
     Args:
         method: Kind of a part, such as `proposer` -> settings of the method's part.
@@ -89,7 +89,7 @@ class MadeFor:
 
 
 def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str, again: str) -> None:
-    """Refuse an artifact that was made from other artifacts than the policy uses.
+    """Check that an artifact was made from the same artifacts that the policy uses.
 
     Args:
         sources: Kind -> hash of each artifact that it was made from. Kinds that the policy does not use are ignored.
@@ -172,7 +172,7 @@ class Artifact(Generic[T]):
         return {}
 
     def needs(self, description: T) -> tuple[str, ...]:
-        """Return further kinds of artifacts that a method needs because this artifact's description names them."""
+        """Return the kinds of further artifacts that a method needs if it uses this one."""
         return ()
 
     def check_use(self, description: T, use: Use) -> None:
@@ -184,7 +184,10 @@ class Artifact(Generic[T]):
         """
 
     def is_complete(self, description: T, kinds: Collection[str]) -> bool:
-        """Return whether the artifact holds everything that its command would make from artifacts of these `kinds`."""
+        """Return whether the artifact is complete, for a policy that also has artifacts of these `kinds`.
+
+        A calibration, for example, is incomplete if the policy got a datastore after it was made.
+        """
         return True
 
     def digest(self, path: Path, description: T) -> str:
@@ -268,7 +271,7 @@ class Artifacts:
             use: The method and the world that they will be used in. None: do not check the use.
 
         Returns:
-            Kind -> hash of the target, of the artifacts and of further artifacts that these name.
+            Kind -> hash, for the target, the artifacts and the further artifacts that these need.
 
         Raises:
             CheckpointError: An artifact is missing, damaged, made for another target, or made from another artifact

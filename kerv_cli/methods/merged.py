@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 class MergedProposerSettings:
     """Merge the whole-chunk drafts of several proposers into one prefix tree (docs/methods.md §5, ours).
 
-    The proposers in `fallback` draft only if none in `sources` is sure of its chunk, because every node costs time.
+    The proposers in `fallback` draft only if no proposer in `sources` expects its whole chunk to be accepted. This
+    keeps the tree small, because every node costs time.
     """
 
     kind: str = "merged"
@@ -60,7 +61,7 @@ class MergedProposer(ChainProposer):
     Args:
         sources: Proposers that always draft.
         nodes: Maximum number of nodes of the tree.
-        fallback: Proposers that draft only if no source is sure of its chunk.
+        fallback: Proposers that draft only if no source expects its whole chunk to be accepted.
     """
 
     def __init__(self, sources: Sequence[ChainProposer], nodes: int, fallback: Sequence[ChainProposer] = ()) -> None:
@@ -99,7 +100,7 @@ class MergedProposer(ChainProposer):
         return Draft.of(tree.tokens, tree.parents)
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Return the drafts of the sources and, if no source is sure of its chunk, of the fallback proposers."""
+        """Return the drafts of the sources. If no source is sure of its draft, add those of the fallback proposers."""
         sources = list(self.sources)
         if not any(source.is_sure(chunk) for source in sources):
             sources += self.fallback

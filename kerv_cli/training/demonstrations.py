@@ -73,8 +73,8 @@ def demos_for(settings: S) -> tuple[S, DemoDataset]:
     """Open the demonstrations named in the settings, or by default the ones that the target was trained on.
 
     Returns:
-        settings: The settings with `demos` filled in. If `task` is empty and the demonstrations contain tasks that the
-            target was not trained on, `task` becomes the tasks that it was trained on.
+        settings: The settings with `demos` filled in. An empty `task` is filled in as well, if the demonstrations
+            contain tasks that the target was not trained on: with the tasks that it was trained on.
         dataset: The demonstrations.
 
     Raises:

@@ -1,8 +1,8 @@
 """Behaviour cloning of a compact target: samples, losses, validation and initial weights.
 
 One sample is one recorded control step: the observation, and the expert's next H undisturbed actions. Validation uses
-held-out episodes. Token accuracy does not show success: two policies with the same accuracy can differ by half of the
-tasks. So with `train.closed_loop`, the success in simulated episodes dominates the score.
+held-out episodes. Two policies with the same token accuracy may differ widely in success. So with `train.closed_loop`,
+the success in simulated episodes decides which weights are best.
 """
 
 from __future__ import annotations

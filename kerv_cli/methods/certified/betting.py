@@ -23,12 +23,12 @@ MOST = 0.75  # largest share of the wealth that a bet may lose
 def bets(values: np.ndarray, bound: float, delta: float) -> np.ndarray:
     """Return the bet on each value. A bet wins its size times (bound − value), as a share of the wealth.
 
-    Each bet depends only on the values before it, and on the number of values n. So n must be fixed beforehand.
+    Each bet depends only on the values before it and on the number of values n. So n must be chosen before the test.
 
     Args:
         values: (n,) in [0, 1], in the order in which they came.
         bound: The hypothesis is a mean of at least `bound`, in (0, 1).
-        delta: Error probability δ at which the bets aim to reject.
+        delta: Error probability δ for which the bets are optimised.
 
     Returns:
         (n,) sizes of the bets.
@@ -47,7 +47,7 @@ def wealth(values: np.ndarray, bound: float, delta: float) -> np.ndarray:
     Args:
         values: (n,) in [0, 1], in the order in which they came.
         bound: The hypothesis is a mean of at least `bound`, in (0, 1).
-        delta: Error probability δ at which the bets aim to reject. The wealth is valid for any other δ too.
+        delta: Error probability δ for which the bets are optimised. The wealth may be compared with any other δ.
     """
     return np.exp(np.cumsum(np.log1p(bets(values, bound, delta) * (bound - values))))
 
@@ -60,6 +60,6 @@ def p_value(values: np.ndarray, bound: float, delta: float) -> float:
     Args:
         values: (n,) in [0, 1], in the order in which they came.
         bound: The hypothesis is a mean of at least `bound`, in (0, 1).
-        delta: Error probability δ at which the bets aim to reject.
+        delta: Error probability δ for which the bets are optimised.
     """
     return float(1 / max(1.0, wealth(values, bound, delta).max(initial=1.0)))

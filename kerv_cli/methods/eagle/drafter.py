@@ -149,7 +149,7 @@ class DrafterProposer(Proposer):
         return self.target.embed(upload([tokens], self.target.device))
 
     def observe(self, following: Tensor, hidden: Tensor, first: int) -> None:
-        """Run the drafter over the target's own hidden states. In the cache, the last draft is overwritten.
+        """Run the drafter over the target's own hidden states. In its cache they replace the last draft.
 
         Args:
             following: (1, T, E) embedding of the token after each position.
@@ -273,7 +273,10 @@ class EagleDrafter(TrainableDrafter):
 
     @classmethod
     def proposer(cls, settings: Any, context: Context) -> DrafterProposer:
-        """Build proposer=drafter, or the drafter of proposer=hybrid. Both settings have shape, depth, top_k, nodes."""
+        """Build the part that proposer=drafter chooses, or that proposer=hybrid contains.
+
+        Both settings have the fields shape, depth, top_k and nodes.
+        """
         top_k, nodes = (settings.top_k, settings.nodes) if settings.shape == "tree" else (1, settings.depth)
         return DrafterProposer(context.artifact(cls.kind), context.target, settings.depth, top_k, nodes)
 
@@ -337,7 +340,7 @@ class EagleDrafter(TrainableDrafter):
         return total / settings.unroll, metrics
 
     def compare(self, training: Training, predicted: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Compare predicted hidden states with the target's, at tokens 1 to N − 1.
+        """Compare predicted hidden states with the target's, at the chunk's tokens 1 to N − 1.
 
         Args:
             training: The training.

@@ -128,9 +128,9 @@ class EarlyNetwork(Packable):
 def choose(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tensor, Tensor]:
     """Choose the tokens that are most likely to be accepted, and estimate how likely it is that all are.
 
-    The best bin has the most probability within ±radius around it. That need not be the most probable bin. With a wide
-    radius many bins are equally good. Then the probability within a third of the radius, and that of the bin itself,
-    decide, so that accepted tokens are near the target's. For a strict token the most probable bin is chosen.
+    A token is accepted if the target's token is within ±radius. So the best bin is the one with the most probability
+    within ±radius, which need not be the most probable bin. If several bins are about equally good, the one with more
+    probability close by wins: it is nearer to the target's token. For a strict token the most probable bin is chosen.
 
     The estimate treats tokens as independent, and training on soft labels makes it too low. Use it only to compare
     chunks.
@@ -294,8 +294,8 @@ def _labels(tokens: int, sigma: float, device: torch.device) -> Tensor:
 def measure(logits: Tensor, examples: Decodes, strict: Tensor) -> Metrics:
     """Measure how much of the drafts would be accepted, at the radii 0, 3 and 9.
 
-    The accepted tokens are the longest prefix within the radius of the target's greedy tokens. That only approximates
-    relaxed acceptance, in which later target tokens depend on the accepted draft.
+    Accepted is the longest beginning of a draft whose tokens are within the radius of the target's greedy tokens. This
+    approximates relaxed acceptance, in which the target's later tokens depend on the accepted draft tokens.
 
     Args:
         logits: (n, N, V) of the drafter.

@@ -61,10 +61,12 @@ def neighbour_tree(
 ) -> Draft:
     """Merge the neighbours' chunks into one tree of kinematic groups (docs/methods.md §4.2).
 
-    A kinematic group is the tokens of position, rotation or gripper of one control step. A path of the tree consists of
-    whole groups. After each group it may continue with any neighbour's next group. But a group of strict DoFs (the
-    gripper) must come from a neighbour that also has the path's previous group. The most probable groups are kept
-    (*ours*): the i-th neighbour has the weight 1 / i, and a path changes to another neighbour with probability `cross`.
+    A kinematic group is the position, rotation or gripper tokens of one control step. Every path of the tree consists
+    of whole groups. After a group, a path may continue with the next group of any neighbour. There is one exception: a
+    group of strict DoFs (the gripper) must come from a neighbour that also has the group before it.
+
+    If the tree would be too large, the most probable groups are kept (*ours*). The i-th neighbour has the weight 1 / i,
+    and a path changes to another neighbour with probability `cross`.
 
     Args:
         chunks: (k, N) tokens, most similar neighbour first.
@@ -178,7 +180,7 @@ class RetrievalProposer(ChainProposer):
 
     @classmethod
     def build(cls, settings: RetrievalProposerSettings | HybridProposerSettings, context: Context) -> RetrievalProposer:
-        """Build proposer=retrieval, or the retrieval of proposer=hybrid."""
+        """Build the part that proposer=retrieval chooses, or that proposer=hybrid contains."""
         return cls(context.artifact("datastore"), context.target, settings.neighbours, settings.nodes)
 
     def neighbours(self, chunk: Chunk) -> Neighbours:
@@ -317,8 +319,9 @@ def by_proposer(settings: HybridAcceptanceSettings, context: Context) -> HybridR
 class VerifySkip(Skip):
     """Executes the most similar stored chunk without verification if its similarity is at least s_min.
 
-    It skips at most `max_skips` verifications in a row. With a boundary, it skips only if that chooses retrieval. If a
-    stored episode was followed to its end, none of its chunks is executed without verification again in this episode.
+    It skips at most `max_skips` verifications in a row. With a boundary, it skips only if that chooses retrieval. Once
+    it has executed a chunk from the end of a stored episode, it skips no more chunks of that stored episode, until the
+    next episode begins.
 
     With `up` or `down` above 0, s_min changes after each episode. A failure raises it by `up` times the calibrated
     range, a success lowers it by `down` times the range. Then results depend on the order of the episodes and on the
@@ -412,10 +415,10 @@ def radius_of_curvature(points: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class BoundaryRanges:
-    """Ranges of the hand's radius of curvature R and path length D over the training demonstrations, in metres.
+    """Ranges of the hand's radius of curvature R and path length D in the training demonstrations, in metres.
 
-    A range goes from the minimum to the 95th percentile. Infinite radii of straight paths are left out, because with
-    them all other radii would be scaled to about 0.
+    A range goes from the minimum to the 95th percentile. The infinite radii of straight paths do not count, because
+    they would make the range infinite.
 
     Attributes:
         radius_low: Minimum of R.
@@ -463,8 +466,7 @@ class BoundaryRanges:
     def normalise(self, radius: float, length: float) -> tuple[float, float]:
         """Scale a path's radius and length (metres) by the ranges. Return both in [0, 1].
 
-        A straight path and a hand at rest have an infinite radius. It is scaled to 1 for the path and 0 for the hand at
-        rest.
+        An infinite radius becomes 1 for a straight path, and 0 for a hand at rest.
         """
         scaled = 0.0
         if length >= STILL:

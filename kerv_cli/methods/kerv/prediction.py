@@ -338,7 +338,8 @@ def assemble(
 ) -> np.ndarray | None:
     """Assemble the actions of a compensated chunk: known tokens, then drafted tokens, then predictions.
 
-    A control step with fewer than `min_verified` known DoFs is dropped, unless it is the chunk's first.
+    The last control step is filled up only if at least `min_verified` of its DoFs are known, or if it is the chunk's
+    first. Otherwise it is dropped.
 
     Args:
         tokens: Known tokens of the chunk: accepted, or the target's.
