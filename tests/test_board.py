@@ -1,24 +1,216 @@
-"""`kerv board`: its pages, what it refuses, and how fast it is."""
+"""`kerv board`: its pages in a browser, what it refuses, and how fast it is."""
+
+import re
+import threading
+import time
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
+import sqlalchemy as sa
+import uvicorn
 from starlette.testclient import TestClient
+from studies_synthetic import episode, swept, threshold_study
 
+from kerv_cli.base.errors import KervError
 from kerv_cli.board.app import make_app
+from kerv_cli.episodes.rows import episode_row, seconds_blob
+from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, SETTINGS, WANTED, Database, now
+from kerv_cli.lab.runs import Run
+from kerv_cli.lab.store import StudyStore
 
 HERE = "http://127.0.0.1"
+CHROMIUM = Path("/usr/bin/chromium")
+TASKS = ["drawer-open-v3", "reach-v3"]
 
 
-@pytest.fixture
-def client(tmp_path):
-    with TestClient(make_app(tmp_path), base_url=HERE) as client:
-        yield client
+def client_of(results):
+    return TestClient(make_app(results), base_url=HERE)
 
 
-def test_other_hosts_and_other_origins_are_refused(client):
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A results folder with a finished sweep, a training that failed, and demonstrations that were interrupted."""
+    results = tmp_path_factory.mktemp("board")
+    swept(results, threshold_study(TASKS, 4, name="radii"))
+    swept(results, threshold_study(TASKS, 2, (3,), name="few"))
+    with pytest.raises(KervError), Run(Database(results), "target", "mine", ["train", "target", "name=mine"], 600):
+        raise KervError("the disk is full")
+    return results
+
+
+# --- what it refuses ---
+
+
+def test_other_hosts_and_other_origins_are_refused(tmp_path):
+    client = client_of(tmp_path)
     assert client.get("/").status_code == 200
     assert client.get("/", headers={"host": "kerv.attacker.example"}).status_code == 400
     for origin in ("http://attacker.example", "null", "http://127.0.0.1:1", "http://127.0.0.1.attacker.example"):
         assert client.post("/", headers={"origin": origin}).status_code == 403
     for headers in ({}, {"origin": HERE}):
         assert client.post("/", headers=headers).status_code == 405
-    assert client.get("/static/%2e%2e/app.py").status_code == 404
+
+
+def test_hostile_names_are_text(tmp_path):
+    bad = "<img src=x onerror=alert(1)>"
+    study = threshold_study(["reach-v3"], 2, (3,), name="plain", title=bad, note=bad)
+    settings = {one.label: replace(one, label=f"{one.label}{bad}") for one in study.settings if one.label != "ar"}
+    changed = tuple(settings.get(one.label, one) for one in study.settings)
+    episodes = tuple(replace(one, setting=settings.get(one.setting.label, one.setting)) for one in study.episodes)
+    swept(tmp_path, replace(study, settings=changed, episodes=episodes))
+    with pytest.raises(KervError), Run(Database(tmp_path), "target", bad, ["train", bad]):
+        raise KervError(bad)
+    client = client_of(tmp_path)
+    for path in ("/", f"/?text={bad}&sort={bad}&kind={bad}", "/compare?run=plain&run=plain"):
+        page = client.get(path).text
+        assert "<img" not in page, path
+        assert "img" in page, path
+
+
+# --- speed ---
+
+
+def quickest(client, path):
+    times = []
+    for _ in range(3):
+        clock = time.perf_counter()
+        assert client.get(path).status_code == 200
+        times.append(time.perf_counter() - clock)
+    return min(times)
+
+
+def test_pages_are_quick_with_ten_thousand_episodes(tmp_path):
+    study = threshold_study(["reach-v3", "drawer-open-v3"], 500, tuple(range(1, 9)), name="large")
+    rows = [episode_row(episode(study.settings[3], "reach-v3", seed)) for seed in range(20)]
+    values = {"started": now(), "block": "b", "decode_seconds": seconds_blob([0.01] * 20)}
+    store = StudyStore(tmp_path, "large")
+    store.save(study)
+    names = ("work", "task", "seed", "repeat")
+    with store.database.writing() as connection:
+        connection.execute(sa.insert(BLOCKS).values(id="b", run="r", seeds="", started=now(), code="", about={}))
+        connection.execute(
+            sa.insert(EPISODES),
+            [
+                dict(zip(names, one.key, strict=True)) | rows[i % 20] | values | {"order": i}
+                for i, one in enumerate(study.episodes)
+            ],
+        )
+        same = (EPISODES.c[name] == WANTED.c[name] for name in names[1:])
+        found = sa.select(EPISODES.c.id).where(EPISODES.c.work == SETTINGS.c.work, *same)
+        found = found.where(SETTINGS.c.id == WANTED.c.setting_id)
+        connection.execute(sa.update(WANTED).values(episode_id=found.scalar_subquery()))
+    client = client_of(tmp_path)
+    assert "10000" in client.get("/").text
+    assert quickest(client, "/") < 0.5
+
+
+def test_the_first_page_is_quick_with_two_hundred_runs(tmp_path):
+    swept(tmp_path, threshold_study(["reach-v3"], 1, (3,), name="study"))
+    with Database(tmp_path).writing() as connection:
+        row = dict(connection.execute(sa.select(RUNS)).mappings().one())
+        kinds = ("sweep", "target", "drafter", "demos")
+        connection.execute(
+            sa.insert(RUNS),
+            [
+                row | {"id": f"r{i}", "kind": kinds[i % 4], "name": f"n{i}", "status": "failed", "message": "no"}
+                for i in range(200)
+            ],
+        )
+    client = client_of(tmp_path)
+    assert client.get("/").text.count("<tr>") > 150
+    assert quickest(client, "/") < 0.3
+
+
+# --- in a browser ---
+
+
+@contextmanager
+def served(results):
+    """The address of the app, which runs in a thread."""
+    server = uvicorn.Server(uvicorn.Config(make_app(results), port=0, log_level="error"))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        while not server.started:
+            time.sleep(0.01)
+        yield f"{HERE}:{server.servers[0].sockets[0].getsockname()[1]}"
+    finally:
+        server.should_exit = True
+        thread.join()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if not CHROMIUM.exists():
+        pytest.skip("no Chromium here: apt-get install chromium")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def open_page(browser):
+    """Opens an address. A page must raise no error and must ask nobody else."""
+    troubles = []
+
+    def opened(address, **options):
+        page = browser.new_context(**options).new_page()
+        page.set_default_timeout(15_000)
+        page.on("pageerror", lambda error: troubles.append(str(error)))
+        page.on("console", lambda message: message.type == "error" and troubles.append(message.text))
+        page.on("request", lambda asked: asked.url.startswith((HERE, "data:")) or troubles.append(asked.url))
+        page.goto(address)
+        return page
+
+    yield opened
+    assert not troubles
+
+
+def names_in(page):
+    return page.locator(".runs tbody a").all_inner_texts()
+
+
+def test_runs_are_filtered_sorted_and_compared_with_the_keyboard(folder, open_page):
+    with served(folder) as address:
+        page = open_page(address)
+        assert sorted(names_in(page)) == ["few", "radii", "target/mine"]
+        page.get_by_label("Search").press_sequentially("naive")
+        page.locator("text=target/mine").wait_for(state="detached")
+        assert sorted(names_in(page)) == ["few", "radii"]
+        page.get_by_label("Search").fill("")
+        page.get_by_label("State").select_option("unfinished")
+        page.locator("text=radii").wait_for(state="detached")
+        assert names_in(page) == ["target/mine"]
+        page.get_by_label("State").select_option("any")
+        page.locator("text=radii").wait_for()
+        page.get_by_role("link", name="episodes").click()
+        page.locator("th[aria-sort]", has_text="episodes").wait_for()
+        assert names_in(page) == ["radii", "few", "target/mine"]
+        assert page.get_by_role("button", name="Compare two").is_disabled()
+        for name in ("radii", "few"):
+            page.get_by_label(f"compare {name}").focus()
+            page.keyboard.press("Space")
+        page.get_by_role("button", name="Compare two").press("Enter")
+        page.wait_for_url("**/compare?*")
+        assert "radii:ar" in page.locator("main").inner_text()
+        page.goto(address)
+        page.keyboard.press("Tab")
+        page.keyboard.press("Enter")
+        assert page.url.endswith("#main"), "the first key skips the navigation"
+
+
+@pytest.mark.parametrize("path", ["/", "/compare?run=radii&run=few"])
+def test_pages_fit_a_phone_and_the_dark(folder, open_page, path):
+    with served(folder) as address:
+        page = open_page(address + path, viewport={"width": 360, "height": 740}, color_scheme="dark")
+        page.wait_for_load_state("networkidle")
+        assert page.evaluate("document.documentElement.scrollWidth") <= 360
+        red, green, blue = (
+            int(n) for n in re.findall(r"\d+", page.evaluate("getComputedStyle(document.body).background"))[:3]
+        )
+        assert max(red, green, blue) < 64

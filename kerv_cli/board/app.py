@@ -54,9 +54,10 @@ def make_app(results: str | Path) -> Starlette:
 
     Pages find the database in `request.app.state.database`.
     """
-    static = Mount("/static", StaticFiles(packages=[("kerv_cli.board", "static")]), name="static")
+    folders = {"/static": ("kerv_cli.board", "static")}
+    files = [Mount(path, StaticFiles(packages=[folder])) for path, folder in folders.items()]
     app = Starlette(
-        routes=[*runs.ROUTES, *studies.ROUTES, *episodes.ROUTES, *training.ROUTES, static],
+        routes=[*runs.ROUTES, *studies.ROUTES, *episodes.ROUTES, *training.ROUTES, *files],
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=_HOSTS), Middleware(SameOrigin)],
         exception_handlers={KervError: _failed, HTTPException: _failed},
     )

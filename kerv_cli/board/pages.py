@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from starlette.exceptions import HTTPException
@@ -11,6 +13,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse
 
 from kerv_cli.lab.database import Database
+from kerv_cli.report.tables import is_number
 
 TEMPLATES = Environment(
     loader=ChoiceLoader([PackageLoader("kerv_cli.board"), PackageLoader("kerv_cli.report", ".")]),
@@ -19,6 +22,25 @@ TEMPLATES = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
+
+
+def few(names: Iterable[str], most: int = 3) -> str:
+    """Return the first names, and how many more there are: `ar, kerv, jacobi +4`."""
+    names = list(names)
+    return ", ".join(names[:most]) + (f" +{len(names) - most}" if len(names) > most else "")
+
+
+def page_of(run: str) -> str:
+    """Return the address of the page of a run, given its id. Artifacts have a slash in it: `target/mine`."""
+    return f"/artifacts/{quote(run)}" if "/" in run else f"/studies/{quote(run)}"
+
+
+def figure(value: float) -> str:
+    """Return a number with four significant digits, or `–` if it is missing or NaN."""
+    return f"{value:.4g}" if is_number(value) else "–"
+
+
+TEMPLATES.filters |= {"few": few, "page_of": page_of, "figure": figure}
 
 
 def database_of(request: Request) -> Database:

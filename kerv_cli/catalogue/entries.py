@@ -29,7 +29,7 @@ from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.episodes.settings import settings_from
 from kerv_cli.lab.database import EPISODES, SETTINGS, STUDIES, WANTED, Database
 from kerv_cli.lab.plan import ALL, Episode, Setting
-from kerv_cli.lab.runs import COMPLETE, RUNNING, RunRow, forget, run_rows, unfinished
+from kerv_cli.lab.runs import COMPLETE, RUNNING, RunRow, forget, run_rows, time_left, unfinished
 from kerv_cli.lab.store import IMPORT, ROLLOUT, SWEEP, Plan, StudyStore, plan_study
 from kerv_cli.targets.folders import shipped_dir
 
@@ -60,6 +60,10 @@ class RunEntry:
         methods: Decoding methods of its settings. For an artifact, its kind.
         tasks: Names of its tasks.
         episodes: Number of its episodes.
+        total: Number of episodes or steps in all. 0 if unknown.
+        done: How many of them are finished.
+        left: While it runs, the estimated remaining time, such as `about 3 min left`.
+        message: Why the newest command that makes it failed.
         figures: Its main numbers by name, such as the success rate.
         command: Command-line arguments (without `kerv`) that made it. Empty if unknown.
         sha256: Hash by which other artifacts refer to it.
@@ -74,6 +78,10 @@ class RunEntry:
     methods: tuple[str, ...] = ()
     tasks: tuple[str, ...] = ()
     episodes: int = 0
+    total: int = 0
+    done: int = 0
+    left: str = ""
+    message: str = ""
     figures: dict[str, float] = field(default_factory=dict)
     command: tuple[str, ...] = ()
     sha256: str = ""
@@ -83,6 +91,11 @@ class RunEntry:
     def has_episodes(self) -> bool:
         """Whether the entry is a study: a sweep, a rollout or an import."""
         return self.kind in _STUDIES
+
+    @property
+    def is_running(self) -> bool:
+        """Whether a process is making it."""
+        return self.state.startswith(RUNNING)
 
     @property
     def is_training(self) -> bool:
@@ -106,7 +119,8 @@ def find_runs(results: str | Path) -> list[RunEntry]:
         if row.status != COMPLETE:
             entry = entry or RunEntry(f"{kind}/{name}", kind, folder / kind / name, "", "", (kind,))
             state = f"{row.status}, {row.done} of {row.total}" if row.total else row.status
-            entry = replace(entry, started=row.started[:23], state=state)
+            entry = replace(entry, started=row.started[:23], state=state, done=row.done, total=row.total)
+            entry = replace(entry, left=time_left(row), message=row.message)
         if entry is not None:
             made[entry.id] = replace(entry, command=row.command)
     return sorted([*runs, *made.values()], key=lambda run: (run.started, run.id), reverse=True)
@@ -216,6 +230,10 @@ def _studies(database: Database, rows: Mapping[tuple[str, str], RunRow]) -> list
                 methods=tuple(dict.fromkeys(one.method for one in compared)),
                 tasks=tuple(one.task for one in mine),
                 episodes=existing,
+                total=every_one,
+                done=existing,
+                left=time_left(row) if row else "",
+                message=row.message if row else "",
                 figures={"success": sum(one.successes or 0 for one in mine) / existing} if existing else {},
                 command=row.command if row else (),
                 made_from=dict(reversed(hashes)),
@@ -326,6 +344,11 @@ def parents(run: RunEntry, runs: Sequence[RunEntry]) -> dict[str, str]:
     return {kind: names.get(value, value[:12]) for kind, value in run.made_from.items()}
 
 
+def children(run: RunEntry, runs: Sequence[RunEntry]) -> list[RunEntry]:
+    """Return the entries that were made from an artifact: trainings, datasets and studies."""
+    return [other for other in runs if run.sha256 and run.sha256 in other.made_from.values()]
+
+
 def disk_bytes(folder: Path) -> int:
     """Return the total size of all files in a folder, in bytes."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
@@ -339,7 +362,7 @@ def check_removable(run: RunEntry) -> None:
     """
     if run.folder.is_symlink():
         raise UsageError(f"{run.folder} is a link to {os.readlink(run.folder)}: remove the link, or what it points to")
-    if run.state.startswith(RUNNING):
+    if run.is_running:
         raise UsageError(f"{run.id} is running: stop it first")
 
 

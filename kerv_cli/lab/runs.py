@@ -20,11 +20,12 @@ from typing import Any
 
 import sqlalchemy as sa
 
+from kerv_cli.base.durations import left
 from kerv_cli.base.errors import Interrupted, KervError, StorageError, UsageError
 from kerv_cli.base.leftovers import is_alive
 from kerv_cli.base.places import results_dir
 from kerv_cli.lab.command import current_command
-from kerv_cli.lab.database import RUNS, Database, now
+from kerv_cli.lab.database import EPISODES, RUNS, STUDIES, Database, now
 from kerv_cli.targets.provenance import git_commit
 
 RUNNING, COMPLETE, FAILED, INTERRUPTED = "running", "complete", "failed", "interrupted"
@@ -90,6 +91,29 @@ def run_rows(database: Database, kind: str | None = None, name: str | None = Non
     query = query if name is None else query.where(RUNS.c.name == name)
     with database.reading() as connection:
         return [_row_of(row) for row in connection.execute(query)]
+
+
+def time_left(row: RunRow) -> str:
+    """Return the estimated remaining time of a running command, such as `about 3 min left`. Empty if unknown."""
+    if row.status != RUNNING or not 0 < row.done < row.total:
+        return ""
+    return left(row.heartbeat - datetime.fromisoformat(row.started).timestamp(), row.done, row.total)
+
+
+def pulse(database: Database) -> tuple[str, bool]:
+    """Look whether anything in the results folder has changed, without reading all of it.
+
+    Returns:
+        A text that every heartbeat, start and end of a command and every new episode changes. And whether a command is
+        running.
+    """
+    studies = sa.select(sa.func.count()).select_from(STUDIES).scalar_subquery()
+    newest = sa.select(sa.func.max(EPISODES.c.id)).scalar_subquery()
+    facts = sa.select(sa.func.count(), sa.func.max(RUNS.c.heartbeat), studies, newest).select_from(RUNS)
+    with database.reading() as connection:
+        rows = [_row_of(row) for row in connection.execute(sa.select(RUNS).where(RUNS.c.status == RUNNING))]
+        running = [row.id for row in rows if row.status == RUNNING]
+        return "/".join(map(str, [*connection.execute(facts).one(), *running])), bool(running)
 
 
 class Run:

@@ -215,6 +215,13 @@ class StudyStore:
             ).one()
         return int(row[0]), int(row[1])
 
+    def version(self) -> str:
+        """Return a text that changes whenever episodes of the study are added, replaced or removed."""
+        facts = sa.func.count(), sa.func.count(WANTED.c.episode_id), sa.func.sum(WANTED.c.episode_id)
+        query = sa.select(*facts).select_from(WANTED.join(SETTINGS).join(STUDIES)).where(STUDIES.c.name == self.name)
+        with self.database.reading() as connection:
+            return "/".join(map(str, connection.execute(query).one()))
+
     def whole_runs(self) -> list[str]:
         """Return the ids of the commands that each ran all episodes of the study, oldest first."""
         wanted = WANTED.join(SETTINGS).join(STUDIES).join(EPISODES, _same_episode()).join(BLOCKS)

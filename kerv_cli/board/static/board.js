@@ -1,0 +1,22 @@
+// Only two runs can be compared.
+document.addEventListener("change", (event) => {
+  if (event.target.name !== "run") return;
+  document.getElementById("compare").disabled = document.querySelectorAll("input[name=run]:checked").length !== 2;
+});
+
+// Charts are drawn when a page is loaded, and again when htmx has replaced a part of it. What was open stays open.
+const opened = "details[open], .switch input:checked, .pick[aria-expanded=true]";
+const name = (element) => (element.closest("summary, label, button") ?? element.querySelector("summary")).textContent;
+let before = [];
+document.addEventListener("htmx:beforeSwap", ({ target }) => {
+  before = [...target.querySelectorAll(opened)].map((one) => [one.tagName, name(one)]);
+});
+document.addEventListener("htmx:load", ({ detail: { elt } }) => {
+  if (!elt.querySelector(".study, .chart")) return;
+  showStudy(elt);
+  for (const one of elt.querySelectorAll("details, .switch input, .pick")) {
+    if (!before.some(([tag, text]) => tag === one.tagName && text === name(one))) continue;
+    one.tagName === "DETAILS" ? (one.open = true) : one.click();
+  }
+  before = [];
+});
