@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from loaded import of_target
 from PIL import Image
 from safetensors.torch import load_file, save_file
+from scipy.ndimage import map_coordinates
 from test_decoding_lossless import RandomTrees, assert_adds_up, decode, plain_greedy
 from torch import Tensor
 from typer.testing import CliRunner
@@ -295,12 +296,9 @@ def test_a_frame_is_prepared_as_in_openvlas_evaluation_on_libero():
 
 def test_the_crop_is_tensorflows(target):
     image = np.random.default_rng(3).integers(0, 256, (90, 61, 3), dtype=np.uint8)
-    side = math.sqrt(0.9)
-    axis = torch.linspace(-side, side, 56)  # of grid_sample: −1 and 1 are the centres of the outermost pixels
-    grid = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1)[None]
-    floats = torch.from_numpy(image).permute(2, 0, 1)[None] / 255
-    expected = torch.nn.functional.grid_sample(floats, grid, align_corners=True)[0].permute(1, 2, 0)
-    expected = (expected.clamp(0, 1) * 255.5).floor().clamp(0, 255).numpy()
+    rows, columns = ((n - 1) * (0.5 + math.sqrt(0.9) * np.linspace(-0.5, 0.5, 56)) for n in image.shape[:2])
+    floats = map_coordinates(image / 255, np.meshgrid(rows, columns, range(3), indexing="ij"), order=1)
+    expected = np.clip(np.floor(floats * 255.5), 0, 255)
     assert np.abs(cropped(image, 56).astype(float) - expected).max() <= 1  # a sum at the edge of a grey level
     assert (cropped(image, 56) == expected).mean() > 0.999
     whole, part = (pixels_of(image, TINY, target.normalisations, crop) for crop in (False, True))

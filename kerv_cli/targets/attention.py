@@ -1,4 +1,4 @@
-"""The key/value cache of a trunk, attention masks, and the rotation by rotary position embeddings.
+"""The key/value cache of a trunk, attention to it, attention masks, and rotary position embeddings.
 
 A slot is the place of one token's keys and values in the cache.
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from kerv_cli.engine.transfer import upload
@@ -65,25 +66,32 @@ Slots = slice | Tensor
 """Slots of a cache that a forward writes: a slice, or for a cache of fixed shapes indices (T,)."""
 
 
-def write(layer: Tensor, slots: Slots, k: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """Write the keys and values of new tokens to a layer's cache.
+def attend(
+    q: Tensor, k: Tensor, v: Tensor, cache: Tensor | None, slots: Slots | None, mask: Tensor | None
+) -> Tensor:
+    """Return the attention's result (B, T, A · C) of new tokens, and write their keys and values to the cache.
 
     Args:
-        layer: (2, B, A, capacity, C) cache of the layer.
-        slots: Slots of the new tokens.
-        k: (B, A, T, C) keys.
-        v: (B, A, T, C) values.
-
-    Returns:
-        The keys and values to attend to, those of earlier tokens included.
+        q: (B, A, T, C) queries. Several heads may share one head of keys and values.
+        k: (B, K, T, C) keys.
+        v: (B, K, T, C) values.
+        cache: (2, B, K, slots, C) keys and values of this layer. None: there are no earlier tokens.
+        slots: Slots of the new tokens. None if there is no cache.
+        mask: Result of `attention_mask`. None: attention is causal.
     """
-    if isinstance(slots, Tensor):
-        layer[0].index_copy_(2, slots, k)
-        layer[1].index_copy_(2, slots, v)
-        return layer[0], layer[1]
-    layer[0][:, :, slots] = k
-    layer[1][:, :, slots] = v
-    return (layer[0][:, :, : slots.stop], layer[1][:, :, : slots.stop]) if slots.start else (k, v)
+    causal = mask is None and q.shape[2] > 1
+    if cache is not None and isinstance(slots, Tensor):
+        cache[0].index_copy_(2, slots, k)
+        cache[1].index_copy_(2, slots, v)
+        k, v = cache
+    elif cache is not None and slots is not None:
+        cache[0][:, :, slots] = k
+        cache[1][:, :, slots] = v
+        if slots.start:
+            k, v = cache[:, :, :, : slots.stop]
+    shared = k.shape[1] != q.shape[1]
+    attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, is_causal=causal, enable_gqa=shared)
+    return attended.transpose(1, 2).flatten(2)
 
 
 def attention_mask(seen: np.ndarray | Tensor | None, tokens: int, cache: Cache | None, like: Tensor) -> Tensor | None:

@@ -20,7 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kerv_cli.engine.transfer import upload
-from kerv_cli.targets.attention import Cache, Slots, attention_mask, rotate, write
+from kerv_cli.targets.attention import Cache, Slots, attend, attention_mask, rotate
 from kerv_cli.targets.compact.captured import CapturedCache
 from kerv_cli.targets.compact.packable import Packable, wants_gradient
 from kerv_cli.targets.compact.program import Program
@@ -52,7 +52,7 @@ class Layer(nn.Module):
 
     def __init__(self, width: int, heads: int, feed_forward: int) -> None:
         super().__init__()
-        self.heads, self.channels = heads, width // heads
+        self.heads = heads
         self.attention_norm = nn.RMSNorm(width, eps=1e-5)
         self.qkv = nn.Linear(width, 3 * width, bias=False)
         self.out = nn.Linear(width, width, bias=False)
@@ -79,32 +79,13 @@ class Layer(nn.Module):
         """
         qkv = self.qkv(self.attention_norm(x))
         if isinstance(qkv, Tensor):
-            x = x + self.out(self.attend(qkv, rotary, cache, slots, mask))
+            qk, v = qkv.unflatten(-1, (3 * self.heads, -1)).split([2 * self.heads, self.heads], 2)
+            q, k = rotate(qk, *rotary).transpose(1, 2).chunk(2, 1)
+            x = x + self.out(attend(q, k, v.transpose(1, 2), cache, slots, mask))
         else:
             x = x + self.out(qkv.attend(self.heads, *rotary))
         gate, up = self.gate_up(self.feed_norm(x)).chunk(2, -1)
         return x + self.down(F.silu(gate) * up)
-
-    def attend(
-        self,
-        qkv: Tensor,
-        rotary: tuple[Tensor, Tensor],
-        cache: Tensor | None,
-        slots: Slots | None,
-        mask: Tensor | None,
-    ) -> Tensor:
-        """Return the attention's result (B, T, E) for q, k and v (B, T, 3 E), not yet rotated; others as `forward`."""
-        batch, tokens, width = qkv.shape
-        qkv = qkv.view(batch, tokens, 3 * self.heads, self.channels)
-        qk = rotate(qkv[:, :, : 2 * self.heads], *rotary)
-        q = qk[:, :, : self.heads].transpose(1, 2)
-        k = qk[:, :, self.heads :].transpose(1, 2)
-        v = qkv[:, :, 2 * self.heads :].transpose(1, 2)
-        if cache is not None and slots is not None:
-            k, v = write(cache, slots, k, v)
-        causal = mask is None and tokens > 1
-        attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, is_causal=causal)
-        return attended.transpose(1, 2).reshape(batch, tokens, width // 3)
 
 
 class LayerStack(Packable):

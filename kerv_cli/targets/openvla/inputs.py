@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
 
@@ -68,18 +69,11 @@ def cropped(image: np.ndarray, size: int) -> np.ndarray:
 
     This equals TensorFlow's crop_and_resize: bilinear interpolation, the outermost pixels are on the crop's edges.
     """
-    side = math.sqrt(CROPPED_AREA)
-    rows, columns = ((n - 1) * ((1 - side) / 2 + side * np.linspace(0, 1, size)) for n in image.shape[:2])
-    pixels = image.astype(np.float32) / 255
-    pixels = _interpolated(_interpolated(pixels, rows).swapaxes(0, 1), columns).swapaxes(0, 1)
-    return np.clip(np.floor(np.clip(pixels, 0, 1) * 255.5), 0, 255).astype(np.uint8)
-
-
-def _interpolated(rows: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Interpolate linearly between rows (n, …) at fractional indices (m,). Return (m, …)."""
-    below = np.clip(np.floor(indices).astype(int), 0, len(rows) - 2)
-    share = (indices - below).astype(np.float32).reshape(-1, *[1] * (rows.ndim - 1))
-    return rows[below] * (1 - share) + rows[below + 1] * share
+    axis = math.sqrt(CROPPED_AREA) * torch.linspace(-1, 1, size)  # -1 and 1 are the centres of the outermost pixels
+    grid = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1)[None]
+    pixels = torch.from_numpy(np.array(image)).permute(2, 0, 1)[None] / 255
+    found = F.grid_sample(pixels, grid, align_corners=True)[0].permute(1, 2, 0)
+    return (found * 255.5).clamp(0, 255).to(torch.uint8).numpy()
 
 
 def as_in_libero(image: np.ndarray, size: int) -> np.ndarray:

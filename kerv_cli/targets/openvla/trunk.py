@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.targets.attention import Cache, Slots, attention_mask, rotate, write
+from kerv_cli.targets.attention import Cache, Slots, attend, attention_mask, rotate
 from kerv_cli.targets.openvla.config import Language
 
 Rotary = tuple[Tensor, Tensor]
@@ -60,16 +60,10 @@ class LlamaAttention(nn.Module):
             cache: (2, B, K, capacity, C) keys and values of this layer. None: there are no earlier tokens.
             slots: Slots of the cache that the new keys and values are written to.
         """
-        batch, tokens, width = x.shape
-        q = rotate(self.q_proj(x).view(batch, tokens, self.heads, -1).transpose(1, 2), *rotary)
-        k = rotate(self.k_proj(x).view(batch, tokens, self.shared, -1).transpose(1, 2), *rotary)
-        v = self.v_proj(x).view(batch, tokens, self.shared, -1).transpose(1, 2)
-        if cache is not None and slots is not None:
-            k, v = write(cache, slots, k, v)
-        causal = mask is None and tokens > 1
-        shared = self.shared != self.heads
-        attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, is_causal=causal, enable_gqa=shared)
-        return self.o_proj(attended.transpose(1, 2).reshape(batch, tokens, width))
+        q = rotate(self.q_proj(x).unflatten(-1, (self.heads, -1)).transpose(1, 2), *rotary)
+        k = rotate(self.k_proj(x).unflatten(-1, (self.shared, -1)).transpose(1, 2), *rotary)
+        v = self.v_proj(x).unflatten(-1, (self.shared, -1)).transpose(1, 2)
+        return self.o_proj(attend(q, k, v, cache, slots, mask))
 
 
 class LlamaPerceptron(nn.Module):
