@@ -13,7 +13,6 @@ from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.files import sha256_of
 from kerv_cli.base.spaces import Observation
-from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.imitation import check_init, continued_target, vocabulary
@@ -109,18 +108,6 @@ def test_every_view_has_tokens_of_its_own():
     assert torch.equal(prompt[:, :cells], other[:, :cells])
     assert not torch.allclose(prompt[:, cells : 2 * cells], other[:, cells : 2 * cells])
     assert not torch.allclose(places, moved)
-
-
-@pytest.mark.bits
-@pytest.mark.parametrize("camera", ["corner4", HAND, "corner4+corner4:25+gripperPOV"])
-def test_packed_weights_compute_the_same_prompt(camera):
-    plain, packed = made(camera), made(camera)
-    pack(packed)
-    assert packed.packed is not None
-    for seed in range(3):
-        inputs = plain.inputs(shown(camera, seed))
-        for ours, theirs in zip(packed.encode_batch(inputs), plain.encode_batch(inputs), strict=True):
-            assert torch.allclose(ours, theirs, atol=1e-4)
 
 
 def test_a_frame_of_other_views_is_refused():

@@ -66,9 +66,7 @@ Slots = slice | Tensor
 """Slots of a cache that a forward writes: a slice, or for a cache of fixed shapes indices (T,)."""
 
 
-def attend(
-    q: Tensor, k: Tensor, v: Tensor, cache: Tensor | None, slots: Slots | None, mask: Tensor | None
-) -> Tensor:
+def attend(q: Tensor, k: Tensor, v: Tensor, cache: Tensor | None, slots: Slots | None, mask: Tensor | None) -> Tensor:
     """Return the attention's result (B, T, A · C) of new tokens, and write their keys and values to the cache.
 
     Args:
@@ -84,7 +82,7 @@ def attend(
         cache[0].index_copy_(2, slots, k)
         cache[1].index_copy_(2, slots, v)
         k, v = cache
-    elif cache is not None and slots is not None:
+    elif cache is not None and isinstance(slots, slice):
         cache[0][:, :, slots] = k
         cache[1][:, :, slots] = v
         if slots.start:
