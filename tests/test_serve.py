@@ -107,7 +107,7 @@ def until(condition: Any, seconds: float = 5) -> None:
 @pytest.mark.bits
 def test_a_client_gets_the_actions_of_the_policy(policy, policies):
     target: Any = Artifacts(str(policies), PolicySettings(target="nano-vision")).target
-    with serving(policy, log_every=2) as (port, log):
+    with serving(policy) as (port, log):
         client = Client(port)
         assert client.metadata["cameras"] == list(target.cameras)
         assert client.metadata["actions"] == ["dx", "dy", "dz", "gripper"]
@@ -120,8 +120,7 @@ def test_a_client_gets_the_actions_of_the_policy(policy, policies):
             np.testing.assert_allclose(answer["actions"], Decoder(target).decode(observation).actions)
             assert answer["server_timing"]["infer_ms"] > 0
         client.connection.close()
-        until(lambda: any("disconnected; 3 answers" in line for line in log))
-        assert any(line.startswith("2 answers, decode p50") for line in log)
+        until(lambda: any("disconnected; 3 answers, decode p50" in line for line in log))
 
 
 BOMB = {b"__ndarray__": True, b"data": b"", b"dtype": "<f8", b"shape": [2**40]}
@@ -332,20 +331,6 @@ def test_a_state_far_from_the_demonstrations_is_refused(policies, tmp_path, heig
             client.infer(seen(0, **{"observation/state": state}))
         assert any("out of range: z" in line for line in log)
         assert client.infer(seen(0, **{"observation/state": np.array([0.5, 0.5, 2.9, 0.5])}))["actions"].shape == (4, 4)
-
-
-def test_or_the_last_action_is_held(policies, tmp_path):
-    near, far = ({"observation/state": np.full(4, value)} for value in (0.5, 9.0))
-    with serving(ranged(policies, tmp_path, "outside=hold")) as (port, log):
-        client = Client(port)
-        with pytest.raises(RuntimeError):
-            client.infer(seen(0, **far))  # there is no last action yet
-        last = client.infer(seen(0, **near))["actions"][-1:]
-        held = client.infer(seen(1, **far))
-        np.testing.assert_array_equal(held["actions"], last)
-        assert held["decode"] == {"forwards": 0, "tokens": 0, "mode": "hold"}
-        assert any("out of range: x is 9" in line and line.endswith("the last action is held") for line in log)
-        assert client.infer(seen(1, **near))["decode"]["forwards"] > 0
 
 
 def fails(*arguments: object) -> None:

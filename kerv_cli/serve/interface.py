@@ -1,14 +1,15 @@
 """Describe what a served policy reads and sends, and check and encode the messages (msgpack with numpy arrays).
 
-openpi sends an array as a map with the *bytes* keys __ndarray__ (true), data, dtype and shape, and a single number as a
-map with __npgeneric__, data and dtype. The checks accept only plain numbers: nothing is unpickled, and no array is
-larger than its own bytes.
+An array is a map with the keys __ndarray__ (true), data, dtype and shape. openpi writes them as bytes, vla-eval as
+text. openpi's single numbers have __npgeneric__, data and dtype. vla-eval's images have __image__, data and format.
+Nothing is unpickled, and no array is larger than its own bytes.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
+import functools
+import io
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,7 +58,7 @@ class Interface:
         """Check an image that a client sent, and return it.
 
         Args:
-            image: The image. Expected: (height, width, 3) uint8.
+            image: The image, or a function that returns it. Expected: (height, width, 3) uint8.
             camera: The camera that it belongs to.
             key: Its key in the message, for the error message.
 
@@ -65,6 +66,7 @@ class Interface:
             UsageError: It has another shape or type.
         """
         shape = frame_shape(camera, self.size)
+        image = image() if callable(image) else image
         if isinstance(image, np.ndarray):
             fits = image.shape == shape
             if self.images_alone:
@@ -151,40 +153,29 @@ Message = Mapping[str, Any]
 """A client's message as msgpack decodes it. Its values have not been checked."""
 
 
-def packed(value: object) -> bytes:
-    """Encode a message as openpi does."""
-    return packed_as(value, _openpi_map)
-
-
-def unpacked(frame: bytes | str) -> Message:
-    """Decode a message that was encoded as openpi does.
-
-    Raises:
-        UsageError: It is not a msgpack map with text keys, or an array in it does not fit its bytes.
-    """
-    return read_map(frame, _openpi_value)
-
-
-def packed_as(value: object, to_plain: Callable[[object], object]) -> bytes:
-    """Encode a message with msgpack.
+def packed(value: object, text_keys: bool = False) -> bytes:
+    """Encode a message with msgpack. A numpy array becomes a map.
 
     Args:
-        value: Dictionaries, lists, texts, numbers, and objects that `to_plain` handles.
-        to_plain: Converts any other object to one of these types.
+        value: Dictionaries, lists, texts, numbers and arrays.
+        text_keys: Whether the keys of an array's map are texts, as vla-eval wants, or bytes, as openpi wants.
     """
     import msgpack
 
-    data: bytes = msgpack.packb(value, default=to_plain)
+    def plain(value: object) -> object:
+        if isinstance(value, np.generic):
+            return value.item()
+        if not isinstance(value, np.ndarray):
+            raise TypeError(f"{type(value).__name__} cannot be sent")
+        array = {"__ndarray__": True, "data": value.tobytes(), "dtype": value.dtype.str, "shape": list(value.shape)}
+        return array if text_keys else {key.encode(): item for key, item in array.items()}
+
+    data: bytes = msgpack.packb(value, default=plain)
     return data
 
 
-def read_map(frame: bytes | str, from_map: Callable[[dict[Any, Any]], object]) -> Message:
-    """Decode a client's message with msgpack.
-
-    Args:
-        frame: The websocket message.
-        from_map: Called with every map inside the message. Returns the object that the map encodes, such as an array,
-            or the map itself.
+def unpacked(frame: bytes | str) -> Message:
+    """Decode a client's message with msgpack. Images in it become functions that return the image.
 
     Raises:
         UsageError: The message is not a msgpack map with text keys, or an array in it does not fit its bytes.
@@ -194,7 +185,7 @@ def read_map(frame: bytes | str, from_map: Callable[[dict[Any, Any]], object]) -
     if isinstance(frame, str):
         raise UsageError("a text message came: send binary messages (msgpack)")
     try:
-        value = msgpack.unpackb(frame, object_hook=from_map, strict_map_key=True)
+        value = msgpack.unpackb(frame, object_hook=_value, strict_map_key=True)
     except UsageError:
         raise
     except Exception as error:  # msgpack raises many types of exceptions
@@ -204,23 +195,39 @@ def read_map(frame: bytes | str, from_map: Callable[[dict[Any, Any]], object]) -
     return value
 
 
-def array_of(name: object, shape: object, data: object) -> np.ndarray:
+def _value(value: dict[Any, Any]) -> object:
+    """Decode a map inside a message, if it encodes an array, a number or an image. Return any other map unchanged.
+
+    An image becomes a function that decodes it when called, because most images are never used.
+    """
+    items = {key.decode() if isinstance(key, bytes) else key: item for key, item in value.items()}
+    data, name = items.get("data"), items.get("dtype")
+    if items.get("__image__") and items.get("format") != "raw":
+        return functools.partial(_image, data)
+    if "__ndarray__" in items or items.get("__image__"):
+        return _array(name, items.get("shape"), data)
+    if "__npgeneric__" in items:
+        return _dtype(name).type(data)
+    return value
+
+
+def _array(name: object, shape: Any, data: Any) -> np.ndarray:
     """Build an array from the parts in which a message encodes it.
 
     Args:
         name: Name of the dtype: a bool, integer or float type.
-        shape: List of at most 8 integers.
+        shape: List of integers.
         data: The array's bytes.
 
     Raises:
-        UsageError: A part is wrong, or the bytes do not fit shape and type.
+        UsageError: The dtype is of another kind, or the bytes do not fit shape and type.
     """
     dtype = _dtype(name)
-    if not isinstance(shape, list) or not all(isinstance(n, int) and n >= 0 for n in shape) or len(shape) > 8:
-        raise UsageError(f"an array of shape {str(shape)[:60]}: at most 8 whole numbers are wanted")
-    if not isinstance(data, bytes) or math.prod(shape) * dtype.itemsize != len(data):
-        raise UsageError(f"an array of shape {shape} and type {dtype} does not fit its bytes")
-    return np.frombuffer(data, dtype).reshape(shape).copy()  # an array over bytes would be read-only
+    try:
+        return np.frombuffer(data, dtype).reshape(shape).copy()  # an array over bytes would be read-only
+    except (TypeError, ValueError) as error:
+        text = str(shape)[:60]
+        raise UsageError(f"an array of shape {text} and type {dtype} does not fit its bytes") from error
 
 
 def _dtype(name: object) -> np.dtype:
@@ -238,19 +245,20 @@ def _dtype(name: object) -> np.dtype:
     return dtype
 
 
-def _openpi_map(value: object) -> object:
-    """Encode a numpy array or scalar as openpi's map."""
-    if isinstance(value, np.ndarray):
-        return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
-    if isinstance(value, np.generic):
-        return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}
-    raise TypeError(f"{type(value).__name__} cannot be sent")
+def _image(data: Any) -> np.ndarray:
+    """Decode a PNG or JPEG file to an image (height, width, 3).
 
+    Raises:
+        UsageError: It is neither PNG nor JPEG, is damaged, or is too large.
+    """
+    from PIL import Image
 
-def _openpi_value(value: dict[Any, Any]) -> object:
-    """Decode openpi's map of an array or scalar. Return any other map unchanged."""
-    if b"__ndarray__" in value:
-        return array_of(value.get(b"dtype"), value.get(b"shape"), value.get(b"data"))
-    if b"__npgeneric__" in value:
-        return _dtype(value.get(b"dtype")).type(value.get(b"data"))
-    return value
+    try:
+        with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
+            if max(image.size) > LARGEST:
+                raise UsageError(f"an image of {image.size[0]} x {image.size[1]} pixels: at most {LARGEST} a side")
+            return np.array(image)
+    except UsageError:
+        raise
+    except Exception as error:  # Pillow raises many types of exceptions
+        raise UsageError(f"an image cannot be read as PNG or JPEG ({type(error).__name__})") from error

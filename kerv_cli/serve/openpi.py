@@ -13,9 +13,8 @@ import numpy as np
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.serve.interface import Interface, Message, hand_of, keys_of, packed, text_of, unpacked
-from kerv_cli.serve.policy import HOLD, Conversation, Log, Policy, Reply
+from kerv_cli.serve.policy import Conversation, Log, Policy, Reply
 
 STATE, IMAGE, PROMPT, RESET, EXECUTED = "observation/state", "observation/image", "prompt", "reset", "executed"
 
@@ -108,10 +107,8 @@ class OpenPi(Conversation):
         else:
             for step, action in enumerate(executed, 1):
                 self.decoder.observe(action, self.last_hand + (hand - self.last_hand) * step / len(executed))
-        if self.holds(observation, len(self.last) > 0):
-            record = DecodeRecord((), self.last[-1:], 0, (), HOLD, 0.0, {})
-        else:
-            record = self.policy.decode(self.decoder, observation)
+        self.policy.range.check(observation)
+        record = self.policy.decode(self.decoder, observation)
         self.last, self.last_hand = record.actions, hand
         self.decodes += 1
         timing = {"infer_ms": 1000 * record.seconds}

@@ -51,7 +51,7 @@ class Policy:
         chunk: H, number of control steps in an answer.
         by_task: Whether a decoder depends on the task, because calibrated values differ between tasks. Clients then
             name the task.
-        range: The states on which the policy may act. None: any.
+        range: The states on which the policy may act.
 
     Raises:
         UnknownName: The policy's environment has no task with that name.
@@ -99,15 +99,15 @@ class Policy:
             grip=tuple(spec.grip) if spec else (),
         )
 
-    def _range(self) -> StateRange | None:
+    def _range(self) -> StateRange:
         """Return the states on which the policy may act.
 
-        None if its checkpoint stores no range, or if the policy reads no state.
+        They are not limited if its checkpoint stores no range, or if the policy reads no state.
         """
         stored, interface = self.description.state_range, self.interface
-        if stored is None or interface.images_alone:
-            return None
         names = interface.observation.proprioception
+        if stored is None or interface.images_alone:
+            stored = ((), ())
         low, high = (np.array(ends)[: None if interface.privileged else len(names)] for ends in stored)
         return StateRange(low, high, names, self.settings.margin)
 
@@ -226,8 +226,6 @@ class Together:
                 self._answer([one])
 
 
-HOLD = "hold"
-"""Value of `outside`: a state out of range is answered with the last action again, instead of an error."""
 LEAST_WIDTH = 1.0
 """Width assumed for the range of a number that hardly varied in the demonstrations, in the number's own unit."""
 
@@ -246,18 +244,15 @@ class StateRange:
         added = margin * np.where(high - low < LEAST_WIDTH / 100, LEAST_WIDTH, high - low)
         self.low, self.high, self.names = low - added, high + added, names
 
-    def outside(self, observation: Observation) -> str:
-        """Return a sentence about the first number that is out of range. Empty if all are in range."""
+    def check(self, observation: Observation) -> None:
+        """Refuse a state that is out of range, with a UsageError about the first such number."""
         numbers = observation.state[: len(self.low)]
-        beyond = np.flatnonzero((numbers < self.low) | (numbers > self.high))
-        if not len(beyond):
-            return ""
-        first = int(beyond[0])
-        name = self.names[first] if first < len(self.names) else f"number {first}"
-        return (
-            f"the state is out of range: {name} is {numbers[first]:.4g}, the policy was trained on "
-            f"{self.low[first]:.4g} to {self.high[first]:.4g}, margin included"
-        )
+        for first in np.flatnonzero((numbers < self.low) | (numbers > self.high)).tolist():
+            name = self.names[first] if first < len(self.names) else f"number {first}"
+            raise UsageError(
+                f"the state is out of range: {name} is {numbers[first]:.4g}, the policy was trained on "
+                f"{self.low[first]:.4g} to {self.high[first]:.4g}, margin included"
+            )
 
 
 class Finite:
@@ -344,23 +339,6 @@ class Conversation(abc.ABC):
         if self.policy.by_task and (self.decoder is None or task != self.task):
             self.decoder, self.task = self.policy.lend_decoder(task), task
         self.decoder.reset(self.task or task, seed, hand)
-
-    def holds(self, observation: Observation, has_last: bool) -> bool:
-        """Return whether to execute the last action again, because the state is out of the policy's range.
-
-        Args:
-            observation: The observation with the state.
-            has_last: Whether the episode has a last action.
-
-        Raises:
-            UsageError: The state is out of range, and `outside=refuse` is set or there is no last action.
-        """
-        why = self.policy.range.outside(observation) if self.policy.range else ""
-        if why and not (self.policy.settings.outside == HOLD and has_last):
-            raise UsageError(why)
-        if why:
-            self.log(f"{why}: the last action is held")
-        return bool(why)
 
     def greeting(self) -> bytes | None:
         """Return the first message that the server sends. None if the client speaks first."""

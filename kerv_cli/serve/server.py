@@ -180,8 +180,6 @@ class PolicyServer:
         latencies.answer.append(conversation.last_ms)
         if not math.isnan(reply.seconds):
             latencies.decode.append(1000 * reply.seconds)
-        if self.settings.log_every and len(latencies.answer) % self.settings.log_every == 0:
-            self.log(str(latencies))
 
 
 def _address(connection: ServerConnection) -> str:

@@ -18,14 +18,10 @@ class ServeSettings(MethodSettings):
     protocol: str = choice("openpi", "openpi", "vla_eval", help="openpi for robots, vla_eval for benchmarks")
     host: str = setting("127.0.0.1", "address to listen on; there is no password")
     port: int = number(8000, 0, 65_535, help="port to listen on; 0: a free one")
-    log_every: int = number(100, 0, 10**9, help="log latencies after this many answers; 0: only when a client leaves")
     gripper: str = choice(
         "as_is", "as_is", "signed", "signed_inverted", help="how the gripper (0 closed to 1 open) is sent"
     )
     task_name: str = setting("", "name of the task, if its calibration is read; vla_eval's clients send it")
     batch: int = number(1, 1, 1024, help="number of clients decoded together; above 1, nothing is timed")
     origins: list[str] = setting([], "addresses of web pages that may connect; programs always may")
-    outside: str = choice(
-        "refuse", "refuse", "hold", help="answer to a state out of range: an error, or the last action again"
-    )
     margin: float = number(1.0, 0, 1e6, help="how far a state may be out of range, in widths of the range")

@@ -7,8 +7,6 @@ package vla-eval is not needed here.
 
 from __future__ import annotations
 
-import functools
-import io
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -18,23 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from kerv_cli.base.errors import KervError, UsageError
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.places import results_dir
 from kerv_cli.base.spaces import Observation
 from kerv_cli.catalogue.evaluations import path_of, write_served
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
-from kerv_cli.serve.interface import (
-    LARGEST,
-    OPEN,
-    Interface,
-    Message,
-    array_of,
-    hand_of,
-    keys_of,
-    packed_as,
-    read_map,
-    text_of,
-)
+from kerv_cli.serve.interface import OPEN, Interface, Message, hand_of, keys_of, packed, text_of, unpacked
 from kerv_cli.serve.policy import Conversation, Log, Policy, Reply
 
 PROTOCOL_VERSION = 1
@@ -116,7 +103,7 @@ class VlaEval(Conversation):
         Raises:
             KervError: Something is wrong with the message.
         """
-        message = read_map(frame, _value)
+        message = unpacked(frame)
         kind, payload, sequence = str(message.get("type")), message.get("payload"), message.get("seq")
         self.sequence = sequence if isinstance(sequence, int) else 0
         if kind not in _HANDLERS or not isinstance(payload, dict):
@@ -130,7 +117,7 @@ class VlaEval(Conversation):
     def _message(self, kind: str, payload: Mapping[str, object]) -> bytes:
         """Encode a message of a type (`kind`) with its content."""
         message = {"type": kind, "payload": payload, "seq": self.sequence, "timestamp": time.time()}
-        return packed_as(message, _plain)
+        return packed(message, text_keys=True)
 
     def _hello(self, payload: Message) -> Reply:
         """Answer the first message of a connection with what the policy reads and sends.
@@ -171,9 +158,7 @@ class VlaEval(Conversation):
         elif step == len(episode.path):
             self.decoder.observe(episode.sent[-1], hand)
         episode.path[step:] = [hand]  # replace the position that a failed observation of this step left
-        if self.holds(state, bool(episode.sent)):
-            episode.left.clear()  # drop the rest of the chunk: it was planned before this state
-            return self._act(episode, episode.sent[-1], None)
+        self.policy.range.check(state)
         seconds = None
         if not episode.left:
             record = self.policy.decode(self.decoder, self._observation(episode, payload, numbers))
@@ -181,17 +166,7 @@ class VlaEval(Conversation):
             episode.decodes.append(record)
             episode.decode_steps.append(step)
             episode.left.extend(record.actions)
-        return self._act(episode, episode.left.popleft(), seconds)
-
-    def _act(self, episode: _Episode, action: np.ndarray, seconds: float | None) -> Reply:
-        """Return the message with an action.
-
-        Args:
-            episode: The current episode.
-            action: (D,) in environment units.
-            seconds: Inference time that was needed for it. None if nothing was decoded.
-        """
-        space = self.interface.space
+        action, space = episode.left.popleft(), self.interface.space
         episode.sent.append(np.clip(action, space.low, space.high).astype(np.float32))
         sent = self.interface.converted(action[None])[0].astype(np.float32)
         return Reply(self._message("action", {"actions": sent}), seconds)
@@ -214,8 +189,7 @@ class VlaEval(Conversation):
         for camera in self.interface.cameras:
             if camera not in images:
                 raise UsageError(f"no image of camera {camera}: the message has images of {keys_of(images)}")
-            image = images[camera]
-            frames[camera] = self.interface.image(image() if callable(image) else image, camera, f"images.{camera}")
+            frames[camera] = self.interface.image(images[camera], camera, f"images.{camera}")
         return Observation(*numbers, episode.instruction, frames)
 
     def _end(self, payload: Message) -> None:
@@ -265,43 +239,3 @@ _HANDLERS: Mapping[str, Callable[[VlaEval, Message], Reply | None]] = {
     "observation": VlaEval._observe,
     "episode_end": VlaEval._end,
 }
-
-
-def _plain(value: object) -> object:
-    """Convert a numpy value to the form in which vla-eval sends it."""
-    if isinstance(value, np.ndarray):
-        return {"__ndarray__": True, "data": value.tobytes(), "dtype": value.dtype.str, "shape": list(value.shape)}
-    if isinstance(value, np.generic):
-        return value.item()
-    raise TypeError(f"{type(value).__name__} cannot be sent")
-
-
-def _value(value: dict[Any, Any]) -> object:
-    """Decode a map inside a message, if it encodes an array or an image. Return any other map unchanged.
-
-    An image becomes a function that decodes it when called, because most images are never used.
-    """
-    if value.get("__image__") and value.get("format") != "raw":
-        return functools.partial(_image, value.get("data"))
-    if value.get("__image__") or "__ndarray__" in value:
-        return array_of(value.get("dtype"), value.get("shape"), value.get("data"))
-    return value
-
-
-def _image(data: Any) -> np.ndarray:
-    """Decode a PNG or JPEG file to an image (height, width, 3).
-
-    Raises:
-        UsageError: It is neither PNG nor JPEG, is damaged, or is too large.
-    """
-    from PIL import Image
-
-    try:
-        with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
-            if max(image.size) > LARGEST:
-                raise UsageError(f"an image of {image.size[0]} x {image.size[1]} pixels: at most {LARGEST} a side")
-            return np.array(image)
-    except KervError:
-        raise
-    except Exception as error:  # Pillow raises many types of exceptions
-        raise UsageError(f"an image cannot be read as PNG or JPEG ({type(error).__name__})") from error
