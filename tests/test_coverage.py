@@ -8,7 +8,7 @@ from command import kerv, told
 from test_calibration import write_dataset
 
 from kerv_cli.base.config import conf_dir
-from kerv_cli.base.files import read_yaml
+from kerv_cli.base.files import read_yaml_lines
 from kerv_cli.worlds import resolve_tasks
 
 
@@ -31,7 +31,7 @@ def test_drafts_of_seven_tasks_are_made_as_the_note_of_their_study_says(results)
     def run(*words):
         return told(*words, f"results={results}")
 
-    study = read_yaml(conf_dir() / "study/coverage_unseen.yaml")
+    study, _ = read_yaml_lines(conf_dir() / "study/coverage_unseen.yaml", "the study")
     making = re.findall(r"kerv (train drafter .*?\])", study["note"])
     few = ("train.steps=2", "train.batch=8", "train.validate_every=2", "drafter.samples=50")
     target = "policy.target=nano-state"

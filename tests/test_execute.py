@@ -305,11 +305,10 @@ def test_progress_without_a_terminal_is_plain_lines(tmp_path, capsys):
         swept(tmp_path, STUDY, bad, on_event=event_printer(show))
     written = capsys.readouterr().err
     lines = written.splitlines()
-    assert lines[:2] == ["episodes …", "4 episodes there already"]
+    assert lines[0] == "4 episodes there already"
     assert any(line.startswith("naive_sd on reach-v3: failed: ValueError: [bold] is not markup") for line in lines)
     assert re.fullmatch(r"12/12 .* on reach-v3, seed 100003: (success|failure), \d\.\d s", lines[-2])
     assert re.fullmatch(r"episodes 12/12, reach-v3 100001-100003: 4 settings in turn", lines[-1])
-    assert any(re.match(r"episodes \d+/12, about \d+ s left, ", line) for line in lines)
     assert "\x1b" not in written
 
 

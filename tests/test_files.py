@@ -54,21 +54,19 @@ def test_the_next_write_removes_what_a_killed_one_left(tmp_path, dead):
     assert [path.name for path in tmp_path.iterdir()] == ["other.json"]
 
 
-def write(folder: Path, text: str, replace: bool = True) -> bool:
-    return write_folder(folder, lambda new: (new / "file").write_text(text), replace)
+def write(folder: Path, text: str) -> None:
+    write_folder(folder, lambda new: (new / "file").write_text(text))
 
 
 def test_a_folder_is_exchanged_in_one_step(tmp_path, monkeypatch):
     folder = tmp_path / "store"
-    assert write(folder, "old")
-    assert not write(folder, "none", replace=False)
-    assert (folder / "file").read_text() == "old"
+    write(folder, "old")
     renames: list[object] = []
     rename = os.rename
     monkeypatch.setattr(os, "rename", lambda a, b: (renames.append(a), rename(a, b)))
-    assert write(folder, "new")
+    write(folder, "new")
     assert (folder / "file").read_text() == "new"
-    assert len(renames) == 1  # the attempt; no moment without a folder
+    assert renames == []  # no moment without a folder
     assert [path.name for path in tmp_path.iterdir()] == ["store"]
 
 
@@ -76,7 +74,7 @@ def test_where_folders_cannot_be_exchanged_two_renames_do(tmp_path, monkeypatch)
     folder = tmp_path / "store"
     write(folder, "old")
     monkeypatch.setattr(files.ctypes, "CDLL", lambda name, use_errno: object())
-    assert write(folder, "new")
+    write(folder, "new")
     assert (folder / "file").read_text() == "new"
     assert [path.name for path in tmp_path.iterdir()] == ["store"]
 
@@ -90,7 +88,7 @@ def test_a_folder_that_fails_leaves_the_old_one(tmp_path):
     folder = tmp_path / "store"
     write(folder, "old")
     with pytest.raises(KeyboardInterrupt):
-        write_folder(folder, fail, replace=True)
+        write_folder(folder, fail)
     assert (folder / "file").read_text() == "old"
     assert [path.name for path in tmp_path.iterdir()] == ["store"]
 
@@ -107,7 +105,7 @@ def counted(path):
         os.kill(os.getpid(), signal.SIGKILL)
     sync(path)
 files.sync = counted
-files.write_folder(Path(sys.argv[1]), lambda new: (new / "file").write_text("new"), replace=True)
+files.write_folder(Path(sys.argv[1]), lambda new: (new / "file").write_text("new"))
 """
 
 
@@ -119,7 +117,7 @@ def test_a_kill_while_a_folder_is_replaced_leaves_a_whole_one(tmp_path, moment):
     assert run.returncode < 0
     assert (folder / "file").read_text() == ("new" if moment == 3 else "old")
     assert len(list(left_over(tmp_path))) == 1
-    assert write(folder, "newest")
+    write(folder, "newest")
     clean(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["store"]
 
@@ -156,13 +154,10 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == ["value.txt"]
 
 
-@pytest.mark.parametrize(
-    ("number", "reason"),
-    [(errno.ENOSPC, "disk is full"), (errno.EROFS, "read-only"), (errno.EACCES, "permission denied")],
-)
-def test_the_disks_refusal_is_one_line(tmp_path, number, reason):
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES])
+def test_the_disks_refusal_is_one_line(tmp_path, number):
     path = tmp_path / "value.bin"
-    with pytest.raises(StorageError, match=f"{re.escape(str(path))}: .*{reason}$"), atomic_path(path):
+    with pytest.raises(StorageError, match=f"{re.escape(str(path))}: {os.strerror(number)}$"), atomic_path(path):
         raise OSError(number, os.strerror(number))
     assert list(tmp_path.iterdir()) == []
 

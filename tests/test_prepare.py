@@ -117,7 +117,7 @@ def test_prepare_ends_with_all_files_after_a_full_disk(results, monkeypatch, fil
     words = ("prepare", MINE, "for=one_pass", "steps=2")
     with monkeypatch.context() as patch:
         patch.setattr(files.os, "replace", full)
-        assert "the disk is full" in told(*words, code=1)
+        assert "No space left" in told(*words, code=1)
     told(*words)
     assert {RESUME, "log.csv", "curves.png"} <= {path.name for path in (results / "artifacts/early/mine").iterdir()}
 

@@ -280,14 +280,15 @@ def as_overrides(*overrides: str, **settings: object) -> list[str]:
     def typed(key: str, value: object) -> list[str]:
         if isinstance(value, Mapping):
             return [text for name, inner in value.items() for text in typed(f"{key}.{name}", inner)]
-        return [f"{key}={_text(value)}"]
+        return [f"{key}={plain_text(value)}"]
 
     return [*overrides, *(text for key, value in settings.items() for text in typed(key, value))]
 
 
-def _text(value: object) -> str:
+def plain_text(value: object) -> str:
+    """Return a value as it is typed in an override: `[reach,push]`, `true`. None gives `null`."""
     if isinstance(value, list | tuple):
-        return f"[{','.join(map(_text, value))}]"
+        return f"[{','.join(map(plain_text, value))}]"
     return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 

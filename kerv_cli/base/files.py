@@ -23,15 +23,7 @@ MOST_TEXT = 2**28
 MOST_BYTES = 2**36
 """Maximum size of a file of weights or of a table in bytes."""
 
-_REFUSALS = {
-    errno.ENOSPC: "the disk is full",
-    errno.EDQUOT: "the disk quota is used up",
-    errno.EFBIG: "the file would be too large",
-    errno.EIO: "the disk does not work",
-    errno.EROFS: "the file system is read-only",
-    errno.EACCES: "permission denied",
-    errno.EPERM: "operation not permitted",
-}
+_OF_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM)
 
 
 @contextlib.contextmanager
@@ -44,10 +36,9 @@ def storage_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        reason = _REFUSALS.get(error.errno or 0)
-        if reason is None:
+        if error.errno not in _OF_DISK:
             raise
-        raise StorageError(f"cannot write {path}: {reason}") from error
+        raise StorageError(f"cannot write {path}: {error.strerror}") from error
 
 
 @contextlib.contextmanager
@@ -78,19 +69,14 @@ def atomic_path(path: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
-def write_folder(folder: Path, fill: Callable[[Path], object], replace: bool = False) -> bool:
-    """Write a folder atomically: fill a temporary folder, then rename it.
+def write_folder(folder: Path, fill: Callable[[Path], object]) -> None:
+    """Write a folder atomically: fill a temporary folder, then rename it. An existing folder is replaced.
 
     If `fill` raises an exception, nothing changes.
 
     Args:
         folder: Path of the finished folder.
         fill: Function that writes the content into the temporary folder, its argument.
-        replace: What happens if `folder` exists and is not empty. True: the new folder replaces it in one step. False:
-            the existing folder stays, and the new one is discarded.
-
-    Returns:
-        Whether `folder` has the new content.
 
     Raises:
         StorageError: The disk is full or read-only, or permission is missing.
@@ -104,24 +90,13 @@ def write_folder(folder: Path, fill: Callable[[Path], object], replace: bool = F
             fill(temporary)
             for path in (*temporary.rglob("*"), temporary):
                 sync(path)
-            is_new = _rename_once(temporary, folder)
-            if not is_new and replace:
+            if folder.exists():
                 _exchange(temporary, folder)
+            else:
+                os.rename(temporary, folder)
             sync(folder.parent)
-            return is_new or replace
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-
-
-def _rename_once(temporary: Path, folder: Path) -> bool:
-    """Rename `temporary` to `folder`. Return False if `folder` exists already and is not empty."""
-    try:
-        os.rename(temporary, folder)
-    except OSError as error:
-        if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
-            return False
-        raise
-    return True
 
 
 def _exchange(a: Path, b: Path) -> None:
@@ -235,21 +210,6 @@ def read_mapping(path: Path) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise CheckpointError(f"{path} cannot be read as JSON: it holds no object")
     return value
-
-
-def read_yaml(path: Path) -> Any:
-    """Return the value in a YAML file. YAML tags that would construct Python objects are refused.
-
-    Raises:
-        OSError: The file is missing or not a regular file.
-        ValueError: The file is too large or not YAML.
-    """
-    import yaml
-
-    try:
-        return yaml.load(read_text(path), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-    except (yaml.YAMLError, RecursionError) as error:
-        raise ValueError(f"not YAML: {error}") from error
 
 
 def read_yaml_lines(path: Path, what: str) -> tuple[dict[str, Any], dict[str, int]]:

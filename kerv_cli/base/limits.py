@@ -67,24 +67,6 @@ def choice(default: str, *names: str, help: str = "") -> Any:
     return setting(default, help, names=names)
 
 
-def field_of(schema: type, key: str) -> tuple[Field[Any] | None, Any]:
-    """Find a setting by its name.
-
-    Args:
-        schema: Dataclass of a command's settings.
-        key: Name of the setting, such as `runtime.device`.
-
-    Returns:
-        Its dataclass field and its default. Both are None if the default settings do not have it, because only some
-        choice of a part does.
-    """
-    value, at = schema(), None
-    for name in key.split("."):
-        at = next((at for at in fields(value) if at.name == name), None) if is_dataclass(value) else None
-        value = getattr(value, name, None)
-    return at, value
-
-
 def description(at: Field[Any]) -> str:
     """Return the description of a setting: its allowed names, if there are any, then its `help` text."""
     return ": ".join(filter(None, (" | ".join(at.metadata.get("names", ())), at.metadata.get("help", ""))))
@@ -174,10 +156,8 @@ def _check_value(name: str, value: Any, metadata: Any) -> None:
 
 
 def _range_text(least: float, most: float, above: float) -> str:
-    low = f"above {above:g}" if not math.isinf(above) else f"at least {least:g}" if not math.isinf(least) else ""
-    if math.isinf(most):
-        return low or "a number"
-    high = f"{most:g}" if most != int(most) or most < 10**6 else f"{int(most)}"
-    if low.startswith("at least"):
-        return f"from {least:g} to {high}"
-    return f"{low}, at most {high}" if low else f"at most {high}"
+    if least > -math.inf and most < math.inf:
+        return f"from {least:g} to {most:.12g}"
+    low = f"above {above:g}" if above > -math.inf else f"at least {least:g}" if least > -math.inf else ""
+    high = f"at most {most:.12g}" if most < math.inf else ""
+    return ", ".join(filter(None, (low, high))) or "a number"

@@ -18,7 +18,7 @@ import pyarrow as pa
 import sqlalchemy as sa
 
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
-from kerv_cli.base.files import read_mapping, read_yaml, regular, visible, write_folder
+from kerv_cli.base.files import read_mapping, read_yaml_lines, regular, visible, write_folder
 from kerv_cli.base.limits import check_label
 from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import SETTINGS_GROUPS, part_of
@@ -144,7 +144,7 @@ def _study_of(folder: Path, kind: str) -> tuple[Study, dict[Path, list[Episode]]
     Returns:
         The study, and for each of its cells the folder and the episodes.
     """
-    plan = read_yaml(folder / "plan.yaml")
+    plan, _ = read_yaml_lines(folder / "plan.yaml", str(folder))
     settings = {
         str(label): Setting(
             check_label(str(label)), str(one["overrides"]), completed(one["settings"]), dict(one["identity"])
@@ -341,5 +341,5 @@ def export_database(store: StudyStore, folder: Path) -> Path:
 
     if folder.is_dir() and any(path.name != FILE for path in folder.iterdir()):
         raise UsageError(f"{folder} holds other files: choose another folder with --dir")
-    write_folder(folder, fill, replace=True)
+    write_folder(folder, fill)
     return folder / FILE

@@ -14,6 +14,7 @@ Every other parameter is an option of the command in typer's notation.
 from __future__ import annotations
 
 import contextlib
+import functools
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -24,10 +25,8 @@ from typing import Annotated, Any, TypeVar
 import typer
 from typer.core import TyperCommand
 
-from kerv_cli.base.config import compose, conf_dir, groups
+from kerv_cli.base.config import compose, groups, plain_text
 from kerv_cli.base.errors import UnknownName
-from kerv_cli.base.files import read_yaml
-from kerv_cli.base.limits import field_of
 from kerv_cli.base.places import check_writable
 from kerv_cli.base.registry import NoSettings, Part, add, find, load, parts
 from kerv_cli.base.settings import CommandSettings, choices_of
@@ -268,28 +267,20 @@ def _row(part: Part, key: str) -> tuple[str, str]:
     """
     name = part.traits.get("typed", {}).get(key, key)
     schema = next(schema for schema in schemas_of(part) if name.split(".")[0] in {at.name for at in fields(schema)})
-    at, value = field_of(schema, name)
-    assert at is not None
-    default = choices_of(schema).get(name, _of_file(schema, name, value))
-    kind = "name" if name in choices_of(schema) else _type_name(at)
-    shown = "{…}" if isinstance(default, dict) else _plain(default)
-    return f"{key}={shown}", f"{kind}: {at.metadata.get('help', '')}"
+    value: Any = _defaults(schema)
+    for word in name.split("."):
+        at = next(at for at in fields(value) if at.name == word)
+        value = getattr(value, word)
+    choices = choices_of(schema)
+    shown = "" if value is None else "{…}" if isinstance(value, dict) else plain_text(value)
+    default = choices.get(name, shown)
+    return f"{key}={default}", f"{'name' if name in choices else _type_name(at)}: {at.metadata.get('help', '')}"
 
 
-def _of_file(schema: type, key: str, default: object) -> object:
-    """Return the default of a setting: its value in the file of conf/ that is chosen by default, else `default`.
-
-    Args:
-        schema: Dataclass of the command's settings.
-        key: Name of the setting, such as `runtime.device`. Its first part may be a group of conf/.
-        default: Default in the dataclass.
-    """
-    group, *path = key.split(".")
-    file = conf_dir() / group / f"{choices_of(schema).get(group)}.yaml"
-    value = read_yaml(file) if path and file.is_file() else {}
-    for name in path:
-        value = value.get(name, {}) if isinstance(value, dict) else {}
-    return default if value == {} else value
+@functools.cache
+def _defaults(schema: type) -> Any:
+    """Return the settings of a command without any override."""
+    return compose("", [], schema)
 
 
 def _type_name(at: Field[Any]) -> str:
@@ -297,12 +288,6 @@ def _type_name(at: Field[Any]) -> str:
         return " | ".join(at.metadata["names"])
     plain = str(at.type).removesuffix(" | None").split("[")[0]
     return {"str": "text", "bool": "true or false", "dict": "mapping", "float": "number"}.get(plain, plain)
-
-
-def _plain(value: object) -> str:
-    if isinstance(value, list):
-        return f"[{','.join(map(str, value))}]"
-    return "" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def commands_below(prefix: str) -> Iterator[Part]:

@@ -7,7 +7,6 @@ import math
 import os
 import shlex
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
@@ -15,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from kerv_cli.base.durations import left
 from kerv_cli.base.errors import Interrupted, KervError, UsageError
 from kerv_cli.base.limits import description
 
@@ -74,16 +72,6 @@ def settings_yaml(settings: Any, indent: str = "") -> str:
         comment = description(setting) if not rest or not isinstance(value, str) else ""
         lines += [f"{first}  # {comment}" if comment else first, *rest]
     return "".join(f"{indent}{line}\n" for line in lines)
-
-
-def print_notes(idle: Mapping[str, str]) -> None:
-    """Print a line on standard error for each override that has no effect.
-
-    Args:
-        idle: Override, such as `threshold.r=5` -> why it has no effect.
-    """
-    for override, reason in idle.items():
-        typer.echo(f"note: {override} has no effect: {reason}", err=True)
 
 
 def end_with_plan(text: str, as_json: bool = False) -> NoReturn:
@@ -172,7 +160,7 @@ def _refuse(message: str, code: int, error: BaseException | None) -> None:
 def progress_bar(title: str, record: Run | None = None) -> Iterator[Callable[..., None]]:
     """Show a progress bar while the block runs. Lines that are printed meanwhile appear above it.
 
-    Without a terminal, print at most 10 lines of progress instead, or 50 for a total of 2000 or more.
+    Without a terminal, print a line after each tenth of the work instead.
 
     Args:
         title: Text before the bar.
@@ -184,30 +172,24 @@ def progress_bar(title: str, record: Run | None = None) -> Iterator[Callable[...
     from rich import progress as bars
 
     on_terminal = sys.stderr.isatty()
-    known, latest, first, began = -1, -1, 0, 0.0  # first: where the count begins, above 0 for resumed work
+    latest = -1
 
     def advance(done: int, total: int, text: str = "") -> None:
-        nonlocal known, latest, first, began
+        nonlocal latest
+        tenths = 10 * done // max(1, total)
         if record is not None:
             record.beat(done, total)
         if on_terminal:
             bar.update(task, completed=done, total=total, text=text)
-            return
-        if total != known:
-            known, latest, first, began = total, -1, done, time.monotonic()
-        part = (50 if total >= 2000 else 10) * done // max(1, total)
-        if part > latest:
-            latest = part
-            rest = left(time.monotonic() - began, done - first, total - first) if first < done < total else ""
-            typer.echo(", ".join(filter(None, (f"{title} {done}/{total}", rest, text))), err=True)
+        elif tenths != latest:
+            latest = tenths
+            typer.echo(", ".join(filter(None, (f"{title} {done}/{total}", text))), err=True)
 
     timed = (bars.BarColumn(), bars.MofNCompleteColumn(), bars.TimeElapsedColumn(), bars.TimeRemainingColumn())
     name, text = (bars.TextColumn(f"{{task.{one}}}", markup=False) for one in ("description", "fields[text]"))
     shown: Any = {"console": console(stderr=True), "transient": True, "disable": not on_terminal}
     with bars.Progress(name, *timed, text, **shown) as bar:
         task = bar.add_task(title, total=None, text="")
-        if not on_terminal:
-            typer.echo(f"{title} …", err=True)
         yield advance
 
 

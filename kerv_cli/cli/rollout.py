@@ -14,12 +14,11 @@ from kerv_cli.cli.common import (
     ShowPlan,
     console,
     end_with_json,
-    print_notes,
     print_table,
     results_word,
     settings_yaml,
 )
-from kerv_cli.cli.work import planned_rollout, run_study
+from kerv_cli.cli.work import planned_study, run_study
 from kerv_cli.episodes.settings import RolloutSettings
 
 if TYPE_CHECKING:
@@ -43,16 +42,14 @@ def rollout(
     overrides: list[str], cfg: bool = False, plan: ShowPlan = False, multirun: Many = False, as_json: AsJson = False
 ) -> None:
     """Run episodes of one method; print success, forwards, acceptance and time; record one episode per task."""
-    from kerv_cli.episodes.identity import stress_text, without_effect
+    from kerv_cli.episodes.identity import stress_text
     from kerv_cli.episodes.resolve import resolve_rollout
 
     resolved = resolve_rollout(overrides, multirun)
     if cfg:
         typer.echo("---\n".join(settings_yaml(settings) for settings in resolved.settings.values()), nl=False)
         return
-    for label, settings in resolved.settings.items():
-        print_notes(without_effect(settings, resolved.points[label].overrides))
-    planned = planned_rollout(resolved, ["rollout", *(["-m"] if multirun else []), *overrides])
+    planned = planned_study(resolved, ["rollout", *(["-m"] if multirun else []), *overrides], is_rollout=True)
     if plan:
         names = ", ".join(f"{label}{stress_text(asdict(settings))}" for label, settings in resolved.settings.items())
         total, tasks = len(planned.study.episodes), resolved.tasks

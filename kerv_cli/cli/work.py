@@ -15,7 +15,6 @@ from kerv_cli.cli.common import (
     end_with_json,
     end_with_plan,
     print_figures,
-    print_notes,
     print_rows,
     progress_bar,
     settings_yaml,
@@ -39,15 +38,16 @@ BUSY = 1.2
 """Load average per core above which a line says that other programs disturb the measured times."""
 
 
-def planned_study(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
-    """Plan a study: find out which of its episodes must run. Print notes about it to standard error.
+def planned_study(resolved: ResolvedStudy, command: Sequence[str], is_rollout: bool = False) -> Plan:
+    """Plan a study or a rollout: find out which of its episodes must run. Print notes about it to standard error.
 
-    The notes give the number of episodes, the overrides that have no effect, and the tasks that the policy was not
-    trained on.
+    The notes give the number of episodes, the overrides that have no effect, the tasks that the policy was not trained
+    on, and whether an interrupted rollout is resumed.
 
     Args:
         resolved: The study with all its settings.
         command: Command-line arguments after `kerv`, to be stored with the episodes.
+        is_rollout: Whether to plan a rollout.
 
     Raises:
         UsageError: The study cannot run with these settings.
@@ -55,21 +55,9 @@ def planned_study(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
     """
     from kerv_cli.episodes.resolve import idle_overrides
 
-    print_notes(idle_overrides(resolved))
-    return _planned(resolved, command, is_rollout=False)
-
-
-def planned_rollout(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
-    """Return the plan of a rollout: its episodes, and which are done. Say so if it continues another."""
-    planned = _planned(resolved, command, is_rollout=True)
-    if planned.existing:
-        there, wanted = len(planned.existing), len(planned.study.episodes)
-        typer.echo(f"resuming {planned.store.name}: {there} of {wanted} episodes are there", err=True)
-    return planned
-
-
-def _planned(resolved: ResolvedStudy, command: Sequence[str], is_rollout: bool) -> Plan:
     settings, tasks = resolved.settings, resolved.tasks
+    for override, reason in idle_overrides(resolved, not is_rollout).items():
+        typer.echo(f"note: {override} has no effect: {reason}", err=True)
     what = next(iter(settings)) if len(settings) == 1 else f"{len(settings)} settings"
     whose = _few(list(dict.fromkeys(setting.policy.target for setting in settings.values())), "targets")
     number = len(settings) * len(tasks) * resolved.first.episodes * resolved.study.repeats
@@ -82,6 +70,9 @@ def _planned(resolved: ResolvedStudy, command: Sequence[str], is_rollout: bool) 
     for target, names in dict.fromkeys((s.policy.target, tuple(unseen_tasks(s, tasks))) for s in settings.values()):
         if names:
             typer.echo(f"kerv: warning: policy {target} was never trained on {', '.join(names)}", err=True)
+    if is_rollout and planned.existing:
+        there, wanted = len(planned.existing), len(planned.study.episodes)
+        typer.echo(f"resuming {planned.store.name}: {there} of {wanted} episodes are there", err=True)
     return planned
 
 

@@ -211,17 +211,22 @@ def _is_ar(settings: RolloutSettings) -> bool:
     return all(part.kind == "none" for part in drafts) and settings.method == "ar"
 
 
-def idle_overrides(resolved: ResolvedStudy) -> dict[str, str]:
+def idle_overrides(resolved: ResolvedStudy, sweep: bool = True) -> dict[str, str]:
     """Return overrides that have no effect, each with the reason.
 
-    An override that the study gives to one setting is listed after the setting's label. An override from the command
-    line is listed only if it has no effect on any setting.
+    An override of one of several settings is listed after the setting's label. An override from the
+    command line is listed only if it has no effect on any setting.
+
+    Args:
+        resolved: The study or rollout.
+        sweep: Whether it is a study, whose episodes may run in several processes.
     """
     reasons: dict[str, str] = {}
     for label, settings in resolved.settings.items():
-        idle = without_effect(settings, resolved.points[label].overrides, sweep=True)
-        reasons |= {f"{label}: {word}": why for word, why in idle.items()}
-    common = [without_effect(settings, resolved.common, sweep=True) for settings in resolved.settings.values()]
+        idle = without_effect(settings, resolved.points[label].overrides, sweep)
+        name = f"{label}: " if len(resolved.settings) > 1 else ""
+        reasons |= {f"{name}{word}": why for word, why in idle.items()}
+    common = [without_effect(settings, resolved.common, sweep) for settings in resolved.settings.values()]
     return reasons | {word: why for word, why in common[0].items() if all(word in idle for idle in common)}
 
 

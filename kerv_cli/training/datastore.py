@@ -101,7 +101,7 @@ class DatastoreBuild:
                 progress(len(parts), sum(map(len, self.chosen.values())))
             shards[name] = Shard((first, rows), tuple(self.seeds[name]))
         files = self._contents({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, shards)
-        write_folder(self.folder, lambda folder: self._write(folder, files, shards), replace=True)
+        write_folder(self.folder, lambda folder: self._write(folder, files, shards))
         return Datastore.open(self.folder, self.artifacts.description)
 
     @torch.inference_mode()

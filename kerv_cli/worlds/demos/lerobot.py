@@ -212,7 +212,7 @@ def export(dataset: DemoDataset, folder: Path, progress: OnProgress) -> Export:
         raise UsageError("LeRobot tells tasks apart by their instruction, but two are the same: export them separately")
     rate = dataset.manifest.actions.control_hz / int(dataset.manifest.config["frame_stride"])
     result = Export(dataset, {name: number for number, name in enumerate(names)}, rate)
-    write_folder(folder, lambda new: result.write(new, progress), replace=True)
+    write_folder(folder, lambda new: result.write(new, progress))
     return result
 
 
