@@ -37,8 +37,8 @@ def world():
 
 
 def test_a_name_says_cameras_and_fields_of_view():
-    assert views_of("corner4") == (View("corner4"),)
-    assert views_of("a+b:75.5+b:60") == (View("a"), View("b", 75.5), View("b", 60.0))
+    assert views_of("corner4") == [View("corner4", "corner4", None)]
+    assert views_of("a+b:75.5+b:60") == [View("a", "a", None), View("b:75.5", "b", 75.5), View("b:60", "b", 60.0)]
     assert frame_shape("a+b", 96) == (96, 192, 3)
     assert frame_shape("", 96) == (96, 96, 3)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -188,12 +188,8 @@ def grow(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
     if not recipe.prompt:
         del identity["prompt"]  # targets that were grown before this setting existed keep their hash
     digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
-    written = checkpoint.target_fields(
-        "grown", {**description.settings, "grown": asdict(recipe)}, description.environment, description.actions,
-        description.observation, cameras=description.cameras, words=description.words,
-        provenance=description.provenance,
-    )  # fmt: skip
+    grown = {**description.settings, "grown": asdict(recipe)}
     folder = artifact(settings.results, "target", settings.name)
-    write_json(folder / "target.json", {"format": checkpoint.FORMAT, "kind": "target", "sha256": digest, **written})
+    write_json(folder / "target.json", asdict(replace(description, family="grown", settings=grown, sha256=digest)))
     weights = sum(p.numel() for p in target.trunk.layers.parameters() if p.dim() == 2)
     return folder, {"weights": weights, "those of the policy": description.provenance.get("parameters", 0)}

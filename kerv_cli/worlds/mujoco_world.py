@@ -51,8 +51,7 @@ class MujocoWorld(World):
         """Start the episode of a seed: restore the model, reset the simulator, then apply the stress to the model."""
         self._changes.restore()
         observation = super().reset(seed)
-        if self.stress.changes_model:
-            self.stress.change(self._drawable()[0], self._changes)
+        self.stress.change(self._drawable()[0], self._changes)
         return observation
 
     def _draw(self, camera: CameraSettings) -> NDArray[np.uint8]:

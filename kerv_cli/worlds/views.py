@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from kerv_cli.base.errors import UsageError
 
@@ -15,25 +15,21 @@ VIEWS = "+"
 _VIEW = re.compile(r"(?P<camera>[^:@]+)(:(?P<fovy>\d{1,3}(\.\d{1,3})?))?", re.ASCII)
 
 
-@dataclass(frozen=True)
-class View:
+class View(NamedTuple):
     """One of the views of an image.
 
     Attributes:
+        name: As in the name of the whole, such as `gripperPOV:75`.
         camera: Name of the camera.
         fovy: Vertical field of view in degrees. None: that of the camera settings.
     """
 
+    name: str
     camera: str
-    fovy: float | None = None
-
-    @property
-    def name(self) -> str:
-        """The camera's name, followed by the field of view if the view has its own."""
-        return self.camera if self.fovy is None else f"{self.camera}:{self.fovy:g}"
+    fovy: float | None
 
 
-def views_of(name: str) -> tuple[View, ...]:
+def views_of(name: str) -> list[View]:
     """Parse a camera's name into its views, from left to right.
 
     Args:
@@ -42,7 +38,17 @@ def views_of(name: str) -> tuple[View, ...]:
     Raises:
         UsageError: A view has no camera or an impossible field of view.
     """
-    return tuple(_view(part, name) for part in name.split(VIEWS)) if name else (View(""),)
+    views = [] if name else [View("", "", None)]
+    for part in name.split(VIEWS) if name else ():
+        match = _VIEW.fullmatch(part)
+        fovy = float(match["fovy"]) if match and match["fovy"] else None
+        if match is None or (fovy is not None and not 0 < fovy < 180):
+            raise UsageError(
+                f"camera name '{name}': '{part}' is no view; write NAME or NAME:DEGREES (above 0, below 180), joined "
+                "with +, e.g. front+wrist:75"
+            )
+        views.append(View(part, match["camera"], fovy))
+    return views
 
 
 def frame_shape(name: str, size: int) -> tuple[int, int, int]:
@@ -53,14 +59,3 @@ def frame_shape(name: str, size: int) -> tuple[int, int, int]:
         size: Height and width of each view in pixels.
     """
     return size, size * len(views_of(name)), 3
-
-
-def _view(part: str, name: str) -> View:
-    match = _VIEW.fullmatch(part)
-    fovy = float(match["fovy"]) if match and match["fovy"] else None
-    if match is None or (fovy is not None and not 0 < fovy < 180):
-        raise UsageError(
-            f"camera name '{name}': '{part}' is no view; write NAME or NAME:DEGREES (above 0, below 180), joined "
-            "with +, e.g. front+wrist:75"
-        )
-    return View(match["camera"], fovy)

@@ -42,7 +42,6 @@ class Stress:
     Attributes:
         kind: Name of the kind of stress.
         levels: Size of the disturbance at level 1, 2, ….
-        changes_model: Whether `change` does anything.
         level: Chosen level. 0: no disturbance.
         amount: The entry of `levels` for the chosen level. None at level 0.
         spread: Factor by which the range of initial states is widened around its centre. 1: unchanged.
@@ -50,7 +49,6 @@ class Stress:
 
     kind: ClassVar[str] = "none"
     levels: ClassVar[tuple[Any, ...]] = ()
-    changes_model: ClassVar[bool] = False
     spread = 1.0
 
     def __init__(self, level: int = 0) -> None:

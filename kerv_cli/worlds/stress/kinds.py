@@ -26,7 +26,6 @@ class Light(Stress):
     """
 
     kind = "light"
-    changes_model = True
     levels = ((1.1, 10), (1.2, 15), (1.3, 20), (1.8, 45))
 
     def change(self, model: Model, changes: ModelChanges) -> None:
@@ -52,7 +51,6 @@ class Colour(Stress):
     """
 
     kind = "colour"
-    changes_model = True
     levels = (0.1, 0.2, 0.3, 0.45)
 
     def change(self, model: Model, changes: ModelChanges) -> None:
@@ -76,7 +74,6 @@ class CameraJitter(Stress):
     """
 
     kind = "camera"
-    changes_model = True
     levels = ((0.006, 0.6), (0.01, 1.0), (0.015, 1.5), (0.022, 2.2))
 
     def change(self, model: Model, changes: ModelChanges) -> None:
@@ -120,7 +117,6 @@ class Objects(Stress):
     """
 
     kind = "object"
-    changes_model = True
     levels = ((1.1, 1.6, 1.5, 1.2), (1.2, 2.5, 2.0, 1.4), (1.3, 4.0, 3.0, 1.7), (1.5, 6.0, 4.0, 2.3))
 
     def __init__(self, level: int) -> None:
