@@ -70,7 +70,9 @@ class Sizes:
         return read, 2.0 * weights * rows + 4.0 * s.layers * s.width * attended
 
     def needs(self, kind: str, rows: int, prompt: int) -> tuple[float, float]:
-        """Return the bytes and operations of one phase of a decode, see `forward`. Zeros if they are not known.
+        """Return the bytes that a phase of a decode reads, and its number of arithmetic operations.
+
+        Both are 0 if the phase is no forward of the target or the drafter.
 
         Args:
             kind: Kind of phase, see `phases.Phase`.

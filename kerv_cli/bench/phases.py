@@ -131,9 +131,10 @@ class Dummy(Proposer):
 
 
 def decoders(model: Model) -> list[Decoder]:
-    """Return decoders that together measure forwards of many sizes. They accept every draft.
+    """Return decoders that accept every draft and together run forwards of many sizes.
 
-    There are plain decoding, drafts before the prefill, dummy drafts after it, and the drafter's chain and tree.
+    One decodes without drafts. Others verify dummy drafts in the prefill or after it. The last three verify chains and
+    a tree of the drafter.
     """
     target, size = model.target, model.size
     rule, everything = RelaxedRule(target.actions, strict_dofs=False), Fixed(target.actions.tokens)
@@ -152,7 +153,9 @@ def decoders(model: Model) -> list[Decoder]:
 def costs_of(decoder: Decoder, prompt: int, rounds: Sequence[Round], laps: Sequence[tuple[str, float]]) -> Iterator[
     tuple[Key, float]
 ]:  # fmt: skip
-    """Yield kind, rows and seconds of each phase in a decode. A forward ends when the CPU knows its target tokens.
+    """Yield kind, rows and seconds of each phase in a decode.
+
+    The time of a forward ends when its target tokens are on the CPU.
 
     Args:
         decoder: The decoder.
@@ -238,7 +241,10 @@ def phases_of(
 
 @torch.inference_mode()
 def needs_of_draft(decoder: Any) -> tuple[float, float]:
-    """Return the bytes of the weights and the operations of a decoder's early draft. Zeros if no network makes it."""
+    """Return the bytes of weights and the operations of the network that makes a decoder's draft before the prefill.
+
+    Both are 0 if no network makes it.
+    """
     draft, target = decoder.parts.prefill_draft, decoder.target
     if not isinstance(draft, EarlyProposer):
         return 0.0, 0.0
@@ -252,7 +258,7 @@ def needs_of_draft(decoder: Any) -> tuple[float, float]:
 
 
 def source_methods() -> dict[str, str]:
-    """Return the phases that only certain proposers have: kind of the phase -> method with which it is measured."""
+    """Return the drafts that have a phase of their own, such as `early`, and for each a method to measure it with."""
     measured = [part.traits for part in parts("proposer").values() if "measured_by" in part.traits]
     return {traits["cost"]: traits["measured_by"] for traits in measured}
 

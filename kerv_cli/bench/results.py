@@ -140,7 +140,7 @@ class MethodCeiling:
 
     Attributes:
         method: Name of the method.
-        how: The forwards that it still needs, as text.
+        how: How often and where it verifies, as text.
         free: Speedup if drafting took no time.
         drafted: Speedup with the time of the drafter. The same as `free` if the method uses no drafter.
     """
@@ -252,15 +252,15 @@ def projections(
 
 
 def shares(phases: Sequence[Phase], machine: Machine) -> tuple[float, float]:
-    """Return how much of the device's limits the measured forwards reach, as median of floor ÷ time.
+    """Return which share of the device's limits the measured forwards reach: the median of floor ÷ time.
 
     Args:
         phases: Measured phases.
         machine: Limits of the device.
 
     Returns:
-        Two medians: of phases in which reading takes longer, and of phases in which arithmetic takes longer. If there
-        are no phases of one kind, it gets the other's median.
+        Two medians: of the forwards that reading memory limits, and of those that arithmetic limits. If there are none
+        of one kind, it gets the other's median.
     """
     by_bound: dict[bool, list[float]] = {True: [], False: []}
     for p in phases:
@@ -340,7 +340,7 @@ def phase_rows(phases: Sequence[Phase]) -> list[tuple[str, ...]]:
 
 
 def ceiling_rows(by_tokens: Mapping[int, Sequence[MethodCeiling]]) -> list[tuple[str, ...]]:
-    """Return a row per method: its name, then for each N the remaining forwards and the two speedups.
+    """Return a row per method: its name, then for each N how it verifies and its two speedups.
 
     Args:
         by_tokens: N (tokens of a chunk) -> highest speedup of each method.

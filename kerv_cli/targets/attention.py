@@ -25,10 +25,11 @@ class Cache:
         capacity: Maximum number of tokens.
         channels: C, channels of a head.
         like: Tensor whose device and number format the cache gets.
-        fixed: Whether a forward attends to all slots under a mask, so that its shapes are always the same.
+        fixed: Whether every forward attends to all slots, with a mask that hides the unused ones. Then all shapes are
+            fixed, as CUDA graphs require.
 
     Attributes:
-        buffer: (layers, 2, B, A, slots, C) keys and values. A fixed cache has one slot more than its capacity.
+        buffer: (layers, 2, B, A, slots, C) keys and values. A fixed cache has a spare slot after its capacity.
         layers: (2, B, A, slots, C) per layer, views of the buffer.
         length: Number of cached tokens. They are in the first slots.
     """
@@ -46,7 +47,7 @@ class Cache:
     def compact(self, start: int, slots: Tensor) -> None:
         """Keep the tokens of an accepted path, and drop the rest of the draft tree.
 
-        The kept entries move to the slots start, start + 1, …. The length is set to the end of them.
+        The kept entries move to the slots start, start + 1, …. The cache then ends with the last of them.
 
         Args:
             start: The first slot to write.
@@ -96,9 +97,9 @@ def attention_mask(seen: np.ndarray | Tensor | None, tokens: int, cache: Cache |
     """Return the additive attention mask of new tokens: 0 for tokens that are seen, -inf for hidden ones.
 
     Args:
-        seen: (T, M) bool, which of the last M ≥ T tokens each new token attends to. The T new tokens are the last of
-            these M. Cached tokens before them are always seen. None: new tokens are causal. A tensor must be on the
-            device of `like`.
+        seen: (T, M) bool, which of the last M ≥ T tokens each new token attends to. The new tokens are the last T of
+            these M. All cached tokens before the M are seen. None: attention is causal. A tensor must be on the device
+            of `like`.
         tokens: T, number of new tokens.
         cache: Cache of earlier tokens. None: there are none.
         like: Tensor whose device and number format the mask gets.

@@ -31,7 +31,7 @@ SCALE = ".scale"
 
 @dataclass(frozen=True)
 class Description:
-    """The fields that the description of every artifact with weights has.
+    """Fields in the description (`<kind>.json`) of every artifact with weights.
 
     Attributes:
         format: Version of the format, `FORMAT`.
@@ -81,9 +81,10 @@ class TargetDescription(Description):
 
     @property
     def origin(self) -> Mapping[str, Any]:
-        """The policy whose tokens the target decodes: the hash of its weights as `sha256`.
+        """The policy that decides which tokens the target decodes. `sha256` is the hash of its weights.
 
-        For a grown target (docs/methods.md §0.2) this is the policy that was enlarged, with its folder as `base`.
+        Usually it is the target itself. For a grown target (docs/methods.md §0.2) it is the policy that was enlarged,
+        and `base` is that policy's folder.
         """
         return self.settings.get("grown") or {"sha256": self.sha256}
 
@@ -328,8 +329,8 @@ def load_state(module: nn.Module, folder: Path, kind: str) -> None:
 def read_target(folder: Path) -> TargetDescription:
     """Return the description of a target and check its weights; errors as `read_description`.
 
-    If the weights of a family of targets are elsewhere, the family's trait `weights` names the function that checks
-    them. Its arguments are the folder and the description.
+    A family whose weights are not in the target's folder registers its own check as the trait `weights`: a function of
+    the folder and the description.
     """
     description = described(folder, "target", TargetDescription)
     family = parts("target").get(description.family)

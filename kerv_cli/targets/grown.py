@@ -81,7 +81,7 @@ def grow_stack(stack: LayerStack, shape: GrowSettings, layers: int) -> None:
 
 
 def _grown_layer(old: Layer | None, stack: LayerStack, shape: GrowSettings, generator: torch.Generator) -> Layer:
-    """Make a layer of the new shape that has the same output as `old`, or one that adds nothing if `old` is None."""
+    """Make a layer of the new shape with the same output as `old`. If `old` is None, the output equals the input."""
     new = Layer(shape.width, shape.heads, shape.feed_forward)
     width, channels, wide = stack.width, stack.width // stack.heads, shape.width // shape.heads
     with torch.no_grad():

@@ -128,14 +128,19 @@ def read_chunks(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarr
 
 
 def steps_of(episode: DemoEpisode, sees: bool) -> np.ndarray:
-    """Return the control steps (n,) at which a policy can observe: all, or if it `sees` images those with an image."""
+    """Return the control steps (n,) that a policy can be trained on.
+
+    Args:
+        episode: The demonstration.
+        sees: Whether the policy reads images. Then only steps with a recorded image count.
+    """
     return episode.frame_steps if sees else np.arange(episode.steps)
 
 
 def observations_of(
     target: Target, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace
 ) -> list[Observation]:
-    """Return the observations of a target at some control steps of a demonstration.
+    """Return what a target would have observed at some control steps of a demonstration.
 
     Args:
         target: The target. Each of its cameras gets the recorded image.
@@ -183,7 +188,7 @@ def prompts_of(target: Target, observations: Iterable[Observation], size: int = 
 
 
 def check_tail(episode: DemoEpisode, steps: int, use: str) -> None:
-    """Check that a chunk can begin at the last control step of an episode.
+    """Check that enough actions were recorded for a chunk that begins at the last control step of an episode.
 
     Args:
         episode: The episode.

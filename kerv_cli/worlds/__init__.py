@@ -97,7 +97,7 @@ def task_names() -> Iterator[str]:
 
 
 def settled(world: W, spec: EnvironmentSpec) -> W:
-    """Fill in the environment's default camera and horizon where the settings leave them open.
+    """Return a world's settings with the environment's default camera and horizon filled in.
 
     Args:
         world: Settings of the world.

@@ -65,8 +65,8 @@ def scene_width(space: ObservationSpace) -> int:
 def privileged_features(proprioception: Tensor, states: Tensor, space: ObservationSpace) -> Tensor:
     """Return the features (B, `privileged_width`) that only a policy with access to the simulator's state reads.
 
-    They hold the state's extra numbers, its velocities, and for each extra place the vectors to it from the hand and
-    from it to the last place.
+    They hold the state's extra numbers, its velocities, and two vectors for each extra place: from the hand to this
+    place, and from this place to the last of `space.places`.
 
     Args:
         proprioception: (B, p).

@@ -244,8 +244,10 @@ def attention(frames, out, qkv, tables, cache, start, filled, mask, keys, values
         start: Number of valid slots in the cache. The new tokens get the next T slots.
         filled: Number of slots that `keys` and `values` hold already.
         mask: (T, start + T), 0 for slots that a token sees. Shape (0, 1) means that attention is causal.
-        keys: (B · A, panels, C, PANEL) the cache's keys as weights of a matrix with one output per slot.
-        values: (B · A, panels, slots, PANEL) the cache's values as weights of a matrix with one output per channel.
+        keys: (B · A, panels, C, PANEL) copy of the cached keys, stored like the weights of a linear layer whose inputs
+            are the channels and whose outputs are the slots. This layer turns a query into its scores.
+        values: (B · A, panels, slots, PANEL) copy of the cached values, stored like the weights of a linear layer whose
+            inputs are the slots and whose outputs are the channels. This layer turns attention weights into a result.
     """
     tokens, heads, channels = tables.shape[0], cache.shape[2], tables.shape[2]
     stop, size, panels, parts = start + tokens, 4 * frames.shape[1], keys.shape[1], values.shape[1]
@@ -349,7 +351,7 @@ def run(ops, times, last, indices, numbers, frames, positions, start, cache, mas
     Args:
         ops: (operations, columns) int64, see `recording.COLUMNS`.
         times: Number of executions.
-        last: Number of operations in the last execution, which needs none after the ARGMAX.
+        last: Number of operations in the last execution. The others only prepare a next execution.
         indices: Places (indices in a frame) that GATHER operations copy from.
         numbers: Constants of all operations.
         frames: (B · T, size) float32, one frame (memory) per row. They hold the inputs, and afterwards the outputs.

@@ -120,7 +120,7 @@ def forget(module: torch.nn.Module) -> None:
 
 
 class Program:
-    """A compiled function of tensors. It is copied and pickled as None, because it holds memory addresses."""
+    """A compiled function of tensors. Copies and pickles hold None in its place, because it holds memory addresses."""
 
     def __init__(self, function: Callable[..., Any], *shapes: Sequence[int], repeats: bool = False) -> None:
         """Record a function as a table of operations.

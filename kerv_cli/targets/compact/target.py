@@ -60,7 +60,7 @@ class Inputs:
 
 
 class Compiled(NamedTuple):
-    """The compiled programs of a target. It is copied and pickled as None.
+    """The compiled programs of a target. Copies and pickles hold None in its place.
 
     Attributes:
         prompt: Encodes a prompt.

@@ -97,7 +97,8 @@ class LayerStack(Packable):
         outer: E, width of inputs and outputs. Equals `width` unless the stack was enlarged (`targets/grown.py`).
         heads: Number of attention heads.
         depth: Number of layers.
-        padding: Number of masked tokens that a forward without cached tokens computes in vain (`targets/grown.py`).
+        padding: Number of tokens that are appended to a prompt, hidden by the mask, and dropped afterwards. They make a
+            prefill cost as much as that of a longer prompt (`targets/grown.py`).
     """
 
     inputs = 1
