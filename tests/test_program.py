@@ -191,7 +191,6 @@ def test_packed_weights_never_outlive_their_weights():
     for change in (
         lambda m: m.load_state_dict(m.state_dict()),
         lambda m: m.to(torch.float64),
-        lambda m: m.train(),
         lambda m: m.requires_grad_(True),
     ):
         _, packed = both_targets("vision", 4)

@@ -66,7 +66,7 @@ class StressSettings:
 
 @dataclass
 class RolloutWorldSettings(WorldSettings):
-    """Settings of a rollout's world, which a stress may make different from the world of training."""
+    """Settings of a rollout's world. A stress can make it differ from the world of the demonstrations."""
 
     stress: StressSettings = setting(StressSettings, "disturbance of the world")
 

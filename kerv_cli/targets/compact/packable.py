@@ -23,9 +23,8 @@ def wants_gradient(x: Tensor) -> bool:
 class Packable(nn.Module):
     """A module that can be compiled for a CPU while its weights are frozen.
 
-    Moving the module, loading weights into it, unfreezing it or switching to training mode discards the compiled form.
-    Then torch computes as usual. After changing weights in any other way (`parameter.data`, a submodule's own
-    `load_state_dict`), call `pack` again.
+    Moving the module, loading weights into it or unfreezing it discards the compiled form, and torch computes as usual.
+    After changing weights in any other way (`parameter.data`, a submodule's own `load_state_dict`), call `pack` again.
 
     Attributes:
         packed: The compiled form. None if there is none.
@@ -48,12 +47,6 @@ class Packable(nn.Module):
     def _load_from_state_dict(self, *arguments: Any, **keywords: Any) -> None:
         self.packed = None
         super()._load_from_state_dict(*arguments, **keywords)
-
-    def train(self, mode: bool = True) -> Self:
-        """Set training or evaluation mode. Training mode discards the compiled form."""
-        if mode:
-            self.packed = None
-        return super().train(mode)
 
     def requires_grad_(self, requires_grad: bool = True) -> Self:
         """Freeze or unfreeze all parameters. Unfreezing discards all compiled forms, those of submodules too."""

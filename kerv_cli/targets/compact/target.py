@@ -64,11 +64,11 @@ class Compiled(NamedTuple):
 
     Attributes:
         prompt: Encodes a prompt.
-        step: Decodes one token after another. None if only the prompt's encoder is compiled.
+        step: Decodes one token after another.
     """
 
     prompt: Program
-    step: Program | None
+    step: Program
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(None), ()
@@ -234,7 +234,9 @@ class CompactTarget(Packable):
         return self.prompt(*given)
 
     def prompt(self, words: Tensor, proprioception: Tensor, *seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the result of `encode_batch` in torch, or record it as a program.
+        """Compute the result of `encode_batch` from what the vision encoders found, or from the states.
+
+        It runs in torch. While a program is recorded, all arguments are `Recorded`.
 
         Args:
             words: (B, L) ids of words.
@@ -311,10 +313,9 @@ class CompactTarget(Packable):
         Returns:
             The tokens. None if this target is not compiled.
         """
-        step = self.packed.step if self.packed else None
-        if step is None or cache.fixed:
+        if self.packed is None or cache.fixed:
             return None
-        tokens = step.repeat(count, torch.tensor([[token]]), cache=cache)
+        tokens = self.packed.step.repeat(count, torch.tensor([[token]]), cache=cache)
         cache.length += count
         return [int(token) for token in tokens[:, 0]]
 
