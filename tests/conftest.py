@@ -103,6 +103,16 @@ def policies(tmp_path_factory):
     return results
 
 
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory):
+    """A results folder with `few`: real demonstrations of one task. Read only: copy it to change it."""
+    from kerv_cli.worlds.demos.recording import DemoConfig, record
+
+    folder = tmp_path_factory.mktemp("recorded")
+    record(DemoConfig(("drawer-close-v3",), 6, frame_stride=8, workers=1), folder / "artifacts/demos/few")
+    return folder
+
+
 @pytest.fixture
 def results(policies, tmp_path):
     """A results folder with a copy of the policies, which a test may change."""

@@ -19,6 +19,7 @@ from examples.own_target import SEVEN
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
+from loaded import datastore_of
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
@@ -37,7 +38,7 @@ from kerv_cli.methods.calibration import (
     SkipSection,
     Variability,
 )
-from kerv_cli.methods.heisd.datastore import Datastore, Manifest, Shard
+from kerv_cli.methods.heisd.datastore import Datastore
 from kerv_cli.methods.heisd.rules import BoundaryRanges
 from kerv_cli.methods.kerv.prediction import PREDICTORS, Noise
 from kerv_cli.methods.settings import PolicySettings
@@ -354,11 +355,7 @@ def calibrated(
 def store_of(similar: np.ndarray, tokens: np.ndarray, seeds: np.ndarray, space: ActionSpace = SPACE) -> Datastore:
     """One task `a`. similar (n,): angle of each entry's key."""
     vectors = np.stack([np.cos(similar), np.sin(similar)], 1).astype(np.float32)
-    rows = np.arange(len(tokens))
-    files = {"vectors.npy": "v" * 64, "payload.parquet": "p" * 64}
-    shards = {"a": Shard((0, len(rows)), tuple(sorted(set(seeds.tolist()))))}
-    manifest = Manifest(2, "datastore", ("scene",), 2, len(rows), 2, space, "t" * 64, "d" * 64, files, shards)
-    return Datastore(manifest, vectors, tokens.astype(np.uint8), seeds, rows, rows, {"a": slice(0, len(rows))})
+    return datastore_of(vectors, tokens, {"a": slice(0, len(tokens))}, seeds, space=space)
 
 
 @hypothesis_settings(deadline=None)

@@ -14,12 +14,13 @@ from command import kerv
 from examples.own_target import SEVEN
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from loaded import datastore_of
 from test_calibration import write_dataset
 
 from kerv_cli.base.errors import CheckpointError, StorageError, UnknownName, UsageError
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.tree import ROOT, TokenTree
-from kerv_cli.methods.heisd.datastore import Datastore, Manifest, Shard, check_seeds, prompt_key
+from kerv_cli.methods.heisd.datastore import Datastore, Shard, check_seeds, prompt_key
 from kerv_cli.methods.heisd.rules import neighbour_tree
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.checkpoint import TargetDescription, load_target
@@ -103,18 +104,9 @@ def opened(results: Path, name: str = "nano-state") -> tuple[Datastore, Any, Tar
     return Datastore.open(folder_of(results, name), description), target, description
 
 
-FILES = {"vectors.npy": "v" * 64, "payload.parquet": "p" * 64}
-
-
-def any_manifest(vectors: np.ndarray, key: tuple[str, ...] = ("scene",)) -> Manifest:
-    rows, width = vectors.shape
-    return Manifest(2, "datastore", key, width, rows, 4, SPACE, "t" * 64, "d" * 64, FILES, {})
-
-
 def store_of(vectors: np.ndarray, shards: dict[str, slice], seeds: np.ndarray | None = None) -> Datastore:
     rows = np.arange(len(vectors))
-    tokens = np.stack([rows % 251, rows // 251], 1).astype(np.uint8)  # tell the row
-    return Datastore(any_manifest(vectors), vectors, tokens, rows if seeds is None else seeds, rows, rows, shards)
+    return datastore_of(vectors, np.stack([rows % 251, rows // 251], 1), shards, seeds)  # tokens tell the row
 
 
 @pytest.mark.bits

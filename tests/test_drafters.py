@@ -1,11 +1,11 @@
 """Drafters: the dynamic tree against one that walks every path alone, and the early drafter's training."""
 
 import dataclasses
+import shutil
 from typing import Any
 
 import pytest
 import torch
-from command import kerv
 from hypothesis import given
 from hypothesis import strategies as st
 from loaded import of_target
@@ -29,9 +29,7 @@ from kerv_cli.training.drafter import DrafterRun
 from kerv_cli.training.imitation import load_samples
 from kerv_cli.training.settings import TrainDrafterSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset
-from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.metaworld.spec import SPEC
-from kerv_cli.worlds.settings import CameraSettings
 
 
 def drafted(seed: int, depth: int, top_k: int, nodes: int) -> tuple[DrafterProposer, CompactTarget, TokenTree]:
@@ -216,14 +214,11 @@ def test_the_odds_are_those_of_independent_tokens(seed, radius):
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory, policies):
+def results(tmp_path_factory, policies, recorded):
     """The nano policies' results folder with a few real demonstrations."""
-    import shutil
-
     folder = tmp_path_factory.mktemp("early")
     shutil.copytree(policies, folder, dirs_exist_ok=True)
-    config = DemoConfig(("drawer-close-v3",), 6, camera=CameraSettings(), frame_stride=8, workers=1)
-    record(config, folder / "artifacts/demos/few")
+    shutil.copytree(recorded, folder, dirs_exist_ok=True)
     return folder
 
 
@@ -262,34 +257,6 @@ def test_a_single_episode_cannot_be_held_out():
     one = EarlyExamples(zeros[:, None], zeros, zeros.bool(), torch.zeros(4, 1))
     with pytest.raises(CheckpointError):
         split(one, 0.1)
-
-
-def test_it_trains_from_the_command_line_and_drafts_for_its_target_alone(results):
-    words = ["train", "drafter", "drafter=early", "demos=few", "policy.target=nano-vision"]
-    words += [
-        "policy.artifacts.early=whole",
-        "drafter.width=32",
-        "drafter.rank=8",
-        "train.batch=8",
-        "train.steps=4",
-        "train.held_out=0.34",
-    ]
-    done = kerv(*words, f"results={results}")
-    assert "accepted_r9" in done.stdout
-    target, description = load_target(results / "artifacts/target/nano-vision")
-    files, folder = EarlyDrafter(), results / "artifacts/early/whole"
-    own, early = files.checked(folder, description), files.load(folder, of_target(description, target))
-    assert own.target == description.sha256
-    assert own.chunk == target.chunk
-    assert own.provenance["settings"]["drafter"]["width"] == early.settings.width == 32
-    assert early.scale.min() > 0
-    assert not torch.equal(early.scale, torch.ones_like(early.scale))
-    drafted = tokens_of(early, torch.randn(1, target.pooled_width), 0)
-    assert len(drafted) == target.chunk * 4
-    assert all(0 <= token < 255 for token in drafted)
-    longer = dataclasses.replace(description, settings={**description.settings, "chunk": 8})
-    with pytest.raises(CheckpointError):
-        files.checked(folder, longer)
 
 
 @pytest.mark.bits

@@ -75,6 +75,8 @@ def test_a_policy_of_seven_dofs_is_trained_and_decodes_with_its_drafters(results
     loaded = of_target(description, target)
     drafter = EagleDrafter().load(results / "artifacts/drafter/arm", loaded)
     early = EarlyDrafter().load(results / "artifacts/early/arm", loaded)
+    assert early.scale.min() > 0
+    assert early.scale.std() > 0  # it knows the spread of what it was shown
     assert early.strict.tolist() == [dof == 6 for dof in range(7)] * target.chunk
     shown = Observation(np.full(7, 0.1), np.full(19, 0.1), "turn the peg and push it into the tilted slot")
     plain = Decoder(target).decode(shown)

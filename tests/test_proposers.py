@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from loaded import datastore_of
 from test_decoding_lossless import assert_adds_up, plain_greedy, random_prompt, random_target
 
 from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
@@ -17,7 +18,7 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.early.drafter import EarlyProposer
 from kerv_cli.methods.heisd import SimilaritySkipSettings
-from kerv_cli.methods.heisd.datastore import Datastore, Manifest, prompt_key
+from kerv_cli.methods.heisd.datastore import Datastore, prompt_key
 from kerv_cli.methods.heisd.rules import HybridProposer, Random, RetrievalProposer, VerifySkip
 from kerv_cli.methods.kerv.prediction import Hold, Kalman, Linear, Noise, PredictionProposer
 from kerv_cli.methods.merged import MergedProposer
@@ -27,7 +28,6 @@ from kerv_cli.worlds.metaworld.spec import SPEC
 SPACE = SPEC.actions
 D = SPACE.dofs
 HELD = SPACE.is_strict
-FILES = {"vectors.npy": "v" * 64, "payload.parquet": "p" * 64}
 
 
 class KnownDraft:
@@ -47,17 +47,7 @@ def stored(target: CompactTarget, prompt: torch.Tensor, chunks: np.ndarray, left
     key = prompt_key(prompt, target, ["scene"])[0].numpy()
     vectors = key + 0.05 * random.standard_normal((len(chunks), len(key)))
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-    return Datastore(
-        manifest=Manifest(
-            2, "datastore", ("scene",), len(key), len(chunks), target.chunk, SPACE, "t" * 64, "d" * 64, FILES, {}
-        ),
-        vectors=vectors.astype(np.float32),
-        tokens=chunks.astype(np.uint8),
-        seeds=np.arange(len(chunks)),
-        steps=np.zeros(len(chunks), dtype=int),
-        left=np.full(len(chunks), left),
-        shards={"t": slice(0, len(chunks))},
-    )
+    return datastore_of(vectors, chunks, {"t": slice(0, len(chunks))}, left=left)
 
 
 def situation(random: np.random.Generator, executed: int) -> Situation:

@@ -1,14 +1,14 @@
 """Qdrant finds the neighbours of exact search; tried with the client's local mode."""
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from loaded import datastore_of
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.methods.heisd import QdrantSearchSettings
-from kerv_cli.methods.heisd.datastore import Datastore, ExactIndex, best
+from kerv_cli.methods.heisd.datastore import ExactIndex, best
 
 ROWS = {"a": slice(0, 60), "b": slice(60, 61), "c": slice(61, 300)}
 SEEDS = np.random.default_rng(1).integers(0, 4, 300)
@@ -16,10 +16,8 @@ pytest.importorskip("qdrant_client")
 
 
 def searched(vectors: np.ndarray, shards: dict[str, slice] = ROWS, **where: str) -> Any:
-    rows = np.arange(len(vectors))
-    manifest: Any = SimpleNamespace(content="d" * 64)
-    search = QdrantSearchSettings(**where)
-    return Datastore(manifest, vectors, rows[:, None], SEEDS, rows, rows, shards, search=search).index
+    tokens = np.arange(len(vectors))[:, None]
+    return datastore_of(vectors, tokens, shards, SEEDS[: len(vectors)], search=QdrantSearchSettings(**where)).index
 
 
 def vectors_of(kind: str, width: int) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import shutil
 from typing import Any
 
 import numpy as np
@@ -34,21 +35,17 @@ from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.settings import PrepareSettings
-from kerv_cli.worlds.demos.recording import DemoConfig, record
-from kerv_cli.worlds.settings import CameraSettings
 
 SMALL = ScoutSettings(width=24, rank=4, keypoints=4, cell_width=8, cell_features=2, word_width=4)
 TASK = "drawer-close-v3"
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory, policies):
+def results(tmp_path_factory, policies, recorded):
     """The nano policies' results folder with a few real demonstrations."""
-    import shutil
-
     folder = tmp_path_factory.mktemp("scout")
     shutil.copytree(policies, folder, dirs_exist_ok=True)
-    record(DemoConfig((TASK,), 4, camera=CameraSettings(), frame_stride=8, workers=1), folder / "artifacts/demos/few")
+    shutil.copytree(recorded, folder, dirs_exist_ok=True)
     return folder
 
 

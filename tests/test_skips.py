@@ -10,8 +10,6 @@ from examples.own_target import SEVEN, MockTarget
 from test_decoding_lossless import plain_greedy, random_prompt, random_target
 from test_proposers import stored
 
-from kerv_cli.base.errors import UsageError
-from kerv_cli.base.limits import check_settings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
@@ -226,14 +224,6 @@ def test_the_regression_is_that_of_least_squares(penalty, window):
     assert predicted == pytest.approx(expected, abs=1e-9)
 
 
-def test_a_steep_line_ends_at_the_limits_and_a_short_history_gives_none():
-    ridge = Ridge(SPACE.is_strict, 1e-4, 6, 4)
-    climb = np.repeat(np.linspace(-0.5, 0.8, 6)[:, None], 4, 1)
-    predicted = ridge.predict(climb, 4)
-    assert predicted[-1] == pytest.approx([1.0, 1.0, 1.0, 0.8])
-    assert ridge.predict(climb[1:], 4) is None
-
-
 class Counting(MockTarget):
     """Counts the observations that it encodes."""
 
@@ -297,11 +287,6 @@ def test_an_intuitive_decode_runs_nothing_of_the_target():
     line[:, SPACE.is_strict] = history[-1, SPACE.is_strict]
     assert intuitive.tokens == tuple(SPACE.bins_of(line).flatten())
     assert intuitive.unverified == intuitive.actions.size == 16
-
-
-def test_speeds_that_are_not_in_order_are_refused():
-    with pytest.raises(UsageError, match=r"skip\.v_min=2 skip\.v_max=1"):
-        check_settings(SpeedSkipSettings(v_min=2, v_max=1))
 
 
 # --- streak

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -29,9 +30,7 @@ from kerv_cli.training.imitation import Imitation, lit, vocabulary, waypoints
 from kerv_cli.training.loop import Loop, Metrics, read_state
 from kerv_cli.training.settings import TrainSettings
 from kerv_cli.worlds.demos.files import DemoEpisode
-from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.metaworld.spec import SPEC
-from kerv_cli.worlds.settings import CameraSettings
 
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
@@ -39,12 +38,9 @@ TINY = TrainSettings(steps=12, batch=4, lr=0.01, warmup=2, validate_every=4, ema
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory):
+def results(tmp_path_factory, recorded):
     """A results folder with a few real demonstrations of one task."""
-    folder = tmp_path_factory.mktemp("training")
-    config = DemoConfig(("drawer-close-v3",), 6, camera=CameraSettings(), frame_stride=8, workers=1)
-    record(config, folder / "artifacts/demos/few")
-    return folder
+    return Path(shutil.copytree(recorded, tmp_path_factory.mktemp("training") / "results"))
 
 
 class Sums:
