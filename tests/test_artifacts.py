@@ -121,7 +121,7 @@ def test_a_changed_file_is_another_artifact(results):
     before, store = check(asked), files.load("datastore")
     assert files.load("datastore") is store
     policy = PolicySettings(target="nano-state")
-    built = BuildDatastoreSettings(policy=policy, demos="few", task=list(TASKS), results=str(results), stride=2)
+    built = BuildDatastoreSettings(policy=policy, demos="few", task=list(TASKS), results=str(results), episodes=1)
     DatastoreBuild(built).build()
     after = check(asked)
     assert {kind for kind in before if before[kind] != after[kind]} == {"datastore"}

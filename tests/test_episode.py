@@ -5,9 +5,7 @@ from pathlib import Path
 import pytest
 
 from kerv_cli.base.config import compose
-from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.engine.record import PHASES, EpisodeRecord
-from kerv_cli.episodes import policy as policies_of
 from kerv_cli.episodes import runner as run
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.worlds.metaworld.spec import SPEC
@@ -79,12 +77,3 @@ def test_deviation_is_sampled_and_zero_for_ar_itself(policies):
     assert [d.deviation for d in ar.decodes] == [None, 0.0, None]
     loose = settings(policies, "policy.target=nano-state", "deviation_every=1", "method=spec_vla", "threshold.r=120")
     assert any(d.deviation for d in episodes(loose, 1)[0].decodes)
-
-
-def test_what_cannot_run_is_refused_beforehand(policies):
-    with pytest.raises(UsageError, match="trained on 96 pixels"):
-        policies_of.check(settings(policies, "policy.target=nano-vision", "world.camera.size=64"))
-    drafter = f"policy.artifacts.drafter={policies}/artifacts/drafter/nano-state"
-    mixed = settings(policies, "policy.target=nano-vision", "method=spec_vla", drafter)
-    with pytest.raises(CheckpointError, match="was trained for target"):
-        policies_of.check(mixed)

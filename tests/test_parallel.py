@@ -18,9 +18,8 @@ from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
-from kerv_cli.training.drafter import DrafterRun
 from kerv_cli.training.imitation import check_init, continued_target
-from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
+from kerv_cli.training.settings import TrainTargetSettings
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 WORDS = WordTokenizer.build(["pull the drawer open"])
@@ -73,7 +72,7 @@ def test_all_tokens_come_from_one_forward_in_which_they_see_each_other(packed):
     assert list(record.tokens) == wanted
     assert len(set(wanted)) > 1
     assert (record.forwards, record.mode, record.unverified) == (1, "parallel", policy.chunk * policy.actions.dofs)
-    assert record.phases["prefill"] > record.phases["propose"]
+    assert record.phases["prefill"] > 0
 
 
 @pytest.mark.bits
@@ -118,15 +117,3 @@ def test_target_and_method_must_fit(results, words, message):
     settings = compose("rollout", [f"results={results}", "task=drawer-open-v3", *words.split()], RolloutSettings)
     with pytest.raises(UsageError, match=message):
         check(settings)
-
-
-def test_no_drafter_is_distilled_from_it(results, monkeypatch):
-    from kerv_cli.worlds.demos.dataset import DemoDataset
-
-    of_them = {"actions": SPEC.actions, "observation": SPEC.observation, "environment": SPEC.name, "tasks": {}}
-    same = type("M", (), of_them)
-    demos = type("D", (), {"manifest": same, "path": Path("demos"), "episodes": ()})()
-    monkeypatch.setattr(DemoDataset, "open", classmethod(lambda cls, folder: demos))
-    settings = compose("train_drafter", [f"results={results}", "policy.target=parallel"], TrainDrafterSettings)
-    with pytest.raises(UsageError, match="no greedy decodes to imitate"):
-        DrafterRun(settings)

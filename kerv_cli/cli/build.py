@@ -60,7 +60,7 @@ def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
 @command(
     "build datastore",
     BuildDatastoreSettings,
-    keys="policy.target policy.artifacts demos task episodes stride key components half",
+    keys="policy.target policy.artifacts demos task episodes key components half",
     examples=(
         "kerv build datastore demos=mt10 policy.artifacts.datastore=mine",
         "kerv build datastore policy.target=mine demos=mine half=true --plan",

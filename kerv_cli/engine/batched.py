@@ -1,6 +1,6 @@
 """Decodes the observations of several episodes at once, for runs that measure success but no times.
 
-Only methods whose decodes all run the same sequence of forwards can be batched (docs/measuring.md).
+Only methods that never verify a draft can be batched (docs/measuring.md).
 """
 
 from __future__ import annotations
@@ -8,15 +8,13 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.chunk import Chunk, EpisodeState, actions_of, deviation
+from kerv_cli.engine.chunk import Chunk, EpisodeState
 from kerv_cli.engine.decoder import Decoder
-from kerv_cli.engine.parts import TakesMany
 from kerv_cli.engine.protocol import Cache, EncodesMany, Target
 from kerv_cli.engine.record import UNTIMED, DecodeRecord
 
@@ -60,19 +58,15 @@ class BatchDecoder:
             )
             for i, episode in enumerate(episodes)
         ]
-        self._complete(chunks)
-        records = [chunk.record(chunk.actions(), math.nan, dict(UNTIMED)) for chunk in chunks]
-        for episode in episodes:
-            episode.decodes += 1
-        every = self.decoder.deviation_every
-        sampled = [i for i, episode in enumerate(episodes) if every and episode.decodes % every == 0]
-        autoregressive = [chunks[i].tokens for i in sampled]
-        if self.skip is not None:
-            autoregressive = self._tokens([chunks[i] for i in sampled])
-        for i, tokens in zip(sampled, autoregressive, strict=True):
-            gap = deviation(space, records[i].actions, actions_of(space, tokens))
-            records[i] = replace(records[i], deviation=gap)
-        return records
+        verified = [chunk for chunk in chunks if not self._skips(chunk)]
+        for chunk, tokens in zip(verified, self._tokens(verified), strict=True):
+            for token in tokens:
+                chunk.commit_token(token)
+        return [chunk.record(chunk.actions(), math.nan, dict(UNTIMED)) for chunk in chunks]
+
+    def _skips(self, chunk: Chunk) -> bool:
+        chunk.cache.length = 0
+        return self.skip is not None and self.skip.take(chunk)
 
     def _encode(self, observations: Sequence[Observation]) -> list[Tensor]:
         """Return each prompt's embeddings (1, P, E).
@@ -82,14 +76,6 @@ class BatchDecoder:
         if isinstance(self.target, EncodesMany) and self.target.device.type != "cpu":
             return list(self.target.encode_many(observations).split(1))
         return [self.target.encode(observation) for observation in observations]
-
-    def _complete(self, chunks: Sequence[Chunk]) -> None:
-        if isinstance(self.skip, TakesMany):
-            self.skip.take_many(chunks, self._cache)
-            return
-        for chunk, tokens in zip(chunks, self._tokens(chunks), strict=True):
-            for token in tokens:
-                chunk.commit_token(token)
 
     def _tokens(self, chunks: Sequence[Chunk]) -> list[list[int]]:
         """Return the N greedy tokens of each chunk. Prompts of equal length are decoded together, without padding."""

@@ -74,10 +74,10 @@ class Situation:
 
 
 class EpisodeState:
-    """What a decoder remembers of the running episode: its actions, its positions, and the number of decodes."""
+    """What a decoder remembers of the running episode: its actions and its positions."""
 
     def __init__(self, space: ActionSpace, cameras: tuple[str, ...]) -> None:
-        self.space, self.cameras, self.decodes = space, cameras, 0
+        self.space, self.cameras = space, cameras
         self.situation = Situation("", ActionHistory(space.dofs))
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
@@ -90,7 +90,6 @@ class EpisodeState:
         """
         random = np.random.default_rng(seed)
         self.situation = Situation(task, ActionHistory(self.space.dofs), [np.asarray(end_effector)], random)
-        self.decodes = 0
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
         """Note an action that was executed.

@@ -84,6 +84,7 @@ class Decoder(ActionDecoder):
         size = self.steps * target.actions.dofs
         nodes = max(p.nodes if p is not None else 0 for p in (self.parts.prefill_draft, self.parts.proposer))
         self.cache = target.new_cache(1, target.max_prompt + size + max(nodes, size) + 1)
+        self.decodes = 0  # in this episode
         self.deviation_every = 0  # every this many decodes, measure the deviation from autoregressive actions; 0: never
 
     @cached_property
@@ -100,6 +101,7 @@ class Decoder(ActionDecoder):
             end_effector: Initial position (3,), metres.
         """
         super().reset(task, seed, end_effector)
+        self.decodes = 0
         parts = self.parts
         if parts.boundary is not None:
             self.situation = replace(self.situation, random=parts.boundary.numbers(task, seed))

@@ -6,14 +6,12 @@ Proposers are in `proposer.py`, acceptance rules in `acceptance.py`. This file i
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     import numpy as np
 
     from kerv_cli.engine.chunk import Choice, Chunk
-    from kerv_cli.engine.protocol import Cache
 
 
 class Threshold(Protocol):
@@ -113,16 +111,3 @@ class Skip(ABC):
 
     def verified(self, chunk: Chunk) -> None:  # noqa: B027
         """Learn from a verification. Called after the prefill has verified a draft that was not skipped."""
-
-
-@runtime_checkable
-class TakesMany(Protocol):
-    """A skip rule that completes all chunks of a batch of episodes together."""
-
-    def take_many(self, chunks: Sequence[Chunk], cache: Callable[[int], Cache]) -> None:
-        """Complete B chunks.
-
-        Args:
-            chunks: One chunk per episode, without committed tokens.
-            cache: Function that returns an empty cache for a given number of sequences.
-        """

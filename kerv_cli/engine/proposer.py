@@ -71,10 +71,6 @@ class ChainProposer(Proposer):
         """Return token sequences that continue the committed tokens, best first, at most `depth` tokens each."""
         raise NotImplementedError
 
-    def tokens_of(self, chunks: Sequence[Chunk]) -> list[list[int]]:
-        """Draft complete chunks without committed tokens: return each chunk's best chain, N tokens."""
-        return [self.chains(chunk, chunk.size)[0] for chunk in chunks]
-
     def is_sure(self, chunk: Chunk) -> bool:
         """Return whether the proposer expects its best chain to be accepted whole. By default, never."""
         return False

@@ -72,6 +72,8 @@ def check(settings: RolloutSettings) -> dict[str, str]:
     method = Method.of(settings)
     if settings.deviation_every > 0:
         target.check_autoregressive(f"deviation_every={settings.deviation_every}", "there is no AR to differ from")
+        if settings.rollout.batch > 1:
+            raise UsageError(f"deviation_every={settings.deviation_every}: not in batches. Leave out rollout.batch")
     method.check(target, settings.rollout.batch)
     clock.check(settings, spec, target)
     world = dataclasses.asdict(settings.world)

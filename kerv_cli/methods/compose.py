@@ -107,12 +107,8 @@ class Method:
         if batch == 1:
             return
         draft, proposer, skip, threshold = (self.parts[k] for k in ("prefill_draft", "proposer", "skip", "threshold"))
-        if not (
-            draft.traits.get("batchable")
-            and proposer.absent
-            and skip.traits.get("batchable")
-            and (draft.absent or skip.traits.get("takes_draft"))
-        ):
+        is_used = draft.absent or skip.traits.get("takes_draft")
+        if not (proposer.absent and skip.traits.get("batchable") and is_used):
             raise UsageError(f"{key}={batch}: method={self.name} decodes one episode at a time. Leave {key} out")
         if not draft.absent and not threshold.traits.get("batchable"):
             raise UsageError(f"{key}={batch}: threshold={threshold.name} follows one episode. Use another")

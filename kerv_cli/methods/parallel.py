@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from kerv_cli.base.errors import UsageError
@@ -12,7 +12,7 @@ from kerv_cli.engine.parts import Skip
 if TYPE_CHECKING:
     from kerv_cli.engine.chunk import Chunk
     from kerv_cli.engine.decoder import Decoder
-    from kerv_cli.engine.protocol import Cache, ParallelTarget
+    from kerv_cli.engine.protocol import ParallelTarget
     from kerv_cli.methods.context import Context
 
 
@@ -37,21 +37,6 @@ class ParallelPass(Skip):
         hidden = self.target.parallel_pass(chunk.prompt, chunk.cache)
         chunk.commit_at_once(self.target.head(hidden[0, : chunk.size]).argmax(-1).tolist())
         return True
-
-    def take_many(self, chunks: Sequence[Chunk], cache: Callable[[int], Cache]) -> None:
-        """Commit all tokens of several chunks after one forward. Their prompts must be equally long.
-
-        Args:
-            chunks: The chunks.
-            cache: Returns an empty cache for a number of chunks.
-        """
-        import torch
-
-        prompt = torch.cat([chunk.prompt for chunk in chunks])
-        hidden = self.target.parallel_pass(prompt, cache(len(chunks)))
-        rows = self.target.head(hidden[:, : chunks[0].size]).argmax(-1).tolist()
-        for chunk, tokens in zip(chunks, rows, strict=True):
-            chunk.commit_at_once(tokens)
 
 
 def is_parallel(target: object) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -13,7 +12,6 @@ from kerv_cli.engine.parts import Skip
 if TYPE_CHECKING:
     from kerv_cli.engine.chunk import Chunk
     from kerv_cli.engine.proposer import ChainProposer
-    from kerv_cli.engine.protocol import Cache
     from kerv_cli.methods.context import Context
 
 TRUSTED, STREAK = "trusted", "streak"
@@ -118,11 +116,6 @@ class AlwaysSkip(Skip):
             return False
         chunk.skip(chains[0], self.source.name)
         return True
-
-    def take_many(self, chunks: Sequence[Chunk], cache: Callable[[int], Cache]) -> None:
-        """Fill several chunks with their drafts. The cache is not used."""
-        for chunk, tokens in zip(chunks, self.source.tokens_of(chunks), strict=True):
-            chunk.skip(tokens, self.source.name)
 
 
 _FILE = "kerv_cli.methods.streak:"

@@ -106,14 +106,14 @@ class DatastoreBuild:
 
     @torch.inference_mode()
     def _entries(self, episode: DemoEpisode) -> dict[str, np.ndarray]:
-        """Make the entries of an episode: one for every `stride`-th observation.
+        """Make the entries of an episode: one for every observation.
 
         Returns:
             Column -> values, one row per entry. The column `keys` holds the encoded observations, and `tokens` the
             expert's next H undisturbed actions.
         """
         target: Any = self.artifacts.target
-        steps = steps_of(episode, bool(target.cameras))[:: self.settings.stride]
+        steps = steps_of(episode, bool(target.cameras))
         tokens = target.actions.encode(read_chunks(episode, steps, target.chunk)).reshape(len(steps), -1)
         observations = observations_of(target, episode, steps, self.dataset.manifest.observation)
         size = -(-len(steps) // -(-len(steps) // BATCH))  # equal batches

@@ -154,7 +154,6 @@ class BuildDatastoreSettings(DemonstrationSettings):
     groups: ClassVar = {"policy": "vision", "runtime": "cpu"}
 
     episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)
-    stride: int = number(1, 1, 10_000, help="store every n-th observation")
     half: bool = setting(False, "store keys in float16, half the size")
     components: int = number(0, 0, 65_536, help="project keys onto this many leading directions; 0: no projection")
     key: list[str] = setting(["scene"], "parts of the prompt that make the key: scene, vision, proprioception")

@@ -27,7 +27,6 @@ add_drafter(
     when=PREFILL,
     chains=True,
     drafts_whole_chunk=True,
-    batchable=True,
     cost="early",
     measured_by="early_unverified",
 )

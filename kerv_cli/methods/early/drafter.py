@@ -8,7 +8,6 @@ small forward pass.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -169,11 +168,6 @@ def _between(below: Tensor, pad: int, radius: int, bins: int) -> Tensor:
     return below[..., pad + radius + 1 :][..., :bins] - below[..., pad - radius :][..., :bins]
 
 
-def radius_of(chunks: Sequence[Chunk]) -> int:
-    """Return the acceptance radius in bins of chunks that all have the same limits."""
-    return max(chunks[0].limits, default=0)
-
-
 class EarlyProposer(ChainProposer):
     """Drafts chunks with the early drafter (docs/methods.md §5), once per observation."""
 
@@ -186,26 +180,21 @@ class EarlyProposer(ChainProposer):
     def drafted(self, chunk: Chunk) -> tuple[list[int], float]:
         """Return the draft of the chunk's N tokens, and the estimated probability that all are accepted."""
         if self._drafted is None or self._drafted[0] is not chunk:
-            numbers = read(self._rows([chunk])[0])[0]
+            numbers = read(self.row(chunk, max(chunk.limits, default=0)))[0]
             self._drafted = chunk, numbers[:-1].astype(np.int64).tolist(), float(numbers[-1])
         return self._drafted[1:]
 
-    def _rows(self, chunks: Sequence[Chunk]) -> Tensor:
-        """Draft several chunks with equal acceptance limits.
+    def row(self, chunk: Chunk, radius: int) -> Tensor:
+        """Draft a chunk for an acceptance radius in bins.
 
         Returns:
-            (B, N + 1) float64: the N tokens, then the estimated probability that all of them are accepted.
+            (N + 1,) float64: the N tokens, then the estimated probability that all of them are accepted.
         """
-        features = torch.cat([self.target.pooled(chunk.prompt) for chunk in chunks])
-        return self.early.draft(features, radius_of(chunks))
+        return self.early.draft(self.target.pooled(chunk.prompt), radius)[0]
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         """Return one chain: up to `depth` drafted tokens after the chunk's committed tokens."""
         return [self.drafted(chunk)[0][len(chunk.tokens) : chunk.size][:depth]]
-
-    def tokens_of(self, chunks: Sequence[Chunk]) -> list[list[int]]:
-        """Return the N draft tokens of each chunk. The chunks must have equal acceptance limits."""
-        return self._rows(chunks)[:, :-1].long().tolist()
 
     def is_sure(self, chunk: Chunk) -> bool:
         """Return whether the estimated probability that the whole chunk is accepted is at least SURE."""

@@ -31,5 +31,4 @@ add_drafter(
     when=PREFILL,
     chains=True,
     drafts_whole_chunk=True,
-    batchable=True,
 )

@@ -8,7 +8,6 @@ drafter.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +22,7 @@ from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.drafters import Decodes, Metrics, Training
-from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyNetwork, EarlyProposer, radius_of
+from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyNetwork, EarlyProposer
 from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.targets.compact.features import hand_features, mlp, scene_features, scene_width
 from kerv_cli.targets.compact.packable import Packable, wants_gradient
@@ -138,15 +137,10 @@ class ScoutProposer(EarlyProposer):
         self.scout, self.inputs = scout, target.inputs
 
     @torch.inference_mode()
-    def _rows(self, chunks: Sequence[Chunk]) -> Tensor:
-        """Draft several chunks with equal acceptance limits.
-
-        Returns:
-            (B, N + 1) float64: the N tokens, then the estimated probability that all of them are accepted.
-        """
-        seen = [chunk.observation for chunk in chunks if chunk.observation is not None]
-        logits = torch.cat([self.scout(self.inputs(observation))[0] for observation in seen])
-        return self.early.chosen(logits, radius_of(chunks))
+    def row(self, chunk: Chunk, radius: int) -> Tensor:
+        """Draft a chunk from its observation; arguments and result as in `EarlyProposer.row`."""
+        assert chunk.observation is not None
+        return self.early.chosen(self.scout(self.inputs(chunk.observation))[0], radius)[0]
 
 
 @dataclass(frozen=True)
