@@ -64,8 +64,8 @@ kerv() { local name=$1 most=$2; shift 2; step "$name" "$most" "$PYTHON" -m kerv_
 
 missing=$("$PYTHON" - <<'PY'
 import importlib.util as found
-names = {"filterpy": "filterpy", "gymnasium": "gymnasium", "hydra": "hydra-core", "jinja2": "jinja2", "joblib": "joblib",
-         "matplotlib": "matplotlib", "metaworld": "metaworld", "mujoco": "mujoco", "pandas": "pandas", "PIL": "pillow",
+names = {"altair": "altair", "vl_convert": "vl-convert-python", "filterpy": "filterpy", "gymnasium": "gymnasium",
+         "hydra": "hydra-core", "jinja2": "jinja2", "joblib": "joblib", "metaworld": "metaworld", "mujoco": "mujoco", "pandas": "pandas", "PIL": "pillow",
          "numba": "numba", "onnx": "onnx", "onnxruntime": "onnxruntime", "pyarrow": "pyarrow", "pydantic": "pydantic", "yaml": "pyyaml",
          "rich": "rich", "safetensors": "safetensors", "scipy": "scipy", "typer": "typer", "pytest": "pytest", "hypothesis": "hypothesis"}
 print(*[package for module, package in names.items() if found.find_spec(module) is None])

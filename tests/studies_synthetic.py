@@ -9,7 +9,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import altair as alt
 import numpy as np
+import pandas as pd
 
 from kerv_cli.base.registry import find
 from kerv_cli.base.settings import RuntimeSettings
@@ -223,3 +225,13 @@ def slow_elsewhere(setting: Setting, task: str) -> RunEpisode:
         return episode(setting, task, seed)
 
     return run
+
+
+def points_of(figure: alt.ConcatChart) -> list[pd.DataFrame]:
+    """The points of each panel of a chart, as a browser gets them."""
+    spec = figure.to_dict()
+    held = [
+        next(one["data"] for one in (panel["layer"][-1], panel, spec) if "name" in one.get("data", {}))
+        for panel in spec["concat"]
+    ]
+    return [pd.DataFrame(spec["datasets"][data["name"]]) for data in held]

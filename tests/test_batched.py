@@ -353,8 +353,8 @@ def test_no_speedup_is_made_of_what_was_not_timed(tmp_path, which):
     assert methods["success"].notna().all()
     printed = summary_frame(table).set_index("setting")
     assert (printed.loc[methods["label"], "speed, per episode"] == "–").all()
-    assert printed.loc["ar", "speed, per episode"] == ("1" if which == "method" else "–")
-    assert study_figures(table, "threshold.r", "threshold")
+    assert printed.loc["ar", "speed, per episode"] == ("1×" if which == "method" else "–")
+    assert study_figures(table, "threshold.r")
 
 
 def test_decodes_without_host_times_have_no_price(tmp_path):

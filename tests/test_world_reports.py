@@ -4,7 +4,7 @@ import dataclasses
 from dataclasses import replace
 
 import pytest
-from studies_synthetic import episode, settings_of, study_of, swept
+from studies_synthetic import episode, points_of, settings_of, study_of, swept
 
 from kerv_cli.base.config import compose
 from kerv_cli.engine.record import Delay
@@ -74,11 +74,14 @@ def test_a_stressed_setting_is_compared_with_the_baseline_under_the_same_stress(
 
 
 def test_the_figure_has_a_panel_per_kind_and_a_line_per_method(stressed_table):
-    figures = study_figures(stressed_table, "", "Success under stress")
+    figures = study_figures(stressed_table, "")
     assert list(figures) == [""]
-    panels = figures[""].axes
-    assert [panel.get_title(loc="left") for panel in panels] == ["push", "light"]
-    assert [list(bars.lines[0].get_ydata()) for bars in panels[1].containers] == [[100, 100, 100], [100, 100, 50]]
+    assert [panel.title for panel in figures[""].concat] == ["push", "light"]
+    light = points_of(figures[""])[1]
+    assert {name: list(line["value"]) for name, line in light.groupby("line")} == {
+        "ar": [100, 100, 100],
+        "bold": [100, 100, 50],
+    }
 
 
 def test_sums_count_every_stressed_world_once(stressed_table):
@@ -191,17 +194,13 @@ def test_every_setting_is_compared_with_ar_at_its_latency(delayed):
 
 
 def test_the_figure_has_a_panel_per_compensation_and_a_line_per_method(delayed):
-    table = latency_table(load_study(StudyStore(delayed, "latency")).table)
-    figure = latency_figure(table, "title")
-    panels = figure.axes
-    assert [panel.get_title(loc="left") for panel in panels] == [
-        "delay compensation: none",
-        "delay compensation: chunk",
-    ]
-    ar, _ = (bars.lines[0] for bars in panels[0].containers)
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["ar", "spec_vla"]
-    assert list(ar.get_xdata()) == pytest.approx([20.0, 30.0, 100.0])  # 30: its own latency
-    assert list(ar.get_ydata()) == [100.0, 100.0, 0.0]
+    figure = latency_figure(load_study(StudyStore(delayed, "latency")).table)
+    assert [panel.title for panel in figure.concat] == ["delay compensation: none", "delay compensation: chunk"]
+    points = points_of(figure)[0]
+    assert list(points["line"].unique()) == ["ar", "spec_vla"]
+    ar = points[points["line"] == "ar"]
+    assert list(ar["x"]) == pytest.approx([20.0, 30.0, 100.0])  # 30: its own latency
+    assert list(ar["value"]) == [100.0, 100.0, 0.0]
 
 
 def test_a_report_has_the_table_and_the_figure(delayed):

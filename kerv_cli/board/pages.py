@@ -16,7 +16,7 @@ from kerv_cli.lab.database import Database
 from kerv_cli.report.tables import is_number
 
 TEMPLATES = Environment(
-    loader=ChoiceLoader([PackageLoader("kerv_cli.board"), PackageLoader("kerv_cli.report", ".")]),
+    loader=ChoiceLoader([PackageLoader("kerv_cli.board"), PackageLoader("kerv_cli.report")]),
     autoescape=True,
     undefined=StrictUndefined,
     trim_blocks=True,

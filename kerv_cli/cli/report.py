@@ -36,6 +36,9 @@ Choose = Annotated[
 ]
 
 
+AllColumns = Annotated[bool, typer.Option("--all", help="Print all columns of the table, in several parts if needed.")]
+
+
 @command(
     "report",
     ReportSettings,
@@ -45,7 +48,13 @@ Choose = Annotated[
     typed={"study": "only"},
     lists=("on",),
 )
-def report(settings: ReportSettings, publish: Publish = False, choose: Choose = False, as_json: AsJson = False) -> None:
+def report(
+    settings: ReportSettings,
+    publish: Publish = False,
+    choose: Choose = False,
+    all_columns: AllColumns = False,
+    as_json: AsJson = False,
+) -> None:
     """Write CSV tables (per task and aggregated), plots and an HTML page about the studies."""
     from kerv_cli.cli.work import print_study, print_verdict
     from kerv_cli.episodes.resolve import study_name
@@ -65,7 +74,7 @@ def report(settings: ReportSettings, publish: Publish = False, choose: Choose = 
         priced = {} if output.priced is None else {"priced": rows_of(output.priced)}
         end_with_json({"files": output.files, "studies": tables, **priced})
     for name, table in output.tables.items():
-        print_study(table, StudyStore(results, name))
+        print_study(table, StudyStore(results, name), all_columns)
     if output.priced is not None:
         summary = repriced_summary(output.priced)
         print_table(summary.columns, summary.itertuples(index=False), ASSUMES)

@@ -185,7 +185,7 @@ def event_printer(show: Callable[[int, int, str], None]) -> Callable[[Event], No
     return on_event
 
 
-def print_study(table: DataFrame, store: StudyStore) -> None:
+def print_study(table: DataFrame, store: StudyStore, all_columns: bool = False) -> None:
     """Print the table of a study and its note.
 
     If times cannot be compared, because they were not measured in turn, print the command that measures them again.
@@ -193,11 +193,12 @@ def print_study(table: DataFrame, store: StudyStore) -> None:
     Args:
         table: Summary with one row per setting.
         store: The study in the database.
+        all_columns: Print all columns, not only those that people need first.
     """
     from kerv_cli.report.summary import SummaryTable, not_in_turn
     from kerv_cli.report.tables import values_of
 
-    console().print(SummaryTable(table))
+    console().print(SummaryTable(table, all_columns))
     codes, commits = values_of(table, "code"), values_of(table, "git_commit")
     if len(codes) > 1:
         names = ", ".join(sorted(commit[:12] for commit in commits))

@@ -1,220 +1,229 @@
-"""Draw the figures of a study from its tables, as PNG files.
+"""Draw the charts of a study from its tables. The page shows them interactively, a PNG file needs no browser.
 
-No display is needed. The same numbers give the same bytes.
+A chart has panels side by side. Each of its points is a setting, with these fields: `setting`, `line`, `x`, `value`,
+`low` and `high` (95 % interval), `is_baseline`, and the text that hovering shows. The page sets the parameter `picked`
+to the setting that was clicked.
 """
 
 from __future__ import annotations
 
-import io
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
 
-import matplotlib as mpl
+import altair as alt
 import pandas as pd
-from matplotlib.figure import Figure
+import vl_convert
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import write_bytes
-from kerv_cli.report.measures import MICRO, Row
-from kerv_cli.report.stressed import by_kind, is_stressed
-from kerv_cli.report.tables import is_baseline, is_number, rows_of
+from kerv_cli.report.measures import MICRO
+from kerv_cli.report.stressed import NONE, is_stressed
+from kerv_cli.report.summary import MAIN, summary_frame
+from kerv_cli.report.tables import is_number, latency_table
 
-INK, MUTED = "#1f2933", "#6b7785"
-COLOURS = ("#0b6fb8", "#d1495b", "#2a9d6f", "#8d5fd3", "#e08e1b", "#3aa6b9", "#7a5c3e")  # distinct when colour-blind
-MARKERS = "os^Dv"
-STYLE: Any = {
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#e3e8ee",
-    "axes.axisbelow": True,
-    "legend.frameon": False,
-}
-SUCCESS, SPEED = "success", "episode_speedup"
-UNITS = {SUCCESS: "success, % of episodes", SPEED: "speed: time per episode, baseline ÷ setting"}
-"""Columns of a study's table that are drawn -> their axis labels."""
-_ACROSS = 4  # panels in a row
-
-
-class Panel(NamedTuple):
-    """One panel of a figure: lines of a measure against a number.
-
-    Attributes:
-        title: Heading of the panel.
-        x: Table column for the x axis.
-        xlabel: Label of the x axis.
-        y: Table column for the y axis, SUCCESS or SPEED.
-        lines: Name of each line -> its table rows. A single row is drawn as a horizontal line.
-    """
-
-    title: str
-    x: str
-    xlabel: str
-    y: str
-    lines: Mapping[str, Sequence[Row]]
+INK, MUTED, BLUE, GREEN = "#1f2933", "#6b7785", "#0b6fb8", "#2a9d6f"
+COLOURS = (BLUE, "#d1495b", GREEN, "#8d5fd3", "#e08e1b", "#3aa6b9", "#7a5c3e")  # distinct when colour-blind
+SUCCESS, SPEED, DIFFERENCE = "success", "episode_speedup", "difference"
+TITLES = {SUCCESS: "Success, % of episodes", SPEED: "Speed, per episode", DIFFERENCE: "Change in success, points"}
+"""Columns of a study's table that are drawn -> their titles."""
+_WIDTH, _HEIGHT, _ACROSS = 320, 240, 3  # of a panel, in pixels; panels in a row
+_SPREAD = 6.0  # a ratio of speeds above which their axis is logarithmic
+_CONFIG = {
+    "axis": {"labelColor": INK, "titleColor": MUTED, "titleFontWeight": "normal", "gridColor": "#e3e8ee",
+             "domainColor": "#b8c1cb", "tickColor": "#b8c1cb", "labelFontSize": 12, "titleFontSize": 12,
+             "labelLimit": 260, "tickCount": 5},
+    "title": {"anchor": "start", "color": INK, "fontSize": 13, "subtitleColor": MUTED, "subtitleFontSize": 12},
+    "legend": {"labelColor": INK, "labelFontSize": 12, "labelLimit": 260, "symbolSize": 70},
+    "view": {"stroke": None},
+}  # fmt: skip
 
 
-def study_figures(table: pd.DataFrame, axis: str, title: str) -> dict[str, Figure]:
-    """Draw the figures that suit a study, from its rows pooled over tasks.
+def study_figures(table: pd.DataFrame, axis: str, loss: float = 3.0) -> dict[str, alt.ConcatChart]:
+    """Draw the chart that suits a study, from its rows pooled over tasks.
 
     - A study of stress: success against the level of stress.
     - A study whose settings differ along `axis`: speed and success against it.
-    - Any other study that was timed: success against speed.
+    - Any other study that compares or was timed: speed and change in success of every setting.
 
     Args:
         table: The study's table.
         axis: Table column for the x axis, such as `threshold.r`. Empty: none.
-        title: The study's title.
+        loss: Largest acceptable loss of success, in points.
 
     Returns:
-        Ending of the file's name, such as `_tradeoff` -> figure. Empty if there is nothing to draw.
+        Ending of the file's name, such as `_tradeoff` -> chart. Empty if there is nothing to draw.
     """
-    rows = table[table["averaging"] == MICRO]
-    heading = f"{title}\n{about(rows)}"
-    if is_stressed(rows):
-        panels = [Panel(kind, "stress_level", "level", SUCCESS, lines) for kind, lines in by_kind(table).items()]
-        return {"": lines_figure(panels, heading)}
-    lines = series_of(rows, axis)
-    if any(len(line) > 1 for line in lines.values()):
-        return {"": lines_figure([Panel("", axis, axis, y, lines) for y in (SPEED, SUCCESS)], heading)}
-    return {"_tradeoff": _tradeoff(rows_of(rows), heading)} if rows[SPEED].notna().any() else {}
+    rows = _pooled(table)
+    if is_stressed(table):
+        kinds = [kind for kind in rows["stress"].unique() if kind != NONE]
+        parts = [rows[rows["stress"].isin([NONE, kind])].assign(panel=kind) for kind in kinds]
+        drawn = pd.concat(parts).assign(line=lambda all: all["unstressed"], x=lambda all: all["stress_level"])
+        return {"": lines_figure([_points(drawn, SUCCESS)], "level of stress")}
+    rows = with_lines(rows, axis)
+    if rows["x"].notna().any():
+        measures = [_points(rows.assign(panel=TITLES[name]), name) for name in (SPEED, SUCCESS)]
+        return {"": lines_figure([one for one in measures if len(one)], axis)}
+    return {"_tradeoff": _tradeoff(rows, loss)} if rows["pairs"].any() else {}
 
 
-def about(rows: pd.DataFrame) -> str:
-    """Return the subtitle of a figure: policies, number of tasks and episodes, device, number format."""
-    first, targets = rows.iloc[0], list(dict.fromkeys(str(name) for name in rows["policy.target"]))
-    names = ", ".join(targets) if len(targets) <= 2 else f"{len(targets)} targets"
-    counts = f"{rows['tasks'].max()} tasks, {rows['episodes'].max()} episodes per setting"
-    return f"{names} · {counts} · {first['device_name']}, {first['runtime.dtype']}"
+def about(table: pd.DataFrame) -> str:
+    """Return the subtitle of a chart: policies, number of settings, tasks and episodes, device, number format."""
+    first, targets = table.iloc[0], list(map(str, table["policy.target"].unique()))
+    names = ", ".join(targets) if len(targets) <= 2 else f"{len(targets)} policies"
+    counts = (table["label"].nunique(), "setting"), (int(table["tasks"].max()), "task")
+    settings, tasks = (f"{number} {what}{'s' * (number != 1)}" for number, what in counts)
+    each = f"{table['episodes'].max()} episodes each"
+    return f"{names} · {settings} on {tasks}, {each} · {first['device_name']}, {first['runtime.dtype']}"
 
 
-def series_of(rows: pd.DataFrame, axis: str) -> dict[str, list[Row]]:
-    """Group the settings that differ only along the axis, so that each group can be drawn as a line.
+def _pooled(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows pooled over tasks, with `setting`, `is_baseline` and the text to show on hovering."""
+    rows = table[table["averaging"] == MICRO].reset_index(drop=True)
+    texts = summary_frame(table).iloc[:, :MAIN].add_prefix("text ")
+    return rows.assign(setting=rows["label"], is_baseline=rows["label"] == rows["baseline"], panel="").join(texts)
 
-    A row without a number on the axis forms a group of its own.
 
-    Returns:
-        Name of the group -> its rows, sorted along the axis.
+def with_lines(rows: pd.DataFrame, axis: str) -> pd.DataFrame:
+    """Add `line` and `x`: settings that differ only along the axis are points of one line.
+
+    A setting that has no number on the axis, or no other such setting, gets a line of its own and no x.
     """
-    series: dict[str, list[Row]] = {}
-    for row in rows_of(rows):
-        series.setdefault(str(row["series"] if is_number(row.get(axis)) else row["label"]), []).append(row)
-    lines = {}
-    for name, line in series.items():
-        if len(line) == 1:
-            lines[str(line[0]["label"])] = line
-        else:
-            lines[name] = sorted(line, key=lambda row: float(row[axis]))
-    return lines
+    numbers = rows[axis] if axis in rows else pd.Series(None, rows.index, dtype=object)
+    x = numbers.map(lambda value: float(value) if is_number(value) else None).astype(float)
+    line = rows["series"].where(x.notna(), rows["label"])
+    alone = line.groupby(line).transform("size") == 1
+    return rows.assign(line=line.mask(alone, rows["label"]), x=x.mask(alone)).sort_values("x", kind="stable")
 
 
-@mpl.rc_context(STYLE)
-def lines_figure(panels: Sequence[Panel], heading: str) -> Figure:
-    """Draw panels side by side with one legend. A name has the same colour in every panel."""
-    names = list(dict.fromkeys(name for panel in panels for name in panel.lines))
-    across = min(_ACROSS, len(panels))
-    down = -(-len(panels) // across)
-    figure = new_figure(max(10.0, 3.4 * across), 1.6 + 3.2 * down, heading)
-    handles: dict[str, Any] = {}
-    for number, panel in enumerate(panels):
-        axes = figure.add_subplot(down, across, number + 1)
-        for name, rows in panel.lines.items():
-            look = _look(names.index(name), all(map(is_baseline, rows)))
-            if len(rows) == 1:
-                level = _bar(rows[0], panel.y)[0]
-                handles[name] = axes.axhline(level, linewidth=1.2, linestyle="--", color=look["color"])
-            else:
-                points = [(row[panel.x], *_bar(row, panel.y)) for row in rows if is_number(row[panel.x])]
-                x, y, low, high = zip(*points, strict=True)
-                handles[name] = axes.errorbar(x, y, yerr=(low, high), elinewidth=1.0, markersize=5, **look)
-        axes.set(title=panel.title, xlabel=panel.xlabel, ylabel=UNITS[panel.y])
-    columns = min(5, len(handles))
-    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=columns)
-    return figure
+def _points(rows: pd.DataFrame, column: str) -> pd.DataFrame:
+    """Return the fields of a chart's points that show one column of the table. Success is in per cent."""
+    scale = 1.0 if column == SPEED else 100.0
+    ends = {"value": "", "low": "_low", "high": "_high"}
+    values = {name: scale * rows[f"{column}{end}"].astype(float) for name, end in ends.items()}
+    texts = [name for name in rows if str(name).startswith("text ")]
+    fields = rows.reindex(columns=["setting", "line", "x", "panel", "is_baseline", *texts])
+    return fields.assign(**values).dropna(subset="value")
 
 
-@mpl.rc_context(STYLE)
-def _tradeoff(rows: Sequence[Row], heading: str) -> Figure:
-    """Draw success against speed per episode. A setting without a speed is a horizontal line at its success."""
-    figure = new_figure(11.0, 6.0, heading)
-    axes = figure.subplots()
-    for number, row in enumerate(rows):
-        look, name = _look(number, is_baseline(row)), str(row["label"])
-        (x, *xerr), (y, *yerr) = _bar(row, SPEED), _bar(row, SUCCESS)
-        if math.isnan(x):
-            axes.axhline(y, label=name, linewidth=1.2, linestyle="--", color=look["color"])
-        else:
-            look |= {"xerr": [[end] for end in xerr], "yerr": [[end] for end in yerr]}
-            axes.errorbar([x], [y], label=name, elinewidth=1.0, markersize=7, linestyle="", **look)
-    axes.axvline(1.0, color=INK, linewidth=1.2, linestyle=":")
-    axes.set(title="Success against speed per episode", xlabel=UNITS[SPEED], ylabel=UNITS[SUCCESS])
-    figure.legend(loc="outside right upper")
-    return figure
+def _tooltip(points: pd.DataFrame) -> list[alt.Tooltip]:
+    names = [str(name) for name in points if str(name).startswith("text ")]
+    return [alt.Tooltip(f"{name}:N", title=name.removeprefix("text ")) for name in names]
 
 
-def latency_figure(table: pd.DataFrame, heading: str) -> Figure:
-    """Draw success against the time that an AR decode takes, with one panel per kind of delay compensation.
+def _faded(full: float) -> alt.When:
+    """Return an opacity: `full`, or little if another setting was picked."""
+    return alt.when("picked == '' || picked == datum.setting").then(alt.value(full)).otherwise(alt.value(0.12))
+
+
+def _tradeoff(rows: pd.DataFrame, loss: float) -> alt.ConcatChart:
+    """Draw speed and change in success of every setting in two panels, with a line that a setting has to pass."""
+    baselines = rows["baseline"].unique()
+    than = f"than {baselines[0]}" if len(baselines) == 1 else "than the baseline"
+    panels = {
+        SPEED: (1.0, f"right of the dashed line: faster {than}"),
+        DIFFERENCE: (-loss, f"right of the dashed line: loses less than {loss:g} points"),
+    }
+    charts: list[alt.LayerChart] = []
+    for column, (bound, hint) in panels.items():
+        points = _points(rows, column)
+        same = points["is_baseline"]  # nothing is uncertain about a comparison with itself
+        points = points.assign(low=points["low"].mask(same), high=points["high"].mask(same))
+        if points.empty:
+            continue
+        ends = points[["value", "low", "high"]].stack()
+        kind = "log" if column == SPEED and ends.max() > _SPREAD * ends.min() else "linear"
+        names = alt.Axis(title=None, grid=True, ticks=False, labelPadding=8, domain=False, labels=not charts)
+        base = alt.Chart(points).encode(
+            y=alt.Y("setting:N", scale=alt.Scale(domain=list(rows["setting"])), axis=names),
+            color=alt.when("datum.is_baseline").then(alt.value(INK)).otherwise(alt.value(BLUE)),
+            tooltip=_tooltip(points),
+        )
+        scale = alt.Scale(type=kind, nice=False, padding=10, **({} if kind == "log" else {"zero": False}))
+        at = alt.X("low:Q", scale=scale, title=None)
+        line = alt.Chart().mark_rule(strokeDash=[4, 3], color=INK).encode(x=alt.datum(bound, type="quantitative"))
+        bars = base.mark_rule(strokeWidth=3).encode(x=at, x2="high:Q", opacity=_faded(0.4))
+        dots = base.mark_point(filled=True, size=75, cursor="pointer").encode(x="value:Q", opacity=_faded(1.0))
+        title = alt.Title(TITLES[column], subtitle=hint)
+        charts.append((line + bars + dots).properties(title=title, width=_WIDTH, height=alt.Step(24)))
+    return _chart(charts, 2)
+
+
+def lines_figure(measures: Iterable[pd.DataFrame], xlabel: str) -> alt.ConcatChart:
+    """Draw panels side by side with one legend. A line has the same colour in every panel.
 
     Args:
-        table: Table made by `latency_table`.
-        heading: Title and subtitle.
+        measures: Points, from `_points`. Those with the same `panel` are drawn together. A point without x is drawn as
+            a line across the panel.
+        xlabel: Title of the x axis.
     """
-    panels: dict[str, dict[str, list[Row]]] = {}
-    for row in rows_of(table[table["ar_latency_ms"] > 0].sort_values("ar_latency_ms", kind="stable")):
-        lines = panels.setdefault(f"delay compensation: {row['rollout.delay_compensation']}", {})
-        lines.setdefault(row["method"], []).append({**row, "baseline": row["ar"]})
-    x = ("ar_latency_ms", "an autoregressive decode takes, ms")
-    return lines_figure([Panel(title, *x, SUCCESS, lines) for title, lines in panels.items()], heading)
+    points = pd.concat(measures)
+    names = points["line"].unique()
+    dark = set(points.loc[points["is_baseline"], "line"])
+    colours = [INK if name in dark else COLOURS[number % len(COLOURS)] for number, name in enumerate(names)]
+    legend = alt.Legend(orient="bottom", columns=4, title=None)
+    colour = alt.Color("line:N", scale=alt.Scale(domain=list(names), range=colours), legend=legend)
+    scale, charts = alt.Scale(zero=False, padding=12), []
+    for title, part in points.groupby("panel", sort=False):
+        base = alt.Chart(part).encode(color=colour, tooltip=_tooltip(part))
+        y, low = (alt.Y(f"{name}:Q", scale=scale, title=None) for name in ("value", "low"))
+        drawn, alone = base.transform_filter("isValid(datum.x)"), base.transform_filter("!isValid(datum.x)")
+        drawn = drawn.encode(x=alt.X("x:Q", scale=scale, title=xlabel))
+        layers = [
+            alone.mark_rule(strokeDash=[5, 4], strokeWidth=1.5).encode(y=y, opacity=_faded(0.9)),
+            drawn.mark_rule(strokeWidth=2).encode(y=low, y2="high:Q", opacity=_faded(0.35)),
+            drawn.mark_line(strokeWidth=1.5).encode(y=y),
+            drawn.mark_point(filled=True, size=60, cursor="pointer").encode(y=y, opacity=_faded(1.0)),
+        ]
+        charts.append(alt.layer(*layers).properties(title=str(title), width=_WIDTH, height=_HEIGHT))
+    return _chart(charts, _ACROSS)
 
 
-def _bar(row: Row, column: str) -> tuple[float, float, float]:
-    """Return a value and the lengths of its error bar to below and above.
-
-    Success is in per cent. All three numbers are NaN if the value is missing.
-    """
-    if column == SPEED and is_baseline(row):
-        return 1.0, 0.0, 0.0  # by definition
-    scale = 100.0 if column == SUCCESS else 1.0
-    value, low, high = (
-        scale * float(row[name]) if is_number(row[name]) else math.nan
-        for name in (column, f"{column}_low", f"{column}_high")
-    )
-    return value, abs(value - low), abs(high - value)
+def latency_figure(table: pd.DataFrame) -> alt.ConcatChart:
+    """Draw success against the time that an AR decode takes, with one panel per kind of delay compensation."""
+    latencies = latency_table(table).set_index("label")["ar_latency_ms"]
+    rows = _pooled(table)
+    rows = rows.assign(x=rows["label"].map(latencies)).query("x > 0").sort_values("x", kind="stable")
+    panels = "delay compensation: " + rows["rollout.delay_compensation"]
+    points = _points(rows.assign(line=rows["method"], panel=panels), SUCCESS)
+    return lines_figure([points], "an autoregressive decode takes, ms")
 
 
-def _look(number: int, baseline: bool) -> dict[str, Any]:
-    """Return the colour and marker of a setting.
-
-    Args:
-        number: Position of the setting in the legend.
-        baseline: Whether it is the baseline, which is drawn in black.
-    """
-    colour = INK if baseline else COLOURS[number % len(COLOURS)]
-    return {"color": colour, "marker": MARKERS[number // len(COLOURS) % len(MARKERS)]}
+def _best_step(log: pd.DataFrame) -> float:
+    """Return the training step of the best validation."""
+    return float(log["step"].to_numpy()[int(log["score"].to_numpy().argmax())])
 
 
-def new_figure(width: float, height: float, heading: str) -> Figure:
-    """Return an empty figure with a heading.
+def curves_figure(log: pd.DataFrame) -> alt.ConcatChart:
+    """Draw every measure of a training's log against the training step. Mark the best validation."""
+    best = _best_step(log)
+    charts = []
+    for name in log.columns.drop("step"):
+        data = log[["step", name]].rename(columns={name: "value"})
+        shown = ["step:Q", alt.Tooltip("value:Q", title=str(name))]
+        base = alt.Chart(data).encode(x=alt.X("step:Q", title="step"), tooltip=shown)
+        y = alt.Y("value:Q", scale=alt.Scale(zero=False), title=None)
+        line = base.mark_line(color=BLUE, point={"size": 30, "color": BLUE}).encode(y=y)
+        mark = alt.Chart().mark_rule(strokeDash=[4, 3], color=MUTED).encode(x=alt.datum(best, type="quantitative"))
+        charts.append((mark + line).properties(title=str(name), width=_WIDTH, height=_HEIGHT))
+    return _chart(charts, _ACROSS)
 
-    Args:
-        width: In inches.
-        height: In inches.
-        heading: Title and subtitle.
-    """
-    figure = Figure(figsize=(width, height), layout="constrained")
-    figure.suptitle(heading, x=0.01, ha="left", fontsize=11)
-    return figure
+
+def _chart(panels: list[alt.LayerChart], across: int) -> alt.ConcatChart:
+    """Put panels side by side, with the look and the parameter that all charts share."""
+    return alt.concat(*panels, columns=across, spacing=28, config=_CONFIG).add_params(alt.param("picked", value=""))
 
 
-def png(figure: Figure) -> bytes:
-    """Return the figure as a PNG file without metadata, so that the same figure gives the same bytes."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=120, metadata={"Software": None})
-    return buffer.getvalue()
+def png(figure: alt.ConcatChart, title: str, subtitle: str) -> bytes:
+    """Return a chart with a heading as a PNG file. The same chart gives the same bytes."""
+    heading = alt.Title(title, subtitle=subtitle, fontSize=17, subtitleFontSize=12, offset=16)
+    spec = figure.properties(title=heading, background="white", padding=14).to_dict()
+    picture: bytes = vl_convert.vegalite_to_png(spec, scale=2)
+    return picture
+
+
+def library() -> str:
+    """Return Vega-Embed with Vega and Vega-Lite, which draw charts in a page, as JavaScript. It needs no network."""
+    return str(vl_convert.javascript_bundle())  # type: ignore[call-arg]  # its stub forgets that it has a default
 
 
 def read_log(folder: Path) -> pd.DataFrame:
@@ -233,20 +242,6 @@ def read_log(folder: Path) -> pd.DataFrame:
         raise CheckpointError(f"{path} cannot be read: {error}") from error
 
 
-@mpl.rc_context(STYLE)
-def curves_figure(log: pd.DataFrame, title: str) -> Figure:
-    """Draw every measure of a training's log against the training step. Mark the best validation."""
-    best = float(log["step"].to_numpy()[int(log["score"].to_numpy().argmax())])
-    names = [str(name) for name in log.columns if name != "step"]
-    about = f"{len(log)} validations of the averaged weights; dotted: the saved ones, step {best:.0f}"
-    figure = new_figure(3.5 * len(names), 3.6, f"{title}\n{about}")
-    for panel, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
-        panel.plot(log["step"], log[name], color=COLOURS[0], marker="o", markersize=3)
-        panel.axvline(best, color=MUTED, linewidth=1.0, linestyle=":")
-        panel.set(title=name, xlabel="step")
-    return figure
-
-
 def save_curves(folder: Path) -> Path:
     """Write `curves.png` into the folder of a trained artifact and return its path.
 
@@ -254,6 +249,7 @@ def save_curves(folder: Path) -> Path:
         CheckpointError: The folder has no readable log of a training.
         StorageError: The disk is full or read-only.
     """
-    path = folder / "curves.png"
-    write_bytes(path, png(curves_figure(read_log(folder), f"{folder.parent.name} {folder.name}")))
+    path, log = folder / "curves.png", read_log(folder)
+    note = f"{len(log)} validations of the averaged weights; dashed: the saved ones, step {_best_step(log):.0f}"
+    write_bytes(path, png(curves_figure(log), f"{folder.parent.name} {folder.name}", note))
     return path

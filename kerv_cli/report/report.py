@@ -2,43 +2,21 @@
 
 from __future__ import annotations
 
-import base64
-import os
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from urllib.parse import quote
 
 import pandas as pd
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.files import write_bytes, write_json, write_text
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.store import ROLLOUT, StudyStore, studies
-from kerv_cli.report.decide import read_decisions, verdict_of
-from kerv_cli.report.measures import MACRO, MICRO, Row
-from kerv_cli.report.plots import about, latency_figure, png, study_figures
-from kerv_cli.report.reprice import ASSUMES, open_profiles, repriced_summary, repriced_table
+from kerv_cli.report.page import LOSS, figures_of, render
+from kerv_cli.report.plots import about, png
+from kerv_cli.report.reprice import open_profiles, repriced_table
 from kerv_cli.report.stressed import is_stressed, summed_table
-from kerv_cli.report.summary import NOTE, SPEEDS, of_runs, summary_frame
-from kerv_cli.report.tables import (
-    CSV_COLUMNS,
-    StudyData,
-    csv_text,
-    further_of,
-    is_baseline,
-    is_number,
-    latency_table,
-    load_study,
-    rows_of,
-    values_of,
-)
-from kerv_cli.report.verdict import caution
-
-LOSS = 3.0
-"""Default for the largest loss of success that the page's verdict accepts, in points."""
+from kerv_cli.report.tables import CSV_COLUMNS, StudyData, csv_text, further_of, latency_table, load_study, values_of
 
 
 def names_to_report(results: Path | str, study: str | None) -> list[str]:
@@ -132,110 +110,24 @@ def write_study(
     if publish:
         check_publishable(data)
     tables = {"": data.table[list(CSV_COLUMNS)], "_per_task": data.per_task[list(CSV_COLUMNS)]}
-    figures = study_figures(data.table, data.study.axis, title)
     if priced is not None:
         tables["_on"] = priced
-    latencies = latency_table(data.table)
-    if len(latencies):
+    if len(latencies := latency_table(data.table)):
         tables["_latency"] = latencies
-        heading = f"Success against the time that AR takes\n{about(data.table)}"
-        figures["_latency"] = latency_figure(latencies, heading)
     if is_stressed(data.table):
         tables["_summed"] = summed_table(data.table)
     folder, page = results if publish else results / "report", store.root / "report.html"
-    pictures = {folder / "plots" / f"{name}{suffix}.png": png(figure) for suffix, figure in figures.items()}
     texts = {folder / "tables" / f"{name}{suffix}.csv": csv_text(table) for suffix, table in tables.items()}
     for path, text in texts.items():
         write_text(path, text)
     document = folder / "tables" / f"{name}.json"
     write_json(document, further_of(data))
-    for path, picture in pictures.items():
-        write_bytes(path, picture)
-    write_text(page, render(store, data, list(pictures.values()), list(texts), priced, loss))
+    pictures = []
+    for suffix, figure in figures_of(data, loss).items():
+        pictures.append(folder / "plots" / f"{name}{suffix}.png")
+        write_bytes(pictures[-1], png(figure, title, about(data.table)))
+    write_text(page, render(store, data, loss, priced, list(texts)))
     return [*texts, document, *pictures, page]
-
-
-def render(
-    store: StudyStore,
-    data: StudyData,
-    figures: Sequence[bytes],
-    tables: Sequence[Path],
-    priced: pd.DataFrame | None,
-    loss: float,
-) -> str:
-    """Return the study's page as HTML.
-
-    Args:
-        store: The study's files and recordings.
-        data: The study's episodes and tables.
-        figures: Plots as PNG files, which are embedded.
-        tables: CSV files of the study, which are linked.
-        priced: The study's speeds on other machines, from `repriced_table`. None: leave them out.
-        loss: Largest loss of success, in points, that the verdict accepts.
-    """
-    template = Environment(
-        loader=PackageLoader("kerv_cli.report", "."), autoescape=True, undefined=StrictUndefined
-    ).get_template("report.html.j2")
-    answer, is_shown = verdict_of(data.table, loss)
-    first, results = data.table.iloc[0], str(store.database.results)
-    where = "" if results == "results" else f" results={shlex.quote(results)}"
-    return template.render(
-        store=store,
-        study=data.study,
-        title=data.study.title or store.name,
-        verdict=answer[:1].upper() + answer[1:],
-        is_shown=is_shown,
-        caution=caution(data.table),
-        about=f"{about(data.table)} · kerv {first['kerv_version']} at {str(first['git_commit'])[:12]}",
-        columns=f"{NOTE} {of_runs(data.table)}",
-        absent=list(dict.fromkeys(f"{one.setting.label} on {one.task}" for one in data.absent)),
-        missing=len(data.absent),
-        where=where,
-        suite=_suite(data.table),
-        decisions=read_decisions(store.root),
-        figures=[base64.b64encode(figure).decode() for figure in figures],
-        machines=None if priced is None else repriced_summary(priced),
-        assumes=ASSUMES,
-        tasks=_by_task(data.per_task),
-        recordings=[(path.stem, _href(path, store.root)) for path in store.recordings],
-        files=[(path.name, _href(path, store.root)) for path in tables],
-    )
-
-
-def _suite(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the page's table of settings, pooled over tasks.
-
-    If the tasks have several difficulty groups, add columns with the unweighted mean of the groups.
-    """
-    frame = summary_frame(table, MICRO)
-    if table["difficulty"].str.contains(";").any():
-        macro = summary_frame(table, MACRO)
-        for name in ("success, %", *SPEEDS.values()):
-            frame[f"{name}, by difficulty"] = macro.get(name, "–")
-    return frame
-
-
-def _by_task(per_task: pd.DataFrame) -> pd.DataFrame:
-    """Return the page's table of successes and speeds per episode, by task and setting.
-
-    Tasks are rows and settings are columns, unless there are more settings than tasks.
-    """
-    cells = per_task.assign(text=[_cell(row) for row in rows_of(per_task)])
-    table = cells.pivot(index="task", columns="label", values="text")[per_task["label"].unique()].fillna("–")
-    return (table.T.rename_axis("setting") if len(table.columns) > len(table) else table).reset_index()
-
-
-def _cell(row: Row) -> str:
-    """Return successes / episodes and, if measured, the speed per episode, as text."""
-    share = f"{int(row['successes'])}/{int(row['episodes'] // max(1, row['repeats']))}"
-    if is_baseline(row) or not is_number(row["episode_speedup"]):
-        return share
-    return f"{share} · {row['episode_speedup']:.2f}×"
-
-
-def _href(path: Path, folder: Path) -> str:
-    """Return the address of a file relative to the page's folder."""
-    return quote(Path(os.path.relpath(path, folder)).as_posix())
 
 
 class Unpublishable(KervError):

@@ -21,7 +21,7 @@ from kerv_cli.episodes.identity import batch_of
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MICRO, Row, decodes, measure
 from kerv_cli.report.summary import SPEEDS, intervals
-from kerv_cli.report.tables import StudyData, rows_of
+from kerv_cli.report.tables import StudyData, is_baseline, rows_of
 from kerv_cli.targets.folders import shipped_dir
 
 ASSUMES = (
@@ -201,6 +201,6 @@ def repriced_summary(table: pd.DataFrame) -> pd.DataFrame:
         cells = rows.setdefault(row["label"], {"setting": row["label"]})
         for machine, prefix in ((f"measured, {row['measured_on']}", "measured_"), (row["machine"], "")):
             for name, heading in SPEEDS.items():
-                text = intervals(f"{prefix}{name}", of_baseline="1")
-                cells[f"{machine}: {heading.removeprefix('speed, ')}"] = text(row)
+                text = "1×" if is_baseline(row) else intervals(f"{prefix}{name}", unit="×")(row)
+                cells[f"{machine}: {heading.removeprefix('speed, ')}"] = text
     return pd.DataFrame(rows.values())

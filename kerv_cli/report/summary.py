@@ -1,8 +1,7 @@
-"""Turn a study's table into text: the columns that matter most, for the terminal and the page."""
+"""Turn a study's table into tables that people read, in the terminal and on the page."""
 
 from __future__ import annotations
 
-import itertools
 import textwrap
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -26,11 +25,13 @@ APART = "*"
 SPEEDS = {"episode_speedup": "speed, per episode", "speedup": "speed, per step"}
 """Table column of each kind of speed -> its heading."""
 DIFFERENCE = "change in success"
+MAIN = 5
+"""Number of columns that are always shown. The others are behind `--all` and the page's "more columns"."""
 NOTE = (
-    "Brackets: 95 % intervals. Change in success: points against the baseline, same initial states. Speed: times as "
-    "fast as the baseline. Slowest 5 %: time of a decode that 95 % of the decodes stay below."
+    "In brackets: 95 % intervals. Change in success: points against the baseline, from the same initial states. Speed: "
+    "times as fast as the baseline. Slowest 5 % of decodes: they take at least so many ms."
 )
-_HEADING = 10
+_HEADING = 12
 """Width at which a heading is wrapped, in characters."""
 _LABEL = 16
 """Width at which a label is wrapped, in characters."""
@@ -56,27 +57,37 @@ def shares(name: str) -> TextOf:
     return lambda row: f"{100 * row[name]:.0f} %" if is_number(row[name]) else "–"
 
 
-def intervals(name: str, scale: float = 1.0, digits: int = 2, between: str = "–", of_baseline: str = "") -> TextOf:
+def intervals(name: str, form: str = ".2f", unit: str = "", scale: float = 1.0, between: str = "–") -> TextOf:
     """Return a function that formats a column's value with its interval in brackets. The text is `–` if it is missing.
 
     Args:
         name: The column.
+        form: Format of the numbers. Numbers without decimals get one in the value if it is not 0, because 99.5 % of
+            success must not read as 100 %.
+        unit: Text after the value.
         scale: Factor for value and interval; 100 for per cent.
-        digits: Decimals. With 0 the value still has one decimal, because 99.5 % of success must not read as 100 %.
         between: Text between the two ends of the interval.
-        of_baseline: Text for the baseline's row. Empty: format its value like any other.
     """
 
     def text(row: Row) -> str:
-        if of_baseline and is_baseline(row):
-            return of_baseline.strip()
         if not is_number(row[name]):
             return "–"
         value, low, high = (row[f"{name}{end}"] * scale for end in ("", "_low", "_high"))
-        shown = f"{value:.{digits}f}" if digits else f"{value:.1f}".removesuffix(".0")
-        return f"{shown} ({low:.{digits}f}{between}{high:.{digits}f})" if is_number(low) else shown
+        ends = ".1f" if form == ".2f" and value >= 10 else form
+        shown = f"{value:{ends.replace('.0f', '.1f')}}".removesuffix(".0") + unit
+        return _minus(f"{shown} ({low:{ends}}{between}{high:{ends}})" if is_number(low) else shown)
 
     return text
+
+
+def _minus(text: str) -> str:
+    """Return the text with proper minus signs and without a sign before zero."""
+    return text.replace("+0 ", "0 ").replace("-0 ", "0 ").replace("-", "−")
+
+
+def _difference(row: Row) -> str:
+    """Return the change in success. It is empty for the baseline."""
+    return "" if is_baseline(row) else intervals("difference", "+.0f", "", 100.0, " to ")(row)
 
 
 def _speed(name: str) -> TextOf:
@@ -88,24 +99,21 @@ def _speed(name: str) -> TextOf:
 
     def text(row: Row) -> str:
         if is_baseline(row):
-            return "1" if is_number(row["time_per_step_ms"]) else "–"
+            return "1×" if is_number(row["time_per_step_ms"]) else "–"
         apart = is_number(row["speedup"]) and row["same_block"] < 1 and not row["same_run"]
-        return intervals(name)(row) + (APART if apart else "")
+        return intervals(name, unit="×")(row) + (APART if apart else "")
 
     return text
 
 
 def _columns() -> dict[str, TextOf]:
-    """Return heading -> function that formats a cell, the most important first.
-
-    A narrow terminal leaves out the last columns.
-    """
+    """Return heading -> function that formats a cell. The first `MAIN` are those that people need first."""
     return {
         "setting": lambda row: str(row["label"]),
-        "success, %": intervals("success", 100.0, 0),
-        DIFFERENCE: intervals("difference", 100.0, 0, " to ", of_baseline=" "),
+        "success": intervals("success", ".0f", " %", 100.0),
+        DIFFERENCE: _difference,
         SPEEDS["episode_speedup"]: _speed("episode_speedup"),
-        "slowest 5 %, ms": numbers("latency_p95_ms"),
+        "slowest 5 % of decodes, ms": numbers("latency_p95_ms"),
         "tokens unverified": shares("unverified_share"),
         SPEEDS["speedup"]: _speed("speedup"),
         "a decode takes, ms": numbers("felt_latency_ms"),
@@ -121,7 +129,7 @@ def _columns() -> dict[str, TextOf]:
         "failures near the object": shares("near_contact_failure"),
         **{name.replace("_", " "): numbers(name) for name in registered_columns()},
         "speed at matched success": numbers("matched_success_speed"),
-        "lost / won": lost_won,
+        "pairs lost / won": lost_won,
     }
 
 
@@ -131,7 +139,7 @@ def lost_won(row: Row) -> str:
 
 
 def summary_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame:
-    """Return the rows of a study's table as text. Columns that are empty in every row are left out.
+    """Return the rows of a study's table as text. Columns that say nothing are left out, except for the main ones.
 
     Args:
         table: The study's table.
@@ -139,25 +147,33 @@ def summary_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame:
     """
     rows, columns = rows_of(table, averaging), _columns()
     frame = pd.DataFrame([{title: text(row) for title, text in columns.items()} for row in rows])
-    is_used = ~frame.isin(["–", "0 %", ""]).all() | frame.columns.isin(frame.columns[:4])
+    is_used = ~frame.isin(["–", "0 %", ""]).all() | frame.columns.isin(frame.columns[:MAIN])
     return frame.loc[:, is_used]
 
 
 @dataclass(frozen=True)
 class SummaryTable:
-    """A study's table as `rich` prints it, pooled over tasks. It shows as many columns as fit."""
+    """A study's table as `rich` prints it, pooled over tasks.
+
+    Attributes:
+        table: The study's table.
+        all: Print every column. If they do not fit side by side, they are printed in several parts.
+    """
 
     table: pd.DataFrame
+    all: bool = False
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
         """Yield the title, the table and the notes below it."""
-        frame = _fitting(summary_frame(self.table), options.max_width)
         rows = self.table[self.table["averaging"] == MICRO]
         first, tasks = rows.iloc[0], int(rows["tasks"].max())
         counts = f"{tasks} task{'s' * (tasks != 1)}, {rows['episodes'].max()} episodes per setting"
-        title = f"{first['study']}: {counts}, {first['device_name']}, {first['runtime.dtype']}"
-        yield Text(title, style="bold", overflow="fold")
-        yield _printed(frame)
+        yield Text(
+            f"{first['study']}: {counts}, {first['device_name']}, {first['runtime.dtype']}", "bold", overflow="fold"
+        )
+        frame = summary_frame(self.table)
+        for part in _parts(frame if self.all else frame.iloc[:, :MAIN], options.max_width):
+            yield _printed(part)
         several = ", under the same stress and clock" if rows["baseline"].nunique() > 1 else ""
         yield Text(f"{NOTE} {of_runs(self.table)} Baseline: {first['baseline']}{several}.")
         if frame[SPEEDS["episode_speedup"]].str.endswith(APART).any():
@@ -173,7 +189,7 @@ def of_runs(table: pd.DataFrame) -> str:
 
 
 def _printed(frame: pd.DataFrame) -> Table:
-    printed = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=0)
+    printed = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
     for name in frame.columns:
         is_label = name == "setting"  # labels wrap, measures do not
         printed.add_column(
@@ -189,12 +205,17 @@ def _heading(name: str) -> str:
     return textwrap.fill(name, _HEADING, break_long_words=False)
 
 
-def _fitting(frame: pd.DataFrame, width: int) -> pd.DataFrame:
-    """Return the first columns that fit into `width` characters, but at least four."""
-    widths = [1 + max(map(len, [*_heading(name).split("\n"), *frame[name]])) for name in frame.columns]
-    widths[0] = min(widths[0], 1 + max(_LABEL, *map(len, " ".join(frame["setting"]).split())))
-    fitting = sum(total - 1 <= width for total in itertools.accumulate(widths))
-    return frame.iloc[:, : max(4, fitting)]
+def _parts(frame: pd.DataFrame, width: int) -> Iterator[pd.DataFrame]:
+    """Cut a table into parts that fit into `width` characters. The first part has at least the main columns."""
+    widths = {name: 2 + max(map(len, [*_heading(name).split("\n"), *frame[name]])) for name in frame.columns}
+    label = min(widths["setting"], 2 + max(_LABEL, *map(len, " ".join(frame["setting"]).split())))
+    part = list(frame.columns[:MAIN])
+    for name in frame.columns[MAIN:]:
+        if label + sum(widths[one] for one in part[1:]) + widths[name] > width:
+            yield frame[part]
+            part = ["setting"]
+        part.append(name)
+    yield frame[part]
 
 
 def not_in_turn(table: pd.DataFrame) -> list[str]:

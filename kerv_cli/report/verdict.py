@@ -94,6 +94,21 @@ class Decision:
     high: float
 
 
+def question(table: pd.DataFrame, loss: float) -> str:
+    """Return the question that the study's verdict answers. Empty if nothing is compared.
+
+    Args:
+        table: The study's table.
+        loss: Largest acceptable loss of success, in points.
+    """
+    baselines = table.loc[table["pairs"] > 0, "baseline"].unique()
+    if len(baselines) > 1:
+        return "Which settings succeed less or more often than the baseline under the same stress and clock?"
+    if not (table["label"] != table["baseline"]).any() or not len(baselines):
+        return ""
+    return f"Which setting is faster than {baselines[0]} and loses less than {loss:g} points of success?"
+
+
 def sentence(choice: Choice, loss: float, baseline: str) -> str:
     """Return the choice for all tasks in one sentence.
 

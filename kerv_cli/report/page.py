@@ -1,0 +1,143 @@
+"""The page of a study: verdict, tables, charts and settings. templates/_study.html is its body."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import altair as alt
+import pandas as pd
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from kerv_cli.episodes.identity import NOT_DETERMINING, without
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.report.decide import read_decisions, verdict_of
+from kerv_cli.report.measures import MACRO, Row
+from kerv_cli.report.plots import about, latency_figure, library, study_figures
+from kerv_cli.report.reprice import ASSUMES, repriced_summary
+from kerv_cli.report.summary import MAIN, NOTE, SPEEDS, of_runs, summary_frame
+from kerv_cli.report.tables import StudyData, flatten, is_baseline, is_number, latency_table, load_study, rows_of
+from kerv_cli.report.verdict import caution, question
+
+LOSS = 3.0
+"""Default for the largest loss of success that the page's verdict accepts, in points."""
+
+
+def render(
+    store: StudyStore, data: StudyData, loss: float, priced: pd.DataFrame | None = None, tables: Sequence[Path] = ()
+) -> str:
+    """Return the study's page as one HTML file that needs no other file and no network; arguments as `study_parts`."""
+    loader = PackageLoader("kerv_cli.report", "templates")
+    template = Environment(loader=loader, autoescape=True, undefined=StrictUndefined).get_template("study.html")
+    return template.render(**study_parts(store, data, loss, priced, tables), library=library())
+
+
+def study_parts(
+    store: StudyStore,
+    data: StudyData | None = None,
+    loss: float = LOSS,
+    priced: pd.DataFrame | None = None,
+    tables: Sequence[Path] = (),
+) -> dict[str, Any]:
+    """Return the values that the template _study.html shows.
+
+    Args:
+        store: The study's files and recordings.
+        data: The study's episodes and tables. None: read them from the database.
+        loss: Largest loss of success, in points, that the verdict accepts.
+        priced: The study's speeds on other machines, from `repriced_table`. None: leave them out.
+        tables: CSV files of the study, which are linked.
+
+    Raises:
+        UsageError: No episode of the study is stored.
+    """
+    data = data or load_study(store)
+    answer, is_shown = verdict_of(data.table, loss)
+    first, results = data.table.iloc[0], str(store.database.results)
+    return {
+        "name": store.name,
+        "title": data.study.title or store.name,
+        "note": data.study.note,
+        "about": f"{about(data.table)} · kerv {first['kerv_version']} at {str(first['git_commit'])[:12]}",
+        "question": question(data.table, loss),
+        "verdict": answer[:1].upper() + answer[1:],
+        "is_shown": is_shown,
+        "caution": caution(data.table),
+        "wanted": len(data.study.episodes),
+        "missing": len(data.absent),
+        "absent": list(dict.fromkeys(f"{one.setting.label} on {one.task}" for one in data.absent)),
+        "results": "" if results == "results" else f" results={shlex.quote(results)}",
+        "baseline": data.study.baseline,
+        "main": MAIN,
+        "columns": f"{NOTE} {of_runs(data.table)}",
+        "suite": _suite(data.table),
+        "charts": [figure.to_dict() for figure in figures_of(data, loss).values()],
+        "decisions": read_decisions(store.root),
+        "tasks": _by_task(data.per_task),
+        "machines": None if priced is None else repriced_summary(priced),
+        "assumes": ASSUMES,
+        "settings": _settings(data),
+        "recordings": [(path.stem, _href(path, store.root)) for path in store.recordings],
+        "files": [(path.name, _href(path, store.root)) for path in tables],
+    }
+
+
+def figures_of(data: StudyData, loss: float) -> dict[str, alt.ConcatChart]:
+    """Return the study's charts by the ending of their file names."""
+    figures = study_figures(data.table, data.study.axis, loss)
+    return figures | ({"_latency": latency_figure(data.table)} if len(latency_table(data.table)) else {})
+
+
+def _suite(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the page's table of settings, pooled over tasks.
+
+    If the tasks have several difficulty groups, add columns with the unweighted mean of the groups.
+    """
+    frame = summary_frame(table)
+    if table["difficulty"].str.contains(";").any():
+        macro = summary_frame(table, MACRO)
+        for name in ("success", *SPEEDS.values()):
+            frame[f"{name}, by difficulty"] = macro.get(name, "–")
+    return frame
+
+
+def _by_task(per_task: pd.DataFrame) -> pd.DataFrame:
+    """Return the page's table of successes and speeds per episode, by task and setting.
+
+    Tasks are rows and settings are columns, unless there are more settings than tasks.
+    """
+    cells = per_task.assign(text=[_cell(row) for row in rows_of(per_task)])
+    table = cells.pivot(index="task", columns="label", values="text")[per_task["label"].unique()].fillna("–")
+    return (table.T.rename_axis("setting") if len(table.columns) > len(table) else table).reset_index()
+
+
+def _cell(row: Row) -> str:
+    """Return successes / episodes and, if measured, the speed per episode, as text."""
+    share = f"{int(row['successes'])}/{int(row['episodes'] // max(1, row['repeats']))}"
+    if is_baseline(row) or not is_number(row["episode_speedup"]):
+        return share
+    return f"{share} · {row['episode_speedup']:.2f}×"
+
+
+def _settings(data: StudyData) -> list[dict[str, Any]]:
+    """Return every setting's label, overrides, and the values in which it differs from the one it is compared with."""
+    flat = {label: flatten(without(one.settings, NOT_DETERMINING)) for label, one in data.settings.items()}
+    settings = []
+    for label, own in flat.items():
+        reference = data.references[label]
+        base = flat.get(reference, {})
+        pairs = {key: (base.get(key), own.get(key)) for key in [*base, *own]}
+        differs = [(key, *pair) for key, pair in pairs.items() if pair[0] != pair[1]]
+        settings.append(
+            {"label": label, "overrides": data.settings[label].overrides, "reference": reference, "differs": differs}
+        )
+    return settings
+
+
+def _href(path: Path, folder: Path) -> str:
+    """Return the address of a file relative to the page's folder."""
+    return quote(Path(os.path.relpath(path, folder)).as_posix())

@@ -1,0 +1,70 @@
+"""The page of a study in a browser without a network: charts, hovering, picking a setting, more columns, sorting."""
+
+from pathlib import Path
+
+import pytest
+from studies_synthetic import swept, threshold_study
+
+from kerv_cli.report.page import render
+from kerv_cli.report.tables import load_study
+
+sync_api = pytest.importorskip("playwright.sync_api")
+CHROMIUM = Path("/usr/bin/chromium")
+pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason="no chromium")
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("page")
+    store, _ = swept(folder, threshold_study(["reach-v3", "push-v3"], axis="", note="Made up."))
+    path = folder / "page.html"
+    path.write_text(render(store, load_study(store), 3.0), encoding="utf-8")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_context(viewport={"width": 1300, "height": 900}, offline=True).new_page()
+        errors: list[str] = []
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(path.as_uri())
+        page.wait_for_selector("figure.chart svg .mark-symbol path")
+        yield page
+        assert not errors
+        browser.close()
+
+
+def test_hovering_a_point_shows_its_numbers_and_intervals(page):
+    page.locator("figure.chart svg .mark-symbol path").nth(3).hover()
+    page.wait_for_selector("dl.tip:not([hidden])")
+    cells = page.locator("tr[data-setting]").nth(3).locator("td:not(.more)").all_text_contents()
+    assert [one.strip() for one in page.locator("dl.tip dd").all_text_contents()] == [one.strip() for one in cells]
+
+
+def test_a_click_on_a_setting_shows_how_it_differs_and_fades_the_others(page):
+    points = page.locator("figure.chart svg .mark-symbol path")
+    page.locator(".pick").nth(2).click()
+    assert "threshold.r" in page.locator("tr.detail").inner_text()
+    page.wait_for_function("document.querySelector('figure.chart svg .mark-symbol path').getAttribute('opacity') < 1")
+    assert points.nth(2).get_attribute("opacity") == "1"
+    points.nth(3).click()
+    assert page.locator("tr.picked").get_attribute("data-setting") == "spec_vla r=9"
+    page.locator(".pick").nth(3).click()
+    assert page.locator("tr.detail").count() == 0
+
+
+def test_more_columns_and_another_order_on_a_click(page):
+    heads = page.locator(".overview thead th:visible")
+    assert heads.all_text_contents() == [
+        "setting", "success", "change in success", "speed, per episode", "slowest 5 % of decodes, ms",
+    ]  # fmt: skip
+    page.get_by_label("more columns").first.check()
+    assert heads.count() > 10
+    page.get_by_role("button", name="speed, per episode", exact=True).click()
+    texts = page.locator(".overview tbody tr td:nth-child(4)").all_text_contents()
+    speeds = [float(text.split("×")[0]) for text in texts]
+    assert speeds == sorted(speeds, reverse=True)
+
+
+def test_a_phone_shows_the_page_without_scrolling_sideways(page):
+    page.set_viewport_size({"width": 390, "height": 800})
+    page.wait_for_timeout(300)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    assert page.locator("figure.chart svg").first.bounding_box()["width"] <= 390
