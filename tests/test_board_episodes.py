@@ -1,23 +1,28 @@
 """The board's pages of episodes and failures, their films and recordings, in a real browser."""
 
 import html
+import io
 import shlex
 import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import pytest
 import rerun_synthetic
 import sqlalchemy as sa
 import uvicorn
 from command import kerv
+from PIL import Image
 from playwright.sync_api import expect, sync_playwright
 from starlette.testclient import TestClient
-from studies_synthetic import episode, settings_of, study_of, swept, threshold_study
+from studies_synthetic import episode, part, settings_of, study_of, swept, threshold_study
 
 from kerv_cli.board.app import make_app
+from kerv_cli.board.episode import command_of
 from kerv_cli.board.episodes import phase_of
+from kerv_cli.board.recorder import record_episode
 from kerv_cli.catalogue.episodes import find_episode
 from kerv_cli.engine.record import Delay
 from kerv_cli.episodes.rows import decode_records, decodes_table
@@ -28,7 +33,7 @@ from kerv_cli.lab.plan import all_episodes
 from kerv_cli.lab.store import studies
 from kerv_cli.report.viewing.token_outcomes import outcomes_of, tokens_hash
 
-expect.set_options(timeout=30_000)
+expect.set_options(timeout=120_000)
 HERE = "http://127.0.0.1"
 ROLLOUT = (
     "method=ar,spec_vla rectifier=compensate rectifier.drop=false task=reach policy=state "
@@ -73,7 +78,7 @@ def page():
         pytest.skip("no browser here: apt-get install chromium")
     with sync_playwright() as playwright, playwright.chromium.launch(executable_path=chromium) as browser:
         page = browser.new_page()
-        page.set_default_timeout(30_000)
+        page.set_default_timeout(120_000)
         yield page
 
 
@@ -143,7 +148,7 @@ def test_names_are_escaped_and_what_does_not_exist_is_not_found(tmp_path, client
     assert {Path(one.recording).name for one in study.episodes} == {one.recording for one in study.episodes}
     absent = ("/studies/none/episodes", "/studies/..%2f/failures", "/episodes/0", f"/episodes/{10**30}", "/episodes/x")
     first = f"/episodes/{numbers[0]}"
-    absent += (f"{first}/decodes/999", f"{first}/film.gif", f"{first}/frames/0", f"{first}/recording.rrd", "/rerun/x")
+    absent += (f"{first}/film.gif", f"{first}/frames/0", f"{first}/recording.rrd", "/rerun/x")
     for path in absent:
         assert client.get(path).status_code == 404, path
     origin = {"origin": "http://attacker.example"}
@@ -198,21 +203,46 @@ def test_the_command_on_the_page_repeats_the_episode(rolled):
         newest.remove()
 
 
-def test_a_person_gets_from_the_grid_to_a_decode_a_film_and_rerun(page, address, rolled):
+def test_settings_that_adapt_are_repeated_with_the_episodes_before(tmp_path):
+    adapting = settings_of("spec_vla", 9)
+    adapting.skip = part("skip", "similarity", up=0.01)
+    store, _ = swept(tmp_path, study_of({"ar": settings_of("ar"), "spec_vla": adapting}, ["reach-v3"]))
+    numbers = store.frame().set_index(["label", "seed"])["episode"].to_dict()
+    last, plain = (find_episode(store.database, numbers[label, 100_003]) for label in ("spec_vla", "ar"))
+    assert (last.earlier, plain.earlier) == ((100_000, 100_001, 100_002), ())
+    words, _ = command_of(last)
+    assert "seed=100000 episodes=4 record=-1" in words
+
+
+def test_an_episode_whose_policy_has_changed_is_not_recorded(tmp_path):
+    store, _ = swept(tmp_path, threshold_study(["reach-v3"]))
+    one = find_episode(store.database, rows_of_wanted(store.database)[0]).episode
+    error = record_episode(one.setting, one.task, [one.seed], str(tmp_path), store.rollouts / one.recording)
+    assert "of ar has changed" in error
+    assert not store.recordings
+
+
+def test_a_person_gets_from_a_failure_to_its_film_a_decode_and_rerun(page, address, rolled):
     (store,) = studies(rolled)
     page.goto(f"{address}/studies/{store.name}/episodes")
-    page.locator("tr", has_text="spec_vla").get_by_role("link").first.click()
-    expect(page.get_by_role("heading", level=1)).to_contain_text("reach-v3, seed 100000")
-    number = int(page.url.rpartition("/")[2])
-    found = find_episode(rolled, number)
+    page.get_by_role("link", name="Failures in groups").click()
+    cluster = page.locator(".cluster", has_text="spec_vla")
+    cluster.get_by_text("100000").click()
+    cluster.get_by_role("button", name="Record it").click()
+    expect(cluster.get_by_role("status")).to_contain_text("record")
+    number = int(cluster.get_by_role("link", name="Open").get_attribute("href").rpartition("/")[2])
     # a second click, here from another program, does not record it a second time
-    page.get_by_role("button", name="Record it").click()
-    expect(page.get_by_role("status")).to_be_visible()
-    again = page.request.post(f"{address}/episodes/{number}/record")
-    assert "Record it" not in again.text()
-    expect(page.get_by_text("same tokens as the stored episode")).to_be_visible()
-    path = store.rollouts / found.episode.recording
+    again = page.request.post(f"{address}/episodes/{number}/record").text()
+    assert "Record it" not in again
+    expect(cluster.get_by_text("same tokens as the stored episode")).to_be_visible()
+    path = store.rollouts / find_episode(rolled, number).episode.recording
     written = path.stat().st_mtime_ns
+    film = page.request.get(f"{address}/episodes/{number}/film.gif").body()
+    assert Image.open(io.BytesIO(film)).n_frames == 5  # of 13 steps, at half the speed of 80 steps per second
+
+    page.goto(f"{address}/studies/{store.name}/episodes")
+    page.locator("tr", has_text="spec_vla").get_by_role("link").click()
+    assert page.url == f"{address}/episodes/{number}"
     image, output = page.locator("film-player img"), page.locator("film-player output")
     page.locator(".tokens tbody tr").nth(2).click()
     expect(output).to_have_text("step 8")
@@ -223,10 +253,25 @@ def test_a_person_gets_from_the_grid_to_a_decode_a_film_and_rerun(page, address,
     page.get_by_role("button", name="play").click()
     expect(output).to_have_text("step 12")
     assert image.evaluate("image => image.complete && image.naturalWidth") == 240
+
+    link = page.get_by_role("link", name="Open in Rerun")
+    recording = parse_qs(urlsplit(link.get_attribute("href")).query)["url"]
+    assert page.request.get(*recording).body() == path.read_bytes()
+    asked = []
+    page.context.on("request", lambda request: asked.append(request.url))
     with page.context.expect_page() as opened:
-        page.get_by_role("link", name="Open in Rerun").click()
-    with opened.value as viewer:
-        with viewer.expect_response(lambda answer: answer.url.endswith("recording.rrd")) as answer:
-            pass
-        assert answer.value.body() == path.read_bytes()
+        link.click()
+    # the viewer would now compile its program, for 5 to 40 s, and read the recording
+    with opened.value as viewer, viewer.expect_response(lambda answer: answer.url.endswith(".wasm")) as answer:
+        pass
+    assert answer.value.ok
+    assert all(url.startswith(address) for url in asked)
     assert path.stat().st_mtime_ns == written
+
+
+def test_a_phone_scrolls_tables_and_not_the_page(page, address, rolled):
+    (store,) = studies(rolled)
+    page.set_viewport_size({"width": 390, "height": 844})
+    for path in (f"/studies/{store.name}/episodes", f"/studies/{store.name}/failures", "/episodes/1"):
+        page.goto(address + path)
+        assert page.evaluate("document.documentElement.scrollWidth") == 390

@@ -21,7 +21,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from kerv_cli.base.errors import KervError, UsageError
-from kerv_cli.board import episodes, runs, studies, training
+from kerv_cli.board import episode, episodes, runs, studies, training
 from kerv_cli.board.pages import render
 from kerv_cli.lab.database import Database
 
@@ -100,3 +100,4 @@ def serve(results: str | Path, port: int, opened: Callable[[str], None], browser
             webbrowser.open(address)
         with contextlib.suppress(KeyboardInterrupt):
             server.run(sockets=[listening])
+        episode.RECORDER.close()

@@ -24,7 +24,6 @@ from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
 from kerv_cli.base.errors import KervError
-from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.board.pages import database_of, inside, render
 from kerv_cli.board.recorder import Recorder
 from kerv_cli.catalogue.episodes import FoundEpisode, find_episode, outcomes
@@ -32,14 +31,13 @@ from kerv_cli.engine.record import PHASES, DecodeRecord
 from kerv_cli.episodes.repeat import repeating_words
 from kerv_cli.lab.store import IMPORT
 from kerv_cli.report.viewing.film import Film, animation, film_of
-from kerv_cli.report.viewing.token_outcomes import OUTCOMES, TokenOutcome, chunk_size, outcomes_of, tokens_hash
+from kerv_cli.report.viewing.token_outcomes import OUTCOMES, chunk_size, outcomes_of, tokens_hash
 from kerv_cli.report.viewing.viewer import viewer_command
 from kerv_cli.worlds import specs
 
 SLOWER = 2
 """Films play so many times slower than the robot moved."""
-_UNKNOWN_HZ = 20.0  # control steps per second, for tasks of unknown environments
-_RECORDER = Recorder()
+RECORDER = Recorder()
 
 
 def _found(request: Request) -> FoundEpisode:
@@ -63,21 +61,11 @@ def _film(request: Request) -> Film:
     return film_of(path)
 
 
-def _space(task: str) -> ActionSpace | None:
-    """Return the action space of a task; None if its environment is not known here."""
-    return next((spec.actions for spec in specs().values() if task in spec.tasks), None)
-
-
 def _names(task: str, decodes: Sequence[DecodeRecord]) -> Sequence[str]:
-    """Return the names of the D degrees of freedom of a task, or their numbers if they are not known."""
-    space, dofs = _space(task), decodes[0].actions.shape[1] if decodes else 1
-    return space.names if space is not None and space.dofs == dofs else [str(number) for number in range(dofs)]
-
-
-def _hz(task: str) -> float:
-    """Return the frames per second at which a film of a task plays."""
-    space = _space(task)
-    return (_UNKNOWN_HZ if space is None else space.control_hz) / SLOWER
+    """Return the names of the D degrees of freedom of a task, or their numbers if its environment is not known here."""
+    dofs = max((decode.actions.shape[1] for decode in decodes if decode.actions.ndim == 2), default=1)
+    names = next((spec.actions.names for spec in specs().values() if task in spec.tasks), ())
+    return names if len(names) == dofs else [str(number) for number in range(dofs)]
 
 
 def command_of(found: FoundEpisode) -> tuple[str, str]:
@@ -93,22 +81,17 @@ def command_of(found: FoundEpisode) -> tuple[str, str]:
     return shlex.join(["kerv", *words, *([] if results == "results" else [f"results={results}"])]), ""
 
 
-def _chunks(decodes: Sequence[DecodeRecord], dofs: int) -> list[list[TokenOutcome]]:
-    """Return the outcomes of the tokens of each decode's chunk."""
-    size = chunk_size(decodes, dofs)
-    return [outcomes_of(decode, size, dofs) for decode in decodes]
-
-
 def show_episode(request: Request) -> Response:
-    """Show one episode."""
+    """Show one episode. `?decode=N` chooses a decode."""
     found = _found(request)
-    decodes, steps = found.decodes()
-    episode, names = found.episode, _names(found.episode.task, decodes)
-    chunks = _chunks(decodes, len(names))
+    (decodes, steps), episode, row = found.decodes(), found.episode, found.row
+    names = _names(episode.task, decodes)
+    size = chunk_size(decodes, len(names))
+    chunks = [outcomes_of(decode, size, len(names)) for decode in decodes]
     counts = Counter(one.kind for chunk in chunks for one in chunk)
-    row, command = found.row, command_of(found)
-    phases = {phase: row[f"seconds.{phase}"] for phase in PHASES if row[f"seconds.{phase}"]}
-    number = _number(request.query_params.get("decode", ""), len(decodes))
+    command, why_not = command_of(found)
+    text = request.query_params.get("decode", "")
+    chosen = int(text) if re.fullmatch(r"\d{1,6}", text) and int(text) < len(decodes) else 0
     return render(
         request,
         "episode.html",
@@ -116,37 +99,12 @@ def show_episode(request: Request) -> Response:
         names=names,
         counts={kind: counts[kind] for kind in OUTCOMES if counts[kind]},
         styles=OUTCOMES,
-        phases=phases,
+        phases={phase: row[f"seconds.{phase}"] for phase in PHASES if row[f"seconds.{phase}"]},
         others=[one for one in outcomes(found.store, episode.task, episode.seed) if one.episode is not None],
-        command=command[0],
-        why_not=command[1],
-        chosen=number,
-        **_film_values(request, found, steps[number] if steps else 0, decodes),
-    )
-
-
-def _number(text: str, count: int) -> int:
-    """Return the number of a decode as it stands in an address; 0 if there is no such decode."""
-    return int(text) if re.fullmatch(r"\d{1,6}", text) and int(text) < count else 0
-
-
-def show_decode(request: Request) -> Response:
-    """Show the tokens of one decode."""
-    found, number = _found(request), request.path_params["number"]
-    decodes, steps = found.decodes()
-    if number >= len(decodes):
-        raise HTTPException(404, f"the episode has {len(decodes)} decodes, numbered from 0")
-    names = _names(found.episode.task, decodes)
-    return render(
-        request,
-        "episode_decode.html",
-        found=found,
-        chosen=number,
-        decode=decodes[number],
-        step=steps[number],
-        chunk=_chunks(decodes, len(names))[number],
-        names=names,
-        styles=OUTCOMES,
+        command=command,
+        why_not=why_not,
+        chosen=chosen,
+        **_film_values(request, found, steps[chosen] if steps else 0, decodes),
     )
 
 
@@ -155,9 +113,9 @@ def _film_values(
 ) -> dict[str, Any]:
     """Return what the template of a film needs."""
     path = _recording(request, found)
-    job = _RECORDER.job(found.store.rollouts / found.episode.recording)
+    job = RECORDER.job(found.store.rollouts / found.episode.recording)
     values: dict[str, Any] = {"found": found, "step": step, "job": job, "film": None, "same": None, "rerun": ""}
-    values |= {"hz": _hz(found.episode.task), "imported": found.store.kind == IMPORT}
+    values |= {"slower": SLOWER, "imported": found.store.kind == IMPORT}
     if path is not None and (job is None or job.future.done()):
         film = film_of(path)
         if film.facts.get("tokens"):
@@ -177,7 +135,7 @@ def record(request: Request) -> Response:
     found = _found(request)
     if found.store.kind == IMPORT:
         raise HTTPException(409, "an imported episode cannot be recorded: another program ran it")
-    _RECORDER.record(found, found.store.rollouts / found.episode.recording)
+    RECORDER.record(found, found.store.rollouts / found.episode.recording)
     return show_film(request)
 
 
@@ -199,7 +157,7 @@ def animated(request: Request) -> Response:
         raise HTTPException(404, "the recording has no camera")
     name = quote(f"{Path(found.episode.recording).stem}.gif")
     headers = {"content-disposition": f"inline; filename*=utf-8''{name}"}
-    return Response(animation(film, _hz(found.episode.task), "gif"), media_type="image/gif", headers=headers)
+    return Response(animation(film, SLOWER, "gif"), media_type="image/gif", headers=headers)
 
 
 def recording(request: Request) -> Response:
@@ -264,7 +222,6 @@ def viewer(request: Request) -> Response:
 
 ROUTES = [
     Route("/episodes/{id:int}", show_episode),
-    Route("/episodes/{id:int}/decodes/{number:int}", show_decode),
     Route("/episodes/{id:int}/film", show_film),
     Route("/episodes/{id:int}/record", record, methods=["POST"]),
     Route("/episodes/{id:int}/frames/{step:int}", frame),

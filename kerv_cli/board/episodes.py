@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
@@ -24,12 +24,12 @@ from kerv_cli.report.tables import StudyData
 
 SUCCESS, FAILURE, LOST, WON, ERROR, MISSING = "success", "failure", "lost", "won", "error", "missing"
 OUTCOMES = {
-    LOST: ("▼", "failed, and the baseline solved it"),
-    FAILURE: ("×", "failed"),
-    WON: ("▲", "solved, and the baseline failed"),
-    SUCCESS: ("✓", "solved"),
-    ERROR: ("!", "raised an error"),
-    MISSING: ("·", "has not run yet"),
+    LOST: ("▼", "only the baseline solved it"),
+    FAILURE: ("×", ""),
+    WON: ("▲", "only this setting solved it"),
+    SUCCESS: ("✓", ""),
+    ERROR: ("!", "could not run"),
+    MISSING: ("·", "not run yet"),
 }
 """Kind of outcome -> its symbol and meaning, in the order of the key."""
 FAILURES = (LOST, FAILURE)
@@ -66,67 +66,50 @@ def phase_of(closest: float | None, moved: float | None) -> str:
 
 @dataclass(frozen=True)
 class Cell:
-    """One episode of the grid. `kind` is a key of OUTCOMES. `row` is its row of `outcomes`."""
+    """One episode of a study. `episode` is its row number, None if it has not run; `kind` is a key of OUTCOMES."""
 
+    label: str
+    task: str
+    seed: int
+    episode: int | None
     kind: str
-    row: Any
+    phase: str
+    stress: str
 
 
-@dataclass
-class TaskGrid:
-    """The episodes of one task.
-
-    Attributes:
-        task: Name of the task.
-        seeds: All seeds. Those that fail most often come first.
-        rows: Label of a setting -> seed -> cell.
-    """
+@dataclass(frozen=True)
+class Grid:
+    """The episodes of one task: label of a setting -> seed -> cell. The seeds that fail most often come first."""
 
     task: str
-    seeds: list[int] = field(default_factory=list)
-    rows: dict[str, dict[int, Cell]] = field(default_factory=lambda: defaultdict(dict))
-
-    @property
-    def counts(self) -> Counter[str]:
-        """Number of episodes by kind of outcome."""
-        return Counter(cell.kind for row in self.rows.values() for cell in row.values())
-
-    @property
-    def failures(self) -> int:
-        """Number of episodes that failed."""
-        return sum(self.counts[kind] for kind in FAILURES)
-
-    def sort(self) -> None:
-        """Put the seeds that fail most often first."""
-        failed = Counter(s for row in self.rows.values() for s, cell in row.items() if cell.kind in FAILURES)
-        seeds = {seed for row in self.rows.values() for seed in row}
-        self.seeds = sorted(seeds, key=lambda seed: (-failed[seed], seed))
+    seeds: list[int]
+    rows: dict[str, dict[int, Cell]]
+    failed: int
+    total: int
 
 
-def references_of(baseline: str, settings: Mapping[str, Setting]) -> dict[str, str]:
-    """Return label of a setting -> label of the one that it is compared with."""
-    return StudyData(Study("", tuple(settings.values()), (), baseline=baseline), pd.DataFrame()).references
-
-
-def grids_of(rows: Sequence[Any], references: Mapping[str, str], label: str = "", task: str = "") -> list[TaskGrid]:
-    """Arrange the outcomes of a study. Tasks that fail most often come first.
+def cells_of(rows: Sequence[Any], baseline: str, settings: Mapping[str, Setting]) -> list[Cell]:
+    """Compare the outcome of every episode with the baseline's.
 
     Args:
         rows: Rows of `outcomes`.
-        references: Label of a setting -> label of the one that it is compared with.
-        label: Show only this setting. Empty: all.
-        task: Show only this task. Empty: all.
+        baseline: Label of the baseline.
+        settings: Label -> setting.
     """
+    study = Study("", tuple(settings.values()), (), baseline=baseline)
+    references = StudyData(study, pd.DataFrame()).references
+    stresses = {label: stress_of(one.settings) for label, one in settings.items()}
+    names = {label: f"{one['kind']} {one['level']}" if one["level"] else "" for label, one in stresses.items()}
     solved = {(row.label, row.task, row.seed): row.success for row in rows if row.episode is not None}
-    grids: dict[str, TaskGrid] = {}
-    for row in rows:
-        if row.label == (label or row.label) and row.task == (task or row.task):
-            other = solved.get((references[row.label], row.task, row.seed))
-            grid = grids.setdefault(row.task, TaskGrid(row.task))
-            grid.rows[row.label][row.seed] = Cell(_kind(row, other), row)
-    for grid in grids.values():
-        grid.sort()
-    return sorted(grids.values(), key=lambda grid: -grid.failures)
+    return [
+        Cell(
+            *(row.label, row.task, row.seed, row.episode),
+            _kind(row, solved.get((references[row.label], row.task, row.seed))),
+            phase_of(row.closest_approach, row.object_moved),
+            names[row.label],
+        )
+        for row in rows
+    ]
 
 
 def _kind(row: Any, baseline: bool | None) -> str:
@@ -138,97 +121,71 @@ def _kind(row: Any, baseline: bool | None) -> str:
     return LOST if baseline else FAILURE
 
 
-@dataclass(frozen=True)
-class _Asked:
-    """What a page of a study shows: its settings, all outcomes, and the filters of the address."""
-
-    store: StudyStore
-    settings: dict[str, Setting]
-    baseline: str
-    rows: list[Any]
-    label: str
-    task: str
-
-    @property
-    def tasks(self) -> list[str]:
-        return sorted({row.task for row in self.rows})
-
-    def grids(self) -> list[TaskGrid]:
-        return grids_of(self.rows, references_of(self.baseline, self.settings), self.label, self.task)
+def grids_of(cells: Sequence[Cell]) -> list[Grid]:
+    """Arrange episodes by task. The tasks that fail most often come first."""
+    tasks: dict[str, list[Cell]] = defaultdict(list)
+    for cell in cells:
+        tasks[cell.task].append(cell)
+    grids = []
+    for task, some in tasks.items():
+        failed = Counter(cell.seed for cell in some if cell.kind in FAILURES)
+        rows: dict[str, dict[int, Cell]] = defaultdict(dict)
+        for cell in some:
+            rows[cell.label][cell.seed] = cell
+        seeds = sorted({cell.seed for cell in some}, key=lambda seed: (-failed[seed], seed))
+        grids.append(Grid(task, seeds, rows, failed.total(), len(some)))
+    return sorted(grids, key=lambda grid: -grid.failed)
 
 
-def _asked(request: Request) -> _Asked:
+def clusters_of(cells: Sequence[Cell]) -> list[tuple[list[Cell], int]]:
+    """Return failures of one task, setting, stress and phase, and how many episodes of that task and setting have run.
+
+    The largest groups come first.
+    """
+    groups: dict[tuple[str, ...], list[Cell]] = defaultdict(list)
+    for cell in cells:
+        if cell.kind in FAILURES:
+            groups[cell.task, cell.label, cell.phase].append(cell)
+    ran = Counter((cell.task, cell.label) for cell in cells if cell.episode is not None)
+    clusters = ((some, ran[some[0].task, some[0].label]) for some in groups.values())
+    return sorted(clusters, key=lambda cluster: -len(cluster[0]))
+
+
+def _asked(request: Request) -> tuple[list[Cell], dict[str, Any]]:
+    """Return the episodes that the address asks for, and what every page of episodes shows.
+
+    Raises:
+        UnknownName: The study has no such setting or task.
+    """
     store = StudyStore(database_of(request), request.path_params["name"])
     baseline, settings = settings_in(store)
-    label, task = (request.query_params.get(name, "") for name in ("setting", "task"))
-    asked = _Asked(store, settings, baseline, outcomes(store), label, task)
-    for what, value, known in (("setting", label, asked.settings), ("task", task, asked.tasks)):
-        if value and value not in known:
-            raise UnknownName(what, value, known)
-    return asked
+    cells = cells_of(outcomes(store), baseline, settings)
+    known = {"setting": list(settings), "task": sorted({cell.task for cell in cells})}
+    chosen = {name: request.query_params.get(name, "") for name in known}
+    for name, value in chosen.items():
+        if value and value not in known[name]:
+            raise UnknownName(name, value, known[name])
+    cells = [cell for cell in cells if chosen["setting"] in ("", cell.label) and chosen["task"] in ("", cell.task)]
+    return cells, {"study": store.name, "baseline": baseline, "known": known, "chosen": chosen}
 
 
 def show_episodes(request: Request) -> Response:
     """Show all episodes of a study as a grid."""
-    asked = _asked(request)
-    grids = asked.grids()
-    counts = sum((grid.counts for grid in grids), Counter[str]())
-    return render(request, "episodes.html", asked=asked, grids=grids, counts=counts, outcomes=OUTCOMES)
-
-
-@dataclass(frozen=True)
-class Cluster:
-    """Failures of one task, setting, stress and phase of the task.
-
-    Attributes:
-        task: Name of the task.
-        label: Label of the setting.
-        stress: Kind and level of the stress. Empty: none.
-        phase: A key of PHASES.
-        cells: The failed episodes.
-        total: Number of episodes of the task and setting that have run.
-    """
-
-    task: str
-    label: str
-    stress: str
-    phase: str
-    cells: list[Cell]
-    total: int
-
-    @property
-    def lost(self) -> int:
-        """Number of failures that the baseline solved."""
-        return sum(cell.kind == LOST for cell in self.cells)
-
-
-def clusters_of(grids: Sequence[TaskGrid], settings: Mapping[str, Setting]) -> list[Cluster]:
-    """Group the failures. The largest groups come first."""
-    clusters = []
-    for grid in grids:
-        for label, row in grid.rows.items():
-            stress = stress_of(settings[label].settings)
-            named = f"{stress['kind']} {stress['level']}" if stress["level"] else ""
-            cells: dict[str, list[Cell]] = defaultdict(list)
-            for cell in row.values():
-                if cell.kind in FAILURES:
-                    cells[phase_of(cell.row.closest_approach, cell.row.object_moved)].append(cell)
-            total = sum(cell.row.episode is not None for cell in row.values())
-            clusters += [Cluster(grid.task, label, named, phase, some, total) for phase, some in cells.items()]
-    return sorted(clusters, key=lambda cluster: -len(cluster.cells))
+    cells, asked = _asked(request)
+    counts = Counter(cell.kind for cell in cells)
+    return render(request, "episodes.html", grids=grids_of(cells), counts=counts, outcomes=OUTCOMES, **asked)
 
 
 def show_failures(request: Request) -> Response:
     """Show the failures of a study in groups."""
-    asked = _asked(request)
-    clusters = clusters_of(asked.grids(), asked.settings)
-    counts: dict[str, Counter[str]] = {}
-    for cluster in clusters:
-        counts.setdefault(cluster.label, Counter())[cluster.phase] += len(cluster.cells)
+    cells, asked = _asked(request)
+    counts: dict[str, Counter[str]] = defaultdict(Counter)
+    for cell in cells:
+        if cell.kind in FAILURES:
+            counts[cell.label][cell.phase] += 1
     phases = {phase: why for phase, why in PHASES.items() if any(one[phase] for one in counts.values())}
-    return render(
-        request, "failures.html", asked=asked, clusters=clusters, counts=counts, phases=phases, most=MOST_SHOWN
-    )
+    shown: dict[str, Any] = {"clusters": clusters_of(cells), "counts": counts, "phases": phases, "most": MOST_SHOWN}
+    return render(request, "failures.html", **shown, **asked)
 
 
 ROUTES = [

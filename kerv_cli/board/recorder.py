@@ -8,6 +8,7 @@ import time
 from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from kerv_cli.base.processes import begin_worker
 from kerv_cli.catalogue.episodes import FoundEpisode
@@ -48,6 +49,7 @@ class Recorder:
 
     def __init__(self) -> None:
         self._jobs: dict[Path, Job] = {}
+        self._pool: Any = None
         self._lock = threading.Lock()
 
     def job(self, path: Path) -> Job | None:
@@ -67,13 +69,17 @@ class Recorder:
             job = self._jobs.get(path)
             if job is not None and not job.future.done():
                 return
-            pool = get_reusable_executor(
-                max_workers=1, timeout=IDLE_SECONDS, initializer=begin_worker, initargs=(os.getpid(),)
-            )
-            episode, results = found.episode, str(found.store.database.results)
-            seeds = [*found.earlier, episode.seed]
-            work = pool.submit(record_episode, episode.setting, episode.task, seeds, results, path)
+            begin = {"initializer": begin_worker, "initargs": (os.getpid(),)}
+            self._pool = get_reusable_executor(max_workers=1, timeout=IDLE_SECONDS, **begin)
+            one, results = found.episode, str(found.store.database.results)
+            seeds = [*found.earlier, one.seed]
+            work = self._pool.submit(record_episode, one.setting, one.task, seeds, results, path)
             self._jobs[path] = Job(work, time.time())
+
+    def close(self) -> None:
+        """End the process, whatever it is recording."""
+        if self._pool is not None:
+            self._pool.shutdown(kill_workers=True)
 
 
 def record_episode(setting: Setting, task: str, seeds: list[int], results: str, path: Path) -> str:

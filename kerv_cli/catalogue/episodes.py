@@ -68,9 +68,8 @@ class FoundEpisode:
         id: Its row number.
         store: The study.
         episode: Setting, task, seed and repeat.
-        row: Columns of the table `episodes`, without `decode_seconds`.
+        row: Columns of the table `episodes`, without `decode_seconds`, and of its setting.
         about: Machine and versions that ran it.
-        studies: Names of all studies with this episode.
         earlier: Seeds that must run before it to give the same tokens, in their order. Empty, unless the setting's skip
             rule adapts from episode to episode.
     """
@@ -80,7 +79,6 @@ class FoundEpisode:
     episode: Episode
     row: Mapping[str, Any]
     about: Mapping[str, Any]
-    studies: tuple[str, ...]
     earlier: tuple[int, ...]
 
     def decodes(self) -> tuple[list[DecodeRecord], list[int]]:
@@ -99,32 +97,23 @@ def find_episode(database: Database, number: int) -> FoundEpisode:
         number: Its row number.
 
     Raises:
-        UsageError: There is no such episode, or no study uses it any more.
+        UsageError: There is no such episode, or no study uses it any more, because it was run again.
     """
     with database.reading() as connection:
-        measures = measures_in(connection)
-        further = [EPISODES.c[name] for name in ("work", "task", "seed", "repeat", "order", "block", "started")]
-        query = sa.select(*further, *measures, BLOCKS.c.about).join(BLOCKS, BLOCKS.c.id == EPISODES.c.block)
-        row = None
-        if number <= LARGEST_ID:
-            row = connection.execute(query.where(EPISODES.c.id == number)).mappings().first()
-        if row is None:
-            raise UsageError(f"no episode {number} in {database.shown}")
-        uses = (
-            sa.select(SETTINGS, STUDIES.c.name.label("study"), STUDIES.c.kind)
-            .join(STUDIES)
-            .join(WANTED, WANTED.c.setting_id == SETTINGS.c.id)
-            .where(WANTED.c.episode_id == number)
+        own = [EPISODES.c[name] for name in ("task", "seed", "repeat", "order", "block", "started")]
+        about = STUDIES.c.name.label("study"), STUDIES.c.kind, BLOCKS.c.about
+        query = (
+            sa.select(SETTINGS, *about, *own, *measures_in(connection))
+            .select_from(WANTED.join(SETTINGS).join(STUDIES).join(EPISODES).join(BLOCKS))
+            .where(WANTED.c.episode_id == min(number, LARGEST_ID))
             .order_by(STUDIES.c.id.desc())
         )
-        found = connection.execute(uses).all()
-        if not found:
-            raise UsageError(f"episode {number} belongs to no study: it was run again since, or its study was removed")
-        setting = setting_of(found[0])
-        same = [EPISODES.c[name] == row[name] for name in ("work", "task", "repeat", "block")]
-        before = sa.select(EPISODES.c.seed).where(*same, EPISODES.c.order < row["order"]).order_by(EPISODES.c.order)
+        row = connection.execute(query).first()
+        if row is None:
+            raise UsageError(f"no study in {database.shown} has an episode {number}")
+        setting = setting_of(row)
+        same = EPISODES.c.work == row.work, EPISODES.c.block == row.block, EPISODES.c.repeat == row.repeat
+        before = sa.select(EPISODES.c.seed).where(*same, EPISODES.c.order < row.order).order_by(EPISODES.c.order)
         earlier = tuple(connection.scalars(before)) if setting.depends_on_order else ()
-    episode = Episode(setting, row["task"], row["seed"], row["repeat"])
-    store = StudyStore(database, found[0].study, found[0].kind)
-    studies = tuple(dict.fromkeys(one.study for one in found))
-    return FoundEpisode(number, store, episode, dict(row), row["about"], studies, earlier)
+    episode, store = Episode(setting, row.task, row.seed, row.repeat), StudyStore(database, row.study, row.kind)
+    return FoundEpisode(number, store, episode, dict(row._mapping), row.about, earlier)

@@ -31,20 +31,21 @@ def repeating_words(settings: Plain, identity: Identity, typed: str, task: str, 
     if list(seeds) != list(range(seeds[0], seeds[0] + len(seeds))):
         raise UsageError("its skip rule adapts from episode to episode, and the seeds before it have gaps")
     place = [f"task={task}", f"seed={seeds[0]}", f"episodes={len(seeds)}", *(["record=-1"] if len(seeds) > 1 else [])]
+
+    def composed() -> Plain:
+        return asdict(resolve_rollout([*words, *place], multirun=False).first)
+
     words = [_first_word(settings, typed)]
-    composed = asdict(resolve_rollout([*words, *place], multirun=False).first)
+    now = composed()
     # parts first: which other keys exist depends on them
     words += [
         f"{group}={settings[group]['kind']}"
         for group in PART_GROUPS
-        if group in settings and settings[group]["kind"] != composed[group]["kind"]
+        if group in settings and settings[group]["kind"] != now[group]["kind"]
     ]
-    composed = asdict(resolve_rollout([*words, *place], multirun=False).first)
-    wanted, have = _keys(settings), _keys(composed)
-    words += [f"{key}={_text(value)}" for key, value in wanted.items() if have.get(key) != value]
-    if work_of(asdict(resolve_rollout([*words, *place], multirun=False).first), identity) != work_of(
-        settings, identity
-    ):
+    have = _keys(composed())
+    words += [f"{key}={_text(value)}" for key, value in _keys(settings).items() if have.get(key) != value]
+    if work_of(composed(), identity) != work_of(settings, identity):
         raise UsageError("the presets in conf/ have changed since: no command gives these settings any more")
     return ["rollout", *words, *place]
 

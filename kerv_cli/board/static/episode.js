@@ -15,7 +15,7 @@ customElements.define("film-player", class extends HTMLElement {
     const last = Number(this.slider.max);
     step = Math.min(step, last);
     this.slider.value = step;
-    this.image.src = `${this.dataset.source}${step}`;
+    this.image.src = this.dataset.source.replace("STEP", step);
     this.querySelector("output").textContent = `step ${step}`;
     this.dispatchEvent(new CustomEvent("step", { bubbles: true, detail: step }));
   }
@@ -23,7 +23,7 @@ customElements.define("film-player", class extends HTMLElement {
   play() {
     const last = Number(this.slider.max), first = Number(this.slider.value) % last, hz = Number(this.dataset.hz);
     for (let step = this.frames.length; step <= last; step++) {  // load all images once
-      this.frames.push(Object.assign(new Image(), { src: `${this.dataset.source}${step}` }));
+      this.frames.push(Object.assign(new Image(), { src: this.dataset.source.replace("STEP", step) }));
     }
     const began = performance.now();
     const draw = (now) => {
@@ -50,6 +50,10 @@ const rows = () => [...document.querySelectorAll(".tokens tbody tr")];
 document.addEventListener("step", (event) => {
   const now = rows().findLast((row) => Number(row.dataset.step) <= event.detail);
   rows().forEach((row) => row.classList.toggle("now", row === now));
+  const box = document.querySelector(".box");
+  if (now && (now.offsetTop < box.scrollTop + 80 || now.offsetTop + 40 > box.scrollTop + box.clientHeight)) {
+    box.scrollTop = now.offsetTop - box.clientHeight / 2;
+  }
 });
 
 // a row is chosen anywhere, and the film goes to its first step

@@ -13,8 +13,8 @@ from PIL import Image
 
 from kerv_cli.report.viewing.viewer import read_chunks
 
-FRAMES_PER_SECOND = 20
-"""Frames per second of a film file. More make it large, and few viewers play a GIF faster."""
+FRAMES_PER_SECOND = 12
+"""Frames per second of a film file. More make it large."""
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,15 @@ class Film:
 
     Attributes:
         frames: JPEG images, one before the first control step and one after each. Empty if no camera was recorded.
+        hz: Control steps per second.
         facts: Totals of the episode, as `token_outcomes.facts_of` computed them, and `tokens`, a hash of all tokens.
+        changed: Time when the recording was written, in nanoseconds.
     """
 
     frames: tuple[bytes, ...]
+    hz: float
     facts: dict[str, Any]
+    changed: int
 
 
 def film_of(path: Path) -> Film:
@@ -44,27 +48,32 @@ def film_of(path: Path) -> Film:
 def _read(path: Path, changed: int) -> Film:
     frames: list[tuple[int, bytes]] = []
     facts: dict[str, Any] = {}
+    hz = 1.0
     for chunk in read_chunks(path)[1]:
         batch = chunk.to_record_batch()
         if chunk.entity_path == "/camera" and not chunk.is_static:
             images = batch["EncodedImage:blob"].flatten()
             data, ends = images.values.to_numpy(), images.offsets.to_pylist()
             blobs = [data[first:last].tobytes() for first, last in itertools.pairwise(ends)]
-            frames += zip(batch["step"].cast("int64").to_pylist(), blobs, strict=True)
+            steps = batch["step"].cast("int64").to_pylist()
+            frames += zip(steps, blobs, strict=True)
+            if steps[-1]:
+                hz = 1e9 * steps[-1] / batch["time"].cast("int64")[-1].as_py()
         elif chunk.entity_path == "/__properties/episode":
             names = [field.name for field in batch.schema if not field.name.startswith("rerun.")]
             facts |= {name: batch[name][0].as_py()[0] for name in names}
-    return Film(tuple(blob for _, blob in sorted(frames)), facts)
+    return Film(tuple(blob for _, blob in sorted(frames)), hz, facts, changed)
 
 
-def animation(film: Film, hz: float, kind: str = "webp") -> bytes:
-    """Return a film as one animated image, which plays in real time and again from the start.
+def animation(film: Film, slower: float = 1.0, kind: str = "webp") -> bytes:
+    """Return a film as one animated image, which plays again and again.
 
     Args:
         film: The film. It must have frames.
-        hz: Control steps per second.
+        slower: How many times slower than the robot moved.
         kind: `webp`, or `gif`, which is about ten times as large.
     """
+    hz = film.hz / slower
     each = max(1, round(hz / FRAMES_PER_SECOND))
     first, *others = [Image.open(io.BytesIO(frame)) for frame in film.frames[::each]]
     buffer = io.BytesIO()
