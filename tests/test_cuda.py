@@ -12,7 +12,7 @@ from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.eagle.drafter import DrafterProposer
 from kerv_cli.methods.jacobi import JacobiProposer
-from kerv_cli.targets.compact.captured import CapturedCache
+from kerv_cli.targets.attention import CapturedCache
 from kerv_cli.targets.compact.trunk import Trunk
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")

@@ -15,11 +15,11 @@ from kerv_cli.episodes.identity import stress_of, work_of
 from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.runner import Runner, close_worlds
 from kerv_cli.episodes.settings import RolloutSettings, settings_from
-from kerv_cli.worlds import stress as stressing
 from kerv_cli.worlds.demos.dataset import register_recorded
 from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD
 from kerv_cli.worlds.mujoco_world import MujocoWorld
 from kerv_cli.worlds.settings import CameraSettings, StressSettings
+from kerv_cli.worlds.stress import base as stressing
 from kerv_cli.worlds.stress.kinds import CameraJitter, Objects, Sensor, objects, scenery_of
 
 SEED, STEPS, SIZE = 50_006, 24, 48
@@ -221,14 +221,7 @@ def test_a_stress_of_level_0_is_no_stress():
     assert [stress_of(plain)["kind"] for plain in (now, zero, two)] == ["none", "none", "light"]
 
 
-def test_a_level_without_a_kind_and_an_unknown_kind_are_refused():
-    with pytest.raises(UsageError):
-        settings("world.stress.level=1")
-    with pytest.raises(UnknownName):
-        settings("world.stress.kind=pusch")
-
-
-def test_what_an_environment_cannot_do_is_refused():
+def test_what_an_environment_cannot_do_and_unknown_kinds_are_refused():
     from examples.point_mass import SPEC as POINT
 
     renamed = tuple(dataclasses.replace(group, name=f"my {group.name}") for group in INSERTION.actions.groups)
@@ -247,6 +240,10 @@ def test_what_an_environment_cannot_do_is_refused():
         METAWORLD.check_stress(StressSettings(kind, 4))
         recorded.check_stress(StressSettings(kind, 0))
     check(settings("world.stress.kind=object", "world.stress.level=4"))
+    with pytest.raises(UsageError):
+        settings("world.stress.level=1")
+    with pytest.raises(UnknownName):
+        settings("world.stress.kind=pusch")
 
 
 def test_the_command_line_stresses_and_records_it_in_every_row(tmp_path):

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 from kerv_cli.base.registry import parts
 from kerv_cli.worlds import spec_of
-from kerv_cli.worlds import stress as stressing
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.settings import CameraSettings, StressSettings
+from kerv_cli.worlds.stress import base as stressing
 from kerv_cli.worlds.vectors import length
 
 pytestmark = pytest.mark.bits

@@ -20,8 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kerv_cli.engine.transfer import upload
-from kerv_cli.targets.attention import Cache, Slots, attend, attention_mask, rotate
-from kerv_cli.targets.compact.captured import CapturedCache
+from kerv_cli.targets.attention import Cache, CapturedCache, Slots, attend, attention_mask, rotate
 from kerv_cli.targets.compact.packable import Packable, wants_gradient
 from kerv_cli.targets.compact.program import Program
 

@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from kerv_cli.base.registry import find
+from kerv_cli.worlds.settings import StressSettings
+
 if TYPE_CHECKING:
     import mujoco
 
@@ -104,6 +107,18 @@ class Stress:
 
 
 NO_STRESS = Stress()
+
+
+def build(settings: StressSettings) -> Stress:
+    """Return the stress that the settings describe. At level 0 it changes nothing.
+
+    Raises:
+        UnknownName: There is no such kind.
+    """
+    if not settings.active:
+        return NO_STRESS
+    stress: Stress = find("stress", settings.kind).built(settings.level)
+    return stress
 
 
 def factor_or_inverse(random: np.random.Generator, factor: float) -> float:
