@@ -46,6 +46,8 @@ other machines keep the recorded seconds."""
 
 Key = tuple[str, int]
 """Kind and rows of a phase, see `Phase`."""
+Lap = tuple[str, float]
+"""Phase of a decode, as in `engine.record.PHASES`, and its seconds."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ class Laps(Stopwatch):
     """A stopwatch that also keeps each lap as (phase, seconds), not only the sums per phase."""
 
     def __init__(self, device: torch.device) -> None:
-        self.laps: list[tuple[str, float]] = []
+        self.laps: list[Lap] = []
         super().__init__(device)
 
     def lap(self, phase: str) -> None:
@@ -150,9 +152,9 @@ def decoders(model: Model) -> list[Decoder]:
     return every + [decoder(0, DrafterProposer(model.drafter, target, *shape)) for shape in shapes]
 
 
-def costs_of(decoder: Decoder, prompt: int, rounds: Sequence[Round], laps: Sequence[tuple[str, float]]) -> Iterator[
-    tuple[Key, float]
-]:  # fmt: skip
+def costs_of(
+    decoder: Decoder, prompt: int, rounds: Sequence[Round], laps: Sequence[Lap]
+) -> Iterator[tuple[Key, float]]:
     """Yield kind, rows and seconds of each phase in a decode.
 
     The time of a forward ends when its target tokens are on the CPU.
@@ -161,7 +163,7 @@ def costs_of(decoder: Decoder, prompt: int, rounds: Sequence[Round], laps: Seque
         decoder: The decoder.
         prompt: P, number of prompt tokens.
         rounds: The rounds of the decode.
-        laps: (phase, seconds) as measured by `Laps`.
+        laps: As measured by `Laps`, in order.
     """
     seconds = {phase: sum(s for name, s in laps if name == phase) for phase in ("vision", "prefill", "verify")}
     yield ("encode", 1), seconds["vision"]

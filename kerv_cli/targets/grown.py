@@ -71,8 +71,9 @@ def grow_stack(stack: LayerStack, shape: GrowSettings, layers: int) -> None:
         if value < least:
             raise UsageError(f"grow.{name}={value}: the policy has {least}, and only growing keeps what it computes")
     if shape.width % (shape.heads * channels):
-        raise UsageError(f"grow.width={shape.width} with {shape.heads} heads: a head's channels must be a multiple of "
-                         f"the policy's {channels}")  # fmt: skip
+        raise UsageError(
+            f"grow.width={shape.width} with {shape.heads} heads: a head's channels must be a multiple of {channels}"
+        )
     generator, like = torch.Generator().manual_seed(0), stack.norm.weight
     new = [_grown_layer(old[i] if i < len(old) else None, stack, shape, generator) for i in range(layers)]
     stack.layers = nn.ModuleList(layer.to(like.device, like.dtype) for layer in new).eval().requires_grad_(False)

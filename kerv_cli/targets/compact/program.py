@@ -128,7 +128,7 @@ class Program:
         Args:
             function: Takes float32 tensors and returns a tensor or a tuple of tensors.
             shapes: Shape of each input. Its first dimension is 1 and stands for any number of rows.
-            repeats: Whether `repeat` will be called. Each output then becomes the input of the same index.
+            repeats: Whether `repeat` will be called. Then output i of an execution becomes input i of the next.
         """
         tape = Tape()
         with torch.no_grad():

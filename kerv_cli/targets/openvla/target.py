@@ -30,7 +30,7 @@ from kerv_cli.targets.checkpoint import FORMAT, TargetDescription, target_fields
 from kerv_cli.targets.openvla.config import action_space, read_shape, read_statistics
 from kerv_cli.targets.openvla.inputs import Prompter, pixels_of, read_normalisations
 from kerv_cli.targets.openvla.loading import check_finite, digest_of, load_model, open_checked, open_shards
-from kerv_cli.targets.provenance import provenance
+from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.targets.settings import BuildTargetSettings
 
 
@@ -229,7 +229,7 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
     target = replace(target, prompt_tokens=settings.prompt_tokens, image_size=shape.towers[0].image)
     if not settings.libero:  # left out, so that targets from before this setting keep their hashes
         del chosen["libero"]
-    origin = {"command": "kerv build target", "settings": asdict(settings), "files": hashes, "parameters": parameters}
+    figures = {"files": hashes, "parameters": parameters}
     fields = target_fields(
         "openvla",
         asdict(target),
@@ -237,11 +237,10 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
         actions,
         spec.observation if spec else NO_STATE,
         cameras=[spec.camera_name(settings.camera) if spec else settings.camera or "primary"],
-        provenance={**origin, **provenance(settings.runtime.device)},
+        provenance=provenance_of("kerv build target", settings, settings.runtime.device, **figures),
     )
     folder = artifact(settings.results, "target", settings.name)
     described = {"format": FORMAT, "kind": "target", "sha256": digest_of(hashes, chosen), **fields}
     write_json(folder / "target.json", described)
-    tokens = shape.patches + len(prompt)
-    figures = {"parameters": parameters, "prompt tokens": tokens, "action tokens": actions.tokens, "DoFs": actions.dofs}
-    return folder, figures
+    sizes = {"prompt tokens": shape.patches + len(prompt), "action tokens": actions.tokens, "DoFs": actions.dofs}
+    return folder, {"parameters": parameters, **sizes}
