@@ -250,6 +250,10 @@ def test_a_policy_grows_by_command_and_keeps_its_drafter(policies, tmp_path):
             decoder.reset("reach-v3", 0, np.zeros(3))
             chunks.append([decoder.decode(observation(seed)).tokens for seed in range(3)])
     assert all(chunk == chunks[0] for chunk in chunks), "AR and strict drafts, small and grown"
+    half = Artifacts(str(policies), PolicySettings(target=str(folder)), dtype="bfloat16")
+    decoder = Decoder(half.target, Parts(proposer=DrafterProposer(half.load("drafter"), half.target, 5, 1, 5)))
+    decoder.reset("reach-v3", 0, np.zeros(3))
+    assert len(decoder.decode(observation(0)).tokens) == len(chunks[0][0])
 
 
 def test_a_grown_target_whose_policy_changed_is_refused(policies, tmp_path):

@@ -9,6 +9,7 @@ weights are made when it is loaded.
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 from dataclasses import asdict, dataclass, replace
@@ -59,7 +60,7 @@ def grow_stack(stack: LayerStack, shape: GrowSettings, layers: int) -> None:
     Raises:
         UsageError: The new shape is smaller, or the channels of a head are no multiple of the old ones.
     """
-    old: list[Any] = list(stack.layers)
+    old: list[Any] = [copy.deepcopy(layer).float() for layer in stack.layers]
     stack.packed = None
     units, channels = old[0].down.in_features, stack.width // stack.heads
     for name, value, least in (
