@@ -81,10 +81,8 @@ def list_(settings: CommandSettings, names: list[str], as_json: AsJson = False) 
     """List the runs of a results folder, the newest first."""
     from kerv_cli.catalogue.entries import find_runs, matching
 
-    for word in names:
-        if "=" not in word:
-            raise UsageError(f"'{word}' is no filter: write kind=, method=, task=, state= or since=")
-    runs = matching(find_runs(settings.results), dict(word.split("=", 1) for word in names))
+    filters = dict(word.partition("=")[::2] for word in names)
+    runs = matching(find_runs(settings.results), filters)
     if as_json:
         end_with_json([_entry_row(run) for run in runs])
     if not runs:
@@ -260,7 +258,6 @@ def export(
     "lerobot's eval_info.json, or folders that hold one.",
     keys="name baseline labels results",
     examples=("kerv runs import ar/recording-1.sqlite kerv/recording-2.sqlite", "kerv runs import old-results"),
-    lists=("labels",),
 )
 def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False) -> None:
     """Import the runs of another results folder, or evaluations of vla-eval or lerobot as a study."""
