@@ -216,7 +216,7 @@ def part_of(group: str, name: str) -> Part:
 def parts(kind: str) -> Mapping[str, Part]:
     """Return the parts of a kind as a map from name to part, in the order of registration.
 
-    For the settings group `drafter` these are the artifacts that have settings: those that are trained.
+    For the settings group `drafter` these are the artifacts that have settings, because only they are trained.
     """
     load_plugins()
     if kind == "drafter":
@@ -249,10 +249,7 @@ def load_plugins() -> None:
 
 
 def _place_of(error: Exception) -> str:
-    """Return the place of an error in a plugin as `FILE:LINE: `, text for the error message.
-
-    It is empty if the plugin was not found.
-    """
+    """Return where a plugin raised an error, as `FILE:LINE: `. Empty if the plugin was not found."""
     if isinstance(error, SyntaxError):
         return f"{error.filename}:{error.lineno}: "
     frames = reversed(traceback.extract_tb(error.__traceback__)[2:])

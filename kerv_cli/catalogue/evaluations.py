@@ -343,7 +343,7 @@ def _settings(first: Evaluation) -> dict[str, Any]:
 def _identity(evaluations: Sequence[Evaluation]) -> dict[str, str]:
     """Return hashes of the weights and of the recorded results.
 
-    The latter make sure that a rollout never reuses an imported episode.
+    Because of the second, no rollout reuses an imported episode.
     """
     recorded = [[one.id, [dataclasses.astuple(e) for e in one.episodes]] for one in evaluations]
     digest = hashlib.sha256(json.dumps(recorded, sort_keys=True).encode()).hexdigest()
@@ -354,7 +354,7 @@ def _identity(evaluations: Sequence[Evaluation]) -> dict[str, str]:
 def _imported(results: Path, episode: Episode, one: Evaluation, recorded: RecordedEpisode) -> ImportedEpisode:
     """Return an episode for the database, with its decodes if kerv served it.
 
-    Each evaluation is a block (episodes that one process ran) of its own, because it did not take turns with others.
+    Settings took no turns, so each evaluation is a block (episodes that one process ran) of its own.
 
     Args:
         results: The results folder, which holds the served episodes.

@@ -1,7 +1,7 @@
 """Declare the commands of `kerv`. A command is a function that is registered as a part of the kind `command`.
 
-The rest is derived from the declaration: typer's command, the settings, `--cfg`, `--help` and completion. These
-parameters of the function have a meaning; it takes only those that it needs:
+Typer's command, its settings, `--cfg`, `--help` and completion are made from the declaration. The function can have
+these parameters:
 
 - `settings`: The command's settings, composed and checked.
 - `overrides`: The `key=value` arguments as typed.
@@ -59,7 +59,7 @@ def command(name: str, settings: type = CommandSettings, keys: str = "", **trait
 
 
 def schemas_of(part: Part) -> list[type]:
-    """Return the dataclass of a command's settings, then that of the command in its trait `each` if it has one."""
+    """Return the dataclass of a command's settings. With the trait `each`, add the settings of that other command."""
     others = [find("command", part.traits["each"])] if "each" in part.traits else []
     return [one.settings for one in (part, *others)]
 

@@ -184,22 +184,19 @@ def rerun(
         command = again_words(run, results)
         run_training(training_again(run, results), plan, as_json, "reading what it needs", "training again", command)
         return
-    if not run.has_episodes:
-        if run.command and run.state != "complete":
-            raise UsageError(f"{run.id} is {run.state}: go on with '{shlex.join(['kerv', *run.command])}'")
-        raise UsageError(f"{run.id} is a {run.kind}: the command that makes it goes on where it is unfinished")
-    if run.kind == "import":
-        raise UsageError(f"{run.id} was imported: run vla-eval again, then 'kerv runs import'")
+    if run.kind not in ("sweep", "rollout"):
+        made = f", which '{shlex.join(['kerv', *run.command])}' makes" if run.command else ""
+        raise UsageError(f"{run.id} is of the kind {run.kind}{made}: only sweeps, rollouts and trainings are repeated")
     from kerv_cli.base.durations import count
     from kerv_cli.catalogue.entries import plan_of
-    from kerv_cli.cli.work import run_planned
+    from kerv_cli.cli.work import run_study
     from kerv_cli.report.compare import same_tokens
 
     planned = plan_of(run, results)
     name = planned.store.name
     if plan:
         end_with_plan(f"{run.id} again as {name}: {count(len(planned.to_run), 'episode')}", as_json)
-    failed = run_planned(planned).failed
+    failed = run_study(planned).failed
     if failed:
         raise KervError(failed[0].reason)
     entry = find_run(results, name, exact=True)

@@ -414,8 +414,8 @@ class _Sweep:
     def _lost(self, attempt: _Attempt) -> list[Episode]:
         """Return the episodes of a lost worker's block that must run again.
 
-        These are the remaining ones. If a setting's results depend on the order of episodes, all of its episodes run
-        again.
+        These are the episodes that did not end. If a setting's results depend on the order of episodes, all of its
+        episodes run again.
         """
         rest = attempt.rest
         whole = {one.setting.work for one in rest if one.setting.depends_on_order}
