@@ -11,9 +11,10 @@ import pytest
 import sqlalchemy as sa
 import uvicorn
 from starlette.testclient import TestClient
-from studies_synthetic import episode, swept, threshold_study
+from studies_synthetic import episode, swept, threshold_study, unhurried
 
 from kerv_cli.base.errors import KervError
+from kerv_cli.board import studies
 from kerv_cli.board.app import make_app
 from kerv_cli.episodes.rows import episode_row, seconds_blob
 from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, SETTINGS, WANTED, Database, now
@@ -53,6 +54,20 @@ def test_other_hosts_and_other_origins_are_refused(tmp_path):
         assert client.post("/", headers=headers).status_code == 405
 
 
+def test_paths_outside_the_results_folder_are_refused(tmp_path):
+    results, outside = tmp_path / "results", tmp_path / "secret"
+    outside.mkdir()
+    (outside / "target.json").write_text('{"provenance": {"command": "kerv treasure"}}')
+    with pytest.raises(KervError), Run(Database(results), "target", str(outside), ["train", "target"]):
+        raise KervError("no")
+    client = client_of(results)
+    assert f"target/{outside}" in client.get("/").text
+    for path in (f"/artifacts/target/{outside}", "/artifacts/target/../../../secret", "/studies/..%2f..%2fsecret",
+                 "/static/%2e%2e/app.py", "/report/..%2freport.py", "/studies/..%2fsecret/tables"):  # fmt: skip
+        answer = client.get(path)
+        assert (answer.status_code, "treasure" in answer.text) == (404, False), path
+
+
 def test_hostile_names_are_text(tmp_path):
     bad = "<img src=x onerror=alert(1)>"
     study = threshold_study(["reach-v3"], 2, (3,), name="plain", title=bad, note=bad)
@@ -63,7 +78,8 @@ def test_hostile_names_are_text(tmp_path):
     with pytest.raises(KervError), Run(Database(tmp_path), "target", bad, ["train", bad]):
         raise KervError(bad)
     client = client_of(tmp_path)
-    for path in ("/", f"/?text={bad}&sort={bad}&kind={bad}", "/compare?run=plain&run=plain"):
+    for path in ("/", f"/?text={bad}&sort={bad}&kind={bad}", "/studies/plain/tables",
+                 f"/artifacts/target/{bad}", "/compare?run=plain&run=plain", f"/studies/{bad}"):  # fmt: skip
         page = client.get(path).text
         assert "<img" not in page, path
         assert "img" in page, path
@@ -103,7 +119,7 @@ def test_pages_are_quick_with_ten_thousand_episodes(tmp_path):
         connection.execute(sa.update(WANTED).values(episode_id=found.scalar_subquery()))
     client = client_of(tmp_path)
     assert "10000" in client.get("/").text
-    assert quickest(client, "/") < 0.5
+    assert max(quickest(client, "/"), quickest(client, "/studies/large")) < 0.5
 
 
 def test_the_first_page_is_quick_with_two_hundred_runs(tmp_path):
@@ -204,13 +220,53 @@ def test_runs_are_filtered_sorted_and_compared_with_the_keyboard(folder, open_pa
         assert page.url.endswith("#main"), "the first key skips the navigation"
 
 
-@pytest.mark.parametrize("path", ["/", "/compare?run=radii&run=few"])
+def test_a_failed_run_says_why_and_what_to_type(folder, open_page):
+    with served(folder) as address:
+        page = open_page(address)
+        page.get_by_role("link", name="target/mine").click()
+        assert "the disk is full" in page.locator("main").inner_text()
+        assert "kerv train target name=mine" in page.locator(".command").inner_text()
+
+
+def test_a_study_shows_numbers_on_hovering_and_differences_on_a_click(folder, open_page):
+    with served(folder) as address:
+        page = open_page(f"{address}/studies/radii")
+        page.locator(".chart svg").first.wait_for()
+        page.locator(".chart svg path[aria-roledescription=point]").last.hover(force=True)
+        assert re.search(r"success\n\d", page.locator(".tip").inner_text())
+        page.get_by_role("button", name="spec_vla r=9").click()
+        assert "threshold.r" in page.locator("tr.detail").inner_text()
+        page.locator("a[href='/studies/radii/episodes?setting=spec_vla+r%3D9&task=reach-v3']").click()
+        page.get_by_role("heading", name="Episodes").wait_for()
+
+
+def test_a_running_sweep_is_watched_until_it_ends(tmp_path, open_page, monkeypatch):
+    monkeypatch.setattr(studies, "_SHARE", 1.0)
+    sweep = threading.Thread(target=swept, args=(tmp_path, threshold_study(TASKS, 4, (3,), name="live"), unhurried))
+    with served(tmp_path) as address:
+        page = open_page(address)
+        assert "Nothing here yet" in page.locator("main").inner_text()
+        sweep.start()
+        while not StudyStore(tmp_path, "live").counts()[0]:
+            time.sleep(0.05)
+        page.reload()
+        page.locator(".pill", has_text=re.compile(r"running, \d+ of 24")).wait_for()
+        page.get_by_role("link", name="live").click()
+        page.locator(".pill", has_text="running").wait_for()
+        page.locator(".pill", has_text="complete").wait_for()
+        sweep.join()
+        page.locator(".study .about", has_text="8 episodes each").wait_for()
+        asked = []
+        page.on("request", lambda request: asked.append(request.url))
+        page.wait_for_timeout(3500)
+        assert not asked, "nothing runs: nothing is asked"
+
+
+@pytest.mark.parametrize("path", ["/", "/studies/radii", "/artifacts/target/mine", "/compare?run=radii&run=few"])
 def test_pages_fit_a_phone_and_the_dark(folder, open_page, path):
     with served(folder) as address:
         page = open_page(address + path, viewport={"width": 360, "height": 740}, color_scheme="dark")
         page.wait_for_load_state("networkidle")
         assert page.evaluate("document.documentElement.scrollWidth") <= 360
-        red, green, blue = (
-            int(n) for n in re.findall(r"\d+", page.evaluate("getComputedStyle(document.body).background"))[:3]
-        )
-        assert max(red, green, blue) < 64
+        background = page.evaluate("getComputedStyle(document.body).backgroundColor")
+        assert max(int(part) for part in re.findall(r"\d+", background)) < 64

@@ -1,6 +1,5 @@
 """No process of a command outlives it, however it ends."""
 
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -9,9 +8,6 @@ import time
 from pathlib import Path
 
 import pytest
-
-from kerv_cli.base.errors import KervError
-from kerv_cli.lab.executors.local import build
 
 LONGEST = 5.0
 
@@ -149,13 +145,3 @@ def test_an_interrupt_waits_for_code_that_cannot_raise(library, number, tmp_path
         preexec_fn=lambda: signal.signal(number, signal.SIG_DFL),
     )  # fmt: skip
     assert (run.returncode, run.stdout) == (0, "loaded\ncleared\n"), run.stderr
-
-
-def test_without_shared_memory_workers_are_refused(monkeypatch, tmp_path):
-    def refused(self):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(type(multiprocessing.get_context("fork")), "Lock", refused)
-    with pytest.raises(KervError, match=r"runtime\.workers=1"):
-        build(None, 2, 1, tmp_path)
-    assert build(None, 1, 1, tmp_path).slots == 1

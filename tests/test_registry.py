@@ -12,12 +12,12 @@ import pytest
 from kerv_cli.base import registry
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.limits import check_settings
-from kerv_cli.base.registry import METHOD_KINDS, PREFILL, STATES, Part, find, kinds, load, parts, register
+from kerv_cli.base.registry import METHOD_KINDS, PREFILL, STATES, add, find, kinds, load, parts
 
 PLUGIN = """
 from dataclasses import dataclass
 
-from kerv_cli.base.registry import Part, register
+from kerv_cli.base.registry import add
 
 
 @dataclass
@@ -26,7 +26,7 @@ class Settings:
     width: int = 17
 
 
-register(Part("proposer", "{name}", "{module}:build", Settings, traits={{"when": "prefill"}}))
+add("proposer", "{name}", "{module}:build", Settings, when="prefill")
 
 
 def build(settings, context):
@@ -48,16 +48,16 @@ EVERY = [(kind, name) for kind in kinds() for name, part in parts(kind).items() 
 
 
 def test_a_name_belongs_to_one_piece_of_code(shelf):
-    first = register(Part("proposer", "mine", "one:build", traits={"when": PREFILL}))
-    again = register(Part("proposer", "mine", "one:build", colour=1, traits={"when": PREFILL}))
-    assert find("proposer", "mine") is again is not first
+    add("proposer", "mine", "one:build", when=PREFILL)
+    add("proposer", "mine", "one:build", colour=1, when=PREFILL)
+    assert find("proposer", "mine").colour == 1
     with pytest.raises(UsageError, match="proposer 'mine' is registered twice: one:build and two:build") as refused:
-        register(Part("proposer", "mine", "two:build", traits={"when": PREFILL}))
+        add("proposer", "mine", "two:build", when=PREFILL)
     assert "\n" not in str(refused.value)
     with pytest.raises(UsageError):
-        register(Part("proposer", "drafter", "elsewhere:build", traits={"when": STATES}))
+        add("proposer", "drafter", "elsewhere:build", when=STATES)
     assert find("proposer", "drafter").build == "kerv_cli.methods.eagle.drafter:EagleDrafter.proposer"
-    register(Part("threshold", "mine", "two:build"))  # another kind: another name
+    add("threshold", "mine", "two:build")  # another kind: another name
     assert list(parts("proposer"))[-1] == "mine"  # in the order of registration
 
 

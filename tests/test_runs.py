@@ -6,7 +6,6 @@ from __future__ import annotations
 import importlib.util
 import json
 import re
-import shlex
 import shutil
 import subprocess
 import sys
@@ -188,14 +187,6 @@ def test_a_method_composed_on_the_command_line_is_called_what_it_is(words, label
     from kerv_cli.episodes.resolve import resolve_rollout
 
     assert list(resolve_rollout(words, multirun=True).settings) == labels
-
-
-def test_the_commands_behind_a_rollout_run_too(results, tmp_path):
-    copy = tmp_path / "results"
-    shutil.copytree(results, copy)
-    told = works("rollout", "method=ar", "episodes=1", *FAST, f"results={copy}")
-    (command,) = re.findall(r": (kerv runs show .*)$", told, re.MULTILINE)
-    assert "method=ar" in works(*shlex.split(command)[1:])
 
 
 # --- export ---

@@ -114,20 +114,19 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
 
 
 def _typed(overrides: Sequence[str], schema: type) -> dict[str, Any]:
-    """Parse overrides into a map from key to value. A list of tasks needs no brackets: `task=a,b`."""
-    lists_tasks = any(field.name == "task" and str(field.type) == "list[str]" for field in fields(schema))
+    """Parse overrides into a map from key to value. A list needs no brackets: `task=a,b`."""
+    lists = {at.name for at in fields(schema) if str(at.type).startswith("list[")}
     typed: dict[str, Any] = {}
     for override in overrides:
-        value = override.partition("=")[2]
-        brackets = lists_tasks and override.startswith("task=") and not value.startswith("[")
-        parsed = _parsed(f"task=[{value}]" if brackets else override)
+        key, _, value = override.partition("=")
+        parsed = _parsed(f"{key}=[{value}]" if key in lists and value[:1] not in "[$" else override)
         key = parsed.key_or_group
         if key in typed:
             raise UsageError(f"{key} is given twice: leave one out", key)
         if parsed.is_sweep_override():
             raise UsageError(f"{override}: several values need 'kerv rollout -m'; as a list write {key}=[{value}]", key)
         typed[key] = parsed.value()
-    if typed.get("task") == [] and lists_tasks:
+    if "task" in lists and typed.get("task") == []:
         raise UsageError("task= is empty: name a task or a suite, or leave it out")
     return typed
 

@@ -125,7 +125,7 @@ def _clean_once(folder: Path) -> None:
 
 
 def sync(path: Path) -> None:
-    """Flush a file, or the list of names in a folder, to the disk."""
+    """Wait until the disk has stored a file, or a folder's list of names."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

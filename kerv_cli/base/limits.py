@@ -35,7 +35,7 @@ def setting(default: Any, help: str = "", **metadata: Any) -> Any:
 
 
 def limits(least: float = -math.inf, most: float = math.inf, above: float = -math.inf) -> dict[str, Any]:
-    """Return the metadata that restricts a field to a range of numbers, or each number of a list or mapping.
+    """Return the metadata of a field that limits its number, or every number in its list or mapping.
 
     None is always allowed, NaN never.
 

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import multiprocessing
 import os
 import signal
 import threading
 import time
-
-from kerv_cli.base.errors import KervError
 
 WATCH_SECONDS = 1.0
 """Seconds between two checks whether the parent process is alive."""
@@ -35,18 +32,6 @@ def end_with(parent: int) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-def check_workers() -> None:
-    """Check that this machine can run worker processes, which need semaphores.
-
-    Raises:
-        KervError: Semaphores cannot be created. On Linux the reason is that /dev/shm cannot be used.
-    """
-    try:
-        multiprocessing.get_context("fork").Lock()
-    except (OSError, ImportError) as error:
-        raise KervError(f"no worker processes here, /dev/shm cannot be used ({error}): set runtime.workers=1") from None
 
 
 def begin_worker(parent: int) -> None:

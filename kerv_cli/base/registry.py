@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 import importlib
 import os
+import pkgutil
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -115,19 +116,6 @@ class Part:
 _PARTS: dict[str, dict[str, Part]] = {}
 
 
-def register(part: Part) -> Part:
-    """Add a part to the registry. A module that is reloaded can register its parts again.
-
-    Raises:
-        UsageError: A part of the same kind and name, but with a different `build`, is registered already.
-    """
-    other = _PARTS.setdefault(part.kind, {}).get(part.name)
-    if other is not None and other.build != part.build:
-        raise UsageError(f"{part.kind} '{part.name}' is registered twice: {other.build} and {part.build}")
-    _PARTS[part.kind][part.name] = part
-    return part
-
-
 def add(
     kind: str,
     name: str,
@@ -137,7 +125,7 @@ def add(
     colour: int | None = None,
     **traits: Any,
 ) -> None:
-    """Register a part; see `Part`.
+    """Register a part; see `Part`. A module that is reloaded can register its parts again.
 
     Args:
         kind: Kind of part, such as `proposer`.
@@ -147,8 +135,14 @@ def add(
         needs: Kinds of artifacts that must exist to use it, or a function of its settings that returns them.
         colour: Colour in tables and plots, 0xRRGGBB.
         **traits: Further properties that other modules read. docs/extending.md lists them.
+
+    Raises:
+        UsageError: A part of the same kind and name, but with a different `build`, is registered already.
     """
-    register(Part(kind, name, build, settings, needs if callable(needs) else lambda _: needs, colour, traits))
+    same = _PARTS.setdefault(kind, {})
+    if name in same and same[name].build != build:
+        raise UsageError(f"{kind} '{name}' is registered twice: {same[name].build} and {build}")
+    same[name] = Part(kind, name, build, settings, needs if callable(needs) else lambda _: needs, colour, traits)
 
 
 def add_drafter(
@@ -181,15 +175,12 @@ def load(name: str) -> Any:
     Raises:
         UsageError: The module cannot be imported, or it has no such attribute.
     """
-    module, _, attribute = name.partition(":")
     try:
-        imported = importlib.import_module(module)
+        return pkgutil.resolve_name(name)
     except ImportError as error:
-        raise UsageError(f"{module} cannot be imported: {error}") from error
-    try:
-        return functools.reduce(getattr, attribute.split("."), imported)
+        raise UsageError(f"{name} cannot be imported: {error}") from error
     except AttributeError:
-        raise UsageError(f"{module} has no {attribute}") from None
+        raise UsageError(f"{name} does not exist") from None
 
 
 def find(kind: str, name: str, what: str = "") -> Part:
@@ -225,7 +216,7 @@ def part_of(group: str, name: str) -> Part:
 def parts(kind: str) -> Mapping[str, Part]:
     """Return the parts of a kind as a map from name to part, in the order of registration.
 
-    For the settings group `drafter` these are the artifacts that have settings: those that are trained.
+    For the settings group `drafter` these are the artifacts that have settings, because only they are trained.
     """
     load_plugins()
     if kind == "drafter":
@@ -258,10 +249,7 @@ def load_plugins() -> None:
 
 
 def _place_of(error: Exception) -> str:
-    """Return the place of an error in a plugin as `FILE:LINE: `, text for the error message.
-
-    It is empty if the plugin was not found.
-    """
+    """Return where a plugin raised an error, as `FILE:LINE: `. Empty if the plugin was not found."""
     if isinstance(error, SyntaxError):
         return f"{error.filename}:{error.lineno}: "
     frames = reversed(traceback.extract_tb(error.__traceback__)[2:])

@@ -24,7 +24,7 @@ def chosen(kind: str, name: str = "none") -> Callable[[], Any]:
 def part(kind: str, name: str = "none", help: str = "") -> Any:
     """Return a dataclass field that holds the settings of a part, such as a proposer.
 
-    The field must have the name of a group in conf/. On the command line that name chooses another part.
+    Its name must be a group of settings, because `NAME=PART` on the command line chooses another part.
 
     Args:
         kind: Kind of part.

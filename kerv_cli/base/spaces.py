@@ -263,9 +263,10 @@ class ObservationSpace:
         places: Positions in the state that a policy can estimate from images, such as object and goal.
         centre: Middle of the workspace in metres.
         extra_places: Further positions, read only by a policy that gets the state.
-        extra: Indices of further numbers in the state, read only by such a policy.
-        previous: (count, index) if the state repeats its first `count` numbers, as they were one control step earlier,
-            from `index` on. A policy that gets the state reads the differences as velocities. None: it does not.
+        extra: Indices of further numbers in the state, read only by a policy that gets the state.
+        previous: (count, index) if `state[index : index + count]` holds the first `count` numbers of the previous
+            control step. A policy that gets the state reads the differences as velocities. None: the state holds no
+            earlier numbers.
     """
 
     proprioception: tuple[str, ...]

@@ -54,12 +54,12 @@ def make_app(results: str | Path) -> Starlette:
 
     Pages find the database in `request.app.state.database`.
     """
-    folders = {"/static": ("kerv_cli.board", "static")}
+    folders = {"/static": ("kerv_cli.board", "static"), "/report": ("kerv_cli.report", "templates")}
     files = [Mount(path, StaticFiles(packages=[folder])) for path, folder in folders.items()]
     app = Starlette(
         routes=[*runs.ROUTES, *studies.ROUTES, *episodes.ROUTES, *training.ROUTES, *files],
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=_HOSTS), Middleware(SameOrigin)],
-        exception_handlers={KervError: _failed, HTTPException: _failed},
+        exception_handlers=dict.fromkeys((KervError, HTTPException, Exception), _failed),
     )
     app.state.database = Database(results)
     return app
@@ -69,7 +69,8 @@ async def _failed(request: Request, error: Exception) -> Response:
     """Return the page for an error: 404 if something does not exist, 500 if something is damaged."""
     if isinstance(error, HTTPException):
         return render(request, "error.html", error.status_code, reason=error.detail)
-    return render(request, "error.html", 404 if isinstance(error, UsageError) else 500, reason=str(error))
+    reason = str(error) if isinstance(error, KervError) else f"internal error, {type(error).__name__}: {error}"
+    return render(request, "error.html", 404 if isinstance(error, UsageError) else 500, reason=reason)
 
 
 def serve(results: str | Path, port: int, opened: Callable[[str], None], browser: bool) -> None:
@@ -84,7 +85,7 @@ def serve(results: str | Path, port: int, opened: Callable[[str], None], browser
     Raises:
         UsageError: The port is taken.
     """
-    server = uvicorn.Server(uvicorn.Config(make_app(results), log_level="error", timeout_graceful_shutdown=1))
+    server = uvicorn.Server(uvicorn.Config(make_app(results), log_level="critical", timeout_graceful_shutdown=1))
     with socket.socket() as listening:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

@@ -1,7 +1,124 @@
-"""The page of a study: its verdict, tables and plots."""
+"""The page of a study: how far it is, its verdict, tables and charts, live while it runs."""
 
 from __future__ import annotations
 
+import functools
+import os
+import shlex
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote, urlencode
+
+from starlette.requests import Request
+from starlette.responses import Response
 from starlette.routing import Route
 
-ROUTES: list[Route] = []
+from kerv_cli.base.errors import UsageError
+from kerv_cli.board.pages import database_of, render
+from kerv_cli.catalogue.entries import find_runs, parents
+from kerv_cli.lab.runs import RUNNING, pulse, run_rows
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.report.page import study_parts
+from kerv_cli.report.plots import library
+
+_SHARE = 0.01
+"""Largest share of each core's time that goes into refreshing a study while it runs, so that its timings hold."""
+_SECONDS = 5.0
+"""Shortest time between two refreshes."""
+
+
+@functools.lru_cache(maxsize=16)
+def _parts(results: Path, name: str, version: str) -> tuple[dict[str, Any], float]:
+    """Return the values of a study's report, and the seconds to wait before the next refresh.
+
+    Args:
+        results: The results folder.
+        name: Name of the study.
+        version: Its version, so that a study that did not change is not read again.
+    """
+    clock = time.thread_time()
+    parts = study_parts(StudyStore(results, name))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return parts, max(_SECONDS, (time.thread_time() - clock) / (_SHARE * cores))
+
+
+def show_study(request: Request) -> Response:
+    """Show how far a study is. The tables follow in a second request, because many episodes take time to read."""
+    database = database_of(request)
+    version, is_live = pulse(database)
+    if request.query_params.get("known") == version:
+        return Response(status_code=204)
+    runs = find_runs(database.results)
+    run = next((run for run in runs if run.id == request.path_params["name"] and run.has_episodes), None)
+    if run is None:
+        raise UsageError(f"there is no study '{request.path_params['name']}'")
+    page = render(
+        request,
+        "study_page.html",
+        run=run,
+        title=run.id,
+        command=shlex.join(["kerv", *run.command]) if run.command else "",
+        parents=parents(run, runs),
+        known={one.id for one in runs},
+        version=version,
+        is_live=is_live and run.is_running,
+    )
+    if not run.is_running:
+        page.headers["HX-Trigger"] = "ended"  # tables that show the running study are loaded again
+    return page
+
+
+def show_tables(request: Request) -> Response:
+    """Show the report of a study: its verdict, tables and charts."""
+    database, name = database_of(request), request.path_params["name"]
+    store = StudyStore(database, name)
+    is_running = any(row.status == RUNNING for row in run_rows(database, store.kind, name))
+    version = f"{store.version()}/{is_running}"
+    if request.query_params.get("known") == version:
+        return Response(status_code=204)
+    has_episodes = store.counts()[0] > 0
+    parts, seconds = _parts(database.results, name, version) if has_episodes else ({}, _SECONDS)
+    hidden: dict[str, Any] = {"recordings": [], "files": []} | ({"missing": 0} if is_running else {})
+    return render(
+        request,
+        "study_tables.html",
+        study=name,
+        has_episodes=has_episodes,
+        is_running=is_running,
+        version=version,
+        seconds=round(seconds),
+        **parts | hidden | {"cell_link": _episodes_of(name)},
+    )
+
+
+def _episodes_of(study: str) -> Callable[[str, str, str], str]:
+    """Return a function that returns the address of the episodes behind a cell of the table by task.
+
+    Its arguments are the heading of the table's first column (`task` or `setting`), the row's name, and the column's.
+    """
+
+    def address(heading: str, row: str, column: str) -> str:
+        setting, task = (column, row) if heading == "task" else (row, column)
+        return f"/studies/{quote(study)}/episodes?{urlencode({'setting': setting, 'task': task})}"
+
+    return address
+
+
+@functools.cache
+def _library() -> str:
+    return library()
+
+
+def send_library(request: Request) -> Response:
+    """Send the library that draws charts."""
+    day = {"cache-control": "max-age=86400"}
+    return Response(_library(), media_type="text/javascript", headers=day)
+
+
+ROUTES = [
+    Route("/studies/{name}", show_study),
+    Route("/studies/{name}/tables", show_tables),
+    Route("/report/charts.js", send_library),
+]

@@ -2,6 +2,56 @@
 
 from __future__ import annotations
 
+import shlex
+
+from starlette.requests import Request
+from starlette.responses import Response
 from starlette.routing import Route
 
-ROUTES: list[Route] = []
+from kerv_cli.base.errors import KervError, UsageError
+from kerv_cli.board.pages import database_of, render
+from kerv_cli.catalogue.entries import RunEntry, children, description_of, disk_bytes, find_run, find_runs, parents
+from kerv_cli.lab.runs import pulse
+from kerv_cli.report.plots import curves_figure, read_log
+from kerv_cli.report.tables import flatten
+
+
+def show_artifact(request: Request) -> Response:
+    """Show one artifact, and its curves while it is trained."""
+    database = database_of(request)
+    version, is_live = pulse(database)
+    if request.query_params.get("known") == version:
+        return Response(status_code=204)
+    runs = find_runs(database.results)
+    run = find_run(database.results, request.path_params["name"], exact=True)
+    if not run.folder.is_relative_to(database.results):
+        raise UsageError(f"{run.id} is outside {database.results}")
+    described = description_of(run)
+    return render(
+        request,
+        "artifact.html",
+        run=run,
+        command=shlex.join(["kerv", *run.command]) if run.command else "",
+        size=disk_bytes(run.folder),
+        parents=parents(run, runs),
+        children=children(run, runs),
+        known={one.id for one in runs},
+        chart=_curves(run),
+        settings=flatten(described.get("settings", {})),
+        commit=described.get("git_commit", ""),
+        version=version,
+        is_live=is_live and run.is_running,
+    )
+
+
+def _curves(run: RunEntry) -> dict[str, object] | None:
+    """Return the chart of a training's validations. None before the second one, or if it is no training."""
+    try:
+        log = read_log(run.folder)
+    except KervError:
+        return None
+    first = [name for name in ("step", "score", "train_loss") if name in log]
+    return curves_figure(log[[*first, *log.columns.drop(first)]]).to_dict() if len(log) > 1 else None
+
+
+ROUTES = [Route("/artifacts/{name:path}", show_artifact)]

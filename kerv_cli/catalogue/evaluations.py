@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
+import itertools
 import json
 import math
 import re
@@ -231,26 +232,15 @@ def _evaluation(file: sqlite3.Connection, path: Path, name: str, metadata: str) 
         "ORDER BY rowid",
         (name,),
     )
-    episodes = tuple(_episode(*row) for row in rows)
+    episodes = []
+    for task, index, metrics, steps, seconds, eid, reason in rows:
+        measured, index = dict(json.loads(metrics or "{}")), int(index)
+        start = tuple(float(x) for x in measured.get("initial_state") or (index,))
+        task, seed = " ".join(str(task or "unknown").split())[:200], int(measured.get("seed", index))
+        result = bool(measured.get("success")), int(steps or 0), float(seconds or 0.0)
+        episodes.append(RecordedEpisode(task, index, seed, *result, str(eid or ""), start, str(reason or "")))
     (queued,) = file.execute("SELECT COUNT(*) FROM work_queue WHERE eval_id = ?", (name,)).fetchone()
-    return Evaluation(path, name, str(about["benchmark"]), config, server, episodes, queued)
-
-
-def _episode(
-    task: Any, episode_id: Any, metrics: Any, steps: Any, seconds: Any, eid: Any, reason: Any
-) -> RecordedEpisode:
-    measured, index = dict(json.loads(metrics or "{}")), int(episode_id)
-    return RecordedEpisode(
-        task=" ".join(str(task or "unknown").split())[:200],
-        index=index,
-        seed=int(measured.get("seed", index)),
-        success=bool(measured.get("success")),
-        steps=int(steps or 0),
-        seconds=float(seconds or 0.0),
-        id=str(eid or ""),
-        start=tuple(float(x) for x in measured.get("initial_state") or (index,)),
-        reason=str(reason or ""),
-    )
+    return Evaluation(path, name, str(about["benchmark"]), config, server, tuple(episodes), queued)
 
 
 def labelled(recordings: Sequence[list[Evaluation]], labels: Sequence[str] = ()) -> dict[str, list[Evaluation]]:
@@ -268,10 +258,9 @@ def labelled(recordings: Sequence[list[Evaluation]], labels: Sequence[str] = ())
             f"labels={','.join(labels)}: write a different one for each of the {len(recordings)} recordings"
         )
     by_label: dict[str, list[Evaluation]] = {}
-    for number, evaluations in enumerate(recordings):
-        name = labels[number] if labels else evaluations[0].name
-        label = next(n for n in (name, *(f"{name}-{i}" for i in range(2, 10_000))) if n not in by_label)
-        by_label[label] = evaluations
+    for name, evaluations in zip(labels or [one[0].name for one in recordings], recordings, strict=True):
+        names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
+        by_label[next(one for one in names if one not in by_label)] = evaluations
     first, *others = by_label
     for other in others:
         _check_same_episodes(f"{first} and {other}", by_label[first], by_label[other])
@@ -354,7 +343,7 @@ def _settings(first: Evaluation) -> dict[str, Any]:
 def _identity(evaluations: Sequence[Evaluation]) -> dict[str, str]:
     """Return hashes of the weights and of the recorded results.
 
-    The latter make sure that a rollout never reuses an imported episode.
+    Because of the second, no rollout reuses an imported episode.
     """
     recorded = [[one.id, [dataclasses.astuple(e) for e in one.episodes]] for one in evaluations]
     digest = hashlib.sha256(json.dumps(recorded, sort_keys=True).encode()).hexdigest()
@@ -365,7 +354,7 @@ def _identity(evaluations: Sequence[Evaluation]) -> dict[str, str]:
 def _imported(results: Path, episode: Episode, one: Evaluation, recorded: RecordedEpisode) -> ImportedEpisode:
     """Return an episode for the database, with its decodes if kerv served it.
 
-    Each evaluation is a block (episodes that one process ran) of its own, because it did not take turns with others.
+    Settings took no turns, so each evaluation is a block (episodes that one process ran) of its own.
 
     Args:
         results: The results folder, which holds the served episodes.

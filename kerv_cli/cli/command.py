@@ -1,7 +1,7 @@
 """Declare the commands of `kerv`. A command is a function that is registered as a part of the kind `command`.
 
-The rest is derived from the declaration: typer's command, the settings, `--cfg`, `--help` and completion. These
-parameters of the function have a meaning; it takes only those that it needs:
+Typer's command, its settings, `--cfg`, `--help` and completion are made from the declaration. The function can have
+these parameters:
 
 - `settings`: The command's settings, composed and checked.
 - `overrides`: The `key=value` arguments as typed.
@@ -45,7 +45,6 @@ def command(name: str, settings: type = CommandSettings, keys: str = "", **trait
         **traits: Optional properties:
             examples: Command lines for the help.
             names: Help text for arguments that are not `key=value`. Without it there are none.
-            lists: Settings whose value is a list and can be typed without brackets.
             typed: Key on the command line -> name of the setting, for settings with two names.
             writes: Whether the command writes to the results folder (default true). Then kerv checks first that it can.
             each: Name of another command. Overrides that are no settings of this command are settings of that one.
@@ -60,7 +59,7 @@ def command(name: str, settings: type = CommandSettings, keys: str = "", **trait
 
 
 def schemas_of(part: Part) -> list[type]:
-    """Return the dataclass of a command's settings, then that of the command in its trait `each` if it has one."""
+    """Return the dataclass of a command's settings. With the trait `each`, add the settings of that other command."""
     others = [find("command", part.traits["each"])] if "each" in part.traits else []
     return [one.settings for one in (part, *others)]
 
@@ -218,9 +217,7 @@ def _settings(part: Part, overrides: list[str], cfg: bool) -> Any:
     """
     typed = part.traits.get("typed", {})
     pairs = [(typed.get(key, key), equals, value) for key, equals, value in (word.partition("=") for word in overrides)]
-    lists = part.traits.get("lists", ())
-    plain = [f"{key}=[{value.strip('[]')}]" if key in lists else key + equals + value for key, equals, value in pairs]
-    settings: Any = compose(part.name.replace(" ", "_"), plain, part.settings)
+    settings: Any = compose(part.name.replace(" ", "_"), ["".join(pair) for pair in pairs], part.settings)
     if cfg:
         typer.echo(settings_yaml(settings), nl=False)
         raise typer.Exit(0)

@@ -23,7 +23,6 @@ NOT_OF_STEPS = ("for", "steps")
     keys="policy.target for demos task steps runtime.device results",
     examples=("kerv prepare policy.target=mine", "kerv prepare policy.target=mine for=one_pass,kerv --plan"),
     typed={"for": "methods"},
-    lists=("methods",),
 )
 def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = False) -> None:
     """Make all artifacts of a target that methods need, in order: drafters, datastore, calibration, certificate.

@@ -46,7 +46,6 @@ AllColumns = Annotated[bool, typer.Option("--all", help="Print all columns of th
     examples=("kerv report study=demo", "kerv report --choose study=threshold loss=5"),
     # renamed, because Hydra would take study= as a choice among the files of conf/study
     typed={"study": "only"},
-    lists=("on",),
 )
 def report(
     settings: ReportSettings,

@@ -59,7 +59,7 @@ def rollout(
             )
         typer.echo(f"{names}: {count(len(tasks), 'task')}, {count(total, 'episode')}, {about(3 * total)}")
         return
-    run_study(resolved, planned)
+    run_study(planned)
     _print_rollout(planned.store, as_json, results_word(overrides))
 
 

@@ -81,10 +81,8 @@ def list_(settings: CommandSettings, names: list[str], as_json: AsJson = False) 
     """List the runs of a results folder, the newest first."""
     from kerv_cli.catalogue.entries import find_runs, matching
 
-    for word in names:
-        if "=" not in word:
-            raise UsageError(f"'{word}' is no filter: write kind=, method=, task=, state= or since=")
-    runs = matching(find_runs(settings.results), dict(word.split("=", 1) for word in names))
+    filters = dict(word.partition("=")[::2] for word in names)
+    runs = matching(find_runs(settings.results), filters)
     if as_json:
         end_with_json([_entry_row(run) for run in runs])
     if not runs:
@@ -186,22 +184,19 @@ def rerun(
         command = again_words(run, results)
         run_training(training_again(run, results), plan, as_json, "reading what it needs", "training again", command)
         return
-    if not run.has_episodes:
-        if run.command and run.state != "complete":
-            raise UsageError(f"{run.id} is {run.state}: go on with '{shlex.join(['kerv', *run.command])}'")
-        raise UsageError(f"{run.id} is a {run.kind}: the command that makes it goes on where it is unfinished")
-    if run.kind == "import":
-        raise UsageError(f"{run.id} was imported: run vla-eval again, then 'kerv runs import'")
+    if run.kind not in ("sweep", "rollout"):
+        made = f", which '{shlex.join(['kerv', *run.command])}' makes" if run.command else ""
+        raise UsageError(f"{run.id} is of the kind {run.kind}{made}: only sweeps, rollouts and trainings are repeated")
     from kerv_cli.base.durations import count
     from kerv_cli.catalogue.entries import plan_of
-    from kerv_cli.cli.work import run_planned
+    from kerv_cli.cli.work import run_study
     from kerv_cli.report.compare import same_tokens
 
     planned = plan_of(run, results)
     name = planned.store.name
     if plan:
         end_with_plan(f"{run.id} again as {name}: {count(len(planned.to_run), 'episode')}", as_json)
-    failed = run_planned(planned).failed
+    failed = run_study(planned).failed
     if failed:
         raise KervError(failed[0].reason)
     entry = find_run(results, name, exact=True)
@@ -260,7 +255,6 @@ def export(
     "lerobot's eval_info.json, or folders that hold one.",
     keys="name baseline labels results",
     examples=("kerv runs import ar/recording-1.sqlite kerv/recording-2.sqlite", "kerv runs import old-results"),
-    lists=("labels",),
 )
 def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False) -> None:
     """Import the runs of another results folder, or evaluations of vla-eval or lerobot as a study."""

@@ -49,7 +49,7 @@ def sweep(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_js
     if plan:
         print_study_plan(planned, as_json)
         return
-    _print_outcome(run_study(resolved, planned), resolved, planned, as_json)
+    _print_outcome(run_study(planned, resolved.sweep), resolved, planned, as_json)
 
 
 def _list_studies(as_json: bool) -> None:

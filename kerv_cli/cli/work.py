@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from kerv_cli.episodes.resolve import ResolvedStudy
+    from kerv_cli.episodes.settings import SweepSettings
     from kerv_cli.lab.events import Event, Outcome
     from kerv_cli.lab.runs import Run
     from kerv_cli.lab.store import Plan, StudyStore
-    from kerv_cli.lab.study import InterimAnalysis
     from kerv_cli.training.run import TrainingRun
 
 SECONDS_PER_EPISODE = 1.0
@@ -106,37 +106,29 @@ def print_study_plan(planned: Plan, as_json: bool) -> None:
     typer.echo(f"{count(len(to_run), 'episode')} to run, {len(reused)} reused, {about(seconds, source)}")
 
 
-def run_study(resolved: ResolvedStudy, planned: Plan) -> Outcome:
-    """Run the missing episodes of a study and show the progress.
+def run_study(planned: Plan, sweep: SweepSettings | None = None) -> Outcome:
+    """Run the missing episodes of a plan and show the progress.
 
-    With until=decided the study ends as soon as its results are clear.
+    Args:
+        planned: The plan.
+        sweep: Settings of the sweep. With until=decided the study ends as soon as its results are clear. None: all
+            episodes run.
 
     Raises:
         Interrupted: The user pressed Ctrl-C.
         KervError: The study could not run, see `study.run`.
     """
     from kerv_cli.lab.plan import seed_blocks
+    from kerv_cli.lab.study import run
     from kerv_cli.report.decide import confidence_of_a_look, judge
     from kerv_cli.report.verdict import stopping_rule
-
-    analysis = None
-    if resolved.sweep.until == "decided":
-        loss, looks = resolved.sweep.loss, len(seed_blocks(planned.study))
-        typer.echo(stopping_rule(loss, looks, confidence_of_a_look(looks)), err=True)
-        analysis = judge(loss, lambda line: typer.echo(line, err=True))
-    return run_planned(planned, analysis)
-
-
-def run_planned(planned: Plan, analysis: InterimAnalysis | None = None) -> Outcome:
-    """Run the missing episodes of a plan and show the progress; raises as `study.run`.
-
-    Args:
-        planned: The plan.
-        analysis: Decides during the study whether it can end early. None: all episodes run.
-    """
-    from kerv_cli.lab.study import run
     from kerv_cli.report.viewing import save_recording
 
+    analysis = None
+    if sweep is not None and sweep.until == "decided":
+        looks = len(seed_blocks(planned.study))
+        typer.echo(stopping_rule(sweep.loss, looks, confidence_of_a_look(looks)), err=True)
+        analysis = judge(sweep.loss, lambda line: typer.echo(line, err=True))
     with progress_bar("episodes") as show:
         return run(planned, event_printer(show), save=save_recording, analysis=analysis)
 
@@ -144,7 +136,7 @@ def run_planned(planned: Plan, analysis: InterimAnalysis | None = None) -> Outco
 def event_printer(show: Callable[[int, int, str], None]) -> Callable[[Event], None]:
     """Return a function that prints a line about each event of a running study and moves its progress bar.
 
-    Without a terminal, runs of more than 100 episodes get no line per episode.
+    If standard error is no terminal and more than 100 episodes run, no line is printed per episode.
 
     Args:
         show: Moves the bar, see `progress_bar`.

@@ -146,29 +146,20 @@ class BlockRun:
 
     def _run_batch(self) -> None:
         self.send(Message(0))
+        runner: Any = self.prepare
         failed: set[str] = set()
         order = itertools.count()
-        for one, result in self._batch_results():
-            if one.task in failed:
-                continue
-            if isinstance(result, EpisodeRecord):
-                started = datetime.now(UTC) - timedelta(seconds=result.wall_seconds)
-                self.send(self._ended(one, result, next(order), started))
-            else:
-                failed.add(one.task)
-                self.send(Message(self.block.episodes.index(one), failure=failure_of(result)))
-
-    def _batch_results(self) -> Iterator[tuple[Episode, EpisodeRecord | Exception]]:
-        """Run the block's episodes as a batch, and yield each when it ends, with its record or error.
-
-        An error that stops the whole batch is yielded once per task.
-        """
-        runner: Any = self.prepare
         try:
-            yield from runner.together(self.block.episodes)
+            for one, result in runner.together(self.block.episodes):
+                if isinstance(result, Exception):
+                    failed.add(one.task)
+                    self.send(Message(self.block.episodes.index(one), failure=failure_of(result)))
+                elif one.task not in failed:
+                    started = datetime.now(UTC) - timedelta(seconds=result.wall_seconds)
+                    self.send(self._ended(one, result, next(order), started))
         except Exception as error:  # noqa: BLE001 - the other blocks go on
-            for one in {one.task: one for one in self.block.episodes}.values():
-                yield one, error
+            for index in range(len(self.block.episodes)):
+                self.send(Message(index, failure=failure_of(error)))
 
     def _ended(self, one: Episode, record: EpisodeRecord, order: int, started: datetime) -> Message:
         row = episode_row(record) | {
@@ -423,8 +414,8 @@ class _Sweep:
     def _lost(self, attempt: _Attempt) -> list[Episode]:
         """Return the episodes of a lost worker's block that must run again.
 
-        These are the remaining ones. If a setting's results depend on the order of episodes, all of its episodes run
-        again.
+        These are the episodes that did not end. If a setting's results depend on the order of episodes, all of its
+        episodes run again.
         """
         rest = attempt.rest
         whole = {one.setting.work for one in rest if one.setting.depends_on_order}

@@ -238,7 +238,7 @@ def making(results: str | Path, kind: str, folder: Path, command: Sequence[str] 
 
 
 def command_to_go_on(results: str | Path, kind: str, folder: Path) -> tuple[str, ...]:
-    """Return the command-line arguments (without `kerv`) that resume an unfinished artifact (weights or data).
+    """Return the arguments after `kerv` that resume the making of an artifact (weights or data).
 
     Empty if the artifact is complete, or if the database has no row for it.
     """
@@ -259,9 +259,9 @@ def forget(database: Database, kind: str, name: str) -> None:
 
 
 def interrupted_since(database: Database, kind: str, name: str, command: Sequence[str]) -> str:
-    """Return when a command was first started that has been interrupted and is now resumed (ISO 8601).
+    """Return the first start time of an interrupted command that now runs again (ISO 8601).
 
-    Empty if there is nothing to resume: the newest run has other arguments or is complete.
+    Empty if the newest run of this study or artifact has other arguments or is complete.
 
     Args:
         database: The database.

@@ -152,8 +152,8 @@ class StudyStore:
     def save(self, study: Study, existing: Mapping[Episode, StoredEpisode] | None = None, whole: bool = True) -> None:
         """Write a study's settings and episodes.
 
-        Settings that did not change keep their stored episodes of other tasks, as far as their seeds and repeats are in
-        the new study's ranges. So sweeps of one study over different tasks end in one report.
+        A setting that did not change keeps its episodes of other tasks, so that sweeps of one study over different
+        tasks give one report. Only seeds and repeats in the new study's ranges are kept.
 
         Args:
             study: The study.
@@ -325,10 +325,7 @@ class StudyStore:
                 connection.execute(self.update_of(one.episode).values(episode_id=number))
 
     def update_of(self, one: Episode) -> sa.Update:
-        """Return the SQL UPDATE of an episode's rows in this study.
-
-        It affects several rows if several labels have equal settings: they share the episode.
-        """
+        """Return the SQL UPDATE of an episode's rows in this study: one for each label that shares the episode."""
         settings = sa.select(SETTINGS.c.id).join(STUDIES).where(STUDIES.c.name == self.name)
         settings = settings.where(SETTINGS.c.work == one.setting.work)
         same = (WANTED.c.task == one.task, WANTED.c.seed == one.seed, WANTED.c.repeat == one.repeat)
@@ -458,7 +455,7 @@ def plan_study(
 def stored_episodes(database: Database, study: Study, newer_than: int = 0) -> dict[Key, list[StoredEpisode]]:
     """Return the stored episodes that a study may reuse, by `Episode.key`.
 
-    Episodes of rollouts are reused only by rollouts, because no other setting was timed in turn with them.
+    Only rollouts reuse episodes of rollouts. In a rollout no other setting takes turns, so times cannot be compared.
 
     Args:
         database: The database.

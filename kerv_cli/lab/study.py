@@ -248,8 +248,8 @@ def plan_rows(planned: Plan) -> list[dict[str, object]]:
 def estimate(planned: Plan, guess: float) -> tuple[float, str]:
     """Estimate how long the missing episodes will take.
 
-    Each episode counts with the mean wall time of the setting's stored episodes, or of all stored episodes if the
-    setting has none. The result is divided by the number of workers.
+    An episode is expected to take as long as the setting's stored episodes took on average, or all stored episodes if
+    the setting has none. The workers share the total equally.
 
     Args:
         planned: The plan.

@@ -78,6 +78,7 @@ def study_parts(
         "charts": [figure.to_dict() for figure in figures_of(data, loss).values()],
         "decisions": read_decisions(store.root),
         "tasks": _by_task(data.per_task),
+        "cell_link": None,  # the board gives a function: heading of the first column, row, column -> address
         "machines": None if priced is None else repriced_summary(priced),
         "assumes": ASSUMES,
         "settings": _settings(data),

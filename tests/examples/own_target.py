@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.base.registry import Part, register
+from kerv_cli.base.registry import add
 from kerv_cli.base.spaces import ActionSpace, Group, Observation
 from kerv_cli.targets.checkpoint import TargetDescription
 
@@ -86,4 +86,4 @@ def build(folder: Path, description: TargetDescription, device: str, dtype: torc
     return MockTarget(description.actions, description.chunk)
 
 
-register(Part("target", "mock", "examples.own_target:build"))
+add("target", "mock", "examples.own_target:build")

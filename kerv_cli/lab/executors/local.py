@@ -10,7 +10,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, TypeVar
 
-from kerv_cli.base.processes import begin_worker, check_workers
+from kerv_cli.base.processes import begin_worker
 from kerv_cli.lab.executors import THREAD_VARIABLES, Executor, WorkerLost, in_thread, settle
 
 T = TypeVar("T")
@@ -40,7 +40,6 @@ class Processes:
     """Runs functions in worker processes. Each has its own loky pool, so that a crash loses only one block."""
 
     def __init__(self, slots: int, threads: int) -> None:
-        check_workers()
         self.slots, self.threads = slots, threads
         self._free: list[Any] = []
         self._all: list[Any] = []

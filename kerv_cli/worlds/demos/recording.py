@@ -29,7 +29,7 @@ from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import read_json, write_json
 from kerv_cli.base.limits import check_settings, limits, number
 from kerv_cli.base.manifests import read
-from kerv_cli.base.processes import begin_worker, check_workers
+from kerv_cli.base.processes import begin_worker
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.demos.dataset import FORMAT, DemoManifest, EpisodeEntry, OnProgress, episode_path, totals
@@ -283,7 +283,6 @@ def _run_jobs(
     if config.workers == 1 or len(jobs) == 1:
         yield from (_record_seeds(config, out, task, seeds, make_actor) for task, seeds in jobs)
         return
-    check_workers()
     from joblib import Parallel, delayed, parallel_config
     from joblib.externals.loky.process_executor import BrokenProcessPool
 
