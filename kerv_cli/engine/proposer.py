@@ -28,13 +28,6 @@ class Proposer:
     def reset(self) -> None:
         """Start a new episode."""
 
-    def prepare(self, chunk: Chunk) -> None:
-        """Prepare for the prefill, which is about to run.
-
-        A proposer that needs values from the GPU adds them to `chunk.reads`. The CPU reads them with the prefill's
-        tokens.
-        """
-
     def begin(self, chunk: Chunk) -> None:
         """Begin a chunk. Called after its prefill has committed the first tokens."""
 
