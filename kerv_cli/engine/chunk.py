@@ -331,11 +331,6 @@ class Chunk:
         )
 
 
-def actions_of(space: ActionSpace, tokens: Sequence[int]) -> np.ndarray:
-    """Convert the tokens of whole control steps to actions (steps, D), float32, environment units."""
-    return space.decode(np.array(tokens).reshape(-1, space.dofs)).astype(np.float32)
-
-
 def deviation(space: ActionSpace, actions: np.ndarray, autoregressive: np.ndarray) -> float:
     """Return the mean absolute difference between two chunks of actions, in normalised action units.
 

@@ -17,12 +17,10 @@ class Proposer:
 
     Attributes:
         name: Name in the records, e.g. `drafter`.
-        needs_states: Whether it reads the target's hidden states. If so, it cannot draft before the prefill.
         nodes: Maximum number of tokens in a draft, for which the cache reserves room; 0 for as many as a chunk has.
     """
 
     name = ""
-    needs_states = False
     nodes = 0
 
     def reset(self) -> None:

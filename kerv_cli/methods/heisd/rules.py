@@ -212,8 +212,6 @@ class HybridProposer(Proposer):
         name: Name of the proposer that drafts the present chunk.
     """
 
-    needs_states = True
-
     def __init__(self, drafter: Proposer, retrieval: Proposer) -> None:
         self.proposers: dict[str, Proposer] = {"drafter": drafter, "retrieval": retrieval}
         self.nodes = max(drafter.nodes, retrieval.nodes)
