@@ -28,7 +28,6 @@ from kerv_cli.board.pages import database_of, inside, render
 from kerv_cli.board.recorder import Recorder
 from kerv_cli.catalogue.episodes import FoundEpisode, find_episode, outcomes
 from kerv_cli.engine.record import PHASES, DecodeRecord
-from kerv_cli.episodes.repeat import repeating_words
 from kerv_cli.lab.store import IMPORT
 from kerv_cli.report.viewing.film import Film, animation, film_of
 from kerv_cli.report.viewing.token_outcomes import OUTCOMES, chunk_size, outcomes_of, tokens_hash
@@ -70,6 +69,8 @@ def _names(task: str, decodes: Sequence[DecodeRecord]) -> Sequence[str]:
 
 def command_of(found: FoundEpisode) -> tuple[str, str]:
     """Return the command that repeats an episode, and why there is none. One of the two is empty."""
+    from kerv_cli.episodes.repeat import repeating_words  # imports torch, which takes seconds
+
     episode, results = found.episode, str(found.store.database.results)
     if found.store.kind == IMPORT:
         return "", "it was imported: another program ran it"
