@@ -95,7 +95,14 @@ def test_rollout_prints_figures_and_writes_a_recording(results):
         f"results={results}",
     )  # fmt: skip
     assert run.returncode == 0, run.stderr
-    for word in ("success", "forwards/step", "tokens/verification", "ms/step", "time by phase", "kerv view"):
+    for word in (
+        "success",
+        "forwards per step",
+        "tokens per verification",
+        "time per step, ms",
+        "time by phase",
+        "kerv view",
+    ):
         assert word in run.stdout
     (recording,) = results.glob("rollouts/*-spec_vla/rollouts/spec_vla-drawer-open-v3-100000-*.rrd")
     assert recording.stat().st_size > 10_000
