@@ -61,7 +61,7 @@ def study_parts(
     """
     data = data or load_study(store)
     answer, is_shown = verdict_of(data.table, loss)
-    first, results = data.table.iloc[0], str(store.database.results)
+    first, results, figures = data.table.iloc[0], str(store.database.results), figures_of(data, loss)
     return {
         "name": store.name,
         "title": data.study.title or store.name,
@@ -79,7 +79,8 @@ def study_parts(
         "main": MAIN,
         "columns": f"{NOTE} {of_runs(data.table)}",
         "suite": _suite(data.table),
-        "charts": [figure.to_dict() for figure in figures_of(data, loss).values()],
+        "charts": [figure.to_dict() for figure in figures.values()],
+        "has_bounds": "_tradeoff" in figures,
         "decisions": read_decisions(store.root),
         "tasks": _by_task(data.per_task),
         "cell_link": None,  # the board gives a function: heading of the first column, row, column -> address
