@@ -24,10 +24,11 @@ from kerv_cli.report.summary import MAIN, NOTE, SPEEDS, of_runs, summary_frame
 from kerv_cli.report.tables import StudyData, flatten, is_baseline, is_number, latency_table, load_study, rows_of
 from kerv_cli.report.verdict import caution, question
 from kerv_cli.report.viewing.film import animation, film_of
-from kerv_cli.worlds import spec_of
 
 LOSS = 3.0
 """Default for the largest loss of success that the page's verdict accepts, in points."""
+_SLOWER = 2.0
+"""How many times slower than the robot films play."""
 
 
 def render(
@@ -156,7 +157,7 @@ def _films(store: StudyStore, data: StudyData) -> list[dict[str, Any]]:
         if success is None or (method, success) in films or not path.is_file():
             continue
         if (film := film_of(path)).frames:
-            picture = base64.b64encode(animation(film, spec_of(one.task).actions.control_hz)).decode()
+            picture = base64.b64encode(animation(film, _SLOWER)).decode()
             films[method, success] = {"label": one.setting.label, "task": one.task, "seed": one.seed,
                                       "success": success, "steps": film.facts["steps"], "picture": picture}  # fmt: skip
     return list(films.values())
