@@ -308,7 +308,7 @@ ANSWERS = [
     ("rollout results=~/runs", "quote the value: \"results='~/runs'\""),
     ("rollout results=", "results= is empty: write a value, or leave it out"),
     ("rollout task=", "task= is empty: name a task or a suite, or leave it out"),
-    ("bench tokens=7,16", "tokens=7,16: several values need 'kerv rollout -m'; as a list write tokens=[7,16]"),
+    ("rollout threshold.r=3,9", "threshold.r=3,9: several values need 'kerv rollout -m'"),
     # unknown keys and names
     ("rollout nonsense=3", "unknown key 'nonsense': see 'kerv rollout --cfg' for the keys"),
     ("rollout device=cuda", "unknown key 'device': did you mean runtime.device?"),
