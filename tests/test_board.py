@@ -1,8 +1,12 @@
 """`kerv board`: its pages in a browser, what it refuses, and how fast it is."""
 
 import re
+import signal
+import subprocess
+import sys
 import threading
 import time
+import urllib.request
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -83,6 +87,17 @@ def test_hostile_names_are_text(tmp_path):
         page = client.get(path).text
         assert "<img" not in page, path
         assert "img" in page, path
+
+
+def test_ctrl_c_ends_the_command_quietly(tmp_path):
+    words = [sys.executable, "-m", "kerv_cli", "board", "port=0", "open=false", f"results={tmp_path}"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        address = process.stdout.readline().split()[0]
+        assert address.startswith(f"{HERE}:")
+        with urllib.request.urlopen(address) as page:
+            assert b"Runs" in page.read()
+        process.send_signal(signal.SIGINT)
+        assert (process.wait(60), process.stderr.read()) == (0, "")
 
 
 # --- speed ---

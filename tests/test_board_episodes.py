@@ -2,6 +2,7 @@
 
 import html
 import io
+import json
 import shlex
 import threading
 import time
@@ -96,7 +97,7 @@ def test_a_failure_is_assigned_to_the_phase_in_which_it_happened():
     assert phase_of(None, None) == "unknown"
 
 
-def test_the_grid_says_which_episodes_the_baseline_or_the_setting_alone_solved(tmp_path, client):
+def test_the_grid_says_which_episodes_the_baseline_or_the_setting_alone_solved(database, tmp_path, client):
     solved = {"ar": (True, True, False, False), "spec_vla r=9": (True, False, True, False)}
 
     def prepare(setting, task):
@@ -118,6 +119,9 @@ def test_the_grid_says_which_episodes_the_baseline_or_the_setting_alone_solved(t
     failures = client.get("/studies/threshold/failures").text
     assert "2 of 4 episodes, the baseline solved 1 of them" in " ".join(failures.split())
     assert client.get("/studies/threshold/failures?setting=none").status_code == 404
+    number = rows_of_wanted(database)[0]
+    assert client.get(f"/episodes/{number}").status_code == 200
+    assert client.get(f"/episodes/{10**30}").status_code == 404
 
 
 def test_ten_thousand_episodes_are_shown_in_half_a_second(tmp_path, client):
@@ -201,6 +205,17 @@ def test_the_command_on_the_page_repeats_the_episode(rolled):
         )
     finally:
         newest.remove()
+
+
+def test_an_imported_episode_has_a_page_and_no_film(tmp_path, client):
+    facts = {"per_episode": [{"episode_ix": 0, "success": False, "seed": 7}], "aggregated": {"eval_ep_s": 1.0}}
+    (tmp_path / "eval_info.json").write_text(json.dumps(facts))
+    kerv("runs", "import", str(tmp_path / "eval_info.json"), "name=libero", f"results={tmp_path}")
+    (number,) = rows_of_wanted(Database(tmp_path))
+    text = client.get(f"/episodes/{number}").text
+    assert text.count("another program ran it") == 2
+    assert client.post(f"/episodes/{number}/record").status_code == 409
+    assert "unknown" in client.get("/studies/libero/failures").text
 
 
 def test_settings_that_adapt_are_repeated_with_the_episodes_before(tmp_path):

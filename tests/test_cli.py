@@ -95,7 +95,14 @@ def test_rollout_prints_figures_and_writes_a_recording(results):
         f"results={results}",
     )  # fmt: skip
     assert run.returncode == 0, run.stderr
-    for word in ("success", "forwards/step", "tokens/verification", "ms/step", "time by phase", "kerv view"):
+    for word in (
+        "success",
+        "forwards per step",
+        "tokens per verification",
+        "time per step, ms",
+        "time by phase",
+        "kerv view",
+    ):
         assert word in run.stdout
     (recording,) = results.glob("rollouts/*-spec_vla/rollouts/spec_vla-drawer-open-v3-100000-*.rrd")
     assert recording.stat().st_size > 10_000
@@ -301,7 +308,7 @@ ANSWERS = [
     ("rollout results=~/runs", "quote the value: \"results='~/runs'\""),
     ("rollout results=", "results= is empty: write a value, or leave it out"),
     ("rollout task=", "task= is empty: name a task or a suite, or leave it out"),
-    ("bench tokens=7,16", "tokens=7,16: several values need 'kerv rollout -m'; as a list write tokens=[7,16]"),
+    ("rollout threshold.r=3,9", "threshold.r=3,9: several values need 'kerv rollout -m'"),
     # unknown keys and names
     ("rollout nonsense=3", "unknown key 'nonsense': see 'kerv rollout --cfg' for the keys"),
     ("rollout device=cuda", "unknown key 'device': did you mean runtime.device?"),

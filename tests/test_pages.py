@@ -1,12 +1,15 @@
 """The page of a study in a browser without a network: charts, hovering, picking a setting, more columns, sorting."""
 
+import io
 from pathlib import Path
 
 import pytest
+from PIL import Image
 from studies_synthetic import swept, threshold_study
 
 from kerv_cli.report.page import render
 from kerv_cli.report.tables import load_study
+from kerv_cli.report.viewing.film import Film
 
 sync_api = pytest.importorskip("playwright.sync_api")
 CHROMIUM = Path("/usr/bin/chromium")
@@ -68,3 +71,21 @@ def test_a_phone_shows_the_page_without_scrolling_sideways(page):
     page.wait_for_timeout(300)
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
     assert page.locator("figure.chart svg").first.bounding_box()["width"] <= 390
+
+
+def test_a_report_has_a_film_of_one_success_and_one_failure_per_method(tmp_path, monkeypatch):
+    """Recordings are made up: what matters is which are chosen."""
+    study = threshold_study(["reach-v3"], episodes=30, radii=(20,))
+    store, _ = swept(tmp_path, study)
+    data = load_study(store)
+    store.rollouts.mkdir(parents=True, exist_ok=True)
+    for one in study.episodes:
+        (store.rollouts / one.recording).touch()
+    buffer = io.BytesIO()
+    Image.new("RGB", (8, 8)).save(buffer, "jpeg")
+    monkeypatch.setattr("kerv_cli.report.page.film_of", lambda path: Film((buffer.getvalue(),), 80.0, {"steps": 4}, 0))
+    monkeypatch.setattr("kerv_cli.report.page.library", str)
+    page = render(store, data, 3.0)
+    expected = data.episodes.groupby("label")["success"].nunique().sum()
+    assert page.count("data:image/webp;base64,") == expected > 3
+    assert page.count('class="lost"') == expected - 3

@@ -56,7 +56,7 @@ def situation(random: np.random.Generator, executed: int) -> Situation:
     for _ in range(executed):
         history.append(random.uniform(-1, 1, D))
         path.append(path[-1] + 0.01 * random.standard_normal(3))
-    return Situation("t", history, path, random)
+    return Situation("t", history, path)
 
 
 def proposers(target: CompactTarget, prompt: torch.Tensor, truth: list[int], seed: int) -> dict[str, Any]:

@@ -27,3 +27,4 @@ def test_the_printed_command_installs_a_policy_that_the_wheel_leaves_out(policie
     assert printed
     subprocess.run(printed[1], shell=True, cwd=tmp_path, check=True)
     assert "1 task, 3 episodes" in told(*words)
+    assert "mt50-vision" in folders.target_names(f"{tmp_path}/results")

@@ -123,18 +123,18 @@ def test_an_infinite_radius_is_a_straight_reach_unless_the_hand_stands_still():
     assert RANGES.normalise(math.inf, 0.15) == (1.0, 1.0)
     assert RANGES.normalise(math.inf, 0.0) == (0.0, 0.0)
     boundary = boundary_of("fused")
-    still = boundary.choose(np.full((WINDOW, 3), 0.6), np.random.default_rng(0))
+    still = boundary.choose(np.full((WINDOW, 3), 0.6))
     assert still == Choice("drafter", 0.0)
 
 
 def test_fused_sends_straight_reaches_to_retrieval_and_bends_to_the_drafter():
     rng = np.random.default_rng(3)
     boundary = boundary_of("fused")
-    reach, bend = boundary.choose(line(rng, 0.14), rng), boundary.choose(arc(rng, 0.02, 0.05), rng)
+    reach, bend = boundary.choose(line(rng, 0.14)), boundary.choose(arc(rng, 0.02, 0.05))
     assert (reach.mode, bend.mode) == ("retrieval", "drafter")
     assert reach.metric > 0.9 > 0.3 > bend.metric
     exact = boundary_of("fused", f_star=reach.metric)
-    assert exact.choose(line(np.random.default_rng(3), 0.14), rng).mode == "retrieval"  # F ≥ F*
+    assert exact.choose(line(np.random.default_rng(3), 0.14)).mode == "retrieval"  # F ≥ F*
 
 
 def test_only_the_newest_positions_count():
@@ -142,30 +142,30 @@ def test_only_the_newest_positions_count():
     boundary = boundary_of("fused", window=10)
     newest = arc(rng, 0.05, 0.1, 10)
     path = np.concatenate([line(rng, 0.4, 30), newest])
-    assert boundary.choose(path, rng) == boundary.choose(newest, rng)
-    assert boundary.choose(path, rng) != boundary.choose(path[-15:-5], rng)
+    assert boundary.choose(path) == boundary.choose(newest)
+    assert boundary.choose(path) != boundary.choose(path[-15:-5])
 
 
 @pytest.mark.parametrize("n", [0, 1, 2])
 def test_fewer_than_three_positions_go_to_the_drafter(n):
     boundary = boundary_of("fused", f_star=0.0)
     path = np.arange(3.0 * n).reshape(n, 3)
-    assert boundary.choose(path, np.random.default_rng(0)) == Choice("drafter", None)
+    assert boundary.choose(path) == Choice("drafter", None)
 
 
 @pytest.mark.parametrize("mode", ["retrieval", "drafter"])
 def test_the_fixed_kinds_never_change_their_mind(mode):
     boundary = boundary_of(f"always_{mode}")
     for n in (0, 2, 20):
-        assert boundary.choose(np.zeros((n, 3)), np.random.default_rng(n)).mode == mode
+        assert boundary.choose(np.zeros((n, 3))).mode == mode
 
 
 def test_random_keeps_its_share_and_repeats_itself():
     boundary, other = (boundary_of("random", p=0.3, seed=seed) for seed in (5, 6))
 
     def modes(task, seed, boundary=boundary):
-        rng = boundary.numbers(task, seed)
-        return [boundary.choose(np.zeros((0, 3)), rng).mode for _ in range(2000)]
+        boundary.reset(task, seed)
+        return [boundary.choose(np.zeros((0, 3))).mode for _ in range(2000)]
 
     assert modes("reach-v3", 100_000) == modes("reach-v3", 100_000)
     assert modes("reach-v3", 100_000) != modes("reach-v3", 100_001)

@@ -13,7 +13,7 @@ from test_proposers import stored
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.engine.parts import Fixed
+from kerv_cli.engine.parts import Boundary, Fixed
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.methods.heisd import SimilaritySkipSettings
@@ -179,14 +179,11 @@ def test_frozen_skip_levels_know_no_order_and_no_block():
 def test_the_boundarys_path_begins_where_the_episode_does():
     seen: list[np.ndarray] = []
 
-    class Watching:
-        def numbers(self, task, seed):
-            return np.random.default_rng(seed)
-
-        def choose(self, path, random):
+    class Watching(Boundary):
+        def choose(self, path):
             seen.append(path.copy())
 
-    decoder = Decoder(MockTarget(SPEC.actions, 1), Parts(boundary=Watching()))  # type: ignore[arg-type]
+    decoder = Decoder(MockTarget(SPEC.actions, 1), Parts(boundary=Watching()))
     for start in (HOME, 2 * HOME):
         decoder.reset("t", 0, start)
         decoder.decode(SHOWN)

@@ -21,11 +21,11 @@ from kerv_cli.training.demonstrations import open_demos
 HOLD = """
 import sys
 from pathlib import Path
-from kerv_cli.lab.command import set_command
+from kerv_cli.lab.command import noted
 from kerv_cli.lab.runs import making
 results = Path(sys.argv[1])
-set_command(["demos", "name=mine", "episodes=7", f"results={results}"])
-with making(results, "demos", results / "artifacts/demos/mine") as record:
+words = ["demos", "name=mine", "episodes=7", f"results={results}"]
+with noted(words), making(results, "demos", results / "artifacts/demos/mine") as record:
     record.beat(3, 7)
     print("begun", flush=True)
     sys.stdin.read()

@@ -119,7 +119,7 @@ def _typed(overrides: Sequence[str], schema: type) -> dict[str, Any]:
     typed: dict[str, Any] = {}
     for override in overrides:
         key, _, value = override.partition("=")
-        parsed = _parsed(f"{key}=[{value}]" if key in lists and value[:1] not in "[$" else override)
+        parsed = _parsed(f"{key}=[{value}]" if key in lists and not value.startswith(("[", "$")) else override)
         key = parsed.key_or_group
         if key in typed:
             raise UsageError(f"{key} is given twice: leave one out", key)

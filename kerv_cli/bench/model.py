@@ -24,7 +24,7 @@ from kerv_cli.targets.compact.program import Program, stored_bytes
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import Layer
-from kerv_cli.targets.folders import target_names
+from kerv_cli.targets.folders import find_target, target_names
 from kerv_cli.training.imitation import vocabulary
 from kerv_cli.training.settings import TrainTargetSettings
 from kerv_cli.worlds.metaworld.spec import SPEC
@@ -172,16 +172,13 @@ def open_model(settings: BenchSettings) -> Model:
     shapes = groups()["target"]
     if settings.model in shapes:
         return _shape(settings)
-    device, _ = set_up(settings.runtime)
     try:
-        artifacts = Artifacts(
-            settings.results, PolicySettings(target=settings.model), None, device, settings.runtime.dtype
-        )
-        target: Any = artifacts.target
+        find_target(settings.results, settings.model)
     except UsageError as error:
-        if "/" not in settings.model and "is damaged" not in str(error):
-            raise UnknownName("target", settings.model, [*target_names(settings.results), *shapes]) from error
-        raise
+        raise UnknownName("target", settings.model, [*target_names(settings.results), *shapes]) from error
+    device, _ = set_up(settings.runtime)
+    artifacts = Artifacts(settings.results, PolicySettings(target=settings.model), None, device, settings.runtime.dtype)
+    target: Any = artifacts.target
     drafter = artifacts.load("drafter") if artifacts.path("drafter").exists() else _drafter(target)
     return Model(settings.model, target, drafter, blank(target), False)
 

@@ -13,7 +13,6 @@ import time
 import urllib.request
 from collections import Counter
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 from urllib.error import URLError
 from urllib.parse import quote
@@ -28,7 +27,6 @@ from kerv_cli.board.pages import database_of, inside, render
 from kerv_cli.board.recorder import Recorder
 from kerv_cli.catalogue.episodes import FoundEpisode, find_episode, outcomes
 from kerv_cli.engine.record import PHASES, DecodeRecord
-from kerv_cli.episodes.repeat import repeating_words
 from kerv_cli.lab.store import IMPORT
 from kerv_cli.report.viewing.film import Film, animation, film_of
 from kerv_cli.report.viewing.token_outcomes import OUTCOMES, chunk_size, outcomes_of, tokens_hash
@@ -44,21 +42,8 @@ def _found(request: Request) -> FoundEpisode:
     return find_episode(database_of(request), request.path_params["id"])
 
 
-def _recording(request: Request, found: FoundEpisode) -> Path | None:
-    """Return the recording of an episode; None if there is none.
-
-    Raises:
-        HTTPException: It is a link to a file outside the results folder.
-    """
-    path = found.store.rollouts / found.episode.recording
-    return inside(request, path) if path.exists() else None
-
-
 def _film(request: Request) -> Film:
-    path = _recording(request, _found(request))
-    if path is None:
-        raise HTTPException(404, "the episode has no recording yet")
-    return film_of(path)
+    return film_of(inside(request, _found(request).recording))
 
 
 def _names(task: str, decodes: Sequence[DecodeRecord]) -> Sequence[str]:
@@ -70,6 +55,8 @@ def _names(task: str, decodes: Sequence[DecodeRecord]) -> Sequence[str]:
 
 def command_of(found: FoundEpisode) -> tuple[str, str]:
     """Return the command that repeats an episode, and why there is none. One of the two is empty."""
+    from kerv_cli.episodes.repeat import repeating_words  # imports torch, which takes seconds
+
     episode, results = found.episode, str(found.store.database.results)
     if found.store.kind == IMPORT:
         return "", "it was imported: another program ran it"
@@ -112,12 +99,11 @@ def _film_values(
     request: Request, found: FoundEpisode, step: int = 0, decodes: Sequence[DecodeRecord] | None = None
 ) -> dict[str, Any]:
     """Return what the template of a film needs."""
-    path = _recording(request, found)
-    job = RECORDER.job(found.store.rollouts / found.episode.recording)
+    job = RECORDER.job(found.recording)
     values: dict[str, Any] = {"found": found, "step": step, "job": job, "film": None, "same": None, "rerun": ""}
     values |= {"slower": SLOWER, "imported": found.store.kind == IMPORT}
-    if path is not None and (job is None or job.future.done()):
-        film = film_of(path)
+    if found.recording.exists() and (job is None or job.future.done()):
+        film = film_of(inside(request, found.recording))
         if film.facts.get("tokens"):
             values["same"] = film.facts["tokens"] == tokens_hash(found.decodes()[0] if decodes is None else decodes)
         address = f"{request.base_url}episodes/{found.id}/recording.rrd"
@@ -135,7 +121,7 @@ def record(request: Request) -> Response:
     found = _found(request)
     if found.store.kind == IMPORT:
         raise HTTPException(409, "an imported episode cannot be recorded: another program ran it")
-    RECORDER.record(found, found.store.rollouts / found.episode.recording)
+    RECORDER.record(found)
     return show_film(request)
 
 
@@ -152,19 +138,15 @@ def frame(request: Request) -> Response:
 
 def animated(request: Request) -> Response:
     """Return the film as a GIF, to show elsewhere."""
-    film, found = _film(request), _found(request)
+    film = _film(request)
     if not film.frames:
         raise HTTPException(404, "the recording has no camera")
-    name = quote(f"{Path(found.episode.recording).stem}.gif")
-    headers = {"content-disposition": f"inline; filename*=utf-8''{name}"}
-    return Response(animation(film, SLOWER, "gif"), media_type="image/gif", headers=headers)
+    return Response(animation(film, SLOWER), media_type="image/gif")
 
 
 def recording(request: Request) -> Response:
     """Return the recording, a file for Rerun's viewer."""
-    path = _recording(request, _found(request))
-    if path is None:
-        raise HTTPException(404, "the episode has no recording yet")
+    path = inside(request, _found(request).recording)
     return FileResponse(path, media_type="application/octet-stream", filename=path.name)
 
 

@@ -56,15 +56,11 @@ class Recorder:
         """Return the last job that was asked to write this file."""
         return self._jobs.get(path)
 
-    def record(self, found: FoundEpisode, path: Path) -> None:
-        """Begin to record an episode, unless that is under way.
-
-        Args:
-            found: The episode.
-            path: File to write.
-        """
+    def record(self, found: FoundEpisode) -> None:
+        """Begin to record an episode, unless that is under way."""
         from joblib.externals.loky import get_reusable_executor
 
+        path = found.recording
         with self._lock:
             job = self._jobs.get(path)
             if job is not None and not job.future.done():

@@ -20,8 +20,6 @@ from kerv_cli.board.pages import database_of, render
 from kerv_cli.catalogue.entries import find_runs, parents
 from kerv_cli.lab.runs import RUNNING, pulse, run_rows
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.page import study_parts
-from kerv_cli.report.plots import library
 
 _SHARE = 0.01
 """Largest share of each core's time that goes into refreshing a study while it runs, so that its timings hold."""
@@ -38,6 +36,8 @@ def _parts(results: Path, name: str, version: str) -> tuple[dict[str, Any], floa
         name: Name of the study.
         version: Its version, so that a study that did not change is not read again.
     """
+    from kerv_cli.report.page import study_parts  # imports Altair, which takes a second
+
     clock = time.thread_time()
     parts = study_parts(StudyStore(results, name))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -81,6 +81,8 @@ def show_tables(request: Request) -> Response:
     has_episodes = store.counts()[0] > 0
     parts, seconds = _parts(database.results, name, version) if has_episodes else ({}, _SECONDS)
     hidden: dict[str, Any] = {"recordings": [], "files": []} | ({"missing": 0} if is_running else {})
+    if len(parts.get("settings", ())) == 1:
+        hidden["charts"] = []  # nothing to compare
     return render(
         request,
         "study_tables.html",
@@ -108,6 +110,8 @@ def _episodes_of(study: str) -> Callable[[str, str, str], str]:
 
 @functools.cache
 def _library() -> str:
+    from kerv_cli.report.plots import library
+
     return library()
 
 

@@ -12,7 +12,6 @@ from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.board.pages import database_of, render
 from kerv_cli.catalogue.entries import RunEntry, children, description_of, disk_bytes, find_run, find_runs, parents
 from kerv_cli.lab.runs import pulse
-from kerv_cli.report.plots import curves_figure, read_log
 from kerv_cli.report.tables import flatten
 
 
@@ -46,6 +45,8 @@ def show_artifact(request: Request) -> Response:
 
 def _curves(run: RunEntry) -> dict[str, object] | None:
     """Return the chart of a training's validations. None before the second one, or if it is no training."""
+    from kerv_cli.report.plots import curves_figure, read_log
+
     try:
         log = read_log(run.folder)
     except KervError:

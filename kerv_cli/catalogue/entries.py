@@ -67,7 +67,7 @@ class RunEntry:
         figures: Its main numbers by name, such as the success rate.
         command: Command-line arguments (without `kerv`) that made it. Empty if unknown.
         sha256: Hash by which other artifacts refer to it.
-        made_from: Kind -> hash, for the artifacts that it was made from.
+        made_from: Kind -> hash, for the artifacts that it was made from. `KIND of LABEL` for a second one of a kind.
     """
 
     id: str
@@ -206,7 +206,9 @@ def _studies(database: Database, rows: Mapping[tuple[str, str], RunRow]) -> list
         sa.func.min(EPISODES.c.started).label("started"),
         sa.func.sum(sa.cast(EPISODES.c.success, sa.Integer)).label("successes"),
     ).select_from(every).group_by(*group).order_by(WANTED.c.task)  # fmt: skip
-    of_setting = sa.select(SETTINGS.c.study_id, SETTINGS.c.method, SETTINGS.c.identity).order_by(SETTINGS.c.position)
+    of_setting = sa.select(SETTINGS.c.study_id, SETTINGS.c.label, SETTINGS.c.method, SETTINGS.c.identity).order_by(
+        SETTINGS.c.position
+    )
     with database.reading() as connection:
         studies, tasks, settings = (connection.execute(query).all() for query in (sa.select(STUDIES), sums, of_setting))
     entries = []
@@ -219,7 +221,10 @@ def _studies(database: Database, rows: Mapping[tuple[str, str], RunRow]) -> list
             state = f"{RUNNING}, {existing} of {every_one} episodes"
         started = min((one.started for one in mine if one.started), default=row.started if row else study.created)
         compared = [one for one in settings if one.study_id == study.id]
-        hashes = [pair for one in compared for pair in one.identity.items() if pair[0] != OBSERVATION and pair[1]]
+        made_from: dict[str, str] = {}
+        for label, kind, value in ((one.label, *pair) for one in compared for pair in one.identity.items()):
+            if kind != OBSERVATION and value and value not in made_from.values():
+                made_from[f"{kind} of {label}" if kind in made_from else kind] = value
         entries.append(
             RunEntry(
                 id=study.name,
@@ -236,7 +241,7 @@ def _studies(database: Database, rows: Mapping[tuple[str, str], RunRow]) -> list
                 message=row.message if row else "",
                 figures={"success": sum(one.successes or 0 for one in mine) / existing} if existing else {},
                 command=row.command if row else (),
-                made_from=dict(reversed(hashes)),
+                made_from=made_from,
             )
         )
     return entries

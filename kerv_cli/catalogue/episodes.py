@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
@@ -14,7 +15,8 @@ from kerv_cli.lab.database import BLOCKS, EPISODES, SETTINGS, STUDIES, WANTED, D
 from kerv_cli.lab.plan import Episode, Setting
 from kerv_cli.lab.store import StudyStore, setting_of
 
-LARGEST_ID = 2**63 - 1
+LARGEST_ID = 2**31 - 1
+"""Largest row number that PostgreSQL stores."""
 
 
 def settings_in(store: StudyStore) -> tuple[str, dict[str, Setting]]:
@@ -80,6 +82,11 @@ class FoundEpisode:
     row: Mapping[str, Any]
     about: Mapping[str, Any]
     earlier: tuple[int, ...]
+
+    @property
+    def recording(self) -> Path:
+        """Path of its recording, which may not exist."""
+        return self.store.rollouts / self.episode.recording
 
     def decodes(self) -> tuple[list[DecodeRecord], list[int]]:
         """Read its decodes, and the control step at which the actions of each begin."""

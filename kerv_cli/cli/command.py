@@ -13,7 +13,6 @@ Every other parameter is an option of the command in typer's notation.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import inspect
 import re
@@ -83,13 +82,13 @@ def typer_command(part: Part) -> TyperCommand:
 
     def callback(typed: list[str] | None = None, cfg: bool = False, **options: object) -> None:
         overrides, names = _split(part, typed or [], "names" in parameters)
-        from kerv_cli.lab.command import chosen_store
+        from kerv_cli.lab.command import chosen_store, noted
 
         with chosen_store(overrides) as overrides:
             arguments = {"overrides": overrides, "names": names, "cfg": cfg}
             if "settings" in parameters or (cfg and "cfg" not in parameters):
                 arguments["settings"] = _settings(part, overrides, cfg)
-            with _noted([*part.name.split(), *overrides, *names, *_flags(made, options)]):
+            with noted([*part.name.split(), *overrides, *names, *_flags(made, options)]):
                 run(**{name: value for name, value in arguments.items() if name in parameters}, **options)
 
     cfg_option = [] if part.settings is NoSettings else [_option("cfg", False, _CFG)]
@@ -101,24 +100,6 @@ def typer_command(part: Part) -> TyperCommand:
     made: Any = typer.main.get_command(single)
     made.part = part
     return made
-
-
-@contextlib.contextmanager
-def _noted(overrides: list[str]) -> Iterator[None]:
-    """Remember the command line while the block runs, to store it with the runs that the command starts.
-
-    The previous one is restored afterwards, because `kerv prepare` runs other commands inside its own.
-
-    Args:
-        overrides: Command-line arguments after `kerv`.
-    """
-    from kerv_cli.lab.command import set_command
-
-    before = set_command(overrides)
-    try:
-        yield
-    finally:
-        set_command(before)
 
 
 def _flags(command: TyperCommand, options: Mapping[str, object]) -> list[str]:

@@ -69,14 +69,13 @@ def _print_rollout(store: StudyStore, as_json: bool, where: str) -> None:
     from kerv_cli.report.tables import load_study, rows_of
 
     data = load_study(store)
-    whole, per_task = rows_of(data.table, MICRO), rows_of(data.per_task)
     if as_json:
-        end_with_json({"run": store.name, "folder": store.root, "settings": whole, "tasks": per_task,
-                    "recordings": store.recordings})  # fmt: skip
+        end_with_json({"run": store.name, "folder": store.root, "settings": rows_of(data.table, MICRO),
+                       "tasks": rows_of(data.per_task), "recordings": store.recordings})  # fmt: skip
     if len(data.study.labels) > 1:
         console().print(SummaryTable(data.table))
     else:
-        for table in setting_tables(data, per_task, whole[0]):
+        for table in setting_tables(data):
             print_table(*table)
     show = f"kerv runs show {store.name}{where}"
     typer.echo(f"run {store.name} in {store.root}; its settings and figures: {show}")

@@ -64,13 +64,11 @@ class Situation:
         task: Name of the task.
         history: The last executed actions.
         path: Measured positions of the end effector, (3,) each, metres, oldest first.
-        random: Random number generator for the boundary, seeded per episode.
     """
 
     task: str
     history: ActionHistory
     path: list[np.ndarray] = field(default_factory=list)  # measured end-effector positions (3,), metres
-    random: np.random.Generator = field(default_factory=np.random.default_rng)  # for the boundary, seeded per episode
 
 
 class EpisodeState:
@@ -85,11 +83,10 @@ class EpisodeState:
 
         Args:
             task: Name of the task.
-            seed: Seed of the episode's random number generator.
+            seed: Seed of the episode, for parts that draw random numbers.
             end_effector: Initial position (3,), metres.
         """
-        random = np.random.default_rng(seed)
-        self.situation = Situation(task, ActionHistory(self.space.dofs), [np.asarray(end_effector)], random)
+        self.situation = Situation(task, ActionHistory(self.space.dofs), [np.asarray(end_effector)])
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
         """Note an action that was executed.
@@ -147,8 +144,6 @@ class Chunk:
     rounds: list[Round] = field(default_factory=list)
     rejection: Rejection = Rejection()  # of the last round's verification
     hidden: Tensor = field(default_factory=lambda: torch.empty(0))  # (1, P + c − 1, E) after a prefill of c tokens
-    # vectors (n,) on the GPU to read together with the next forward's target tokens, and the function that gets each
-    reads: list[tuple[Tensor, Callable[[np.ndarray], None]]] = field(default_factory=list)
     forwards: int = 0
     similarity: float | None = None  # cosine of the best match in the datastore, if it was searched
     reason: str | None = None  # as in `DecodeRecord`
@@ -334,11 +329,6 @@ class Chunk:
             metric=self.choice.metric if self.choice is not None else None,
             reason=self.reason,
         )
-
-
-def actions_of(space: ActionSpace, tokens: Sequence[int]) -> np.ndarray:
-    """Convert the tokens of whole control steps to actions (steps, D), float32, environment units."""
-    return space.decode(np.array(tokens).reshape(-1, space.dofs)).astype(np.float32)
 
 
 def deviation(space: ActionSpace, actions: np.ndarray, autoregressive: np.ndarray) -> float:

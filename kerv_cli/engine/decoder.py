@@ -104,7 +104,7 @@ class Decoder(ActionDecoder):
         self.decodes = 0
         parts = self.parts
         if parts.boundary is not None:
-            self.situation = replace(self.situation, random=parts.boundary.numbers(task, seed))
+            parts.boundary.reset(task, seed)
         for part in (self.threshold, parts.rectifier, parts.prefill_draft, parts.proposer):
             if part is not None:
                 part.reset()
@@ -177,7 +177,7 @@ class Decoder(ActionDecoder):
     def _new_chunk(self, prompt: Tensor | Callable[[], Tensor], observation: Observation | None) -> Chunk:
         self.cache.length, choice, boundary = 0, None, self.parts.boundary
         if boundary is not None:
-            choice = boundary.choose(np.array(self.situation.path), self.situation.random)
+            choice = boundary.choose(np.array(self.situation.path))
         limits = self.acceptance.limits(self.threshold.radius())
         return Chunk(prompt, self.steps, self.space, self.cache, self.situation, limits, choice, observation)
 
@@ -189,8 +189,6 @@ class Decoder(ActionDecoder):
         parts, is_first, last = self.parts, not chunk.tokens, len(chunk.tokens) - 1
         drafter, proposer = parts.prefill_draft if is_first else parts.proposer, parts.proposer
         draft = self.propose(chunk, drafter, stopwatch)
-        if is_first and proposer is not None and chunk.remaining > 1:
-            proposer.prepare(chunk)
         verified = self.verify(chunk, draft)
         stopwatch.lap("prefill" if is_first else "verify")
         accepted = self.accept(chunk, verified, drafter)
@@ -261,19 +259,9 @@ class Decoder(ActionDecoder):
             x = target.embed(draft.tokens_after(uncached, target.device)[None])
             x = x if uncached else torch.cat([chunk.prompt, x], 1)
         hidden = target.forward(x, draft.positions(cache.length, before, x.device), cache, draft.visible(before))
-        return self._read(chunk, draft, hidden, target.head(hidden[0, before - 1 :]).argmax(-1))
-
-    def _read(self, chunk: Chunk, draft: Draft, hidden: Tensor, argmax: Tensor) -> Verified:
-        """Copy the target tokens (1 + n,), and other values that parts asked for, to the CPU.
-
-        This is the only place in a round where the CPU waits for the GPU.
-        """
-        reads, chunk.reads = chunk.reads, []
-        remote = draft.remote
-        targets, *vectors = read(argmax, *remote, *(tensor for tensor, _ in reads))
-        for (_, receive), vector in zip(reads, vectors[len(remote) :], strict=True):
-            receive(vector)
-        return Verified(hidden, draft.judged(vectors[: len(remote)]), targets.astype(np.int64).tolist())
+        # the only place in a round where the CPU waits for the GPU
+        targets, *remote = read(target.head(hidden[0, before - 1 :]).argmax(-1), *draft.remote)
+        return Verified(hidden, draft.judged(remote), targets.astype(np.int64).tolist())
 
     def accept(self, chunk: Chunk, verified: Verified, proposer: Proposer | None) -> Accepted:
         """Return the path of the draft that the acceptance rule chooses; an empty one without a proposer."""

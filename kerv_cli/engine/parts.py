@@ -76,21 +76,18 @@ class Rectifier(Protocol):
         """
 
 
-class Boundary(Protocol):
+class Boundary(ABC):
     """Decides whether retrieval or the drafter drafts the next chunk (docs/methods.md §4.4)."""
 
-    def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
+    def reset(self, task: str, seed: int) -> None:  # noqa: B027 - most boundaries draw no random numbers
+        """Start a new episode of `task` with this seed."""
+
+    @abstractmethod
+    def choose(self, path: np.ndarray) -> Choice:
         """Return the decision for the next chunk.
 
         Args:
             path: Positions (n, 3) of the end effector measured in this episode so far, metres, oldest first.
-            rng: The episode's generator, from `numbers`.
-        """
-
-    def numbers(self, task: str, seed: int) -> np.random.Generator:
-        """Return the random number generator of an episode.
-
-        It depends only on the boundary's own seed setting, the task, and `seed`, the seed of the episode.
         """
 
 

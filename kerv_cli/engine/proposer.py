@@ -17,23 +17,14 @@ class Proposer:
 
     Attributes:
         name: Name in the records, e.g. `drafter`.
-        needs_states: Whether it reads the target's hidden states. If so, it cannot draft before the prefill.
         nodes: Maximum number of tokens in a draft, for which the cache reserves room; 0 for as many as a chunk has.
     """
 
     name = ""
-    needs_states = False
     nodes = 0
 
     def reset(self) -> None:
         """Start a new episode."""
-
-    def prepare(self, chunk: Chunk) -> None:
-        """Prepare for the prefill, which is about to run.
-
-        A proposer that needs values from the GPU adds them to `chunk.reads`. The CPU reads them with the prefill's
-        tokens.
-        """
 
     def begin(self, chunk: Chunk) -> None:
         """Begin a chunk. Called after its prefill has committed the first tokens."""

@@ -152,6 +152,12 @@ def read_decodes(blob: bytes, columns: Sequence[str] | None = None) -> pa.Table:
     return pq.read_table(io.BytesIO(blob), columns=columns, use_threads=False)
 
 
+_SAME = (
+    "forwards", "seconds", "mode", "compensated", "skipped",
+    "variability", "similarity", "metric", "reason", "deviation",
+)  # fmt: skip
+
+
 def decode_records(table: pa.Table) -> list[DecodeRecord]:
     """Return the decodes in a table that `decodes_table` made."""
     return [_decode_record(row) for row in table.to_pylist()]
@@ -165,24 +171,16 @@ def _round(values: dict[str, Any]) -> Round:
 def _decode_record(row: dict[str, Any]) -> DecodeRecord:
     rounds = tuple(_round(one) for one in row["rounds"])
     verified = {index for one in rounds for index in range(one.start, one.start + one.committed)}
-    actions = np.asarray(row["actions"], np.float32)
-    delay = None
-    if row["delay_steps"] is not None:
-        delay = Delay(row["delay_seconds"], *(row[name] for name in ("delay_steps", *_DELAYED)))
+    late = None if row["delay_steps"] is None else [row[name] for name in ("delay_seconds", "delay_steps", *_DELAYED)]
     return DecodeRecord(
         tokens=tuple(row["tokens"]),
-        actions=actions,
-        forwards=row["forwards"],
+        actions=np.asarray(row["actions"], np.float32),
         rounds=rounds,
-        mode=row["mode"],
-        seconds=math.nan if row["seconds"] is None else row["seconds"],
         phases={phase: row[f"seconds.{phase}"] for phase in PHASES if row[f"seconds.{phase}"] is not None},
-        compensated=row["compensated"],
         # a rectifier filled what no round committed
         filled=tuple(i for i in range(len(row["tokens"])) if i not in verified) if row["compensated"] else (),
-        skipped=row["skipped"],
-        delay=delay,
-        **{name: row[name] for name in ("variability", "similarity", "metric", "reason", "deviation")},
+        delay=None if late is None else Delay(*late),
+        **{name: row[name] for name in _SAME},
     )
 
 

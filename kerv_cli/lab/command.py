@@ -17,11 +17,19 @@ def current_command() -> list[str]:
     return list(_words)
 
 
-def set_command(words: Sequence[str]) -> list[str]:
-    """Replace this process's command-line arguments (without `kerv`), and return the previous ones."""
-    before = list(_words)
+@contextlib.contextmanager
+def noted(words: Sequence[str]) -> Iterator[None]:
+    """Remember this process's command-line arguments (without `kerv`) while the block runs.
+
+    They are stored with everything that the command makes. The previous ones are restored afterwards, because `kerv
+    prepare` runs other commands inside its own.
+    """
+    before = current_command()
     _words[:] = words
-    return before
+    try:
+        yield
+    finally:
+        _words[:] = before
 
 
 @contextlib.contextmanager

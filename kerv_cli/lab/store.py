@@ -265,7 +265,8 @@ class StudyStore:
         if episodes is not None:
             chosen = {(one.setting.label, one.task, one.seed, one.repeat) for one in episodes}
             frame = frame[[key in chosen for key in zip(*(frame[name] for name in keys), strict=True)]]
-        unknown = [column.name for column in MEASURES if frame[column.name].isna().all()]
+        numbers = [column.name for column in MEASURES if isinstance(column.type, sa.Double | sa.BigInteger)]
+        unknown = [name for name in numbers if frame[name].isna().all()]
         frame = frame.astype(dict.fromkeys(unknown, float))
         frame["decode_seconds"] = frame["decode_seconds"].map(lambda blob: np.frombuffer(blob, "<f8"))
         about = pd.DataFrame(list(frame.pop("about")), index=frame.index)

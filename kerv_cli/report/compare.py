@@ -12,7 +12,7 @@ from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, without
 from kerv_cli.lab.plan import seeds_text
 from kerv_cli.report.measures import MICRO, Row, measure
 from kerv_cli.report.summary import DIFFERENCE, SPEEDS
-from kerv_cli.report.tables import StudyData, flatten, is_number, load_study
+from kerv_cli.report.tables import StudyData, flatten, is_number, load_study, values_of
 
 _MEASURES = {
     "AL": "tokens per verification",
@@ -39,6 +39,12 @@ class ComparedRun:
     run: RunEntry
     label: str = ""
     data: StudyData | None = None
+
+    @property
+    def episodes(self) -> pd.DataFrame:
+        """Episodes of the setting."""
+        assert self.data is not None
+        return self.data.episodes[self.data.episodes["label"] == self.label]
 
 
 def compared_runs(results: str, name: str) -> list[ComparedRun]:
@@ -112,7 +118,7 @@ def compare(first: ComparedRun, second: ComparedRun) -> Row:
         figures = first.run.figures, second.run.figures
         results = [_change(name, *(side[name] for side in figures)) for name in figures[0] if name in figures[1]]
     else:
-        results = _episode_results(_episodes(first.data, first.label), _episodes(second.data, second.label))
+        results = _episode_results(first.episodes, second.episodes)
     return {"first": first.name, "second": second.name, "settings": settings, "results": results}
 
 
@@ -122,7 +128,7 @@ def _settings_of(side: ComparedRun) -> Row:
         settings: Row = dict(description.get("settings", {}))
         settings.update((key, description[key]) for key in ("git_commit", "versions", "demos") if key in description)
         return flatten(settings)
-    setting, episodes = side.data.settings[side.label], _episodes(side.data, side.label)
+    setting, episodes = side.data.settings[side.label], side.episodes
     wanted = [one for one in side.data.study.episodes if one.setting.label == side.label]
     return {
         **flatten(without(setting.settings, NOT_DETERMINING - {"policy", "method"})),
@@ -130,15 +136,11 @@ def _settings_of(side: ComparedRun) -> Row:
         "tasks": ";".join(sorted({one.task for one in wanted})),
         "seeds": seeds_text(one.seed for one in wanted),
         **{
-            name: ";".join(sorted({str(v) for v in episodes[name].dropna()}))
+            name: ";".join(sorted(values_of(episodes.dropna(subset=name), name)))
             for name in _PROVENANCE
             if name in episodes
         },
     }
-
-
-def _episodes(data: StudyData, label: str) -> pd.DataFrame:
-    return data.episodes[data.episodes["label"] == label]
 
 
 def _episode_results(first: pd.DataFrame, second: pd.DataFrame) -> list[Row]:
@@ -169,20 +171,14 @@ def same_tokens(first: RunEntry, second: RunEntry) -> tuple[int, int]:
     Raises:
         UsageError: A run has no episode.
     """
-    ours, theirs = _tokens(first), _tokens(second)
-    shared = ours.keys() & theirs.keys()
-    return sum(ours[key] == theirs[key] for key in shared), len(shared)
+    shared = _tokens(first).merge(_tokens(second), on=["label", "task", "seed", "repeat"])
+    return int((shared["tokens_x"] == shared["tokens_y"]).sum()), len(shared)
 
 
-def _tokens(run: RunEntry) -> dict[tuple[str, str, int, int], list[list[int]]]:
-    """Return the tokens of every decode, by the label, task, seed and repeat of the episode."""
+def _tokens(run: RunEntry) -> pd.DataFrame:
+    """Return a row per episode: label, task, seed, repeat, and the tokens of all its decodes."""
     store = store_of(run)
-    frame = store.frame()
-    if frame.empty:
-        return {}
-    decodes = store.decodes(frame["episode"].tolist(), ["tokens"]).to_pandas()
-    keys = list(zip(*(frame[name] for name in ("label", "task", "seed", "repeat")), strict=True))
-    return {
-        keys[int(str(position))]: [list(row) for row in group["tokens"]]
-        for position, group in decodes.groupby("episode")
-    }
+    frame = store.frame()[["episode", "label", "task", "seed", "repeat"]]
+    decodes = store.decodes(frame["episode"].tolist(), ["tokens"]).to_pandas()  # `episode` is a position in the list
+    tokens = decodes.groupby("episode")["tokens"].agg(lambda rows: tuple(map(tuple, rows)))
+    return frame.assign(tokens=tokens.reindex(range(len(frame))).to_list())

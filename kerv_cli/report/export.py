@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -132,24 +133,22 @@ def _to_trackio(tracked: Tracked, folder: Path) -> str:
     os.environ.setdefault("TRACKIO_DIR", str(folder))  # trackio reads it when it is imported
     import trackio
 
-    trackio.init(project=PROJECT, name=tracked.name, config=tracked.config, embed=False)
-    for step, numbers in tracked.history:
-        trackio.log(numbers, step=step)
-    if tracked.summary:
-        trackio.log({f"summary/{name}": value for name, value in tracked.summary.items()})
-    trackio.finish()
-    return tracked.name
+    return _logged(trackio.init(project=PROJECT, name=tracked.name, config=tracked.config, embed=False), tracked)
 
 
 def _to_wandb(tracked: Tracked, folder: Path) -> str:
     import wandb
 
-    run = wandb.init(
-        project=PROJECT, name=tracked.name, group=tracked.group, config=tracked.config, mode="offline", dir=str(folder)
-    )
+    about = {"name": tracked.name, "group": tracked.group, "config": tracked.config}
+    return _logged(wandb.init(project=PROJECT, mode="offline", dir=str(folder), **about), tracked)
+
+
+def _logged(run: Any, tracked: Tracked) -> str:
+    """Send history and summary to a run of trackio or wandb, whose interfaces are the same."""
     for step, numbers in tracked.history:
         run.log(numbers, step=step)
-    run.summary.update(tracked.summary)
+    if tracked.summary:
+        run.log({f"summary/{name}": value for name, value in tracked.summary.items()})
     run.finish()
     return tracked.name
 

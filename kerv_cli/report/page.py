@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import os
 import shlex
 from collections.abc import Sequence
@@ -22,9 +23,12 @@ from kerv_cli.report.reprice import ASSUMES, repriced_summary
 from kerv_cli.report.summary import MAIN, NOTE, SPEEDS, of_runs, summary_frame
 from kerv_cli.report.tables import StudyData, flatten, is_baseline, is_number, latency_table, load_study, rows_of
 from kerv_cli.report.verdict import caution, question
+from kerv_cli.report.viewing.film import animation, film_of
 
 LOSS = 3.0
 """Default for the largest loss of success that the page's verdict accepts, in points."""
+_SLOWER = 2.0
+"""How many times slower than the robot films play."""
 
 
 def render(
@@ -33,7 +37,8 @@ def render(
     """Return the study's page as one HTML file that needs no other file and no network; arguments as `study_parts`."""
     loader = PackageLoader("kerv_cli.report", "templates")
     template = Environment(loader=loader, autoescape=True, undefined=StrictUndefined).get_template("study.html")
-    return template.render(**study_parts(store, data, loss, priced, tables), library=library())
+    values = study_parts(store, data, loss, priced, tables) | {"films": _films(store, data)}
+    return template.render(**values, library=library())
 
 
 def study_parts(
@@ -57,7 +62,7 @@ def study_parts(
     """
     data = data or load_study(store)
     answer, is_shown = verdict_of(data.table, loss)
-    first, results = data.table.iloc[0], str(store.database.results)
+    first, results, figures = data.table.iloc[0], str(store.database.results), figures_of(data, loss)
     return {
         "name": store.name,
         "title": data.study.title or store.name,
@@ -75,13 +80,15 @@ def study_parts(
         "main": MAIN,
         "columns": f"{NOTE} {of_runs(data.table)}",
         "suite": _suite(data.table),
-        "charts": [figure.to_dict() for figure in figures_of(data, loss).values()],
+        "charts": [figure.to_dict() for figure in figures.values()],
+        "has_bounds": "_tradeoff" in figures,
         "decisions": read_decisions(store.root),
         "tasks": _by_task(data.per_task),
         "cell_link": None,  # the board gives a function: heading of the first column, row, column -> address
         "machines": None if priced is None else repriced_summary(priced),
         "assumes": ASSUMES,
         "settings": _settings(data),
+        "films": [],
         "recordings": [(path.stem, _href(path, store.root)) for path in store.recordings],
         "files": [(path.name, _href(path, store.root)) for path in tables],
     }
@@ -137,6 +144,23 @@ def _settings(data: StudyData) -> list[dict[str, Any]]:
             {"label": label, "overrides": data.settings[label].overrides, "reference": reference, "differs": differs}
         )
     return settings
+
+
+def _films(store: StudyStore, data: StudyData) -> list[dict[str, Any]]:
+    """Return a film of one success and one failure per method, as far as they were recorded with a camera."""
+    keys = ["label", "task", "seed", "repeat"]
+    outcomes = data.episodes.set_index(keys)["success"].to_dict()
+    films: dict[tuple[str, bool], dict[str, Any]] = {}
+    for one in data.study.episodes:
+        path, method = store.rollouts / one.recording, one.setting.settings["method"]
+        success = outcomes.get((one.setting.label, *one.key[1:]))
+        if success is None or (method, success) in films or not path.is_file():
+            continue
+        if (film := film_of(path)).frames:
+            picture = base64.b64encode(animation(film, _SLOWER)).decode()
+            films[method, success] = {"label": one.setting.label, "task": one.task, "seed": one.seed,
+                                      "success": success, "steps": film.facts["steps"], "picture": picture}  # fmt: skip
+    return list(films.values())
 
 
 def _href(path: Path, folder: Path) -> str:

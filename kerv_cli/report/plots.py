@@ -7,12 +7,14 @@ to the setting that was clicked.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable
 from pathlib import Path
 
 import altair as alt
 import pandas as pd
 import vl_convert
+from PIL import Image
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import write_bytes
@@ -58,7 +60,7 @@ def study_figures(table: pd.DataFrame, axis: str, loss: float = 3.0) -> dict[str
         kinds = [kind for kind in rows["stress"].unique() if kind != NONE]
         parts = [rows[rows["stress"].isin([NONE, kind])].assign(panel=kind) for kind in kinds]
         drawn = pd.concat(parts).assign(line=lambda all: all["unstressed"], x=lambda all: all["stress_level"])
-        return {"": lines_figure([_points(drawn, SUCCESS)], "level of stress")}
+        return {"": lines_figure([_points(drawn, SUCCESS)], "level of stress", "success, %")}
     rows = with_lines(rows, axis)
     if rows["x"].notna().any():
         measures = [_points(rows.assign(panel=TITLES[name]), name) for name in (SPEED, SUCCESS)]
@@ -148,13 +150,14 @@ def _tradeoff(rows: pd.DataFrame, loss: float) -> alt.ConcatChart:
     return _chart(charts, 2)
 
 
-def lines_figure(measures: Iterable[pd.DataFrame], xlabel: str) -> alt.ConcatChart:
+def lines_figure(measures: Iterable[pd.DataFrame], xlabel: str, ylabel: str | None = None) -> alt.ConcatChart:
     """Draw panels side by side with one legend. A line has the same colour in every panel.
 
     Args:
         measures: Points, from `_points`. Those with the same `panel` are drawn together. A point without x is drawn as
             a line across the panel.
         xlabel: Title of the x axis.
+        ylabel: Title of the y axis. None: the panels' titles say enough.
     """
     points = pd.concat(measures)
     names = points["line"].unique()
@@ -165,7 +168,7 @@ def lines_figure(measures: Iterable[pd.DataFrame], xlabel: str) -> alt.ConcatCha
     scale, charts = alt.Scale(zero=False, padding=12), []
     for title, part in points.groupby("panel", sort=False):
         base = alt.Chart(part).encode(color=colour, tooltip=_tooltip(part))
-        y, low = (alt.Y(f"{name}:Q", scale=scale, title=None) for name in ("value", "low"))
+        y, low = (alt.Y(f"{name}:Q", scale=scale, title=ylabel) for name in ("value", "low"))
         drawn, alone = base.transform_filter("isValid(datum.x)"), base.transform_filter("!isValid(datum.x)")
         drawn = drawn.encode(x=alt.X("x:Q", scale=scale, title=xlabel))
         layers = [
@@ -185,7 +188,7 @@ def latency_figure(table: pd.DataFrame) -> alt.ConcatChart:
     rows = rows.assign(x=rows["label"].map(latencies)).query("x > 0").sort_values("x", kind="stable")
     panels = "delay compensation: " + rows["rollout.delay_compensation"]
     points = _points(rows.assign(line=rows["method"], panel=panels), SUCCESS)
-    return lines_figure([points], "an autoregressive decode takes, ms")
+    return lines_figure([points], "an autoregressive decode takes, ms", "success, %")
 
 
 def _best_step(log: pd.DataFrame) -> float:
@@ -217,8 +220,9 @@ def png(figure: alt.ConcatChart, title: str, subtitle: str) -> bytes:
     """Return a chart with a heading as a PNG file. The same chart gives the same bytes."""
     heading = alt.Title(title, subtitle=subtitle, fontSize=17, subtitleFontSize=12, offset=16)
     spec = figure.properties(title=heading, background="white", padding=14).to_dict()
-    picture: bytes = vl_convert.vegalite_to_png(spec, scale=2)
-    return picture
+    buffer = io.BytesIO()  # written again: the renderer hardly compresses
+    Image.open(io.BytesIO(vl_convert.vegalite_to_png(spec, scale=2))).convert("RGB").save(buffer, "png", optimize=True)
+    return buffer.getvalue()
 
 
 def library() -> str:

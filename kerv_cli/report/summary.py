@@ -229,41 +229,37 @@ def not_in_turn(table: pd.DataFrame) -> list[str]:
     return [str(label) for label in dict.fromkeys(rows["label"])] if of_baseline else []
 
 
-_FIGURES = ("forwards_per_step", "AL", "accepted_per_round", "time_per_step_ms")
+def _task_columns() -> dict[str, TextOf]:
+    """Return heading -> function that formats a cell of the table of tasks."""
+    return {
+        "task": lambda row: str(row["task"]),
+        "success": lambda row: f"{row['successes']}/{row['episodes']}",
+        "steps per episode": lambda row: f"{row['steps'] / row['episodes']:.0f}",
+        "forwards per step": numbers("forwards_per_step"),
+        "tokens per verification": numbers("AL"),
+        "drafts accepted": numbers("accepted_per_round"),
+        "time per step, ms": numbers("time_per_step_ms"),
+    }
 
 
-def setting_tables(data: StudyData, per_task: list[Row], whole: Row) -> Iterator[tuple[Any, Any, str]]:
+def setting_tables(data: StudyData) -> Iterator[tuple[Any, Any, str]]:
     """Yield the tables of a study with one setting: results per task, and time per phase of a decode.
-
-    Args:
-        data: The study.
-        per_task: One row per task.
-        whole: The row over all tasks.
 
     Yields:
         Column names, rows and title of each table.
     """
-    episodes, setting = data.episodes, data.study.settings[0]
-    by_task = {row["task"]: row for row in per_task}
-    figures = [(task, by_task[task]) for task in dict.fromkeys(episodes["task"])]
-    if len(figures) > 1:
-        figures.append(("all", whole))
-    timed = is_timed(episodes)
-    headers = ("task", "success", "steps", "forwards/step", "tokens/verification", "drafts accepted", "ms/step")
+    episodes, setting, columns = data.episodes, data.study.settings[0], _task_columns()
+    rows = rows_of(data.per_task) + [row | {"task": "all"} for row in rows_of(data.table, MICRO) if row["tasks"] > 1]
     seeds = f"{episodes['seed'].min()}…{episodes['seed'].max()}"
     observation = setting.identity.get("observation", "")
     title = f"{setting.label}, observation {observation}{stress_text(setting.settings)}, seeds {seeds}"
+    timed = is_timed(episodes)
     if not timed:
         title += f"; not timed: {batch_of(setting.settings)} episodes at a time"
-    yield headers, ((name, *_figures(row)) for name, row in figures), title
+    yield columns, ([text(row) for text in columns.values()] for row in rows), title
     if timed:
+        sums = episodes[[f"seconds.{phase}" for phase in PHASES]].sum()
         decodes, total = episodes["decodes"].sum(), episodes["seconds"].sum()
-        seconds = {phase: episodes[f"seconds.{phase}"].sum() for phase in PHASES}
-        rows = [(name, f"{1000 * s / decodes:.2f}", f"{s / total:.0%}") for name, s in seconds.items() if s]
-        yield ("phase", "ms per decode", "share"), rows, "time by phase"
-
-
-def _figures(row: Row) -> list[str]:
-    """Return the cells of one row of the first table: successes, steps and measures."""
-    successes, steps = f"{row['successes']}/{row['episodes']}", f"{row['steps'] / row['episodes']:.0f}"
-    return [successes, steps, *(f"{row[name]:.2f}" if is_number(row[name]) else "–" for name in _FIGURES)]
+        phases = {str(name).removeprefix("seconds."): float(s) for name, s in sums.items() if s}
+        cells = [(name, f"{1000 * s / decodes:.2f}", f"{s / total:.0%}") for name, s in phases.items()]
+        yield ("phase", "ms per decode", "share"), cells, "time by phase"

@@ -106,7 +106,7 @@ def question(table: pd.DataFrame, loss: float) -> str:
         return "Which settings succeed less or more often than the baseline under the same stress and clock?"
     if not (table["label"] != table["baseline"]).any() or not len(baselines):
         return ""
-    return f"Which setting is faster than {baselines[0]} and loses less than {loss:g} points of success?"
+    return f"Which setting is faster than the baseline {baselines[0]} and loses less than {loss:g} points of success?"
 
 
 def sentence(choice: Choice, loss: float, baseline: str) -> str:

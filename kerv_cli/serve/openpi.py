@@ -14,7 +14,7 @@ import numpy as np
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import Observation
 from kerv_cli.serve.interface import Interface, Message, hand_of, keys_of, packed, text_of, unpacked
-from kerv_cli.serve.policy import Conversation, Log, Policy, Reply
+from kerv_cli.serve.policy import Conversation, Log, Policy
 
 STATE, IMAGE, PROMPT, RESET, EXECUTED = "observation/state", "observation/image", "prompt", "reset", "executed"
 
@@ -75,7 +75,7 @@ class OpenPi(Conversation):
         """Return the metadata as the first message to the client."""
         return packed(metadata(self.policy))
 
-    def answer(self, frame: bytes | str) -> Reply:
+    def answer(self, frame: bytes | str) -> bytes:
         """Return the message with the actions for one observation.
 
         Args:
@@ -84,8 +84,7 @@ class OpenPi(Conversation):
         Raises:
             UsageError: The message or a value in it is wrong.
         """
-        values = self.act(unpacked(frame))
-        return Reply(packed(values), values["policy_timing"]["infer_ms"] / 1000)
+        return packed(self.act(unpacked(frame)))
 
     def act(self, message: Message) -> dict[str, Any]:
         """Return the values of the answer to a client's message: actions (H, D), times, and number of target forwards.

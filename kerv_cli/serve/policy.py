@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -288,18 +288,6 @@ class Finite:
 Log = Callable[[str], None]
 
 
-class Reply(NamedTuple):
-    """The answer to a client's message.
-
-    Attributes:
-        frame: The websocket message to send.
-        seconds: Inference time. NaN if it was not measured. None if nothing was decoded.
-    """
-
-    frame: bytes
-    seconds: float | None = None
-
-
 class Conversation(abc.ABC):
     """One client's connection: its decoder and its episodes. Each protocol is a subclass.
 
@@ -309,7 +297,7 @@ class Conversation(abc.ABC):
         idle_s: A client that sends no message for this many seconds is disconnected.
         task: Task of the current episode. Empty if unknown.
         decoder: The client's decoder. If it depends on the task, None before the first episode.
-        last_ms: Milliseconds from the arrival of the last decoded message until its answer was sent. NaN before it.
+        last_ms: Milliseconds from the arrival of the last message until its answer was sent. NaN before the first.
     """
 
     seats: int
@@ -345,7 +333,7 @@ class Conversation(abc.ABC):
         return None
 
     @abc.abstractmethod
-    def answer(self, frame: bytes | str) -> Reply | None:
+    def answer(self, frame: bytes | str) -> bytes | None:
         """Return the answer to a websocket message, or None if it needs no answer.
 
         Raises:

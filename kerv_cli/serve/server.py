@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import http
 import logging
-import math
 import threading
 import time
 from collections.abc import Iterator
@@ -41,22 +40,6 @@ PATIENCE = 1.0
 """Seconds that a new client waits for a free place: its own previous connection may just be closing."""
 FAREWELL = 2.0
 """Seconds to wait for a connection to close."""
-
-
-class Latencies:
-    """Collect the times of a client's answers in milliseconds. `str` summarises them for the log."""
-
-    def __init__(self) -> None:
-        self.decode: list[float] = []  # inference
-        self.answer: list[float] = []  # from the message's arrival to the answer's end
-
-    def __str__(self) -> str:
-        parts = [f"{len(self.answer)} answers"]
-        for name, values in vars(self).items():
-            if values:
-                p50, p95 = np.percentile(values, [50, 95])
-                parts.append(f"{name} p50 {p50:.1f} p95 {p95:.1f} worst {max(values):.1f} ms")
-        return ", ".join(parts)
 
 
 class PolicyServer:
@@ -116,10 +99,11 @@ class PolicyServer:
             connection.close(BUSY, f"{full}: try again later")
             return
         self._connections.add(connection)
-        latencies, why = Latencies(), ""
+        times: list[float] = []
+        why = ""
         try:
             self.log(f"{who} connected")
-            self._talk(connection, who, latencies)
+            self._talk(connection, who, times)
         except ConnectionClosed as error:
             frame = error.rcvd or error.sent
             why = f": {frame.reason}" if frame and frame.reason else ""
@@ -130,15 +114,15 @@ class PolicyServer:
         finally:
             self._connections.discard(connection)
             self._seats.release()
-            self.log(f"{who} disconnected{why}; {latencies}")
+            self.log(f"{who} disconnected{why}; {_summary(times)}")
 
-    def _talk(self, connection: ServerConnection, who: str, latencies: Latencies) -> None:
+    def _talk(self, connection: ServerConnection, who: str, times: list[float]) -> None:
         """Answer messages until the connection ends.
 
         Args:
             connection: The connection.
             who: The client's address, for the log.
-            latencies: Times of its answers are added here.
+            times: The time of every answer in milliseconds is added here.
 
         Raises:
             ConnectionClosed: The client has left.
@@ -149,37 +133,30 @@ class PolicyServer:
             if (greeting := conversation.greeting()) is not None:
                 connection.send(greeting)
             while True:
-                self.reply(connection, conversation, connection.recv(timeout=self.protocol.idle_s), latencies)
+                frame, began = connection.recv(timeout=self.protocol.idle_s), time.perf_counter()
+                answer = self._answer(conversation, frame)
+                if answer is not None:
+                    connection.send(answer)
+                    conversation.last_ms = 1000 * (time.perf_counter() - began)
+                    times.append(conversation.last_ms)
 
-    def reply(
-        self, connection: ServerConnection, conversation: Conversation, frame: bytes | str, latencies: Latencies
-    ) -> None:
-        """Answer one message. If something is wrong with it, tell the client and write one line to the log.
-
-        Args:
-            connection: The connection.
-            conversation: The client's decoder and episodes.
-            frame: The client's websocket message.
-            latencies: The time of the answer is added here.
-        """
-        began = time.perf_counter()
+    def _answer(self, conversation: Conversation, frame: bytes | str) -> bytes | str | None:
+        """Return the answer to a message, or a message that says what is wrong, which is also logged."""
         try:
-            reply = conversation.answer(frame)
+            return conversation.answer(frame)
         except Exception as error:  # noqa: BLE001 - whatever a client sends, the server goes on
             internal = f"internal error, {type(error).__name__}: {str(error)[:200]}"
             line = " ".join((str(error) if isinstance(error, KervError) else internal).split())[:LONGEST]
             conversation.log(f"error: {line}")
-            connection.send(conversation.fault(line))
-            return
-        if reply is None:
-            return
-        connection.send(reply.frame)
-        if reply.seconds is None:
-            return
-        conversation.last_ms = 1000 * (time.perf_counter() - began)
-        latencies.answer.append(conversation.last_ms)
-        if not math.isnan(reply.seconds):
-            latencies.decode.append(1000 * reply.seconds)
+            return conversation.fault(line)
+
+
+def _summary(times: list[float]) -> str:
+    """Return the number of answers and how long they took, as text for the log. `times` are in milliseconds."""
+    if not times:
+        return "0 answers"
+    p50, p95 = np.percentile(times, [50, 95])
+    return f"{len(times)} answers, p50 {p50:.1f} p95 {p95:.1f} worst {max(times):.1f} ms"
 
 
 def _address(connection: ServerConnection) -> str:

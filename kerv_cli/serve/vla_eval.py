@@ -21,7 +21,7 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.catalogue.evaluations import path_of, write_served
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
 from kerv_cli.serve.interface import OPEN, Interface, Message, hand_of, keys_of, packed, text_of, unpacked
-from kerv_cli.serve.policy import Conversation, Log, Policy, Reply
+from kerv_cli.serve.policy import Conversation, Log, Policy
 
 PROTOCOL_VERSION = 1
 _FORMATS = {("position", 3): "delta_xyz", ("rotation", 3): "axis_angle"}
@@ -96,7 +96,7 @@ class VlaEval(Conversation):
         self.episode: _Episode | None = None
         self.sequence = 0
 
-    def answer(self, frame: bytes | str) -> Reply | None:
+    def answer(self, frame: bytes | str) -> bytes | None:
         """Return the answer to a message, or None if it needs no answer.
 
         Raises:
@@ -118,7 +118,7 @@ class VlaEval(Conversation):
         message = {"type": kind, "payload": payload, "seq": self.sequence, "timestamp": time.time()}
         return packed(message, text_keys=True)
 
-    def _hello(self, payload: Message) -> Reply:
+    def _hello(self, payload: Message) -> bytes:
         """Answer the first message of a connection with what the policy reads and sends.
 
         Raises:
@@ -139,13 +139,13 @@ class VlaEval(Conversation):
             "kerv": self.policy.facts(),
             **({"observation_params": params} if params else {}),
         }
-        return Reply(self._message("hello", about))
+        return self._message("hello", about)
 
     def _start(self, payload: Message) -> None:
         """Note that a new episode begins. The first observation builds its decoder and reports what is wrong."""
         self.episode = _Episode(payload)  # errors are reported at the first observation
 
-    def _observe(self, payload: Message) -> Reply:
+    def _observe(self, payload: Message) -> bytes:
         """Return the next action. Decode an observation first if the last chunk is used up."""
         episode = self.episode = self.episode or _Episode({})
         numbers = self.interface.numbers(payload.get("state", payload.get("states")), "state", payload)
@@ -158,17 +158,15 @@ class VlaEval(Conversation):
             self.decoder.observe(episode.sent[-1], hand)
         episode.path[step:] = [hand]  # replace the position that a failed observation of this step left
         self.policy.range.check(state)
-        seconds = None
         if not episode.left:
             record = self.policy.decode(self.decoder, self._observation(episode, payload, numbers))
-            seconds = record.seconds
             episode.decodes.append(record)
             episode.decode_steps.append(step)
             episode.left.extend(record.actions)
         action, space = episode.left.popleft(), self.interface.space
         episode.sent.append(np.clip(action, space.low, space.high).astype(np.float32))
         sent = self.interface.converted(action[None])[0].astype(np.float32)
-        return Reply(self._message("action", {"actions": sent}), seconds)
+        return self._message("action", {"actions": sent})
 
     def _observation(self, episode: _Episode, payload: Message, numbers: tuple[np.ndarray, np.ndarray]) -> Observation:
         """Read the observation from a message.
@@ -232,7 +230,7 @@ class VlaEval(Conversation):
         )
 
 
-_HANDLERS: Mapping[str, Callable[[VlaEval, Message], Reply | None]] = {
+_HANDLERS: Mapping[str, Callable[[VlaEval, Message], bytes | None]] = {
     "hello": VlaEval._hello,
     "episode_start": VlaEval._start,
     "observation": VlaEval._observe,

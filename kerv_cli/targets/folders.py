@@ -70,8 +70,9 @@ def check_not_shipped(path: Path, word: str) -> None:
 
 
 def target_names(results: str) -> list[str]:
-    """Return the names of all targets: the shipped ones, then those in the results folder."""
-    shipped = sorted(path.parent.parent.name for path in shipped_dir().glob("[!.]*/target/target.json"))
+    """Return the names of all targets: the shipped and unpacked policies, then those in the results folder."""
+    policies = shipped_dir(), results_dir(results) / "pretrained"
+    shipped = sorted(path.parts[-3] for folder in policies for path in folder.glob("[!.]*/target/target.json"))
     stored = sorted(path.parent.name for path in (results_dir(results) / "artifacts/target").glob("[!.]*/target.json"))
     return list(dict.fromkeys([*shipped, *stored]))
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from kerv_cli.base.limits import number
 from kerv_cli.base.registry import add
+from kerv_cli.engine.parts import Boundary
 
 if TYPE_CHECKING:
     from kerv_cli.engine.chunk import Choice
@@ -23,19 +24,14 @@ class HeightSettings:
     metres: float = number(0.1, -10, 10)
 
 
-class Height:
-    """The `Boundary` protocol of `kerv_cli/engine/parts.py`."""
-
+class Height(Boundary):
     def __init__(self, metres: float) -> None:
         self.metres = metres
 
-    def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
+    def choose(self, path: np.ndarray) -> Choice:
         from kerv_cli.engine.chunk import Choice  # imports torch
 
         return Choice("retrieval" if len(path) and path[-1][2] > self.metres else "drafter")
-
-    def numbers(self, task: str, seed: int) -> np.random.Generator:
-        return np.random.default_rng(seed)
 
 
 def build(settings: HeightSettings, context: Context) -> Height:

@@ -50,11 +50,17 @@ const rows = () => [...document.querySelectorAll(".tokens tbody tr")];
 document.addEventListener("step", (event) => {
   const now = rows().findLast((row) => Number(row.dataset.step) <= event.detail);
   rows().forEach((row) => row.classList.toggle("now", row === now));
-  const box = document.querySelector(".box");
-  if (now && (now.offsetTop < box.scrollTop + 80 || now.offsetTop + 40 > box.scrollTop + box.clientHeight)) {
-    box.scrollTop = now.offsetTop - box.clientHeight / 2;
-  }
+  reveal(now);
 });
+
+// scrolls the grid, and not the page, to a row that is out of sight
+function reveal(row) {
+  const box = document.querySelector(".box");
+  if (row && (row.offsetTop < box.scrollTop + 80 || row.offsetTop + 40 > box.scrollTop + box.clientHeight)) {
+    box.scrollTop = row.offsetTop - box.clientHeight / 2;
+  }
+}
+reveal(document.querySelector(".tokens .chosen"));
 
 // a row is chosen anywhere, and the film goes to its first step
 document.addEventListener("click", (event) => {

@@ -113,7 +113,6 @@ class DrafterProposer(Proposer):
     """
 
     name = "drafter"
-    needs_states = True
 
     def __init__(
         self, drafter: EagleNetwork | PublicDrafter, target: Target, depth: int, top_k: int, nodes: int

@@ -24,7 +24,7 @@ from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.acceptance import Accepted, DistanceRule, accept_by_group
 from kerv_cli.engine.chunk import Choice, Chunk
 from kerv_cli.engine.draft import Draft
-from kerv_cli.engine.parts import Skip
+from kerv_cli.engine.parts import Boundary, Skip
 from kerv_cli.engine.proposer import ChainProposer, Proposer
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.engine.record import path_length
@@ -175,7 +175,6 @@ class RetrievalProposer(ChainProposer):
 
     def __init__(self, datastore: Datastore, target: ReadableTarget, neighbours: int, nodes: int) -> None:
         self.datastore, self.target, self.count, self.nodes = datastore, target, neighbours, nodes
-        self.waits = target.device.type == "cpu"
         self._nearest: tuple[Chunk, Neighbours] | None = None
 
     @classmethod
@@ -189,23 +188,11 @@ class RetrievalProposer(ChainProposer):
         The search runs once per chunk.
         """
         if self._nearest is None or self._nearest[0] is not chunk:
-            self._search(chunk, read(self.datastore.pooled(chunk.prompt, self.target))[0])
-        assert self._nearest is not None
+            pooled = read(self.datastore.pooled(chunk.prompt, self.target))[0]
+            key = self.datastore.key_of(pooled.astype(np.float32, copy=False))
+            self._nearest = chunk, self.datastore.query(key, chunk.situation.task, self.count)
+            chunk.similarity = float(self._nearest[1].similarity[0])
         return self._nearest[1]
-
-    def prepare(self, chunk: Chunk) -> None:
-        """On a GPU, add the pooled prompt to `chunk.reads`, so that it is copied together with other results.
-
-        The search starts as soon as it has arrived on the CPU.
-        """
-        if not self.waits and (self._nearest is None or self._nearest[0] is not chunk):
-            vector = self.datastore.pooled(chunk.prompt, self.target)
-            chunk.reads.append((vector, lambda pooled: self._search(chunk, pooled)))
-
-    def _search(self, chunk: Chunk, pooled: np.ndarray) -> None:
-        key = self.datastore.key_of(pooled.astype(np.float32, copy=False))
-        self._nearest = chunk, self.datastore.query(key, chunk.situation.task, self.count)
-        chunk.similarity = float(self._nearest[1].similarity[0])
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
         """Return the most similar stored chunks, as one tree of at most `depth` tokens per path."""
@@ -225,8 +212,6 @@ class HybridProposer(Proposer):
         name: Name of the proposer that drafts the present chunk.
     """
 
-    needs_states = True
-
     def __init__(self, drafter: Proposer, retrieval: Proposer) -> None:
         self.proposers: dict[str, Proposer] = {"drafter": drafter, "retrieval": retrieval}
         self.nodes = max(drafter.nodes, retrieval.nodes)
@@ -237,15 +222,11 @@ class HybridProposer(Proposer):
         """Build the hybrid proposer, which `proposer=hybrid` chooses."""
         return cls(EagleDrafter.proposer(settings, context), RetrievalProposer.build(settings, context))
 
-    def prepare(self, chunk: Chunk) -> None:
-        """Select the proposer that the boundary chose for this chunk, and prepare it."""
+    def begin(self, chunk: Chunk) -> None:
+        """Select the proposer that the boundary chose for this chunk, and pass the prefill's results to it."""
         assert chunk.choice is not None, "a hybrid proposer needs a boundary"
         self.chosen = self.proposers[chunk.choice.mode]
         self.name = self.chosen.name
-        self.chosen.prepare(chunk)
-
-    def begin(self, chunk: Chunk) -> None:
-        """Pass the prefill's results to the selected proposer."""
         self.chosen.begin(chunk)
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
@@ -485,28 +466,15 @@ class BoundaryRanges:
         return alpha * radius + (1 - alpha) * length
 
 
-class Seeded:
-    """Base of boundaries, with a random generator per episode."""
-
-    seed = 0
-
-    def numbers(self, task: str, seed: int) -> np.random.Generator:
-        """Return the random generator of an episode.
-
-        It depends only on the boundary's seed, the task's full name and the episode's seed.
-        """
-        return np.random.default_rng([self.seed, zlib.crc32(task.encode()), seed])
-
-
-@dataclass(frozen=True)
-class Random(Seeded):
+class Random(Boundary):
     """Chooses retrieval with probability p, else the drafter: a baseline that does not look at the path.
 
-    With p = 1 retrieval drafts all chunks, with p = 0 the drafter does.
+    With p = 1 retrieval drafts all chunks, with p = 0 the drafter does. An episode's random numbers depend only on the
+    boundary's seed, the task's full name and the episode's seed.
     """
 
-    p: float
-    seed: int = 0
+    def __init__(self, p: float, seed: int = 0) -> None:
+        self.p, self.seed, self.random = p, seed, np.random.default_rng(seed)
 
     @classmethod
     def build(cls, settings: RandomBoundarySettings, context: Context) -> Random:
@@ -518,13 +486,17 @@ class Random(Seeded):
         """Build the boundary that always chooses one side: boundary=always_retrieval or boundary=always_drafter."""
         return cls(float(settings.kind == "always_retrieval"))
 
-    def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
+    def reset(self, task: str, seed: int) -> None:
+        """Begin an episode: seed the random numbers."""
+        self.random = np.random.default_rng([self.seed, zlib.crc32(task.encode()), seed])
+
+    def choose(self, path: np.ndarray) -> Choice:
         """Choose retrieval with probability p, else the drafter. The path is not used."""
-        return Choice("retrieval" if rng.random() < self.p else "drafter")
+        return Choice("retrieval" if self.random.random() < self.p else "drafter")
 
 
 @dataclass(frozen=True)
-class Fused(Seeded):
+class Fused(Boundary):
     """Chooses retrieval if F ≥ F*, where F is the weighted sum of the path's scaled curvature radius and length.
 
     With fewer than three positions it chooses the drafter.
@@ -547,13 +519,8 @@ class Fused(Seeded):
         ranges = context.calibration.ranges(settings.window)
         return cls(ranges, settings.alpha, settings.window, settings.f_star)
 
-    def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
-        """Choose retrieval or the drafter from the path's newest `window` positions.
-
-        Args:
-            path: (m, 3) measured hand positions of the episode, metres.
-            rng: Not used.
-        """
+    def choose(self, path: np.ndarray) -> Choice:
+        """Choose retrieval or the drafter from the newest `window` positions of the path (m, 3), in metres."""
         points = np.asarray(path)[-self.window :]
         if len(points) < LEAST:
             return Choice("drafter")
