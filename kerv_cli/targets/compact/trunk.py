@@ -4,10 +4,10 @@ Shapes: B batch, T new tokens, S cached tokens, E width, A heads, C = E / A.
 
 There are three implementations, whose results are equal up to rounding:
 
-- torch, for training and for number formats other than float32 on a CPU.
-- On a CPU a frozen float32 stack is compiled (`program.py`).
 - On CUDA a captured graph replays a forward. For this the cache has fixed shapes: every forward attends to all slots,
   and a mask hides the unused ones.
+- On a CPU a frozen float32 stack is compiled (`program.py`).
+- On a CPU a frozen bfloat16 stack stores its weights in oneDNN's blocked layout (`bfloat16.py`).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from kerv_cli.engine.transfer import upload
 from kerv_cli.targets.attention import Cache, CapturedCache, Slots, attend, attention_mask, rotate
+from kerv_cli.targets.compact.bfloat16 import Bfloat16Layers, multiplies_bfloat16
 from kerv_cli.targets.compact.packable import Packable, wants_gradient
 from kerv_cli.targets.compact.program import Program
 
@@ -132,15 +133,23 @@ class LayerStack(Packable):
             fixed: Whether every forward attends to all slots, so that its shapes are fixed. None: only on CUDA.
         """
         like: Tensor = self.norm.weight
+        if isinstance(self.packed, Bfloat16Layers):
+            like = like.float()
         sizes = self.depth, batch, self.heads, capacity + self.padding, self.width // self.heads
         fixed = like.is_cuda if fixed is None else fixed
         return CapturedCache(*sizes, like) if fixed else Cache(*sizes, like)
 
-    def pack_weights(self) -> Program | None:
-        """Compile the stack for a CPU. Return None if its weights are not float32."""
-        if self.norm.weight.dtype != torch.float32:
-            return None
-        return Program(self.recorded, *[(1, 1, self.outer)] * self.inputs)
+    def pack_weights(self) -> Program | Bfloat16Layers | None:
+        """Compile the stack for a CPU. `pack` calls this.
+
+        Returns:
+            A program in float32. In bfloat16 layers with blocked weights, if the CPU can multiply bfloat16. Else None.
+        """
+        if self.norm.weight.dtype == torch.float32:
+            return Program(self.recorded, *[(1, 1, self.outer)] * self.inputs)
+        if self.norm.weight.dtype == torch.bfloat16 and multiplies_bfloat16():
+            return Bfloat16Layers(self.rotary(slice(None)), self.layers)
+        return None
 
     def run(
         self, inputs: Sequence[Tensor], positions: Tensor, cache: Cache | None, seen: np.ndarray | Tensor | None
@@ -162,14 +171,16 @@ class LayerStack(Packable):
                 seen = F.pad(F.pad(seen, (0, padding)), (0, 0, 0, padding), value=True)
         x = inputs[0]
         mask = attention_mask(seen, x.shape[1], cache, x)
-        if self.is_packed(x) and (cache is None or not cache.fixed):
-            hidden = self.packed(*inputs, positions=positions, cache=cache, mask=mask)[0].view(x.shape)
+        packed = self.packed if self.is_packed(x) and (cache is None or not cache.fixed) else None
+        if isinstance(packed, Program):
+            hidden = packed(*inputs, positions=positions, cache=cache, mask=mask)[0].view(x.shape)
         elif isinstance(cache, CapturedCache) and self.captures(x):
             assert mask is not None
             hidden = self.finish(cache.run(self.run_layers, self.begin(*inputs), positions, mask))
         else:
             slots = cache.next_slots(x.shape[1]) if cache is not None else None
-            hidden = self.finish(self.run_layers(self.begin(*inputs), positions, cache, slots, mask))
+            layers = self.run_layers if packed is None else packed
+            hidden = self.finish(layers(self.begin(*inputs), positions, cache, slots, mask))
         if cache is not None:
             cache.length += tokens  # the next forward overwrites the padding
         return hidden[:, :tokens]
