@@ -144,7 +144,7 @@ def test_suites_expand_in_order_without_duplicates():
 
 
 def test_names_are_looked_for_in_every_environment():
-    assert set(specs()) == {"metaworld", "insertion"}
+    assert set(specs()) == {"metaworld", "libero", "insertion"}
     assert spec_of("fetch-peg") is specs()["insertion"]
     assert resolve_tasks(["insertion"]) == ("insert-peg", "fetch-peg")
     assert {"MT10", "INSERTION", "reach-v3", "insert-peg"} <= set(task_names())

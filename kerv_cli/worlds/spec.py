@@ -6,6 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib.metadata import PackageNotFoundError, version
 from typing import ClassVar, Self, TypeAlias
 
 import numpy as np
@@ -86,7 +87,8 @@ class EnvironmentSpec:
         expert_class: `module:class` that is called with (spec, task) and returns an `Expert`. Empty if there are none.
         upside_down: Cameras whose raw images must be rotated by 180 degrees.
         suffix: Ending of all full task names. Users may leave it out.
-        packages: Python packages whose versions determine the physics.
+        packages: Python packages whose versions determine the physics. The first one is the simulator's.
+        extra: Extra of kerv that installs the simulator: `pip install 'kerv[EXTRA]'`. Empty: kerv itself does.
         grip: Two values of the gripper's DoF: the one that closes it and the one that opens it. Empty if there is no
             gripper.
         seeds: Ranges of episode seeds.
@@ -106,6 +108,7 @@ class EnvironmentSpec:
     upside_down: tuple[str, ...] = ()
     suffix: str = ""
     packages: tuple[str, ...] = ()
+    extra: str = ""
     grip: tuple[float, float] | tuple[()] = ()
     seeds: Seeds = Seeds()
     experts: Mapping[str, str] = field(default_factory=dict)
@@ -204,6 +207,26 @@ class EnvironmentSpec:
             action[self.actions.is_strict] = closed + (opened - closed) * opening
         return action
 
+    @property
+    def installed(self) -> bool:
+        """Whether the simulator's package is installed. True if kerv itself installs it."""
+        try:
+            return not self.extra or bool(version(self.packages[0]))
+        except PackageNotFoundError:
+            return False
+
+    def check_installed(self) -> None:
+        """Refuse an environment whose simulator is not installed, or not in versions that work.
+
+        Raises:
+            UsageError: A package is missing or has a wrong version, or the environment is a recorded dataset.
+        """
+        if not self.world_class:
+            raise UsageError(f"{self.name} is a recording: no episode can run in it")
+        if not self.installed:
+            raise UsageError(f"{self.name} needs more packages: pip install 'kerv[{self.extra}]'")
+        load(self.world_class).check_installed()
+
     def open_world(self, task: str, camera: CameraSettings | None = None, horizon: int = 0) -> World:
         """Return a world for a task. Its simulator is built at the first reset.
 
@@ -214,10 +237,10 @@ class EnvironmentSpec:
 
         Raises:
             UnknownName: There is no such task or camera.
-            UsageError: The simulator cannot run so many control steps, or the environment is a recorded dataset.
+            UsageError: The simulator cannot run so many control steps or is not installed, or the environment is a
+                recorded dataset.
         """
-        if not self.world_class:
-            raise UsageError(f"{self.name} is a recording: no episode can run in it")
+        self.check_installed()
         world: World = load(self.world_class)(self, task, camera, horizon)
         return world
 
@@ -266,6 +289,10 @@ class World(ABC):
         self.steps, self.success, self.succeeded = 0, False, False
         self.stress: Stress = NO_STRESS
         self._observation: Observation | None = None
+
+    @classmethod  # noqa: B027 - most simulators come with kerv
+    def check_installed(cls) -> None:
+        """Raise UsageError if a package of the simulator is missing or has a version that does not work."""
 
     @abstractmethod
     def _start(self, seed: int) -> NDArray[np.float64]:

