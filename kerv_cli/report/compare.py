@@ -12,7 +12,7 @@ from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, without
 from kerv_cli.lab.plan import seeds_text
 from kerv_cli.report.measures import MICRO, Row, measure
 from kerv_cli.report.summary import DIFFERENCE, SPEEDS
-from kerv_cli.report.tables import StudyData, flatten, is_number, load_study, values_of
+from kerv_cli.report.tables import StudyData, differences, flatten, is_number, load_study, values_of
 
 _MEASURES = {
     "AL": "tokens per verification",
@@ -111,9 +111,8 @@ def compare(first: ComparedRun, second: ComparedRun) -> Row:
     Raises:
         UsageError: A setting has no episodes.
     """
-    ours, theirs = _settings_of(first), _settings_of(second)
-    pairs = {key: (ours.get(key), theirs.get(key)) for key in [*ours, *theirs]}
-    settings = [{"key": key, "first": a, "second": b} for key, (a, b) in pairs.items() if a != b]
+    differing = differences(_settings_of(first), _settings_of(second))
+    settings = [{"key": key, "first": ours, "second": theirs} for key, ours, theirs in differing]
     if first.data is None or second.data is None:
         figures = first.run.figures, second.run.figures
         results = [_change(name, *(side[name] for side in figures)) for name in figures[0] if name in figures[1]]

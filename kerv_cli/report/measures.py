@@ -178,28 +178,15 @@ def speedups(episodes: pd.DataFrame, pairs: pd.DataFrame, macro: bool, all_pairs
         all_pairs: Whether to use pairs that were not measured in one block, too.
     """
     timed = pairs if all_pairs else pairs[pairs["same_block"]]
-    usable = decodes(episodes) and is_timed(timed, "time_method") and is_timed(timed, "time_baseline")
-    times = {"speedup": "time", "episode_speedup": "seconds"}
-    return {name: _speedup(timed, time, macro) if usable else stats.NO_ESTIMATE for name, time in times.items()}
-
-
-def _speedup(pairs: pd.DataFrame, time: str, macro: bool) -> Estimate:
-    """Estimate the speedup over pairs.
-
-    Args:
-        pairs: Table made by `paired`.
-        time: `time` for seconds per control step, `seconds` for seconds per episode.
-        macro: Whether to average times over difficulty groups.
-    """
-    blocks = pairs["block_method"].astype(str) + "|" + pairs["block_baseline"].astype(str)
-    blocks = blocks.groupby([pairs["task"], pairs["seed"]]).transform("first")  # repeats of a world count once
-    return stats.speedup(
-        pairs[f"{time}_baseline"].to_numpy(),
-        pairs[f"{time}_method"].to_numpy(),
-        list(pairs["task"]),
-        list(pairs["difficulty"]) if macro else None,
-        list(blocks),
-    )
+    if not (decodes(episodes) and is_timed(timed, "time_method") and is_timed(timed, "time_baseline")):
+        return {"speedup": stats.NO_ESTIMATE, "episode_speedup": stats.NO_ESTIMATE}
+    blocks = timed["block_method"].astype(str) + "|" + timed["block_baseline"].astype(str)
+    blocks = blocks.groupby([timed["task"], timed["seed"]]).transform("first")  # repeats of a world count once
+    about = list(timed["task"]), list(timed["difficulty"]) if macro else None, list(blocks)
+    return {
+        name: stats.speedup(timed[f"{time}_baseline"].to_numpy(), timed[f"{time}_method"].to_numpy(), *about)
+        for name, time in (("speedup", "time"), ("episode_speedup", "seconds"))
+    }
 
 
 def _means(episodes: pd.DataFrame) -> dict[str, float]:

@@ -21,14 +21,23 @@ from kerv_cli.report.measures import MACRO, Row
 from kerv_cli.report.plots import about, latency_figure, library, study_figures
 from kerv_cli.report.reprice import ASSUMES, repriced_summary
 from kerv_cli.report.summary import MAIN, NOTE, SPEEDS, of_runs, summary_frame
-from kerv_cli.report.tables import StudyData, flatten, is_baseline, is_number, latency_table, load_study, rows_of
+from kerv_cli.report.tables import (
+    StudyData,
+    differences,
+    flatten,
+    is_baseline,
+    is_number,
+    latency_table,
+    load_study,
+    rows_of,
+)
 from kerv_cli.report.verdict import caution, question
 from kerv_cli.report.viewing.film import animation, film_of
 
 LOSS = 3.0
 """Default for the largest loss of success that the page's verdict accepts, in points."""
-_SLOWER = 2.0
-"""How many times slower than the robot films play."""
+_FRAMES = 240
+"""Films of more than half as many frames play faster than at half speed: all last a few seconds and stay small."""
 
 
 def render(
@@ -134,16 +143,15 @@ def _cell(row: Row) -> str:
 def _settings(data: StudyData) -> list[dict[str, Any]]:
     """Return every setting's label, overrides, and the values in which it differs from the one it is compared with."""
     flat = {label: flatten(without(one.settings, NOT_DETERMINING)) for label, one in data.settings.items()}
-    settings = []
-    for label, own in flat.items():
-        reference = data.references[label]
-        base = flat.get(reference, {})
-        pairs = {key: (base.get(key), own.get(key)) for key in [*base, *own]}
-        differs = [(key, *pair) for key, pair in pairs.items() if pair[0] != pair[1]]
-        settings.append(
-            {"label": label, "overrides": data.settings[label].overrides, "reference": reference, "differs": differs}
-        )
-    return settings
+    return [
+        {
+            "label": label,
+            "overrides": data.settings[label].overrides,
+            "reference": (reference := data.references[label]),
+            "differs": differences(flat.get(reference, {}), own),
+        }
+        for label, own in flat.items()
+    ]
 
 
 def _films(store: StudyStore, data: StudyData) -> list[dict[str, Any]]:
@@ -157,7 +165,8 @@ def _films(store: StudyStore, data: StudyData) -> list[dict[str, Any]]:
         if success is None or (method, success) in films or not path.is_file():
             continue
         if (film := film_of(path)).frames:
-            picture = base64.b64encode(animation(film, _SLOWER)).decode()
+            slower = min(2.0, _FRAMES / len(film.frames))
+            picture = base64.b64encode(animation(film, slower)).decode()
             films[method, success] = {"label": one.setting.label, "task": one.task, "seed": one.seed,
                                       "success": success, "steps": film.facts["steps"], "picture": picture}  # fmt: skip
     return list(films.values())

@@ -255,6 +255,12 @@ def flatten(settings: Plain) -> Row:
     return {k: _joined(v) if isinstance(v, list | tuple) else v for k, v in flat(settings).items()}
 
 
+def differences(first: Row, second: Row) -> list[tuple[str, Any, Any]]:
+    """Return every key whose values differ, with both values. None: one side does not have the key."""
+    pairs = ((key, first.get(key), second.get(key)) for key in first | second)
+    return [pair for pair in pairs if pair[1] != pair[2]]
+
+
 def _joined(values: Iterable[object]) -> str:
     return ";".join(dict.fromkeys(str(value) for value in values))
 
