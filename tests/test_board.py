@@ -42,6 +42,9 @@ def folder(tmp_path_factory):
     swept(results, threshold_study(TASKS, 2, (3,), name="few"))
     with pytest.raises(KervError), Run(Database(results), "target", "mine", ["train", "target", "name=mine"], 600):
         raise KervError("the disk is full")
+    training = results / "artifacts" / "target" / "mine"
+    training.mkdir(parents=True)
+    (training / "log.csv").write_text("step,score,train_loss\n100,0.5,2.0\n200,0.6,1.5\n")
     return results
 
 
@@ -235,12 +238,13 @@ def test_runs_are_filtered_sorted_and_compared_with_the_keyboard(folder, open_pa
         assert page.url.endswith("#main"), "the first key skips the navigation"
 
 
-def test_a_failed_run_says_why_and_what_to_type(folder, open_page):
+def test_a_failed_training_shows_its_curves_why_it_failed_and_what_to_type(folder, open_page):
     with served(folder) as address:
         page = open_page(address)
         page.get_by_role("link", name="target/mine").click()
         assert "the disk is full" in page.locator("main").inner_text()
         assert "kerv train target name=mine" in page.locator(".command").inner_text()
+        page.locator(".chart svg").get_by_text("train_loss").wait_for()
 
 
 def test_a_study_shows_numbers_on_hovering_and_differences_on_a_click(folder, open_page):

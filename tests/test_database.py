@@ -19,7 +19,7 @@ from kerv_cli.catalogue.imports import import_results
 from kerv_cli.episodes.rows import decodes_table, episode_row
 from kerv_cli.lab import database as module
 from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, FILE, RUNS, STUDIES, Database
-from kerv_cli.lab.runs import Run, run_rows
+from kerv_cli.lab.runs import Run, pulse, run_rows, time_left
 from kerv_cli.lab.store import StudyStore, studies
 from kerv_cli.report.tables import load_study
 
@@ -272,3 +272,21 @@ def test_a_run_has_a_row_from_its_first_second_to_its_end(database, monkeypatch)
     with pytest.raises(ValueError, match="two"), Run(database, "target", "mine", ["train", "target"]):
         raise ValueError("two\nlines")
     assert row() == ("failed", 0, 0, "two lines")
+
+
+def test_one_query_says_whether_anything_has_changed(database):
+    seen = [pulse(database)]
+    with Run(database, "target", "mine", ["train", "target"]) as record:
+        seen.append(pulse(database))
+        record.beat(3, 9)
+        seen.append(pulse(database))
+        assert time_left(run_rows(database)[0]).endswith("left")
+    seen.append(pulse(database))
+    store, _ = swept(database.results, STUDY)
+    seen.append(pulse(database))
+    assert [is_live for _, is_live in seen] == [False, True, True, False, False]
+    assert len({version for version, _ in seen}) == len(seen)
+    assert pulse(database) == seen[-1]
+    before = store.version()
+    swept(database.results, STUDY, rerun="all")
+    assert store.version() != before
