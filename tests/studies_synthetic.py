@@ -130,6 +130,7 @@ def episode(setting: Setting, task: str, seed: int) -> EpisodeRecord:
         still_episode(task, seed, bool(difficulty < 0.9 - 0.015 * max(0, r - 5)), decodes, 4),
         initial_state=initial_state,
         closest_approach=0.04 * difficulty,
+        object_moved=0.02,
         wall_seconds=2.0 * sum(d.seconds for d in decodes),
     )
 
