@@ -172,7 +172,8 @@ class SummaryTable:
             f"{first['study']}: {counts}, {first['device_name']}, {first['runtime.dtype']}", "bold", overflow="fold"
         )
         frame = summary_frame(self.table)
-        for part in _parts(frame if self.all else frame.iloc[:, :MAIN], options.max_width):
+        own = [name for name in frame.columns if name.replace(" ", "_") in registered_columns()]  # of plugins
+        for part in _parts(frame if self.all else frame[[*frame.columns[:MAIN], *own]], options.max_width):
             yield _printed(part)
         several = ", under the same stress and clock" if rows["baseline"].nunique() > 1 else ""
         yield Text(f"{NOTE} {of_runs(self.table)} Baseline: {first['baseline']}{several}.")
