@@ -124,6 +124,7 @@ def edited(results: Path, tmp_path: Path, **changes: Any) -> Path:
     ("changes", "words", "said"),
     [
         ({}, ["source="], "source=DIR"),
+        ({}, ["source=meta"], "of a LeRobot dataset of version 3"),
         ({"codebase_version": "v2.1"}, [], "v2.1"),
         ({"features": {"action": {"dtype": "float32", "shape": [7]}}}, [], "no images"),
         ({}, ["camera=side"], "unknown camera 'side': known: front"),
@@ -135,7 +136,7 @@ def edited(results: Path, tmp_path: Path, **changes: Any) -> Path:
 def test_an_import_refuses_in_one_line(results, tmp_path, changes, words, said):
     source = edited(results, tmp_path, **changes)
     (tmp_path / "artifacts/demos/front").mkdir(parents=True)
-    given = words if words == ["source="] else [f"source={source}", *words]
+    given = words if words and words[0].startswith("source=") else [f"source={source}", *words]
     code, line = kerv("demos", "import", *given, f"results={tmp_path}")
     assert code in (1, 2)
     assert said in line

@@ -11,11 +11,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import sqlalchemy as sa
 from command import told
 from test_calibration import write_dataset
 
 from kerv_cli.base import files
 from kerv_cli.episodes.resolve import resolve, resolve_rollout
+from kerv_cli.lab.database import RUNS, Database
 from kerv_cli.targets.folders import RESUME
 from kerv_cli.training.preparation import needs
 
@@ -42,7 +44,7 @@ def results(policies, tmp_path, monkeypatch):
 @pytest.mark.parametrize("command", ["build datastore", "calibrate"])
 def test_tasks_and_demonstrations_are_those_of_the_target(command):
     plan = " ".join(told(*command.split(), MINE, "--plan").split())
-    assert "1 tasks" in plan
+    assert "of 1 task, " in plan
     assert "2 tasks" in " ".join(told(*command.split(), MINE, "task=[reach,push]", "--plan").split())
 
 
@@ -53,7 +55,7 @@ def test_a_target_is_trained_on_the_demonstrations_that_are_named(results):
     assert "no episode of drawer-open-v3" in refused
     assert "'kerv demos task=drawer-open-v3'" in refused
     (results / "artifacts/demos/few").rename(results / "artifacts/demos/reach")
-    assert "4 demonstrations of 1 tasks" in told("train", "target", "name=new", "task=reach", "--plan")
+    assert "4 demonstrations of 1 task," in told("train", "target", "name=new", "task=reach", "--plan")
 
 
 def test_missing_demonstrations_are_recorded_by_the_command_that_is_named(results):
@@ -102,6 +104,24 @@ def test_prepare_makes_what_is_missing_and_skips_what_is_there(results):
     path = results / "artifacts/drafter/mine/drafter.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"target": "0" * 64}))
     assert "kerv runs rm drafter/mine'" in told("prepare", MINE, "--plan", code=1)
+
+
+@pytest.mark.usefixtures("few_validations")
+def test_a_plan_takes_its_time_from_the_most_similar_command_on_this_machine(results):
+    train = ("train", "target", "demos=few", "target=nano", "target.observation=state")
+    assert "time unknown" in told(*train, "name=new", "train.steps=4", "--plan")
+    for name, steps, minutes in (("short", 2, 1), ("long", 100, 5)):
+        told(*train, f"name={name}", "train.steps=2")
+        times = {"started": "2026-01-01T00:00:00+00:00", "finished": f"2026-01-01T00:0{minutes}:00+00:00"}
+        with Database(results).writing() as connection:
+            connection.execute(sa.update(RUNS).where(RUNS.c.name == name).values(total=steps, **times))
+    assert "about 2 min (at the speed of target/short)" in told(*train, "name=new", "train.steps=4", "--plan")
+    assert "about 3 min (at the speed of target/long)" in told(*train, "name=new", "train.steps=60", "--plan")
+    assert "time unknown" in told(*train, "name=new", "train.batch=8", "--plan")
+    with Database(results).writing() as connection:
+        connection.execute(sa.update(RUNS).values(host="another"))
+    assert "time unknown" in told(*train, "name=new", "--plan")
+    assert "early: time unknown" in told("prepare", MINE, "--plan")
 
 
 @pytest.mark.usefixtures("few_validations")

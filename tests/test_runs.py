@@ -109,6 +109,7 @@ def test_comparison_says_what_differs_in_settings_and_results(results):
     assert found["settings"] == [{"key": "threshold.r", "first": 5, "second": 9}]
     measures = {row["measure"]: row for row in found["results"]}
     assert measures["pairs"]["change"] == 2
+    assert measures["speed, per step"]["change"] > 0
     assert measures["success"]["low"] <= measures["success"]["change"] <= measures["success"]["high"]
     single = next(run["id"] for run in listed(results, "method=ar"))
     kerv("runs", "compare", single, "target/nano-state", f"results={results}", code=2)
@@ -123,6 +124,9 @@ def test_a_rerun_repeats_the_tokens_in_a_folder_of_its_own(results, tmp_path):
     told = json.loads(works("runs", "rerun", single, f"results={copy}", "--json"))
     assert (told["episodes"], told["same_tokens"]) == (2, 2)
     assert told["run"] != single
+    shown = works("runs", "compare", single, told["run"], f"results={copy}")
+    assert "not timed in turn" in shown  # they ran one after the other, perhaps on a machine in another state
+    assert "speed, per step" not in shown
     with Database(copy).writing() as connection:  # as a kill leaves it
         connection.execute(sa.update(RUNS).where(RUNS.c.name == told["run"]).values(status=INTERRUPTED))
         last = sa.select(sa.func.max(EPISODES.c.id)).scalar_subquery()

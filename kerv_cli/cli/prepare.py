@@ -29,6 +29,8 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
 
     Existing artifacts are skipped. The same command continues after an interruption.
     """
+    from kerv_cli.lab.database import Database
+    from kerv_cli.lab.runs import time_of
     from kerv_cli.training.preparation import THERE, Step
     from kerv_cli.training.preparation import plan as planned
 
@@ -42,6 +44,10 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
     steps, name = planned(settings), settings.policy.target
     print_table(("what", "state", "command"), [(s.kind, s.state, f"kerv {line(s)}") for s in steps], name)
     if plan:
+        database = Database(settings.results)
+        for step in steps:
+            if step.state != THERE:
+                typer.echo(f"{step.kind}: {time_of(database, step.kind, shlex.split(line(step)), step.steps)}")
         return
     for kind in [step.kind for step in steps]:
         # planned again before each step: an artifact that was just made can make a later one outdated

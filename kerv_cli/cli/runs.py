@@ -156,6 +156,8 @@ def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False
         else:
             typer.echo("no difference in settings, weights, machine or versions")
         print_rows([_result_cells(row) for row in comparison["results"]])
+        if comparison["note"]:
+            typer.echo(comparison["note"])
 
 
 def _result_cells(row: Row) -> dict[str, str]:

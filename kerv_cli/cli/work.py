@@ -237,10 +237,14 @@ def run_training(
     Raises:
         UsageError: Another process is training the same artifact.
     """
-    if plan:
-        end_with_plan(run.plan(), as_json)
-    from kerv_cli.lab.runs import making
+    from kerv_cli.lab.command import current_command
+    from kerv_cli.lab.database import Database
+    from kerv_cli.lab.runs import making, time_of
 
+    if plan:
+        database, words = Database(run.settings.results), list(command) or current_command()
+        time = time_of(database, run.artifact_kind, words, run.settings.train.steps)
+        end_with_plan(f"{run.plan()}, {time}", as_json)
     with making(run.settings.results, run.artifact_kind, run.folder, command) as record:
         metrics, plot = _train(run, record, loading, training)
     if as_json:

@@ -6,6 +6,7 @@ A row says which process runs the command, how far it is, and how it ended.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import secrets
 import socket
@@ -20,7 +21,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from kerv_cli.base.durations import left
+from kerv_cli.base.durations import about, left
 from kerv_cli.base.errors import Interrupted, KervError, StorageError, UsageError
 from kerv_cli.base.leftovers import is_alive
 from kerv_cli.base.places import results_dir
@@ -98,6 +99,46 @@ def time_left(row: RunRow) -> str:
     if row.status != RUNNING or not 0 < row.done < row.total:
         return ""
     return left(row.heartbeat - datetime.fromisoformat(row.started).timestamp(), row.done, row.total)
+
+
+def time_of(database: Database, kind: str, command: Sequence[str], units: int = 0) -> str:
+    """Say how long a command will take, from an earlier one on this machine with the same options.
+
+    Names, tasks and numbers of steps or episodes may differ. Of several earlier commands, the one with the most similar
+    number of units counts, then the newest. Resumed and repeated commands do not count.
+
+    Args:
+        database: The database.
+        kind: Kind of the artifact that the command makes.
+        command: Command-line arguments after `kerv`.
+        units: Number of steps or episodes. 0: as many as the earlier command.
+
+    Returns:
+        The duration and the earlier command's artifact as text. If there is no such command, the text says so.
+    """
+    rows = run_rows(database, kind)
+    first, wanted = {row.name: row.id for row in rows}, _options(command)
+    similar = [
+        row
+        for row in rows
+        if row.status == COMPLETE and row.host == socket.gethostname() and first[row.name] == row.id and row.finished
+        if (row.total or not units) and _options(row.command) == wanted
+    ]
+    if not similar:
+        return "time unknown, nothing like it has run on this machine"
+    row = min(similar, key=lambda row: abs(math.log(units / row.total))) if units else similar[0]
+    seconds = (datetime.fromisoformat(str(row.finished)) - datetime.fromisoformat(row.started)).total_seconds()
+    return about(seconds * (units / row.total if units else 1), f"at the speed of {kind}/{row.name}")
+
+
+_SIZES = ("name", "task", "demos", "episodes", "seed", "train.steps", "results", "store", "policy.target")
+"""Settings in which two commands may differ although they work at the same speed."""
+
+
+def _options(command: Sequence[str]) -> set[str]:
+    """Return the arguments of a command that change its speed."""
+    keys = {word: word.split("=")[0] for word in command if not word.startswith("--")}
+    return {word for word, key in keys.items() if key not in _SIZES and not key.startswith("policy.artifacts")}
 
 
 def pulse(database: Database) -> tuple[str, bool]:

@@ -106,7 +106,7 @@ def compare(first: ComparedRun, second: ComparedRun) -> Row:
     Returns:
         `first` and `second`: the two names. `settings`: every key whose values differ, with both values; None if one
         side does not have the key. `results`: for each measure both values, the change, and the change's 95 % interval
-        if there is one.
+        if there is one. `note`: why there is no ratio of times, or "".
 
     Raises:
         UsageError: A setting has no episodes.
@@ -116,9 +116,12 @@ def compare(first: ComparedRun, second: ComparedRun) -> Row:
     if first.data is None or second.data is None:
         figures = first.run.figures, second.run.figures
         results = [_change(name, *(side[name] for side in figures)) for name in figures[0] if name in figures[1]]
+        is_timed = True
     else:
         results = _episode_results(first.episodes, second.episodes)
-    return {"first": first.name, "second": second.name, "settings": settings, "results": results}
+        is_timed = any(row["measure"] in SPEEDS.values() for row in results)
+    note = "" if is_timed else "no ratio of times: the two were not timed in turn, in one study"
+    return {"first": first.name, "second": second.name, "settings": settings, "results": results, "note": note}
 
 
 def _settings_of(side: ComparedRun) -> Row:
@@ -145,9 +148,13 @@ def _settings_of(side: ComparedRun) -> Row:
 def _episode_results(first: pd.DataFrame, second: pd.DataFrame) -> list[Row]:
     if first.empty or second.empty:
         raise UsageError("one of the two settings has no episode yet: run it first")
-    a, b = measure(first, first, MICRO), measure(second, first, MICRO, all_pairs=True)
+    a, b = measure(first, first, MICRO), measure(second, first, MICRO)
     rows = [_change("success", a["success"], b["success"]) | _interval(b, "difference", DIFFERENCE)]
-    rows += [_change(head, 1.0, b[name]) | _interval(b, name, "ratio of times") for name, head in SPEEDS.items()]
+    rows += [
+        _change(head, 1.0, b[name]) | _interval(b, name, "ratio of times")
+        for name, head in SPEEDS.items()
+        if is_number(b[name])  # not if the two were not measured in turn
+    ]
     rows += [
         _change(heading, a[name], b[name])
         for name, heading in _MEASURES.items()

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError, KervError
 from kerv_cli.base.files import read_mapping, write_json
 from kerv_cli.base.spaces import ActionSpace
@@ -111,8 +112,9 @@ class CalibrationRun:
         held_out, settings = sum(self.chosen.values()), self.settings
         without = f"; without {' and '.join(self.missing)}" if self.missing else ""
         return (
-            f"{self.path}: predictors fitted on {len(self.chosen) - held_out} demonstrations of {len(self.tasks)} "
-            f"tasks, tested on {held_out}; {settings.decodes} decodes per task with {settings.proposer.kind} drafts; "
+            f"{self.path}: predictors fitted on {count(len(self.chosen) - held_out, 'demonstration')} of "
+            f"{count(len(self.tasks), 'task')}, tested on {held_out}; "
+            f"{settings.decodes} decodes per task with {settings.proposer.kind} drafts; "
             f"boundary over {', '.join(map(str, settings.boundary_windows))} positions{without}"
         )
 

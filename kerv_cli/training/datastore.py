@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
 
+from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import read_mapping, sha256_of, visible, write_folder, write_json
 from kerv_cli.base.runtime import set_up
@@ -74,7 +75,7 @@ class DatastoreBuild:
         """Return one line that `--plan` prints: episodes, tasks, target and folder."""
         episodes = [self.dataset.episodes[i] for chosen in self.chosen.values() for i in chosen]
         return (
-            f"{self.folder}: {len(episodes)} demonstrations of {len(self.chosen)} tasks, "
+            f"{self.folder}: {count(len(episodes), 'demonstration')} of {count(len(self.chosen), 'task')}, "
             f"{sum(episode.steps for episode in episodes)} control steps, through {self.artifacts.folder}, keys from "
             f"{' + '.join(self.settings.key)}"
         )

@@ -17,7 +17,7 @@ from kerv_cli.methods.artifacts import Artifacts, kind_of, removal
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.drafters import TrainableDrafter
 from kerv_cli.training.demonstrations import demos_for
-from kerv_cli.training.settings import PrepareSettings
+from kerv_cli.training.settings import PrepareSettings, TrainDrafterSettings
 from kerv_cli.worlds import specs
 
 THERE, MISSING = "there", "missing"
@@ -32,11 +32,13 @@ class Step:
         state: `there`, `missing`, `unfinished`, `of other artifacts` (made from others than the present ones) or,
             while it trains, `step 300 of 4000`.
         command: Command-line arguments after `kerv` that make the artifact, without the arguments that all steps share.
+        steps: Number of optimisation steps. 0 if it is no training.
     """
 
     kind: str
     state: str
     command: tuple[str, ...]
+    steps: int = 0
 
 
 def plan(settings: PrepareSettings) -> list[Step]:
@@ -56,10 +58,12 @@ def plan(settings: PrepareSettings) -> list[Step]:
     steps: list[Step] = []
     for kind in kinds:
         files = kind_of(kind)
-        command = files.command
-        if isinstance(files, TrainableDrafter) and settings.steps:
-            command = (*command, f"train.steps={settings.steps}")
-        steps.append(Step(kind, _state(artifacts, kind, kinds), command))
+        command, number = files.command, 0
+        if isinstance(files, TrainableDrafter):
+            if settings.steps:
+                command = (*command, f"train.steps={settings.steps}")
+            number = compose("train_drafter", command[2:], TrainDrafterSettings).train.steps
+        steps.append(Step(kind, _state(artifacts, kind, kinds), command, number))
     if any(step.state != THERE and not find("artifact", step.kind).traits.get("study") for step in steps):
         demos_for(settings)
     return steps

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.places import artifact
 from kerv_cli.base.runtime import set_up
@@ -117,8 +118,8 @@ class TargetRun(TrainingRun):
         target, train = self.settings.target, self.settings.train
         episodes = [episode for episode in self.dataset.episodes if episode.task in self.tasks]
         return (
-            f"{self.folder}: {target.size} on {target.observation}, {len(episodes)} demonstrations of "
-            f"{len(self.tasks)} tasks, {train.steps} steps of {train.batch} samples"
+            f"{self.folder}: {target.size} on {target.observation}, {count(len(episodes), 'demonstration')} of "
+            f"{count(len(self.tasks), 'task')}, {count(train.steps, 'step')} of {train.batch} samples"
             + (f", starting from {self.init}" if self.init else "")
         )
 

@@ -257,6 +257,11 @@ class Source:
         """
         if folder.is_file():
             raise UsageError(f"{folder} is a file: name the folder of a LeRobot dataset, which holds meta/")
+        if not (folder / INFO).is_file():
+            raise CheckpointError(
+                f"{folder / INFO} is missing: source= names the folder of a LeRobot dataset of version 3, with meta/, "
+                "data/ and videos/"
+            )
         info = read_mapping(folder / INFO)
         version = str(info.get("codebase_version"))
         if not version.startswith("v3."):
