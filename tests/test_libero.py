@@ -8,6 +8,7 @@ import pytest
 from command import kerv
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.cli.common import print_table
 from kerv_cli.worlds import spec as spec_module
 from kerv_cli.worlds.conformance import check_environment
 from kerv_cli.worlds.demos.dataset import DemoDataset
@@ -28,6 +29,11 @@ def test_without_the_extra_a_command_says_what_to_install(command, tmp_path, mon
     monkeypatch.setattr(spec_module, "version", absent)
     run = kerv(*command.split(), "task=bowl-on-stove", f"results={tmp_path}", code=2)
     assert "pip install 'kerv[libero]'" in run.output
+
+
+def test_a_table_keeps_an_extra_in_brackets(capsys):
+    print_table(["finding"], [["pip install 'kerv[libero]'"]])
+    assert "'kerv[libero]'" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

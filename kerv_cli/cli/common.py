@@ -216,7 +216,7 @@ def print_table(columns: Iterable[str], rows: Iterable[Iterable[object]], title:
         table.add_row(*map(str, row))
     if title:
         typer.echo(title)
-    console().print(table)
+    console().print(table, markup=False)  # cells may name an extra in brackets
 
 
 def print_rows(rows: Sequence[Mapping[str, object]], title: str | None = None) -> None:
