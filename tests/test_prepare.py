@@ -115,7 +115,7 @@ def test_a_plan_takes_its_time_from_the_most_similar_command_on_this_machine(res
         times = {"started": "2026-01-01T00:00:00+00:00", "finished": f"2026-01-01T00:0{minutes}:00+00:00"}
         with Database(results).writing() as connection:
             connection.execute(sa.update(RUNS).where(RUNS.c.name == name).values(total=steps, **times))
-    assert "about 2 min (at the speed of target/short)" in told(*train, "name=new", "train.steps=4", "--plan")
+    assert "about 115 s (at the speed of target/short)" in told(*train, "name=new", "train.steps=4", "--plan")
     assert "about 3 min (at the speed of target/long)" in told(*train, "name=new", "train.steps=60", "--plan")
     assert "time unknown" in told(*train, "name=new", "train.batch=8", "--plan")
     with Database(results).writing() as connection:

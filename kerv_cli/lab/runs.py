@@ -33,6 +33,8 @@ RUNNING, COMPLETE, FAILED, INTERRUPTED = "running", "complete", "failed", "inter
 
 BEAT_SECONDS = 5.0
 """Seconds between two heartbeats of a run."""
+LOADING_SECONDS = 5.0
+"""Guess of the part of a command's time that does not grow with its work: loading libraries and the simulator."""
 STALE_SECONDS = 900.0
 """A run on another machine counts as dead after so many seconds without a heartbeat."""
 
@@ -128,7 +130,9 @@ def time_of(database: Database, kind: str, command: Sequence[str], units: int = 
         return "time unknown, nothing like it has run on this machine"
     row = min(similar, key=lambda row: abs(math.log(units / row.total))) if units else similar[0]
     seconds = (datetime.fromisoformat(str(row.finished)) - datetime.fromisoformat(row.started)).total_seconds()
-    return about(seconds * (units / row.total if units else 1), f"at the speed of {kind}/{row.name}")
+    loading = min(LOADING_SECONDS, seconds / 2)
+    scaled = loading + (seconds - loading) * (units / row.total if units else 1)
+    return about(scaled, f"at the speed of {kind}/{row.name}")
 
 
 _SIZES = ("name", "task", "demos", "episodes", "seed", "train.steps", "results", "store", "policy.target")
