@@ -231,6 +231,14 @@ def test_prepare_refuses_what_cannot_be(words, says):
     assert says in told("prepare", *words, code=2)
 
 
+def test_a_target_whose_training_was_interrupted_is_finished_by_the_command_that_is_shown(results):
+    train = ["train", "target", "name=new", "demos=few", "target=nano", "target.observation=state", "train.steps=2"]
+    told(*train)
+    (results / "artifacts/target/new/target.json").unlink()  # as before the first validation
+    (shown,) = typed(told("prepare", "policy.target=new", code=2))
+    assert f"kerv {' '.join(train)}" in told(*shown)
+
+
 @pytest.mark.usefixtures("results")
 @pytest.mark.parametrize("command", ["prepare", "build datastore", "calibrate", "train drafter", "rollout", "serve"])
 def test_a_wrong_target_is_noticed_before_anything_else(command):

@@ -47,6 +47,11 @@ def find_target(results: str, name: str) -> Path:
             f"policy '{name}' is not in this wheel: fetch {name}.tar.gz of the release, then 'mkdir -p {policies} && "
             f"tar -xzf {name}.tar.gz -C {policies}'"
         )
+    if (folders[0] / RESUME).is_file():
+        raise UsageError(
+            f"target '{name}' is unfinished: 'kerv runs show target/{name} results={results}' shows the command that "
+            "goes on with its training"
+        )
     names = target_names(results)
     raise UsageError(
         f"no target '{name}' in {', '.join(map(str, folders))}: train it with 'kerv train target name={name}'"
