@@ -95,7 +95,7 @@ def test_everything_trains_on_recorded_observations_of_an_openvla(results):
     short = ["train.steps=2", "train.batch=2", "train.warmup=1", "train.validate_every=2", "drafter.samples=6"]
     assert kerv("train", "drafter", *common, *short, "train.held_out=0.5")[0] == 0
     assert kerv("train", "drafter", "drafter=early", *common, *short, "train.held_out=0.5")[0] == 0
-    assert kerv("build", "datastore", *common, "task=BACK", "key=[vision]", "stride=4")[0] == 0
+    assert kerv("build", "datastore", *common, "task=BACK", "key=[vision]")[0] == 0
     calibrate = ["calibrate", *common, "task=BACK", "decodes=2", "held_out=0.5", "window=5", "boundary_windows=[5]"]
     assert kerv(*calibrate)[0] == 0
     made = json.loads((results / "artifacts/calibration/rec/calibration.json").read_text())

@@ -240,8 +240,9 @@ class Artifacts:
         self, results: str, policy: PolicySettings, search: Any = None, device: str = "cpu", dtype: str = "float32"
     ) -> None:
         self.results, self.policy, self.search, self.device, self.dtype = results, policy, search, device, dtype
-        for kind in policy.artifacts:
-            find("artifact", kind, "policy.artifacts")
+        for kind, name in policy.artifacts.items():
+            if name is not None:  # settings stored beside a plugin name its kinds, which need not be here now
+                find("artifact", kind, "policy.artifacts")
         self.folder = find_target(results, policy.target)
 
     @functools.cached_property

@@ -112,7 +112,7 @@ def settled(world: W, spec: EnvironmentSpec) -> W:
 
 
 add("environment", "metaworld", "kerv_cli.worlds.metaworld.spec:SPEC", names="kerv_cli.worlds.metaworld.tasks:NAMES")
-add("environment", "libero", "kerv_cli.worlds.libero.spec:SPEC")
+add("environment", "libero", "kerv_cli.worlds.libero.spec:SPEC", names="kerv_cli.worlds.libero.tasks:NAMES")
 for _name, _class, _needed in (
     ("push", "kinds:Push", ("actions", "position")),
     ("actuation", "kinds:Actuation", ("actions",)),

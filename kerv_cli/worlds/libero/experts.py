@@ -14,9 +14,6 @@ from scipy.spatial.transform import Rotation
 from kerv_cli.base.spaces import Observation
 from kerv_cli.worlds.spec import EnvironmentSpec
 
-VERSION = "kerv 1"
-"""Name of these experts in recordings and in the identity of `policy=expert`. Raise it if their actions change."""
-
 _LEFT, _RIGHT, _ALONG_DRAWER = -90.0, 90.0, 154.0
 _SIDES = {
     "bowl-next-to-ramekin": _RIGHT,

@@ -3,32 +3,15 @@
 from __future__ import annotations
 
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, Place
-from kerv_cli.worlds.libero.experts import VERSION
+from kerv_cli.worlds.libero.tasks import INSTRUCTIONS, SUITE
 from kerv_cli.worlds.spec import EnvironmentSpec, Seeds
 from kerv_cli.worlds.task import Task
 
+EXPERTS = "kerv 1"
+"""Name of the experts in recordings and in the identity of `policy=expert`. Raise it if their actions change."""
 STATES = 50
 """Initial states that the benchmark has for each task."""
 _FIRST = 100_000
-
-_WHERE = (
-    "between the plate and the ramekin",
-    "next to the ramekin",
-    "from table center",
-    "on the cookie box",
-    "in the top drawer of the wooden cabinet",
-    "on the ramekin",
-    "next to the cookie box",
-    "on the stove",
-    "next to the plate",
-    "on the wooden cabinet",
-)
-_INSTRUCTIONS = {
-    f"bowl-{where.replace(' the', '').replace('the ', '').replace(' ', '-')}": (
-        f"pick up the black bowl {where} and place it on the plate"
-    )
-    for where in _WHERE
-}
 
 SPEC = EnvironmentSpec(
     name="libero",
@@ -50,8 +33,8 @@ SPEC = EnvironmentSpec(
         centre=(0.0, 0.0, 1.0),
         previous=(10, 13),
     ),
-    tasks={name: Task(name, text, "spatial") for name, text in _INSTRUCTIONS.items()},
-    suites={"LIBERO_SPATIAL": tuple(_INSTRUCTIONS)},
+    tasks={name: Task(name, text, "spatial") for name, text in INSTRUCTIONS.items()},
+    suites={SUITE: tuple(INSTRUCTIONS)},
     difficulties=("spatial",),
     horizon=220,  # as in OpenVLA's evaluation
     cameras=("agentview", "robot0_eye_in_hand", "frontview", "sideview"),
@@ -61,5 +44,5 @@ SPEC = EnvironmentSpec(
     extra="libero",
     grip=(1.0, -1.0),
     seeds=Seeds(evaluation=range(_FIRST, _FIRST + STATES)),
-    experts=dict.fromkeys(_INSTRUCTIONS, VERSION),
+    experts=dict.fromkeys(INSTRUCTIONS, EXPERTS),
 )
