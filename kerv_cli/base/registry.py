@@ -54,7 +54,7 @@ PART_GROUPS = (*METHOD_KINDS, "datastore")
 choices."""
 
 SETTINGS_GROUPS = (*PART_GROUPS, "drafter")
-"""All groups of settings that choose a part: those of a rollout, and `drafter=`, the artifact that is trained."""
+"""The groups of a rollout that choose a part, and `drafter=`, which chooses the drafter that is trained."""
 
 DRAFTING = "draft"
 """Kind of cost of a proposer that drafts with a drafter layer of the target's shape (docs/measuring.md)."""

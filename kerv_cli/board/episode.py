@@ -34,7 +34,7 @@ from kerv_cli.report.viewing.viewer import viewer_command
 from kerv_cli.worlds import specs
 
 SLOWER = 2
-"""Films play so many times slower than the robot moved."""
+"""How many times slower than the robot a film plays."""
 RECORDER = Recorder()
 
 
@@ -54,7 +54,11 @@ def _names(task: str, decodes: Sequence[DecodeRecord]) -> Sequence[str]:
 
 
 def command_of(found: FoundEpisode) -> tuple[str, str]:
-    """Return the command that repeats an episode, and why there is none. One of the two is empty."""
+    """Return the command that repeats an episode, or the reason why there is none.
+
+    Returns:
+        (command, reason). One of them is empty.
+    """
     from kerv_cli.episodes.repeat import repeating_words  # imports torch, which takes seconds
 
     episode, results = found.episode, str(found.store.database.results)

@@ -62,7 +62,7 @@ def render(request: Request, template: str, status: int = 200, **values: Any) ->
 
 
 def inside(request: Request, path: Path) -> Path:
-    """Return a path if it lies in the results folder, symbolic links followed.
+    """Resolve the symbolic links of a path, which must be in the results folder.
 
     Raises:
         HTTPException: There is no such file, or it is outside.

@@ -15,7 +15,7 @@ from kerv_cli.catalogue.episodes import FoundEpisode
 from kerv_cli.lab.plan import Setting
 
 IDLE_SECONDS = 60
-"""The process ends after so many seconds without work, and frees its memory."""
+"""Seconds without work after which the recording process ends, to free its memory."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def record_episode(setting: Setting, task: str, seeds: list[int], results: str, 
     Args:
         setting: Its setting.
         task: Its task.
-        seeds: Its seed, after those of the episodes that must run before it.
+        seeds: Seeds of the episodes that must run before it, then its own.
         results: The results folder, which has its weights and data.
         path: File to write.
 

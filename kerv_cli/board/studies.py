@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import os
-import shlex
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -59,7 +58,6 @@ def show_study(request: Request) -> Response:
         "study_page.html",
         run=run,
         title=run.id,
-        command=shlex.join(["kerv", *run.command]) if run.command else "",
         parents=parents(run, runs),
         known={one.id for one in runs},
         version=version,
@@ -96,7 +94,7 @@ def show_tables(request: Request) -> Response:
 
 
 def _episodes_of(study: str) -> Callable[[str, str, str], str]:
-    """Return a function that returns the address of the episodes behind a cell of the table by task.
+    """Return a function that links a cell of the table by task to its episodes.
 
     Its arguments are the heading of the table's first column (`task` or `setting`), the row's name, and the column's.
     """

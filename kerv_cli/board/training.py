@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
@@ -30,7 +28,6 @@ def show_artifact(request: Request) -> Response:
         request,
         "artifact.html",
         run=run,
-        command=shlex.join(["kerv", *run.command]) if run.command else "",
         size=disk_bytes(run.folder),
         parents=parents(run, runs),
         children=children(run, runs),

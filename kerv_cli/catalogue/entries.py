@@ -10,6 +10,7 @@ import io
 import itertools
 import os
 import re
+import shlex
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -86,6 +87,11 @@ class RunEntry:
     command: tuple[str, ...] = ()
     sha256: str = ""
     made_from: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def command_line(self) -> str:
+        """The command that made it, as it is typed. Empty if unknown."""
+        return shlex.join(["kerv", *self.command]) if self.command else ""
 
     @property
     def has_episodes(self) -> bool:

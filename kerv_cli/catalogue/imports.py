@@ -116,7 +116,7 @@ def is_results(path: Path) -> bool:
 
 
 def _database_of(path: Path) -> Path | None:
-    """Return the database file: the path itself, or kerv.db in the folder. None if there is none."""
+    """Find a database: `path` itself, or kerv.db in the folder `path`. Return None if there is none."""
     file = path / FILE if path.is_dir() else path
     return file if file.is_file() and file.suffix == Path(FILE).suffix else None
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -128,7 +127,7 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
     if as_json:
         rows = [] if table is None else rows_of(table)
         end_with_json({**_entry_row(run), "made_from": origin, "bytes": size, "settings": rows})
-    line = shlex.join(["kerv", *run.command]) if run.command else "unknown"
+    line = run.command_line or "unknown"
     lines = {"run": run.id, "kind": run.kind, "state": run.state, "started": run.started, "folder": run.folder}
     parts = {"made from": ", ".join(f"{kind} {name}" for kind, name in origin.items())} if origin else {}
     words = "command" if run.has_episodes else "made by"
@@ -187,7 +186,7 @@ def rerun(
         run_training(training_again(run, results), plan, as_json, "reading what it needs", "training again", command)
         return
     if run.kind not in ("sweep", "rollout"):
-        made = f", which '{shlex.join(['kerv', *run.command])}' makes" if run.command else ""
+        made = f", which '{run.command_line}' makes" if run.command else ""
         raise UsageError(f"{run.id} is of the kind {run.kind}{made}: only sweeps, rollouts and trainings are repeated")
     from kerv_cli.base.durations import count
     from kerv_cli.catalogue.entries import plan_of

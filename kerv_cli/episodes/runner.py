@@ -158,7 +158,7 @@ def _one_after_another(
 
     Args:
         state: The running episode, for the batch decoder.
-        waiting: Requests that no place has taken yet. It takes those of its own task first.
+        waiting: Requests that have not begun. Those of the task that runs now are taken first.
         ended: Gets each request, with the record of its episode or its error.
         open_world: Opens a world for a task.
     """

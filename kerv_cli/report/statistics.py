@@ -149,7 +149,7 @@ def difference(first: Estimate, second: Estimate) -> Estimate:
 def pairs_for_power(lost: float, won: float, power: float = 0.8) -> float:
     """Return about how many pairs McNemar's exact test needs to show a difference at the 5 % level.
 
-    The power is that of the unconditional test: the number of discordant pairs (exactly one success) is random, too.
+    A pair is discordant if exactly one of the two succeeds. The number of such pairs is taken as random, too.
 
     Args:
         lost: Expected share of pairs in which only the baseline succeeds.

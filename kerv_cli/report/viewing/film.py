@@ -65,17 +65,16 @@ def _read(path: Path, changed: int) -> Film:
     return Film(tuple(blob for _, blob in sorted(frames)), hz, facts, changed)
 
 
-def animation(film: Film, slower: float = 1.0, kind: str = "gif") -> bytes:
-    """Return a film as one animated image, which plays again and again.
+def animation(film: Film, slower: float = 1.0) -> bytes:
+    """Return a film as a GIF that plays again and again.
 
     Args:
         film: The film. It must have frames.
         slower: How many times slower than the robot moved.
-        kind: `gif`, or `webp`, which has a tenth of its size.
     """
     hz = film.hz / slower
     each = max(1, round(hz / FRAMES_PER_SECOND))
     first, *others = [Image.open(io.BytesIO(frame)) for frame in film.frames[::each]]
     buffer = io.BytesIO()
-    first.save(buffer, kind, save_all=True, append_images=others, duration=round(1000 * each / hz), loop=0, quality=60)
+    first.save(buffer, "gif", save_all=True, append_images=others, duration=round(1000 * each / hz), loop=0)
     return buffer.getvalue()
