@@ -116,9 +116,9 @@ class Laps(Stopwatch):
 
 
 class Dummy(Proposer):
-    """A proposer that always drafts the same number of nodes, with meaningless tokens.
+    """A proposer that always drafts the same number of nodes, with arbitrary tokens.
 
-    The nodes form a chain. If the chunk has no room for such a long chain, the rest are children of the root.
+    The nodes form a chain. Nodes for which the chunk has no room become children of the root instead.
     """
 
     name = "dummy"

@@ -22,19 +22,19 @@ from kerv_cli.engine.record import UNTIMED, DecodeRecord
 class BatchDecoder:
     """Decodes one chunk for each of several episodes, with the target and the method of a decoder.
 
-    In float32 the tokens are the decoder's own, except where rounding decides between two equal logits. The records
-    have no times.
+    In float32 the tokens are those that `Decoder` decodes, unless two logits are equal up to rounding. The records have
+    no times.
     """
 
     def __init__(self, decoder: Decoder) -> None:
-        """Build it from a decoder whose method can be batched (`Method.check` tests this)."""
+        """Take target and method from a decoder. `Method.check` tests whether the method can be batched."""
         self.decoder, self.target = decoder, decoder.target
         self.limits = decoder.acceptance.limits(decoder.threshold.radius())
         self.skip = decoder.parts.skip
         self._caches: dict[int, Cache] = {}
 
     def new_episode(self) -> EpisodeState:
-        """Return an empty record of actions and positions for one more episode in the batch."""
+        """Return the state of one more episode in the batch, without actions or positions."""
         return EpisodeState(self.target.actions, self.target.cameras)
 
     @torch.inference_mode()

@@ -16,14 +16,14 @@ from kerv_cli.engine.draft import check_tokens
 from kerv_cli.engine.protocol import Cache
 from kerv_cli.engine.record import PARALLEL, DecodeRecord, Round
 
-WINDOW = 10  # KERV's action context AC, control steps
+WINDOW = 10  # number of past actions that a prediction reads (KERV's action context AC)
 
 
 def steps_of(chunk: int, trained: int) -> int:
     """Return the number of control steps to decode at once.
 
     Args:
-        chunk: The setting; 0 for `trained`.
+        chunk: Control steps that the user chose. 0: as many as `trained`.
         trained: Number of control steps that the target was trained for.
 
     Raises:
@@ -68,7 +68,7 @@ class Situation:
 
     task: str
     history: ActionHistory
-    path: list[np.ndarray] = field(default_factory=list)  # measured end-effector positions (3,), metres
+    path: list[np.ndarray] = field(default_factory=list)
 
 
 class EpisodeState:
@@ -128,8 +128,8 @@ class Choice:
 class Chunk:
     """The N tokens of one decode, filled step by step.
 
-    Parts of a method may read it. They change it only through its methods. The cache holds the prompt and all committed
-    tokens but `uncached`: the last token, or several if a rectifier has filled a control step.
+    Parts of a method may read it, and change it only through its methods. The cache holds the prompt and the committed
+    tokens except the newest ones, `uncached`: one token, or several after a rectifier has filled a control step.
     """
 
     encoding: Tensor | Callable[[], Tensor]  # the prompt, or a function that encodes it
@@ -143,7 +143,8 @@ class Chunk:
     tokens: list[int] = field(default_factory=list)  # committed
     rounds: list[Round] = field(default_factory=list)
     rejection: Rejection = Rejection()  # of the last round's verification
-    hidden: Tensor = field(default_factory=lambda: torch.empty(0))  # (1, P + c − 1, E) after a prefill of c tokens
+    # the target's hidden states after the prefill, (1, P + c − 1, E) if it committed c tokens
+    hidden: Tensor = field(default_factory=lambda: torch.empty(0))
     forwards: int = 0
     similarity: float | None = None  # cosine of the best match in the datastore, if it was searched
     reason: str | None = None  # as in `DecodeRecord`
@@ -282,7 +283,7 @@ class Chunk:
         self.closed = values
 
     def fill(self, values: np.ndarray, with_target_token: bool) -> None:
-        """Commit predicted values up to the end of a control step. The chunk goes on behind it.
+        """Commit predicted values up to the end of a control step. Decoding continues with the next step.
 
         The values are executed as they are. The target reads their nearest tokens.
 

@@ -16,7 +16,7 @@ from kerv_cli.base.registry import DRAFTING, parts
 from kerv_cli.engine.record import PARALLEL, DecodeRecord
 
 FORWARDS = ("encode", "prefill", "verify", "feed", DRAFTING, "tree")
-"""Kinds of costs that depend on the target's size (docs/measuring.md). Each other kind belongs to proposers."""
+"""Kinds of costs that depend on the target's size (docs/measuring.md). All other kinds are drafts of proposers."""
 
 FORMAT = 2
 """Version of the profile's file format."""
@@ -24,7 +24,7 @@ FORMAT = 2
 READ_PHASES = ("vision", "propose", "accept", "rectify", "other")
 """Phases whose recorded seconds the cost model reads. For `vision` it only matters whether they are zero."""
 
-_WIDE = 32  # a draft of at least so many nodes counts as a tree, if the drafter's settings are unknown
+_WIDE = 32  # a draft of at least this many nodes counts as a tree, if the drafter's settings are unknown
 _LEVELS = 5  # assumed depth of such a tree
 
 
@@ -57,7 +57,7 @@ class Profile:
     about: Mapping[str, Any] = field(default_factory=dict)
 
     def lacks(self, kinds: Iterable[str]) -> list[str]:
-        """Return those of `kinds` (kinds of costs) that the profile has no times for."""
+        """Return the kinds of costs among `kinds` for which the profile has no times."""
         return [kind for kind in kinds if not self.phases.get(kind, ((), ()))[0]]
 
     def seconds(self, kind: str, rows: int) -> float:
@@ -115,7 +115,7 @@ def read_profile(path: Path) -> Profile:
 
 
 class Calls(NamedTuple):
-    """All forwards, or all drafts, of one kind in several decodes. There are m of them.
+    """The m forwards, or m drafts, of one kind in several decodes.
 
     Attributes:
         decode: (m,) index of the decode that made the call.
@@ -130,7 +130,7 @@ class Calls(NamedTuple):
 
 @dataclass(frozen=True)
 class Work:
-    """What several decodes computed: their forwards, drafts and other recorded seconds, to be priced by the cost model.
+    """What several decodes computed: forwards, drafts, and recorded seconds of everything else.
 
     Attributes:
         calls: Kind of cost -> its forwards or drafts, for the kinds that depend on the target's size (`FORWARDS`).
@@ -221,8 +221,8 @@ def work_of_record(decode: DecodeRecord) -> Work:
 def prices(work: Work, profile: Profile) -> np.ndarray:
     """Return the seconds (decodes,) of each decode by the cost model.
 
-    Forwards, drafts and the hidden states fed to the drafter cost what the profile says. Everything else costs the
-    recorded seconds. So do the drafts of other proposers, if the profile has no times for them.
+    The profile gives the seconds of forwards, and of everything that the drafter computes. It also gives those of other
+    drafts, if it has times for them. Everything else costs the recorded seconds.
     """
     total = np.array(work.host, dtype=float)
     for kind, (decode, rows, with_prompt) in work.calls.items():

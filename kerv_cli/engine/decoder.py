@@ -264,7 +264,7 @@ class Decoder(ActionDecoder):
         return Verified(hidden, draft.judged(remote), targets.astype(np.int64).tolist())
 
     def accept(self, chunk: Chunk, verified: Verified, proposer: Proposer | None) -> Accepted:
-        """Return the path of the draft that the acceptance rule chooses; an empty one without a proposer."""
+        """Return the path that the acceptance rule chooses. It is empty if there was no proposer."""
         if proposer is None:
             return Accepted((), None)
         rule, r = self.acceptance.of_drafts_from(proposer.name), self.threshold.radius()
@@ -325,7 +325,7 @@ class Decoder(ActionDecoder):
         If several values were filled and the chunk goes on, one forward reads their tokens and gives the next token.
 
         Returns:
-            `hidden`, the target's hidden states of this round, followed by those of that forward.
+            `hidden`, the target's hidden states of this round, followed by the states of the additional forward.
         """
         last, rectifier = chunk.rounds[-1], self.parts.rectifier
         if rectifier is None or last.accepted == len(last.drafted):

@@ -48,7 +48,7 @@ class Draft:
         return self.tokens.shape[0]
 
     def check(self, vocabulary: int, proposer: str) -> None:
-        """Refuse tokens out of range. Tokens on the GPU are not checked: they come from a head and are always in range.
+        """Refuse tokens out of range. Tokens on the GPU are not checked: each is an argmax, which is always in range.
 
         Args:
             vocabulary: Number of action tokens.

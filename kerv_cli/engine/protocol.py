@@ -122,7 +122,7 @@ class ContinuesGreedily(Protocol):
 
 
 class ReadableTarget(Target, Protocol):
-    """A target that also tells its prompt's parts and its layers' shapes, for drafters and the datastore."""
+    """A target that also describes its prompt and the shape of its layers. Drafters and the datastore need both."""
 
     @property
     def segments(self) -> Mapping[str, slice]:

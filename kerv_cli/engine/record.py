@@ -81,7 +81,7 @@ class DecodeRecord:
     seconds: float  # inference time (docs/methods.md §7), device synchronised at both ends; NaN: not timed
     phases: dict[str, float]  # seconds by phase, keys from PHASES
     compensated: int = 0  # tokens filled by a prediction instead of the target
-    filled: tuple[int, ...] = ()  # their indices; empty: the last executed tokens, if the rest of the chunk was dropped
+    filled: tuple[int, ...] = ()  # indices of these tokens; empty if the chunk ended early: then they are the last ones
     size: int = 0  # N; 0: as many as `tokens`
     skipped: bool = False  # executed without verification
     variability: float | None = None  # K of this decode (§3.2), normalised action units
@@ -132,7 +132,7 @@ class EpisodeRecord:
     """One episode: a task, a seed, and everything that the decoder and the robot did."""
 
     environment: str  # name of the task's environment
-    space: ActionSpace  # the environment's
+    space: ActionSpace  # action space of the environment
     task: str
     instruction: str
     seed: int

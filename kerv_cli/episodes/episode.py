@@ -20,7 +20,7 @@ from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import World
 
 AT_OBJECT = 0.05
-"""Distance of the fingertips to the object, in metres, from which on a motion of the object is attributed to them."""
+"""Metres. Once the fingertips came closer to the object than this, they count as the cause of its motion."""
 
 
 def moved_after_approach(distances: Sequence[float], objects: Sequence[np.ndarray]) -> float:

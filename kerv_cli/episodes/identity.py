@@ -218,8 +218,8 @@ _COMPUTING = ("base", "engine", "methods", "targets", "worlds", "episodes")
 def code_hash() -> str:
     """Return a hash of the code that computes episodes, as hexadecimal SHA-256.
 
-    It is stored with episodes to tell later which of them other code computed. It covers the syntax trees of kerv's own
-    files and of registered plugins. Comments, docstrings and formatting do not change it.
+    Episodes are stored with this hash, so that those computed by other code can be found. It covers the syntax trees of
+    kerv's own files and of registered plugins. Comments, docstrings and formatting do not change it.
     """
     root, digest = Path(kerv_cli.__file__).parent, hashlib.sha256()
     own = sorted(path for room in _COMPUTING for path in (root / room).rglob("*.py"))

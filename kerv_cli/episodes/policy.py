@@ -167,7 +167,7 @@ def _method_decoder(settings: RolloutSettings, task: str = "") -> Decoder:
 
 
 def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:
-    """Return the clock that tells how long decodes take for the world. None if the world waits for decodes."""
+    """Return the clock of a world that goes on while the policy decodes. None if the world waits."""
     if settings.rollout.clock == WAITS:
         return None
     target, measured = None, 0.0

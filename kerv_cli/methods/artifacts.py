@@ -92,7 +92,8 @@ def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str
     """Check that an artifact was made from the same artifacts that the policy uses.
 
     Args:
-        sources: Kind -> hash of each artifact that it was made from. Kinds that the policy does not use are ignored.
+        sources: Kind -> hash of each artifact that the artifact was made from. Kinds that the policy does not use are
+            ignored.
         used: Kind -> hash of the policy's target and artifacts.
         what: Beginning of the error message, such as `the early drafter in FOLDER was trained`.
         again: What to do, for the error message.
@@ -155,7 +156,7 @@ class Artifact(Generic[T]):
         return path / f"{self.kind}.json"
 
     def load(self, path: Path, artifacts: Artifacts) -> Any:
-        """Load the artifact in `path`, for the target of `artifacts`. Without other files it is its description.
+        """Load the artifact in `path`, for the target of `artifacts`. By default return its description.
 
         Raises:
             CheckpointError: The artifact is missing, damaged or made for another target.
@@ -191,7 +192,7 @@ class Artifact(Generic[T]):
         return True
 
     def digest(self, path: Path, description: T) -> str:
-        """Return the hash that stands for the artifact in the identity of results."""
+        """Return the artifact's hash. Stored episodes name the artifacts that they used by these hashes."""
         return sha256_of(self.json(path))
 
     def read(self, path: Path) -> T:

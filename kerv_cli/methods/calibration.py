@@ -63,9 +63,9 @@ class BoundarySection:
 
 @dataclass(frozen=True)
 class SkipLevel:
-    """The similarities from which a task's retrieved chunks are executed without verification (docs/methods.md §4.3).
+    """The threshold s_min of a task: the similarity at which verification is skipped (docs/methods.md §4.3).
 
-    Similarities are cosines. To measure them, entries of the datastore were looked up in other episodes.
+    Similarities are cosines. For the measurement, each entry was looked up among the other episodes of the datastore.
 
     Attributes:
         s_min: A chunk is executed without verification if its similarity is at least this.
@@ -88,13 +88,13 @@ class SkipLevel:
 
 @dataclass(frozen=True)
 class SkipSection:
-    """The similarities from which verification is skipped, for one datastore.
+    """The thresholds at which verification is skipped, for one datastore.
 
     Attributes:
         datastore: Hash of the datastore.
         epsilon: Largest mean absolute error of a good chunk, in normalised action units.
         confidence: Minimum share of good chunks among the skipped ones.
-        tasks: Task -> its similarities.
+        tasks: Task -> its threshold.
     """
 
     datastore: str
@@ -115,7 +115,7 @@ class Calibration:
         errors: Errors of all predictors on held-out episodes.
         variability: Task -> reference level K_S of the kinematic variability K.
         boundary: Ranges of the hybrid boundary.
-        skip: Similarities from which verification is skipped.
+        skip: Thresholds at which verification is skipped.
         provenance: How it was made.
     """
 
@@ -166,9 +166,9 @@ class Calibration:
         return windows[str(window)]
 
     def skip_levels(self, task: str, datastore: str) -> tuple[float, float, float]:
-        """Return (low, s_min, high): the similarity s_min from which the task skips verification, and its bounds.
+        """Return (low, s_min, high): the similarity s_min at which the task skips verification, and its bounds.
 
-        Feedback may move s_min between the bounds. All three are NEVER if the task never skips.
+        Feedback after an episode may move s_min between the bounds. All three are NEVER if the task never skips.
 
         Args:
             task: Full name of the task.

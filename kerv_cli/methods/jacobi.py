@@ -62,7 +62,7 @@ class JacobiProposer(ChainProposer):
 
         Args:
             chunk: The chunk that is decoded.
-            first: Index in the chunk of the first newly committed position.
+            first: Index in the chunk of the last token that was committed before the round.
             hidden: Not used.
             target_tokens: The target's tokens at all positions of this round.
         """

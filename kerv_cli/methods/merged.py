@@ -37,7 +37,7 @@ class MergedProposerSettings:
         """Refuse empty `sources`, and proposers that cannot draft whole chunks before the prefill.
 
         Raises:
-            UsageError: One of the two.
+            UsageError: `sources` is empty, or a proposer cannot draft whole chunks before the prefill.
             UnknownName: A proposer does not exist.
         """
         if not self.sources:
@@ -48,7 +48,7 @@ class MergedProposerSettings:
 
 
 def needs_of_sources(settings: MergedProposerSettings) -> tuple[str, ...]:
-    """Return the kinds of artifacts that all these proposers need, without repetitions."""
+    """Return the kinds of artifacts that the proposers in `sources` and `fallback` need, without repetitions."""
     names = (*settings.sources, *settings.fallback)
     return tuple(dict.fromkeys(kind for name in names for kind in find("proposer", name).needs(None)))
 

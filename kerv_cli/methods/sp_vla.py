@@ -33,7 +33,7 @@ class SpeedSkipSettings:
         """Refuse a `v_min` above `v_max`.
 
         Raises:
-            UsageError: It is above.
+            UsageError: `v_min` is above `v_max`.
         """
         if self.v_min > self.v_max:
             raise UsageError(f"skip.v_min={self.v_min:g} skip.v_max={self.v_max:g}: v_min must not be above v_max")

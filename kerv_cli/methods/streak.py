@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from kerv_cli.methods.context import Context
 
 TRUSTED, STREAK = "trusted", "streak"
-"""Values of `DecodeRecord.reason`: executed without verification; verified because no such decode was left."""
+"""Values of `DecodeRecord.reason`. TRUSTED: the draft was executed without verification. STREAK: it was verified,
+because no decode without verification was left."""
 
 
 @dataclass

@@ -144,7 +144,7 @@ _WARM_UP = 3  # runs before a capture, in which libraries choose kernels and all
 
 
 def bucket(tokens: int) -> int:
-    """Return the rows of the smallest graph that holds so many tokens: a power of two to 16, then a multiple of 16."""
+    """Return the size of the smallest graph for this many tokens: a power of two up to 16, then a multiple of 16."""
     if tokens <= 16:
         return 1 << (tokens - 1).bit_length()
     return -(-tokens // 16) * 16

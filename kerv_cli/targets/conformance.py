@@ -49,11 +49,11 @@ def check_target(target: Target, observation: Observation) -> list[Finding]:
 class Trial:
     """The checks of one target on one observation.
 
-    Most of them compare the result of a computation with that of `plain`, one causal forward without a cache.
+    Most checks compare hidden states with those of `plain`: one causal forward without a cache.
 
     Attributes:
         tokens: Action tokens for the checks. Their values do not matter.
-        drafted: Tokens of the nodes of `TREE`, likewise.
+        drafted: Tokens of the nodes of `TREE`. Their values do not matter either.
     """
 
     def __init__(self, target: Target, observation: Observation) -> None:
@@ -152,10 +152,10 @@ class Trial:
             yield torch.cat(hidden, 1), self.plain(self.tokens[:count])[:, -count:]
 
     def forward_tree(self) -> tuple[Cache, Tensor]:
-        """Forward the prompt and two tokens; then a third token and the draft tree after it, in one forward.
+        """Run two forwards: the prompt and two tokens, then a third token and the draft tree after it.
 
         Returns:
-            The cache; the hidden states (1, 1 + n, E) of the third token and the tree.
+            The cache, and the hidden states (1, 1 + n, E) of the third token and the tree's n nodes.
         """
         cache = self.new_cache()
         self.append(self.with_prompt(self.tokens[:2]), cache)
@@ -186,7 +186,7 @@ class Trial:
         yield self.append(self.embed([last]), cache), self.plain([*self.tokens[:3], *self.path(6), last])[:, -1:]
 
     def reused_cache(self) -> Pairs:
-        """Check that nothing of its earlier content is left in a cache after its length is set to 0."""
+        """Check that a cache's old content has no effect after its length is set to 0."""
         cache = self.new_cache()
         self.append(self.with_prompt(self.tokens), cache)
         cache.length = 0

@@ -31,7 +31,7 @@ class ScopedSettings:
         """Refuse a draft `outside` that cannot draft whole chunks before the prefill.
 
         Raises:
-            UsageError: It cannot.
+            UsageError: The draft cannot.
         """
         outside = find("proposer", self.outside, "prefill_draft.outside")
         if not (outside.traits.get("merged") or outside.traits.get("chains")):

@@ -39,7 +39,8 @@ class Candidate:
         won: Number of pairs that only the candidate solved.
         p: p-value of the hypothesis that the candidate loses the margin or more. None: not tested, because an earlier
             candidate failed.
-        draft: Settings of the prefill draft, which the rule executes. The first certificates all used the scout.
+        draft: Settings of the prefill draft, which the rule executes. Old certificates do not store it: they used the
+            scout.
     """
 
     label: str
@@ -113,7 +114,7 @@ class Certificate:
         world: Camera and horizon (maximum episode length).
         dtype: Number format of the models.
         margin: Percentage points of success that may be lost.
-        delta: Level of this test: the probability that it certifies falsely, at most.
+        delta: Level of this test: an upper bound of the probability that it certifies falsely.
         seeds: Seeds of the test episodes, as text.
         candidates: All candidates, from cautious to bold.
         chosen: Index of the boldest certified candidate. None: no candidate was certified.
@@ -142,7 +143,7 @@ class Certificate:
 
     @property
     def risk(self) -> float:
-        """Probability that any test of this policy, up to this one, certified falsely, at most."""
+        """Upper bound of the probability that this test or an earlier one of this policy certified falsely."""
         return self.delta + sum(one.delta for one in self.earlier)
 
     @property

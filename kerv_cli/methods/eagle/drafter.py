@@ -133,12 +133,12 @@ class DrafterProposer(Proposer):
         return Draft(self.chain(min(depth, self.nodes))) if self.top_k == 1 else self.tree(depth)
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
-        """Run the drafter over the hidden states of the newly committed positions.
+        """Run the drafter over the hidden states that this round added to the committed tokens.
 
         Args:
             chunk: The chunk that is decoded.
-            first: Index in the chunk of the first newly committed position.
-            hidden: (1, T, E) the target's hidden states at these positions.
+            first: Index in the chunk of the last token that was committed before the round.
+            hidden: (1, T, E) the target's hidden states of the chunk's tokens first … first + T − 1.
             target_tokens: Not used.
         """
         self.observe(self.embed(chunk.tokens[first + 1 :]), hidden, chunk.prompt_length + first)
@@ -355,7 +355,10 @@ class EagleDrafter(TrainableDrafter):
         return F.smooth_l1_loss(predicted, hidden), cross_entropy
 
     def validate(self, training: Training, module: EagleNetwork) -> Metrics:
-        """Decode held-out observations. Return the tokens committed per verification, strict and within 9 bins."""
+        """Decode held-out observations. Return the acceptance length, strict and relaxed (r = 9).
+
+        The acceptance length is the number of tokens committed per verification. The score is the sum of both.
+        """
         target, held_out = training.target, training.held_out
         chosen = torch.linspace(0, len(held_out) - 1, min(VALIDATED, len(held_out))).long().tolist()
         prompts = [held_out.prompt[i, : held_out.lengths[i]][None].to(target.device).float() for i in chosen]

@@ -226,7 +226,7 @@ class EarlyDrafter(TrainableDrafter):
     def decoded(
         self, target: Any, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace, columns: dict[str, Tensor]
     ) -> Decodes:
-        """Decode observations of an episode, and pool their prompts at once: whole prompts would fill the memory."""
+        """Decode observations of an episode. Keep only the pooled prompts, because whole ones would fill the memory."""
         prompts = list(prompts_of(target, observations_of(target, episode, steps, space)))
         features = torch.cat([target.pooled(prompt).half().cpu() for prompt in prompts])
         tokens = torch.cat([greedy(target, prompt)[0].cpu() for prompt in prompts])

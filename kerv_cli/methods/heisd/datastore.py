@@ -38,7 +38,7 @@ from kerv_cli.worlds import spec_of
 VECTORS, PAYLOAD, PROJECTION = "vectors.npy", "payload.parquet", "projection.npy"
 COLUMNS = {"seeds": "seed", "steps": "step", "left": "left"}
 AGAIN = "build one with 'kerv build datastore'"
-MARGIN = 8  # rows that Qdrant returns beyond k; if even the last may tie with the k-th, all rows of the task are used
+MARGIN = 8  # rows asked of Qdrant beyond k; if the last of them may tie with the k-th, all rows of the task are ranked
 ROUNDING = 1e-5  # largest rounding error of a float32 dot product of two unit vectors
 
 
@@ -147,10 +147,10 @@ def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
 
 
 class Index(Protocol):
-    """A search for the most similar rows. It may return more rows than asked for, because `best` ranks them."""
+    """A search for the rows whose keys are most similar to a key. `best` ranks the rows that it finds."""
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return rows, in ascending order, that include the task's k rows most similar to a key.
+        """Return the row numbers of the task's k most similar entries, and possibly of more, in ascending order.
 
         Args:
             key: (d,) float32.
@@ -187,17 +187,7 @@ class ExactIndex:
         self.store = store
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return the task's k most similar rows, and further rows that equal the k-th up to rounding.
-
-        Args:
-            key: (d,) float32.
-            task: Full name of the task.
-            k: Number of rows wanted.
-            without: Seed of an episode to leave out. None: use all episodes.
-
-        Returns:
-            The rows, in ascending order.
-        """
+        """Return the k most similar rows, and rows as similar as the k-th up to rounding; see `Index.candidates`."""
         shard = self.store.shards[task]
         scores = self.store.vectors[shard] @ key
         if without is not None:
@@ -243,14 +233,7 @@ class QdrantIndex:
                 self.client.upload_collection(self.name, store.vectors[rows], payloads, rows, wait=True)
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return rows, in ascending order, that include the task's k rows most similar to a key.
-
-        Args:
-            key: (d,) float32.
-            task: Full name of the task.
-            k: Number of rows wanted.
-            without: Seed of an episode to leave out. None: use all episodes.
-        """
+        """Return the k + MARGIN most similar rows, or all if the k-th is not clearly better; see `Index.candidates`."""
         m, store, shard = self.models, self.store, self.store.shards[task]
         must = [m.FieldCondition(key="task", match=m.MatchValue(value=task))]
         other = [] if without is None else [m.FieldCondition(key="seed", match=m.MatchValue(value=without))]

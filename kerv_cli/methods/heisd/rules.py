@@ -115,7 +115,7 @@ class _Continuations:
     """The kinematic groups that may follow a path of retrieved groups.
 
     Two bit sets of neighbours describe a path. `last` are the neighbours that have its last group. `whole` are those
-    among them that have all its groups.
+    among them that also have all its earlier groups. If no neighbour has, `whole` begins again with `last`.
 
     Args:
         rows: Tokens of each neighbour's chunk, most similar neighbour first.
@@ -300,13 +300,12 @@ def by_proposer(settings: HybridAcceptanceSettings, context: Context) -> HybridR
 class VerifySkip(Skip):
     """Executes the most similar stored chunk without verification if its similarity is at least s_min.
 
-    It skips at most `max_skips` verifications in a row. With a boundary, it skips only if that chooses retrieval. Once
-    it has executed a chunk from the end of a stored episode, it skips no more chunks of that stored episode, until the
-    next episode begins.
+    At most `max_skips` chunks in a row are executed like this. If the method has a boundary, the boundary must choose
+    retrieval. After the last chunk of a stored episode, no further chunk of that stored episode is executed without
+    verification, until the next episode begins.
 
     With `up` or `down` above 0, s_min changes after each episode. A failure raises it by `up` times the calibrated
-    range, a success lowers it by `down` times the range. Then results depend on the order of the episodes and on the
-    evaluator's success flag.
+    range, a success lowers it by `down` times the range. Then results depend on the order of the episodes.
     """
 
     def __init__(

@@ -105,7 +105,7 @@ class RadiusRange:
         """Refuse an `r_min` above `r_max`.
 
         Raises:
-            UsageError: It is above.
+            UsageError: `r_min` is above `r_max`.
         """
         if self.r_min > self.r_max:
             raise UsageError(
@@ -222,7 +222,7 @@ class Quoted(Kinematic):
         self.r, self.last = float(self.settings.r_min), self.k_s
 
     def next(self, variability: float) -> float:
-        """Return r, raised the more, the smaller the change of K is."""
+        """Return the raised r. A small change of K raises it more than a large one."""
         return self.r + self.falling(abs(variability - self.last)) - self.settings.r_min
 
 

@@ -54,8 +54,8 @@ def filter_state(ratio: float, window: int, damping: float) -> tuple[np.ndarray,
         damping: Factor of the velocity per control step.
 
     Returns:
-        Weights (2, window): weights times actions (oldest first) is the state after the last action. And the transition
-        matrix (2, 2) of the state in one control step.
+        Weights (2, window), whose product with the actions (oldest first) is the state after the last action; and the
+        matrix (2, 2) that advances a state by one control step.
     """
     from filterpy.kalman import KalmanFilter
 
@@ -282,8 +282,8 @@ class Compensation:
     - `use_target_token` (ours) also keeps the target's token at the rejected position, which is already computed.
     - `drop` (ours) ends the chunk after the predicted steps. Without it, the target decodes the later steps.
     - `steps` (the paper's predict length PL) lets the prediction fill further control steps.
-    - `predictor=draft` (ours) fills with the rejected draft's remaining tokens first. The draft knows the observation,
-      and a predictor does not.
+    - `predictor=draft` (ours) fills with the rejected draft's remaining tokens first. A draft was made from the
+      observation, a prediction only from past actions.
     - `rest` is the number of decodes without compensation after each compensation.
     """
 

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-ROWS = 32  # oneDNN chooses the layout for so many rows; 154 M weights take 27 ms for 1 row, 33 ms for 31, 41 ms for 47
+ROWS = 32  # oneDNN chooses the layout for this many rows; 154 M weights take 27 ms for 1 row, 33 for 31, 41 for 47
 
 
 @lru_cache(maxsize=1)
@@ -62,7 +62,7 @@ def blocked(layer: nn.Module) -> nn.Module:
 class Bfloat16Layers:
     """Decoder layers with blocked bfloat16 weights and a float32 cache.
 
-    It is copied and pickled as None, because oneDNN's layout cannot be.
+    Copies and pickles hold None in its place, because oneDNN's layout cannot be copied.
     """
 
     def __init__(self, rotary: tuple[Tensor, Tensor], layers: Iterable[nn.Module]) -> None:

@@ -16,7 +16,7 @@ M = TypeVar("M", bound=nn.Module)
 
 
 def wants_gradient(x: Tensor) -> bool:
-    """Whether gradients of `x` are needed. Compiled modules have none, so then torch computes."""
+    """Return whether gradients of `x` are needed. Compiled modules compute none, so torch must compute then."""
     return x.requires_grad and torch.is_grad_enabled()
 
 
@@ -37,7 +37,7 @@ class Packable(nn.Module):
         return None
 
     def is_packed(self, x: Tensor) -> bool:
-        """Whether to use the compiled form for the input `x`: it exists, and no gradients are needed."""
+        """Return whether to use the compiled form for the input `x`: it exists, and no gradients are needed."""
         return self.packed is not None and isinstance(x, Tensor) and not wants_gradient(x)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
@@ -84,7 +84,7 @@ def pack(module: nn.Module) -> None:
 
 
 def load_packed(module: M, folder: Path, kind: str, device: str | torch.device, dtype: torch.dtype) -> M:
-    """Load the weights in a folder into a module. Move it to a device, freeze it, and compile it if that is a CPU.
+    """Load the weights in a folder into a module. Move it to a device, freeze it, and on a CPU compile it.
 
     Args:
         module: A module with the shapes of the stored weights.

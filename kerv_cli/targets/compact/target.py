@@ -90,7 +90,7 @@ class CompactTarget(Packable):
         segments: Name of a prompt part -> its slice of the prompt.
         sha256: Hash of the weights that were loaded. Empty if none were.
         chunk: H, number of control steps that it was trained to decode at once.
-        parallel: Whether it decodes all tokens in one forward (`parallel_pass`), and only so.
+        parallel: Whether it decodes all tokens in one forward (`parallel_pass`), and cannot decode them one by one.
         width: E, width of the embeddings and hidden states.
         heads: Attention heads of a layer, also of a drafter's.
         feed_forward: Hidden units of a layer, also of a drafter's.
@@ -234,9 +234,9 @@ class CompactTarget(Packable):
         return self.prompt(*given)
 
     def prompt(self, words: Tensor, proprioception: Tensor, *seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the result of `encode_batch` from what the vision encoders found, or from the states.
+        """Compute the result of `encode_batch` in torch, from the outputs of the vision encoders or from the states.
 
-        It runs in torch. While a program is recorded, all arguments are `Recorded`.
+        While a program is recorded, all arguments are `Recorded`, stand-ins for tensors.
 
         Args:
             words: (B, L) ids of words.

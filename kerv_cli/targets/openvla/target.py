@@ -115,7 +115,7 @@ class OpenVLATarget:
         return torch.cat([words[:, :1], patches, words[:, 1:]], 1)
 
     def see(self, pixels: Tensor) -> Tensor:
-        """Map prepared images (B, 6, s, s) to vision tokens (B, n, E)."""
+        """Map images from `pixels_of`, (B, 6, s, s), to n vision tokens per image, (B, n, E)."""
         return self.model.projector(self.model.vision_backbone(upload(pixels, self.device).to(self.dtype)))
 
     def _words(self, instruction: str) -> Tensor:
