@@ -37,7 +37,7 @@ FAILURES = (LOST, FAILURE)
 MOST_SHOWN = 24
 """Largest number of episodes that the page lists of one group of failures."""
 MOVED = 0.01
-"""Motion of the object, in metres, from which on a failure counts as after contact."""
+"""Metres. If the object moved at least this far, a failure counts as after contact."""
 PHASES = {
     "before contact": "the fingertips never came within 2 cm of the object, and did not move it",
     "near contact": "they came within 2 cm, and the object moved less than 1 cm",

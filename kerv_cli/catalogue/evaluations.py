@@ -343,7 +343,7 @@ def _settings(first: Evaluation) -> dict[str, Any]:
 def _identity(evaluations: Sequence[Evaluation]) -> dict[str, str]:
     """Return hashes of the weights and of the recorded results.
 
-    Because of the second, no rollout reuses an imported episode.
+    The hash of the results keeps rollouts from reusing imported episodes.
     """
     recorded = [[one.id, [dataclasses.astuple(e) for e in one.episodes]] for one in evaluations]
     digest = hashlib.sha256(json.dumps(recorded, sort_keys=True).encode()).hexdigest()

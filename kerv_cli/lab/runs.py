@@ -36,7 +36,7 @@ BEAT_SECONDS = 5.0
 LOADING_SECONDS = 5.0
 """Guess of the part of a command's time that does not grow with its work: loading libraries and the simulator."""
 STALE_SECONDS = 900.0
-"""A run on another machine counts as dead after so many seconds without a heartbeat."""
+"""A run on another machine counts as dead after this many seconds without a heartbeat."""
 
 _open: set[str] = set()
 """Ids of this process's runs that have not ended. The database may miss an end, because the disk was full."""

@@ -20,10 +20,11 @@ def charged(
 ) -> Certificate:
     """Check a planned certificate against earlier tests of the same policy, and note them in it.
 
-    The n-th test of a policy is made at delta / 2^(n − 1). A test that is repeated as it was stays what it was.
+    The n-th test of a policy has the level delta / 2^(n − 1). A test that is repeated without any change is not counted
+    again.
 
     Args:
-        certificate: The planned certificate. Its `delta` is that of a first test.
+        certificate: The planned certificate. Its `delta` is the level that a first test would have.
         store: The study that gives the certificate.
         episodes: Its episodes.
         paths: Folders of existing certificates. Those of other policies do not count.
@@ -33,7 +34,7 @@ def charged(
         The certificate with `earlier` and the `delta` of this test.
 
     Raises:
-        UsageError: The policy was tested before and `again` is not set, or seeds have served something else.
+        UsageError: The policy was tested before and `again` is not set, or another study ran episodes with these seeds.
     """
     earlier = attempts_on(certificate.target, paths)
     for number, attempt in enumerate(earlier):

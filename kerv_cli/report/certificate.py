@@ -109,7 +109,7 @@ def planned_certificate(
         settings: Settings of the test.
 
     Raises:
-        UsageError: The policy was tested before, or the seeds served something else.
+        UsageError: The policy was tested before, or another study ran episodes with these seeds.
         CheckpointError: An artifact of a candidate is missing or damaged.
     """
     baseline, first = _settings(resolved)[:2]
@@ -173,7 +173,6 @@ def _candidate(planned: Candidate, pairs: pd.DataFrame, margin: float, delta: fl
 
     Args:
         planned: The candidate without results.
-        settings: The setting.
         pairs: Its episodes paired with AR's, from `paired`.
         margin: Largest acceptable loss of success, in points.
         delta: Level of the test.

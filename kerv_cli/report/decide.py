@@ -150,7 +150,7 @@ Group Sequential Methods, table 2.1).
 
 
 def confidence_of_a_look(looks: int) -> float:
-    """Return the confidence level of the interval at each look (interim analysis), so that all looks have 95 %.
+    """Return the confidence level of the interval at each look (interim analysis), for 95 % over all looks together.
 
     Args:
         looks: Number of planned looks.

@@ -37,7 +37,7 @@ from kerv_cli.report.viewing.film import animation, film_of
 LOSS = 3.0
 """Default for the largest loss of success that the page's verdict accepts, in points."""
 _FRAMES = 240
-"""Films of more than half as many frames play faster than at half speed: all last a few seconds and stay small."""
+"""A film plays at half speed, or faster if it has more than half as many frames. So it stays short and small."""
 
 
 def render(

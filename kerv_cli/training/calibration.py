@@ -5,7 +5,7 @@ The JSON holds:
 - the noise of the kinematic predictors, and their errors on held-out episodes,
 - each task's K_S, the reference level of the kinematic variability K (how far drafts are from the target's tokens),
 - the ranges that scale the curvature and the path length of the hybrid boundary,
-- the similarity from which a retrieved draft is executed without verification, per task.
+- for each task the smallest similarity at which a retrieved chunk is executed without verification.
 """
 
 from __future__ import annotations
@@ -413,9 +413,8 @@ def moving_errors(errors: Errors, kind: str, space: ActionSpace) -> np.ndarray:
 class Matches:
     """n datastore entries of one task, each compared with the most similar entry of another episode.
 
-    A match is good if executing the similar entry's chunk would have been: its error is small, and all its tokens of
-    strict DoFs are equal. Strict DoFs count separately, because a wrong gripper hardly changes the mean error but drops
-    the object.
+    A match is good if the two chunks are nearly equal: the error is small, and all tokens of strict DoFs are the same.
+    Strict DoFs count separately, because a wrong gripper hardly changes the mean error but drops the object.
     """
 
     similarity: np.ndarray  # (n,) float32, cosine
@@ -467,7 +466,7 @@ def lowest_level(matches: Matches, confidence: float, least: int = LEAST) -> flo
 
 
 def task_levels(matches: Matches, confidence: float) -> SkipLevel:
-    """Return a task's s_min, the similarity from which verification is skipped, and the bounds of its feedback.
+    """Return a task's s_min, the smallest similarity at which verification is skipped, and the bounds of its feedback.
 
     Feedback after each episode may move s_min between `low` and `high`. `low` allows twice the share of wrong chunks
     that s_min allows, and `high` a third: for a confidence of 0.9, at least 0.8 and 0.967 of the chunks are good.
@@ -498,7 +497,7 @@ def task_levels(matches: Matches, confidence: float) -> SkipLevel:
 def skip_section(
     store: Datastore, tasks: Sequence[str], epsilon: float, confidence: float, progress: OnProgress
 ) -> SkipSection | None:
-    """Return the similarities from which verification is skipped, for each of `tasks` that the datastore holds.
+    """Return the thresholds at which verification is skipped, for each of `tasks` that the datastore holds.
 
     Args:
         store: The datastore.

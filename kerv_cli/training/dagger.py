@@ -56,7 +56,7 @@ class PolicyActor:
         """Return the action (D,) to execute now.
 
         Args:
-            label: (D,) the expert's action. It is returned during the expert's chunks.
+            label: (D,) the expert's action in this state. It is returned if the expert executes this chunk.
         """
         if self.executed is not None:
             self.decoder.observe(self.executed, self.world.end_effector)

@@ -164,7 +164,7 @@ class CalibrateSettings(DemonstrationSettings):
     """Settings of `kerv calibrate`, which measures on demonstrations what KERV and HeiSD need (docs/methods.md §3, §4).
 
     That is the noise of the kinematic predictors, each task's reference level K_S of motion variability, the ranges
-    that scale the hybrid boundary, and the similarities from which a retrieved draft is executed without verification.
+    that scale the hybrid boundary, and the similarities at which a retrieved draft is executed without verification.
     """
 
     episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)
@@ -189,7 +189,7 @@ class CalibrateSettings(DemonstrationSettings):
             prefix: Text before a setting's name in the error message.
 
         Raises:
-            UsageError: One of the two.
+            UsageError: `boundary_windows` is empty, or decodes have no proposer.
         """
         if not self.boundary_windows:
             raise UsageError(f"{prefix}boundary_windows=[]: name at least one number of positions")

@@ -17,8 +17,8 @@ _SPLIT = 2.0**27 + 1.0  # Dekker's constant: splits a double into two halves who
 def length(vector: NDArray[np.float64]) -> float:
     """Return the length of a vector (n,).
 
-    Adding a square rounds only once, as a fused multiply-add does. OpenBLAS did the same on the CPUs that recorded the
-    first datasets (AVX-512, up to 31 numbers), so these can be recorded again bit by bit.
+    Each square is computed and added with a single rounding (fused multiply-add). OpenBLAS worked like this on the CPUs
+    that recorded the first datasets (AVX-512, up to 31 numbers). So these can be recorded again bit by bit.
     """
     total = 0.0
     for number in vector.tolist():

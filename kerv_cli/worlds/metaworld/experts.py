@@ -28,7 +28,7 @@ class HandlePullSide:
     far, near = 0.04, 0.02
     """Horizontal distances from the handle in metres. Beyond `far` the hand first rises, beyond `near` it stays up."""
     slipped = 0.05
-    """Height of the hand above the handle from which on the fingers no longer hold it, in metres."""
+    """Height of the hand above the handle beyond which the fingers do not hold it, in metres."""
     low = 0.005
     """Height of the hand above the handle at which the fingers close, in metres."""
     shut = 0.66
