@@ -11,7 +11,12 @@ import pyarrow.parquet as pq
 import pytest
 from examples.tiny_openvla import TINY, write_checkpoint
 from test_openvla import imported, kerv
+from typer.testing import CliRunner
 
+from kerv_cli.base.spaces import Observation
+from kerv_cli.cli.app import app
+from kerv_cli.engine.decoder import Decoder
+from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.openvla.config import Bounds, action_space
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.recording import DemoConfig, record
@@ -113,6 +118,48 @@ def test_a_recording_cannot_be_rolled_out(results):
     assert "back is a recording: no episode can run in it" in line
 
 
+def without_positions(results: Path, tmp_path: Path) -> Path:
+    """The LeRobot dataset as a robot records it: no privileged state."""
+    copy = edited(results, tmp_path)
+    info = json.loads((copy / "meta/info.json").read_text())
+    del info["features"]["observation.environment_state"]
+    (copy / "meta/info.json").write_text(json.dumps(info))
+    data = copy / "data/chunk-000/file-000.parquet"
+    pq.write_table(pq.read_table(data).drop_columns(["observation.environment_state"]), data)
+    return copy
+
+
+def trained(results: Path, *words: str) -> str:
+    """Train a policy for two steps, and return what the command printed."""
+    short = ["train.steps=2", "train.batch=2", "train.validate_every=2", "train.held_out=0.5", f"results={results}"]
+    sizes = [f"target.image_size={SIZE}", f"world.camera.size={SIZE}", "target=nano", "target.grid=1"]
+    run = CliRunner().invoke(app, ["train", "target", *words, *sizes, *short])
+    assert run.exit_code == 0, run.output
+    return run.output
+
+
+@pytest.mark.usefixtures("few_validations")
+def test_a_policy_of_data_without_object_positions_acts_in_their_world(results, tmp_path):
+    source = without_positions(results, tmp_path)
+    common = [f"results={tmp_path}", f"world.camera.size={SIZE}"]
+    read = ["demos", "import", f"source={source}", "environment=insertion", "name=bare"]
+    assert kerv(*read, f"results={tmp_path}") == (0, "")
+    assert "train.places=path" in trained(tmp_path, "name=own", "demos=bare")
+    rollout = ["rollout", "task=insert-peg", "policy.target=own", "method=ar", "episodes=1", "record=0"]
+    assert kerv(*rollout, "world.horizon=8", *common) == (0, "")
+    short = ["train.steps=2", "train.batch=2", "train.validate_every=2", "train.held_out=0.5", "drafter.samples=6"]
+    assert kerv("train", "drafter", "policy.target=own", *short, f"results={tmp_path}") == (0, "")
+
+
+def test_a_policy_of_a_recording_without_object_positions_decodes(results):
+    assert "waypoint_1_error_cm" in trained(results, "name=recorded", "demos=back", "task=BACK")
+    target, description = load_target(results / "artifacts/target/recorded")
+    assert description.observation.state == 7
+    image = np.zeros((SIZE, SIZE, 3), np.uint8)
+    shown = Observation(np.full(7, 0.1), np.full(7, 0.1), "pick up the peg", {"front": image})
+    assert Decoder(target).decode(shown).actions.shape == (target.chunk, 7)
+
+
 def edited(results: Path, tmp_path: Path, **changes: Any) -> Path:
     copy = Path(shutil.copytree(results / "lerobot/pegs", tmp_path / "copy"))
     info = json.loads((copy / "meta/info.json").read_text())
@@ -130,6 +177,9 @@ def edited(results: Path, tmp_path: Path, **changes: Any) -> Path:
         ({}, ["camera=side"], "unknown camera 'side': known: front"),
         ({}, ["strict=[jaw]"], "unknown strict DoF 'jaw'"),
         ({}, ["dofs=six"], "unknown dofs 'six'"),
+        ({}, ["environment=kitchen"], "unknown environment 'kitchen'"),
+        ({"fps": 10}, ["environment=insertion"], "20 control steps per second"),
+        ({}, ["environment=metaworld"], "unknown camera 'front'"),
         ({}, ["name=front"], "another name"),
     ],
 )

@@ -26,7 +26,7 @@ from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.folders import RESUME
 from kerv_cli.targets.losses import soft_labels, token_loss
-from kerv_cli.training.imitation import Imitation, lit, vocabulary, waypoints
+from kerv_cli.training.imitation import Imitation, lit, vocabulary, waypoints_of
 from kerv_cli.training.loop import Loop, Metrics, read_state
 from kerv_cli.training.settings import TrainSettings
 from kerv_cli.worlds.demos.files import DemoEpisode
@@ -199,11 +199,11 @@ def test_waypoints_are_where_the_gripper_changes_next_and_where_the_episode_ends
     labels[10:, 3] = -1.0  # beyond the success
     frames, steps = np.zeros((10, 8, 8, 3), np.uint8), np.arange(10)
     episode = DemoEpisode("reach-v3", 0, False, 10, frames, steps, states, labels, labels[:10], np.zeros(3))
-    two = waypoints(episode, np.array([0, 3, 4, 7, 8, 9]), 2, ACTIONS)
+    two = waypoints_of(episode, np.array([0, 3, 4, 7, 8, 9]), 2, ACTIONS)
     assert two.shape == (6, 2, 3)
     assert two[:, 0, 0].tolist() == [4, 4, 8, 8, 9, 9]
     assert torch.equal(two[:, 1], torch.from_numpy(states[9, :3]).expand(6, 3))
-    three = waypoints(episode, np.array([0, 5, 8]), 3, ACTIONS)
+    three = waypoints_of(episode, np.array([0, 5, 8]), 3, ACTIONS)
     assert three[:, :, 0].tolist() == [[4, 8, 9], [8, 9, 9], [9, 9, 9]]
 
 

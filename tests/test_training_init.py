@@ -147,11 +147,17 @@ def test_settings_of_targets_are_refused_for_a_drafter(setting):
         DrafterRun(compose("train_drafter", [f"train.{setting}"], TrainDrafterSettings))
 
 
-def test_demonstrations_without_places_are_refused(with_old, monkeypatch):
-    nameless = SimpleNamespace(**{**vars(Demos.manifest), "observation": dataclasses.replace(OBSERVATION, places=())})
-    monkeypatch.setattr(Demos, "manifest", nameless)
-    with pytest.raises(UsageError, match="no places"):
-        TargetRun(init_settings(with_old))
+@pytest.mark.parametrize(
+    ("observation", "proprioception", "error"),
+    [("state", OBSERVATION.proprioception, UsageError), ("vision", (), CheckpointError)],
+)
+def test_demonstrations_without_the_positions_that_a_policy_needs_are_refused(
+    with_old, monkeypatch, observation, proprioception, error
+):
+    space = dataclasses.replace(OBSERVATION.without_state(), proprioception=proprioception)
+    monkeypatch.setattr(Demos, "manifest", SimpleNamespace(**{**vars(Demos.manifest), "observation": space}))
+    with pytest.raises(error):
+        TargetRun(init_settings(with_old, f"target.observation={observation}"))
 
 
 # --- dagger

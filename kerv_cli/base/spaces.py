@@ -281,6 +281,14 @@ class ObservationSpace:
         """Return the fields as values for JSON."""
         return asdict(self)
 
+    def without_state(self, places: tuple[Place, ...] = ()) -> ObservationSpace:
+        """Return this space as the robot alone sees it: the state is the proprioception, without object positions.
+
+        Args:
+            places: Positions to name nevertheless, which a policy estimates without reading them from the state.
+        """
+        return ObservationSpace(self.proprioception, len(self.proprioception), places, self.centre)
+
 
 @dataclass(frozen=True)
 class Observation:

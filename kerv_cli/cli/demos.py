@@ -84,7 +84,7 @@ def export_demos(settings: DemosExportSettings) -> None:
 @command(
     "demos import",
     DemosImportSettings,
-    keys="source name camera episodes dofs strict tail format results",
+    keys="source name environment camera episodes dofs strict tail format results",
     examples=(
         "kerv demos import source=datasets/aloha name=aloha",
         "kerv demos import source=datasets/libero dofs=openvla episodes=50",
@@ -101,5 +101,5 @@ def import_demos(settings: DemosImportSettings) -> None:
     with making(settings.results, "demos", folder) as made, progress_bar("import", made) as advance:
         manifest = import_lerobot(settings, folder, advance).manifest
     rows = ((name, len(row.episodes), f"{row.mean_steps:.0f}") for name, row in manifest.tasks.items())
-    title = f"demonstrations in {folder}, suite {manifest.environment.upper()}"
+    title = f"demonstrations in {folder}" + ("" if settings.environment else f", suite {manifest.environment.upper()}")
     print_table(("task", "episodes", "mean steps"), rows, title)

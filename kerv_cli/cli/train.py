@@ -24,7 +24,10 @@ def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJso
     typer.echo(f"target {settings.name}: {settings.train.steps} steps", err=True)
     from kerv_cli.training.target import TargetRun
 
-    run_training(TargetRun(settings), plan, as_json, "reading demonstrations", "training the target")
+    run = TargetRun(settings)
+    for line in run.notes:
+        typer.echo(line, err=True)
+    run_training(run, plan, as_json, "reading demonstrations", "training the target")
 
 
 @command(

@@ -124,6 +124,8 @@ def check_tasks(dataset: DemoDataset, names: Sequence[str]) -> None:
 def check_spaces(dataset: DemoDataset, actions: ActionSpace, observation: ObservationSpace, owner: str) -> None:
     """Refuse demonstrations with another action space or observation space than expected.
 
+    Demonstrations without object positions need only the same proprioception.
+
     Args:
         dataset: The demonstrations.
         actions: Expected action space.
@@ -135,7 +137,9 @@ def check_spaces(dataset: DemoDataset, actions: ActionSpace, observation: Observ
     """
     where = f"the demonstrations in {dataset.path}"
     dataset.manifest.actions.check_same(actions, where, owner)
-    if observation.state and observation != dataset.manifest.observation:  # a target without a state reads only images
+    recorded = dataset.manifest.observation
+    same = recorded == observation or (not recorded.places and recorded.proprioception == observation.proprioception)
+    if observation.state and not same:  # a target without a state reads only images
         raise CheckpointError(f"{where} have other observations than {owner}: they are of another environment")
 
 

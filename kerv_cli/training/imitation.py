@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.spaces import ActionSpace
+from kerv_cli.base.spaces import ActionSpace, Place
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.features import places_of
 from kerv_cli.targets.compact.settings import TargetSettings
@@ -35,6 +35,9 @@ from kerv_cli.worlds.demos.files import DemoEpisode
 
 WITHIN = 9
 """Validation reports the share of tokens at most this many bins from the label: Spec-VLA's acceptance radius."""
+WAYPOINTS = (Place("waypoint 1", 0), Place("waypoint 2", 0))
+"""What a policy estimates if its demonstrations hold no object positions: where the hand is when the gripper next
+changes, and at the end. They are never read from a state."""
 VALIDATED = 2048
 """Maximum number of samples in a validation."""
 
@@ -55,7 +58,7 @@ def load_samples(
     words: WordTokenizer,
     task_names: tuple[str, ...],
     progress: OnProgress = lambda done, total: None,
-    places: str = "state",
+    waypoints: int = 0,
 ) -> Samples:
     """Read the episodes of some tasks into memory.
 
@@ -65,7 +68,8 @@ def load_samples(
         words: Tokenizer of the instructions.
         task_names: Full names of the tasks.
         progress: Called with the numbers of episodes read and of all.
-        places: Positions to learn. `state`: object and goal. `path`: where the hand will be later in the episode.
+        waypoints: Number of positions to learn that show where the hand will be later in the episode. 0: the positions
+            of object and goal instead.
 
     Raises:
         CheckpointError: An episode has too few labels, or images of another size.
@@ -76,9 +80,10 @@ def load_samples(
         episode = dataset.load(index)
         observations = read_observations(episode, settings, dataset.manifest.observation, words)
         steps, count = observations.steps.numpy(), len(observations)
-        learnt = places_of(observations.states, dataset.manifest.observation)
-        if places == "path":
-            learnt = waypoints(episode, steps, learnt.shape[1], dataset.manifest.actions)
+        if waypoints:
+            learnt = waypoints_of(episode, steps, waypoints, dataset.manifest.actions)
+        else:
+            learnt = places_of(observations.states, dataset.manifest.observation)
         sample = Samples(
             **vars(observations),
             chunks=torch.from_numpy(read_chunks(episode, steps, settings.chunk)).float(),
@@ -91,7 +96,7 @@ def load_samples(
     return Samples.joined(parts)
 
 
-def waypoints(episode: DemoEpisode, steps: np.ndarray, count: int, actions: ActionSpace) -> Tensor:
+def waypoints_of(episode: DemoEpisode, steps: np.ndarray, count: int, actions: ActionSpace) -> Tensor:
     """Return where the hand will be at the next gripper changes, and at the episode's end.
 
     These positions come from the demonstration alone. No simulator state is needed. A gripper change is a control step

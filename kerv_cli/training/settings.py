@@ -42,7 +42,7 @@ class TrainSettings:
         "state",
         "state",
         "path",
-        help="positions to estimate: state: of object and goal; path: of the hand later in the episode",
+        help="positions to estimate: state: of object and goal; path: of the hand later, also if the state holds none",
     )
     colour: float = number(0.0, 0, 3, help="random light on training images: largest spread of log brightness; 0: none")
     scene_steps: int = number(0, 0, 10**9, help="first steps, which train only the vision encoder, on positions")

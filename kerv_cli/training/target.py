@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 from kerv_cli.base.durations import count
-from kerv_cli.base.errors import UsageError
+from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.places import artifact
 from kerv_cli.base.runtime import set_up
 from kerv_cli.episodes.runner import success_of
@@ -22,6 +22,7 @@ from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.folders import find_target
 from kerv_cli.training.demonstrations import check_spaces, check_tasks, name_of, open_demos, seen_by
 from kerv_cli.training.imitation import (
+    WAYPOINTS,
     Imitation,
     check_init,
     continued_target,
@@ -40,6 +41,9 @@ STATE_EPISODES = 200
 class TargetRun(TrainingRun):
     """The training of a compact policy, by `kerv train target`.
 
+    Attributes:
+        notes: One line per setting that the demonstrations decided.
+
     Raises:
         UsageError: Some settings contradict each other.
         CheckpointError: The demonstrations or the target `train.init` do not exist. Or the demonstrations have another
@@ -55,6 +59,7 @@ class TargetRun(TrainingRun):
         self.dataset = open_demos(settings.results, settings.demos, settings.task)
         settings.task = settings.task or list(self.dataset.manifest.tasks)
         self.tasks = resolve_tasks(settings.task)
+        self.notes: list[str] = []
         self.check_places()
         self.spec = spec_of(self.tasks[0])
         self.world = settled(settings.world, self.spec)
@@ -76,20 +81,27 @@ class TargetRun(TrainingRun):
         self.check_folder("name")
 
     def check_places(self) -> None:
-        """Refuse demonstrations without the positions to learn, and image settings for a policy without images.
+        """Choose `train.places=path` if the demonstrations hold no object positions, and refuse what is impossible.
 
         Raises:
-            UsageError: The demonstrations name no positions of object and goal. Or `train.places=path` is chosen but
-                a policy acted in some demonstrations. Or a setting needs images and the policy has none.
+            UsageError: The policy reads object positions, and the demonstrations hold none. Or `train.places=path` is
+                chosen but a policy acted in some demonstrations. Or a setting needs images and the policy has none.
+            CheckpointError: The demonstrations hold neither object positions nor those of the hand.
         """
         train, manifest = self.settings.train, self.dataset.manifest
-        if not manifest.observation.places:
-            raise UsageError(
-                f"the demonstrations in {self.dataset.path} name no places (of object and goal): a compact policy "
-                "cannot be trained on them"
-            )
+        where = f"the demonstrations in {self.dataset.path}"
         if self.settings.target.observation == "state":
+            if not manifest.observation.places:
+                raise UsageError(
+                    f"{where} hold no object positions, which target.observation=state reads: leave it out"
+                )
             refuse_unused(train, ("colour", "places"), " needs images, and target.observation=state has none")
+        if not manifest.observation.places:
+            if len(manifest.observation.proprioception) < 3:
+                raise CheckpointError(f"{where} do not hold the hand's position: import data with observation.state")
+            if train.places == "state":
+                train.places = "path"
+                self.notes.append(f"{where} hold no object positions: train.places=path")
         recordings = [manifest.config, *manifest.config.get("joined", ())]
         if train.places == "path" and train.scene_weight and any(one.get("policy") for one in recordings):
             raise UsageError(
@@ -135,11 +147,14 @@ class TargetRun(TrainingRun):
             init, description = load_target(self.init)
             check_spaces(self.dataset, description.actions, description.observation, f"the target in {self.init}")
         words = init.words if init else vocabulary(self.dataset.manifest.environment)
-        samples = load_samples(self.dataset, settings.target, words, self.tasks, progress, settings.train.places)
+        recorded = self.dataset.manifest.observation
+        fresh = recorded if recorded.places else recorded.without_state(WAYPOINTS)
+        observation = fresh if init is None else init.observation
+        waypoints = len(observation.places) if settings.train.places == "path" else 0
+        samples = load_samples(self.dataset, settings.target, words, self.tasks, progress, waypoints)
         if init is None:
             torch.manual_seed(settings.train.seed)
             actions = self.dataset.manifest.actions.fitted(samples.chunks[:, 0].numpy().astype(np.float64))
-            observation = self.dataset.manifest.observation
             target = CompactTarget(replace(settings.target), actions, observation, words, camera)
         else:
             target = continued_target(settings.target, init, camera)

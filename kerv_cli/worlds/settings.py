@@ -80,6 +80,9 @@ class DemosImportSettings(CommandSettings):
     name: str | None = setting(None, "name of the demonstrations; null: the folder's")
     camera: str = setting("", "camera whose images are read; empty: the first")
     episodes: int = number(0, 0, 1_000_000, help="number of episodes, from the first; 0: all")
+    environment: str = setting(
+        "", "environment that the data were recorded in, such as metaworld; empty: none of kerv's"
+    )
     dofs: str = choice("own", "own", "openvla", help="names of the DoFs: the dataset's own, or OpenVLA's")
     strict: list[str] | None = setting(None, "DoFs that are never relaxed; null: those with gripper in their name")
     tail: int = number(

@@ -186,7 +186,8 @@ class CompactTarget(Packable):
             for x in (observation.proprioception, observation.state)
         )
         given = proprioception.shape[1], state.shape[1]
-        sizes = len(self.observation.proprioception), self.observation.state
+        # a policy that reads images ignores the state, so that its length does not matter
+        sizes = len(self.observation.proprioception), given[1] if self.cameras else self.observation.state
         if given != sizes:
             raise CheckpointError(
                 f"the target takes {sizes[0]} numbers of proprioception and {sizes[1]} of state, the environment gives "

@@ -26,6 +26,7 @@ from PIL import Image, UnidentifiedImageError
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
 from kerv_cli.base.files import atomic_path, read_mapping, regular, visible, write_folder, write_json
 from kerv_cli.base.places import as_path
+from kerv_cli.base.registry import find, load
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, action_limits
 from kerv_cli.worlds import instruction_of
 from kerv_cli.worlds.demos.dataset import (
@@ -38,6 +39,7 @@ from kerv_cli.worlds.demos.dataset import (
 )
 from kerv_cli.worlds.demos.files import DemoEpisode, encode_png, foreign_table, save_episode
 from kerv_cli.worlds.settings import DemosImportSettings
+from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.views import VIEWS
 
 VERSION = "v3.0"
@@ -370,7 +372,8 @@ def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProg
 def _import(source: Source, settings: DemosImportSettings, folder: Path, progress: OnProgress) -> None:
     """Write the demonstrations into an empty folder."""
     chosen = source.episodes[: settings.episodes or None]
-    names = _task_names(source.tasks)
+    world = _world_of(source, settings)
+    names = _task_names(source.tasks, world)
     entries: dict[str, list[EpisodeEntry]] = {}
     actions: list[np.ndarray] = []
     state = 0
@@ -383,7 +386,14 @@ def _import(source: Source, settings: DemosImportSettings, folder: Path, progres
         entries.setdefault(episode.task, []).append(EpisodeEntry.of(path, episode))
         progress(done + 1, len(chosen))
     proprioception = tuple(source.names(STATE, "state")[:state])
-    environment = re.sub(r"\W+", "_", settings.name or source.folder.name).strip("_").lower() or "recorded"
+    if world:
+        environment, space, instructions = world.name, world.actions, {}
+        observation = _observation(source, state, world)
+    else:
+        environment = re.sub(r"\W+", "_", settings.name or source.folder.name).strip("_").lower() or "recorded"
+        space = action_space(source, settings, np.concatenate(actions))
+        observation = ObservationSpace(proprioception, state, (), (0.0, 0.0, 0.0))
+        instructions = {names[i]: text for i, text in source.tasks.items() if names[i] in entries}
     recording = {
         "format": FORMAT,
         "environment": environment,
@@ -397,14 +407,56 @@ def _import(source: Source, settings: DemosImportSettings, folder: Path, progres
     }
     manifest = {
         **recording,
-        "actions": action_space(source, settings, np.concatenate(actions)).as_dict(),
-        "observation": ObservationSpace(proprioception, state, (), (0.0, 0.0, 0.0)).as_dict(),
+        "actions": space.as_dict(),
+        "observation": observation.as_dict(),
         "versions": {"lerobot": str(source.info["codebase_version"])},
         **totals(entries, {}, missing=0),
-        "instructions": {names[i]: text for i, text in source.tasks.items() if names[i] in entries},
+        "instructions": instructions,
     }
     write_json(folder / "recording.json", recording)
     write_json(folder / "manifest.json", manifest)
+
+
+def _world_of(source: Source, settings: DemosImportSettings) -> EnvironmentSpec | None:
+    """Return the environment that the data were recorded in. None without the setting `environment`.
+
+    Raises:
+        UnknownName: There is no such environment, or it has no such camera.
+        UsageError: The data have other actions than the environment, or another rate.
+    """
+    if not settings.environment:
+        return None
+    spec: EnvironmentSpec = load(find("environment", settings.environment).build)
+    spec.camera_name(source.camera)
+    ours, theirs = (spec.actions.dofs, spec.actions.control_hz), (len(source.names(ACTION, "")), source.info["fps"])
+    if ours != theirs:
+        raise UsageError(
+            f"environment={spec.name}: it has {ours[0]} DoFs and {ours[1]:g} control steps per second, the dataset "
+            f"{theirs[0]} and {theirs[1]:g}"
+        )
+    return spec
+
+
+def _observation(source: Source, state: int, world: EnvironmentSpec) -> ObservationSpace:
+    """Return what the data hold of an environment's observations: everything, or the proprioception alone.
+
+    Args:
+        source: The dataset.
+        state: Numbers of state in its rows.
+        world: The environment.
+
+    Raises:
+        CheckpointError: The rows hold another number of values.
+    """
+    whole = world.observation
+    alone = whole.without_state()
+    for space in (whole, alone):
+        if space.state == state:
+            return space
+    raise CheckpointError(
+        f"{source.folder} has {state} numbers of state, {world.name} has {alone.state} of proprioception "
+        f"({STATE}) and {whole.state} in all ({ENVIRONMENT})"
+    )
 
 
 def _episode(source: Source, row: Row, names: Mapping[int, str], tail: int) -> DemoEpisode:
@@ -478,11 +530,24 @@ def _groups(names: Sequence[str], strict: Sequence[str]) -> tuple[Group, ...]:
     return tuple(Group(f"{'strict' if is_strict else 'motion'}_{i}", n) for i, (is_strict, n) in enumerate(runs))
 
 
-def _task_names(tasks: Mapping[int, str]) -> dict[int, str]:
-    """Return task_index -> name of the task, made from its instruction.
+def _task_names(tasks: Mapping[int, str], world: EnvironmentSpec | None) -> dict[int, str]:
+    """Return task_index -> name of the task: the environment's, or made from the instruction.
 
-    The name contains only characters that folders and settings allow.
+    A made name contains only characters that folders and settings allow.
+
+    Args:
+        tasks: task_index -> instruction.
+        world: The environment. None: the tasks are of none of kerv's.
+
+    Raises:
+        UsageError: The environment has no task with this instruction.
     """
+    if world:
+        known = {task.instruction: task.name for task in world.tasks.values()}
+        for text in tasks.values():
+            if text not in known:
+                raise UsageError(f"environment={world.name}: it has no task with the instruction '{text}'")
+        return {number: known[text] for number, text in tasks.items()}
     names: dict[int, str] = {}
     for number, text in tasks.items():
         name = re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:60] or f"task-{number}"
