@@ -434,7 +434,7 @@ def test_tasks_that_the_datastore_does_not_hold_are_left_out():
     store = store_of(np.linspace(0, 1, 40), np.full((40, 8), 100), np.arange(40) % 2)
     seen: list[int] = []
     section = skip_section(store, ["b", "a"], 0.1, 0.9, lambda done, total: seen.append(done))
-    assert (list(section.tasks), section.datastore) == (["a"], store.content)
+    assert (list(section.tasks), section.datastore) == (["a"], store.manifest.content)
     assert seen == [1, 2]
     assert skip_section(store, ["b"], 0.1, 0.9, silent) is None
 
@@ -459,14 +459,14 @@ def test_the_skip_levels_belong_to_one_datastore(own):
     store = Datastore.open(folder, run.description)
     assert row == task_levels(match(store, "reach-v3", 1.9), 0.5)
     assert row.share > 0
-    assert made.skip_levels("reach-v3", store.content) == (row.low, row.s_min, row.high)
+    assert made.skip_levels("reach-v3", store.manifest.content) == (row.low, row.s_min, row.high)
     assert CalibrationArtifact().checked(run.path, run.description) == made
     with pytest.raises(CheckpointError, match=r"for datastore \w+, not for eeeeeeeeeeee: run 'kerv calibrate' again"):
         made.skip_levels("reach-v3", "e" * 64)
     with pytest.raises(CheckpointError, match="no skip level for push-v3, only for reach-v3, drawer-close-v3"):
-        made.skip_levels("push-v3", store.content)
+        made.skip_levels("push-v3", store.manifest.content)
     with pytest.raises(CheckpointError):
-        replace(made, skip=None).skip_levels("reach-v3", store.content)
+        replace(made, skip=None).skip_levels("reach-v3", store.manifest.content)
 
 
 def test_what_cannot_be_computed_now_is_kept(own):

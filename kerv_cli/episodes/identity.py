@@ -190,9 +190,9 @@ def idle_keys(settings: RolloutSettings) -> dict[str, str]:
         idle["rectifier"] = f"skip={skip.name} verifies nothing, so nothing is rejected"
     elif not acceptance.traits.get("reads_threshold", True):
         idle["threshold"] = f"acceptance={acceptance.name} has no threshold"
-    if getattr(method["proposer"], "shape", "") == "chain":
-        shared = hasattr(method["proposer"], "neighbours")  # whose tree `nodes` limits, too
-        idle |= dict.fromkeys(("proposer.top_k", *(() if shared else ("proposer.nodes",))), "a chain is a single path")
+    for kind, part in parts.items():
+        if "idle" in part.traits:
+            idle |= {f"{kind}.{name}": reason for name, reason in part.traits["idle"](method[kind]).items()}
     needed = {need for kind, part in parts.items() for need in part.needs(method[kind])}
     artifacts = registry.parts("artifact")
     if not any(artifacts[kind].traits.get("names_more") for kind in needed):

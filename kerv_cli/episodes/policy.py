@@ -13,7 +13,6 @@ import torch
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.spaces import Observation, ObservationSpace
-from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.decoder import ActionDecoder, Decoder
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.engine.stopwatch import Stopwatch
@@ -149,17 +148,13 @@ def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
     """
     spec = spec_of(task)
     expert = settings.policy.kind == EXPERT
-    decoder: ActionDecoder = ExpertDecoder(task) if expert else _method_decoder(settings, task)
+    decoder: ActionDecoder = ExpertDecoder(task) if expert else method_decoder(settings, task)
     warm_up(decoder, task, spec.observation, settings.world.camera.size)
     return decoder
 
 
-def batch_decoder_for(settings: RolloutSettings) -> BatchDecoder:
-    """Return a decoder for one setting that decodes several episodes at once, of any tasks."""
-    return BatchDecoder(_method_decoder(settings))
-
-
-def _method_decoder(settings: RolloutSettings, task: str = "") -> Decoder:
+def method_decoder(settings: RolloutSettings, task: str = "") -> Decoder:
+    """Return the decoder of a setting's method, not warmed up. Without a task the method must work on any task."""
     artifacts = artifacts_of(settings)
     decoder = Method.of(settings).decoder(artifacts.target, artifacts.load, task)
     decoder.deviation_every = settings.deviation_every

@@ -21,7 +21,7 @@ from kerv_cli.engine.chunk import EpisodeState
 from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
 from kerv_cli.episodes.episode import episode, run_episode
-from kerv_cli.episodes.policy import batch_decoder_for, clock_for, decoder_for
+from kerv_cli.episodes.policy import clock_for, decoder_for, method_decoder
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.parallel import native_decoder
 from kerv_cli.worlds import spec_of
@@ -198,7 +198,7 @@ def run_batch(settings: RolloutSettings, requests: Iterable[Request[K]]) -> Iter
         settings: The rollout's settings.
         requests: The episodes to run, of any tasks.
     """
-    decoder, world = batch_decoder_for(settings), settings.world
+    decoder, world = BatchDecoder(method_decoder(settings)), settings.world
     return run_together(
         decoder, requests, settings.rollout.batch, lambda task: new_world(task, world, build_stress(world.stress))
     )

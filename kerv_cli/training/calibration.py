@@ -514,4 +514,4 @@ def skip_section(
         if task in store.shards:
             levels[task] = task_levels(match(store, task, epsilon), confidence)
         progress(done, len(tasks))
-    return SkipSection(store.content, epsilon, confidence, levels) if levels else None
+    return SkipSection(store.manifest.content, epsilon, confidence, levels) if levels else None

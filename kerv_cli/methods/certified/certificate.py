@@ -20,7 +20,7 @@ from kerv_cli.engine.proposer import Proposer
 from kerv_cli.methods.artifacts import Artifact, MadeFor, Use
 from kerv_cli.methods.certified import CertifiedSkipSettings, ScopedSettings
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.streak import StreakSkipSettings
+from kerv_cli.methods.streak import StreakSkip, StreakSkipSettings
 
 
 @dataclass(frozen=True)
@@ -292,16 +292,12 @@ def certified(settings: CertifiedSkipSettings, context: Context) -> Skip | None:
     """
     certificate = covering(context)
     if certificate is None:
-        return _built(StreakSkipSettings(most=settings.most), context)
+        return StreakSkip.build(StreakSkipSettings(most=settings.most), context)
     if certificate.certified is None:
         return None
     certificate.check_method(context.method, str(context.target.dtype).removeprefix("torch."))
     chunk = context.chunk or context.target.chunk
     if chunk != certificate.chunk:
         raise UsageError(f"skip=certified with chunk={chunk}: the certificate is of {certificate.chunk}")
-    return _built(certificate.certified.rule, context)
-
-
-def _built(rule: Any, context: Context) -> Skip:
-    skip: Skip = part_of("skip", rule.kind).built(rule, context)
-    return skip
+    rule = certificate.certified.rule
+    return part_of("skip", rule.kind).built(rule, context)

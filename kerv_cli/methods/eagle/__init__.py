@@ -35,6 +35,11 @@ class DrafterProposerSettings:
     nodes: int = number(50, 1, MOST_TOKENS)  # tree: maximum number of nodes; the most probable ones are kept
 
 
+def only_of_trees(settings: DrafterProposerSettings, *names: str) -> dict[str, str]:
+    """Return the settings `names`, each with the reason why a chain does not read it. Empty if the shape is a tree."""
+    return dict.fromkeys(names, "a chain is a single path") if settings.shape == "chain" else {}
+
+
 add_drafter(
     "drafter",
     "kerv_cli.methods.eagle.drafter:EagleDrafter",
@@ -43,4 +48,5 @@ add_drafter(
     colour=0x56B4E9,
     when=STATES,
     cost=DRAFTING,
+    idle=lambda settings: only_of_trees(settings, "top_k", "nodes"),
 )

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, number
 from kerv_cli.base.registry import DRAFTING, PREFILL, STATES, add
-from kerv_cli.methods.eagle import DrafterProposerSettings
+from kerv_cli.methods.eagle import DrafterProposerSettings, only_of_trees
 
 MANIFEST = "manifest.json"
 _DATASTORE, _RULES = "kerv_cli.methods.heisd.datastore:", "kerv_cli.methods.heisd.rules:"
@@ -69,8 +69,17 @@ class HybridProposerSettings(DrafterProposerSettings):
     neighbours: int = number(3, 1, MOST_TOKENS)  # retrieval: number of stored chunks in the tree
 
 
-_hybrid = (_RULES + "HybridProposer.build", HybridProposerSettings, ("drafter", "datastore"))
-add("proposer", "hybrid", *_hybrid, when=STATES, has_boundary=True, cost=DRAFTING)
+add(
+    "proposer",
+    "hybrid",
+    _RULES + "HybridProposer.build",
+    HybridProposerSettings,
+    needs=("drafter", "datastore"),
+    when=STATES,
+    has_boundary=True,
+    cost=DRAFTING,
+    idle=lambda settings: only_of_trees(settings, "top_k"),  # `nodes` also limits the tree of stored chunks
+)
 
 
 # --- which drafts are good enough (§2.1)

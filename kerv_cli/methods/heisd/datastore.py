@@ -219,7 +219,12 @@ class QdrantIndex:
             raise UsageError("datastore=qdrant needs the extra: pip install 'kerv[qdrant]'")
         from qdrant_client import QdrantClient, models
 
-        self.store, self.models, self.name, self.settings = store, models, f"kerv-{store.content[:32]}", settings
+        self.store, self.models, self.name, self.settings = (
+            store,
+            models,
+            f"kerv-{store.manifest.content[:32]}",
+            settings,
+        )
         with self._errors():
             memory = None if settings.url or settings.path else ":memory:"
             self.client = QdrantClient(memory, url=settings.url, path=settings.path, check_compatibility=False)
@@ -331,11 +336,6 @@ class Datastore:
     def tasks(self) -> Collection[str]:
         """Full names of the tasks that have entries."""
         return self.shards
-
-    @property
-    def content(self) -> str:
-        """Hash of the keys, the chunks and the target. It stays the same if an equal datastore is built again."""
-        return self.manifest.content
 
     def pooled(self, prompt: Tensor, target: ReadableTarget) -> Tensor:
         """Average the prompt's tokens per part (scene, vision, proprioception), to make a search key with `key_of`.

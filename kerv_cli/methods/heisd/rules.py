@@ -332,7 +332,8 @@ class VerifySkip(Skip):
             retrieval = RetrievalProposer(context.artifact("datastore"), context.target, neighbours=1, nodes=1)
         if settings.s_min is not None:
             return cls(settings, retrieval, (settings.s_min,) * 3)
-        return cls(settings, retrieval, context.calibration.skip_levels(context.task, retrieval.datastore.content))
+        manifest = retrieval.datastore.manifest
+        return cls(settings, retrieval, context.calibration.skip_levels(context.task, manifest.content))
 
     def begin(self, task: str, seed: int) -> None:
         """Begin an episode: count skips from 0, and forget which stored episodes were followed to their end."""

@@ -192,7 +192,6 @@ class Kalman(Predictor):
     """A Kalman filter with constant velocity, per DoF (docs/methods.md §3.1)."""
 
     name = "kalman"
-    least = 2
 
     def weights(self, dof: int, window: int) -> np.ndarray:
         """Return the weights (horizon, window) of the filter with this DoF's noise."""
@@ -353,8 +352,8 @@ def assemble(
     """
     dofs, horizon = chunk.dofs, chunk.steps
     whole, part = divmod(len(tokens), dofs)
-    filled = 1 if whole == 0 or part >= max(settings.min_verified, settings.drop) else 0
-    steps = min(horizon, whole + max(filled, settings.steps - 1 + filled))
+    fills_this = whole == 0 or part >= max(settings.min_verified, settings.drop)
+    steps = min(horizon, whole + settings.steps - 1 + fills_this)
     values = chunk.space.values_of(np.array([*tokens, *drafted][: steps * dofs], dtype=np.int64))
     flat = np.full(steps * dofs, np.nan)
     flat[: len(values)] = values
