@@ -1,5 +1,7 @@
 """Records that look like those of real episodes, made up from a seed; no world, no model."""
 
+from __future__ import annotations
+
 import hashlib
 import os
 import signal
@@ -7,11 +9,9 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import altair as alt
 import numpy as np
-import pandas as pd
 
 from kerv_cli.base.registry import find
 from kerv_cli.base.settings import RuntimeSettings
@@ -25,6 +25,10 @@ from kerv_cli.lab.runs import Run
 from kerv_cli.lab.store import StudyStore, plan_study
 from kerv_cli.worlds import settled
 from kerv_cli.worlds.metaworld.spec import SPEC
+
+if TYPE_CHECKING:
+    import altair as alt
+    import pandas as pd
 
 TOKENS = 16
 IDENTITY = {"target": "a" * 64, "drafter": "b" * 64}
@@ -230,6 +234,8 @@ def slow_elsewhere(setting: Setting, task: str) -> RunEpisode:
 
 def points_of(figure: alt.ConcatChart) -> list[pd.DataFrame]:
     """The points of each panel of a chart, as a browser gets them."""
+    import pandas as pd
+
     spec = figure.to_dict()
     held = [
         next(one["data"] for one in (panel["layer"][-1], panel, spec) if "name" in one.get("data", {}))

@@ -370,7 +370,7 @@ def test_a_rollout_in_batches_prints_success_and_goes_on_where_it_was(policies, 
     results = tmp_path / "results"
     shutil.copytree(policies / "artifacts", results / "artifacts")
     words = ["policy=state", "policy.target=nano-state", "task=reach-v3,push-v3", "world.horizon=8"]
-    command = ["rollout", "method=ar", "episodes=3", "rollout.batch=4", *words, f"results={results}"]
+    command = ["rollout", "method=ar", "episodes=2", "rollout.batch=3", *words, f"results={results}"]
     original = EpisodeRunner.together
 
     def interrupted(self, wanted):
@@ -379,22 +379,14 @@ def test_a_rollout_in_batches_prints_success_and_goes_on_where_it_was(policies, 
 
     monkeypatch.setattr(EpisodeRunner, "together", interrupted)
     stopped = kerv(*command, code=130)
-    assert "2 of 6 episodes of" in stopped.stderr
+    assert "2 of 4 episodes of" in stopped.stderr
     monkeypatch.setattr(EpisodeRunner, "together", original)
     again = kerv(*command)
-    assert "2 of 6 episodes are there" in again.stderr
-    assert "not timed: 4 episodes at a time" in again.stdout
+    assert "2 of 4 episodes are there" in again.stderr
+    assert "not timed: 3 episodes at a time" in again.stdout
     assert "time by phase" not in again.stdout
     for name in ("reach-v3", "push-v3", "all"):
-        assert re.search(rf"{name} .*/[36] .*–", again.stdout), again.stdout
+        assert re.search(rf"{name} .*/[24] .*–", again.stdout), again.stdout
     assert not list(results.glob("rollouts/*/rollouts/*.rrd"))
-    single = [word for word in command if word != "rollout.batch=4"]
-    alone = kerv(*single, "--json")
-    together = kerv(*command, "--json")
-    both = [json.loads(run.stdout) for run in (alone, together)]
-    for a, b in zip(both[0]["tasks"], both[1]["tasks"], strict=True):
-        assert [a[name] for name in ("task", "successes", "steps", "decodes", "forwards_per_step")] == [
-            b[name] for name in ("task", "successes", "steps", "decodes", "forwards_per_step")
-        ]
-        assert a["time_per_step_ms"] > 0
-        assert b["time_per_step_ms"] is None
+    rows = json.loads(kerv(*command, "--json").stdout)["tasks"]
+    assert [row["time_per_step_ms"] for row in rows] == [None] * len(rows)

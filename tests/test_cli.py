@@ -65,10 +65,10 @@ def test_help_is_fast(words):
         ended = os.times()
         return ended.children_user + ended.children_system - began.children_user - began.children_system
 
-    typer = min(seconds([sys.executable, "-c", "import typer"]) for _ in range(3))
-    # half a second on an idle machine; a loaded one is judged against the import of typer alone
     asked = [sys.executable, "-W", "ignore", "-m", "kerv_cli", *words, "--help"]
-    assert min(seconds(asked) for _ in range(5)) < max(0.5, 6 * typer)
+    if seconds(asked) > 0.5:  # a loaded machine is judged against the import of typer alone
+        typer = min(seconds([sys.executable, "-c", "import typer"]) for _ in range(3))
+        assert min(seconds(asked) for _ in range(5)) < max(0.5, 6 * typer)
 
 
 def test_what_is_missing_or_damaged_gets_one_line_and_exit_code_1(results):
@@ -224,8 +224,7 @@ def test_what_has_no_effect_is_said_in_one_line(policies):
     assert announcement == "ar acceptance=relaxed of nano-state on reach-v3: 2 episodes"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize(("number", "late"), [(signal.SIGINT, False), (signal.SIGTERM, False), (signal.SIGTERM, True)])
 def test_an_interrupted_command_says_so_in_one_line(number, late, policies, tmp_path):
     words = ["rollout", "task=reach", "episodes=50", "policy.target=nano-vision", f"results={tmp_path}/results"]
     shutil.copytree(policies, tmp_path / "results")

@@ -26,7 +26,7 @@ def test_a_missing_artifact_with_a_name_is_answered_with_the_command_that_makes_
 
 @pytest.mark.usefixtures("few_validations")
 def test_drafts_of_seven_tasks_are_made_as_the_note_of_their_study_says(results):
-    write_dataset(results / "artifacts/demos/mt10", names=resolve_tasks(["MT10"]))
+    write_dataset(results / "artifacts/demos/mt10", episodes=2, names=resolve_tasks(["MT10"]))
 
     def run(*words):
         return told(*words, f"results={results}")

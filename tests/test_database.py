@@ -101,7 +101,7 @@ WRITERS = """
 others = []
 while len(others) < 2 and (not others or others[-1]):
     others.append(os.fork())
-for number in range(25):
+for number in range(10):
     begun(database, f"{len(others)} {others[-1] == 0} {number}")
     begun(database, f"both{number}")
 if all(others):
@@ -112,7 +112,7 @@ if all(others):
 def test_first_commands_at_once_create_one_set_of_tables(database, tmp_path):
     with python(BEGUN + WRITERS, tmp_path) as process:
         assert process.wait(60) == 0
-    assert count(database, STUDIES) == 100
+    assert count(database, STUDIES) == 40
 
 
 KILLED = """

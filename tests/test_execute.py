@@ -183,6 +183,7 @@ import sys
 import studies_synthetic as s
 from kerv_cli.lab import execute
 execute._POLL_SECONDS = 0.02
+execute.code_hash()  # once, before the processes part
 study = s.threshold_study(["reach-v3", "push-v3"], episodes=2, radii=(3,))
 workers, processes = int(sys.argv[3]), int(sys.argv[4])
 children = []

@@ -91,7 +91,8 @@ def test_weights_and_engine_are_part_of_the_meaning():
 
 
 def test_the_code_below_the_commands_counts_and_nothing_else(tmp_path, monkeypatch):
-    shutil.copytree(Path(kerv_cli.__file__).parent, tmp_path / "kerv_cli")
+    others = shutil.ignore_patterns("methods", "pretrained", "targets", "training", "worlds")  # they take long to read
+    shutil.copytree(Path(kerv_cli.__file__).parent, tmp_path / "kerv_cli", ignore=others)
     monkeypatch.setattr(kerv_cli, "__file__", str(tmp_path / "kerv_cli" / "__init__.py"))
 
     def hash_after(file, more):

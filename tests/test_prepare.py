@@ -183,6 +183,15 @@ def test_an_artifact_is_shown_with_the_settings_that_it_was_made_with():
     assert "made by   kerv train target target=nano " in told("runs", "show", "target/new")
 
 
+@pytest.mark.parametrize("command", ["train drafter", "train drafter drafter=early", "calibrate"])
+def test_a_target_that_decodes_in_parallel_takes_no_drafts(results, command):
+    path = results / "artifacts/target/mine/target.json"
+    described = json.loads(path.read_text())
+    described["settings"]["parallel"] = True
+    path.write_text(json.dumps(described))
+    assert "decodes all tokens at once" in told(*command.split(), MINE, "--plan", code=2)
+
+
 def test_a_certificate_is_made_from_what_its_candidates_read():
     assert needs(("one_pass_certified",), sees=True) == ("drafter", "early", "scout", "certificate")
     assert needs(("one_pass",), sees=True) == ("early",)

@@ -252,7 +252,8 @@ def test_weights_stay_as_they_are_stored(stored):
 
 
 def test_processes_compile_once_and_say_so(tmp_path):
-    """Of two at once one compiles and the other waits; a third has a cache folder that cannot be written."""
+    """Of two at once one compiles and the other waits. A third, whose cache folder cannot be written, falls back to the
+    folder of the first two."""
     script = "from kerv_cli.targets.compact.program import kernels; kernels()"
     variables = os.environ | {"TMPDIR": str(tmp_path), "PYTHONPATH": str(Path(__file__).parent.parent)}
 
@@ -260,10 +261,14 @@ def test_processes_compile_once_and_say_so(tmp_path):
         environment = variables | {"NUMBA_CACHE_DIR": cache}
         return subprocess.Popen([sys.executable, "-c", script], env=environment, stderr=subprocess.PIPE)
 
-    processes = [begun(str(tmp_path)), begun(str(tmp_path)), begun("/proc/none")]
-    told = [process.communicate()[1].decode() for process in processes]
-    assert [process.returncode for process in processes] == [0, 0, 0]
+    fallback = str(tmp_path / f"kerv-{os.getuid()}")
+    told = []
+    for caches in ([fallback, fallback], ["/proc/none"]):
+        processes = [begun(cache) for cache in caches]
+        told += [process.communicate()[1].decode() for process in processes]
+        assert not any(process.returncode for process in processes)
     assert sorted("compiling for this CPU" in text for text in told[:2]) == [False, True]
+    assert "compiling" not in told[2]
 
 
 def test_a_join_of_two_values_is_copied_together():

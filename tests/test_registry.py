@@ -4,10 +4,10 @@ import os
 import subprocess
 import sys
 from importlib.metadata import EntryPoint
-from pathlib import Path
 from typing import Any
 
 import pytest
+from command import told
 
 from kerv_cli.base import registry
 from kerv_cli.base.errors import UnknownName, UsageError
@@ -89,25 +89,16 @@ def test_every_proposer_says_when_it_can_draft():
     assert all(find("proposer", name).traits["when"] == PREFILL for name in chains)
 
 
-def kerv(*words: str, folder: Path, plugins: str = "") -> subprocess.CompletedProcess[str]:
-    path = os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
-    environment = {**os.environ, "PYTHONPATH": path, "KERV_PLUGINS": plugins}
-    command = [sys.executable, "-c", "from kerv_cli.cli.app import app; app()", *words]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=120)
-
-
-def test_a_plugins_proposer_is_a_choice_like_any_other(tmp_path):
+@pytest.mark.usefixtures("shelf")
+def test_a_plugins_proposer_is_a_choice_like_any_other(tmp_path, monkeypatch):
     (tmp_path / "my_parts.py").write_text(PLUGIN.format(name="mine", module="my_parts"))
-    words = ["rollout", "--cfg", "proposer=mine", "prefill_draft=mine"]
-    shown = kerv(*words, "proposer.width=3", folder=tmp_path, plugins="my_parts")
-    assert shown.returncode == 0, shown.stderr
-    assert "\n  kind: mine\n  width: 3\n" in shown.stdout
-    assert "\n  kind: mine\n  width: 17\n" in shown.stdout
-    wrong = kerv("rollout", "--cfg", "proposer=mien", folder=tmp_path, plugins="my_parts")
-    assert (wrong.returncode, wrong.stderr) == (2, "kerv: unknown proposer 'mien': did you mean mine?\n")
-    without = kerv(*words, folder=tmp_path)
-    assert without.returncode == 2
-    assert without.stderr.startswith("kerv: unknown prefill_draft 'mine'")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv(registry.PLUGINS, "my_parts")
+    registry.load_plugins.__wrapped__()
+    shown = told("rollout", "--cfg", "proposer=mine", "prefill_draft=mine", "proposer.width=3")
+    assert "\n  kind: mine\n  width: 3\n" in shown
+    assert "\n  kind: mine\n  width: 17\n" in shown
+    assert "did you mean mine?" in told("rollout", "--cfg", "proposer=mien", code=2)
 
 
 @pytest.mark.parametrize(
@@ -123,7 +114,14 @@ def test_a_plugin_that_does_not_work_gets_one_line(tmp_path, plugins, says):
     (tmp_path / "collides.py").write_text(PLUGIN.format(name="drafter", module="collides"))
     (tmp_path / "unfinished.py").write_text("x = 1\ndef f(:\n")
     (tmp_path / "unknown.py").write_text("nothing\n")
-    done = kerv("rollout", "--cfg", folder=tmp_path, plugins=plugins)
+    path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
+    done = subprocess.run(
+        [sys.executable, "-c", "from kerv_cli.cli.app import app; app()", "rollout", "--cfg"],
+        env={**os.environ, "PYTHONPATH": path, "KERV_PLUGINS": plugins},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 2
     assert says in done.stderr
     assert done.stderr.count("\n") == 1

@@ -126,15 +126,9 @@ def test_packed_weights_give_the_same_draft(target, scout, views):
 
 def test_it_is_trained_from_the_command_line_for_its_target_alone(results):
     words = ["train", "drafter", "drafter=scout", "demos=few", "policy.target=nano-vision"]
-    words += [
-        "policy.artifacts.scout=mine",
-        "drafter.width=24",
-        "drafter.rank=4",
-        "train.batch=8",
-        "train.steps=4",
-        "train.scene_steps=2",
-    ]
-    done = kerv(*words, "train.held_out=0.34", "train.validate_every=4", f"results={results}")
+    words += ["policy.artifacts.scout=mine", "drafter.width=24", "drafter.rank=4", "train.batch=8", "train.steps=4"]
+    words += ["train.scene_steps=2", "train.held_out=0.34", "train.validate_every=4"]
+    done = kerv(*words, f"results={results}")
     assert "object_error_cm" in done.stdout
     target, description = load_target(results / "artifacts/target/nano-vision")
     files, folder = ScoutDrafter(), results / "artifacts/scout/mine"

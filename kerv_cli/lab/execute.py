@@ -271,7 +271,7 @@ class _Sweep:
                     if attempt.future in done:
                         self._end(attempt)
                 if self.elsewhere and not self.waiting and not self.attempts:
-                    time.sleep(1.0)
+                    time.sleep(5 * _POLL_SECONDS)
                     self.waiting.extend(self.elsewhere)
                     self.elsewhere = []
             finished = True
