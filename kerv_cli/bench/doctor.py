@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class DoctorSettings(RunSettings):
-    """Settings of `kerv doctor`. If a target or an environment is given, it checks only that."""
+    """Settings of `kerv doctor`. If a target or an environment is given, nothing else is checked."""
 
     groups: ClassVar = {"world": "default", "runtime": "cpu"}
 

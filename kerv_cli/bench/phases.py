@@ -101,7 +101,7 @@ class Laps(Stopwatch):
         super().__init__(device)
 
     def lap(self, phase: str) -> None:
-        """End the present lap, and count it for a phase."""
+        """End the current lap, and count it for a phase."""
         before = self.phases[phase]
         super().lap(phase)
         self.laps.append((phase, self.phases[phase] - before))

@@ -259,8 +259,8 @@ def shares(phases: Sequence[Phase], machine: Machine) -> tuple[float, float]:
         machine: Limits of the device.
 
     Returns:
-        Two medians: of the forwards that reading memory limits, and of those that arithmetic limits. If there are none
-        of one kind, it gets the other's median.
+        Two medians: of the forwards that reading memory limits, and of the forwards that arithmetic limits. If there
+        are no forwards of one kind, both numbers are the median of the other kind.
     """
     by_bound: dict[bool, list[float]] = {True: [], False: []}
     for p in phases:

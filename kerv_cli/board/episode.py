@@ -102,7 +102,7 @@ def show_episode(request: Request) -> Response:
 def _film_values(
     request: Request, found: FoundEpisode, step: int = 0, decodes: Sequence[DecodeRecord] | None = None
 ) -> dict[str, Any]:
-    """Return what the template of a film needs."""
+    """Return the values that the template of a film shows."""
     job = RECORDER.job(found.recording)
     values: dict[str, Any] = {"found": found, "step": step, "job": job, "film": None, "same": None, "rerun": ""}
     values |= {"slower": SLOWER, "imported": found.store.kind == IMPORT}

@@ -221,8 +221,8 @@ def work_of_record(decode: DecodeRecord) -> Work:
 def prices(work: Work, profile: Profile) -> np.ndarray:
     """Return the seconds (decodes,) of each decode by the cost model.
 
-    The profile gives the seconds of forwards, and of everything that the drafter computes. It also gives those of other
-    drafts, if it has times for them. Everything else costs the recorded seconds.
+    Forwards, and everything that the drafter computes, cost what the profile says. So do drafts of other proposers, if
+    the profile has times for them. Everything else costs the recorded seconds.
     """
     total = np.array(work.host, dtype=float)
     for kind, (decode, rows, with_prompt) in work.calls.items():

@@ -72,7 +72,7 @@ class Rectifier(Protocol):
         them.
 
         Returns:
-            Whether it did either. If not, the target decodes on after its own token.
+            Whether it called one of the two. If not, the target decodes on after its own token.
         """
 
 

@@ -48,7 +48,8 @@ class Proposer:
 class ChainProposer(Proposer):
     """Base class of proposers that draft plain sequences (chains) on the CPU.
 
-    If it drafts before the prefill, its chains can be merged with those of others, or executed without verification.
+    Chains that are drafted before the prefill can be merged with chains of other proposers, or executed without
+    verification.
     """
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:

@@ -95,7 +95,7 @@ class Episode:
 
     @property
     def recording(self) -> str:
-        """File name of its recording. Repeats share it."""
+        """File name of the episode's recording. Repeats of an episode have the same name."""
         name = f"{self.setting.label.replace('=', '')}-{self.task}-{self.seed}-{self.setting.work[:6]}.rrd"
         return re.sub(r"[^\w.+-]", "_", name)[-200:]
 

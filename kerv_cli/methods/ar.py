@@ -1,4 +1,4 @@
-"""Registers the parts of autoregressive decoding: none that drafts, chooses or skips (docs/methods.md §1)."""
+"""Registers the parts of autoregressive decoding, which neither draft nor choose nor skip (docs/methods.md §1)."""
 
 from __future__ import annotations
 

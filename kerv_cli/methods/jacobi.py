@@ -34,7 +34,7 @@ class JacobiProposer(ChainProposer):
 
     Attributes:
         depth: Number of tokens guessed at once. 0: all remaining tokens.
-        guess: The present guess of the remaining tokens.
+        guess: The current guess of the remaining tokens.
     """
 
     name = "jacobi"
@@ -54,7 +54,7 @@ class JacobiProposer(ChainProposer):
         self.guess = [*tokens, *[chunk.space.tokens // 2] * (chunk.remaining - len(tokens))]
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Return the present guess as one chain of at most `depth` tokens."""
+        """Return the current guess as one chain of at most `depth` tokens."""
         return [self.guess[: min(depth, self.depth or depth)]]
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:

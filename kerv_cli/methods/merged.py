@@ -100,7 +100,7 @@ class MergedProposer(ChainProposer):
         return Draft.of(tree.tokens, tree.parents)
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Return the drafts of all sources. If no source is sure of its draft, those of the fallbacks follow."""
+        """Return the drafts of all sources. If no source is sure of its draft, the fallbacks' drafts follow."""
         sources = list(self.sources)
         if not any(source.is_sure(chunk) for source in sources):
             sources += self.fallback

@@ -44,7 +44,7 @@ class StreakSkip(Skip):
         source: The proposer of the drafts.
         allowed: Number of decodes that the last verification allowed without verification.
         left: How many of these are still to come.
-        chain: The draft of the present chunk.
+        chain: The draft of the current chunk.
     """
 
     def __init__(self, settings: StreakSkipSettings, source: ChainProposer) -> None:

@@ -1,4 +1,4 @@
-"""Keep a certificate to one test per policy, on seeds that served nothing else (docs/methods.md §4.6)."""
+"""Keep a certificate to one test per policy, on seeds that no other study ran (docs/methods.md §4.6)."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 Both ask whether a setting loses less success against the baseline than a given bound (docs/methods.md §7).
 
 `--choose` works on a finished study. It tests the settings in a fixed order, the safest first, and ends at the first
-that fails (fixed-sequence testing). So the error rate over all tests is that of one test.
+that fails (fixed-sequence testing). So all tests together have the error rate of one test.
 
 `until=decided` looks at the results after every block of seeds. The intervals use Pocock's constant boundary
 (Biometrika 64, 1977): if a setting's true loss is exactly the bound, the probability that any of the planned looks

@@ -172,4 +172,4 @@ TRACKERS: dict[str, Callable[[Tracked, Path], str]] = {
     "wandb": _to_wandb,
     "mlflow": _to_mlflow,
 }
-"""Tracker -> function that exports a run to it. The names are also those of the packages and of kerv's extras."""
+"""Tracker -> function that exports a run to it. The trackers' packages and kerv's extras have the same names."""

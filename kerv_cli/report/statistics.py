@@ -40,7 +40,7 @@ class PairedCounts(NamedTuple):
 
 NO_ESTIMATE = Estimate(math.nan, math.nan, math.nan)
 MOST_PAIRS = 10_000
-"""Above this number of pairs, messages say only "more than 10,000": nobody runs so many."""
+"""Above this number of pairs, messages say only "more than 10,000", because nobody runs that many."""
 
 
 def wilson(successes: float, episodes: float, confidence: float = 0.95) -> Estimate:
@@ -228,9 +228,9 @@ def speedup(
 ) -> Estimate:
     """Estimate how many times as fast as the baseline a method is: mean time of the baseline / mean time of the method.
 
-    The 95 % interval is that of the ratio's logarithm, linearised, in a stratified cluster sample (Cochran, Sampling
-    Techniques, 1977). The strata are the tasks. The clusters are blocks: episodes that ran together in one process and
-    so share the state of the machine. Two cases differ:
+    The 95 % interval is computed for the ratio's logarithm, linearised, in a stratified cluster sample (Cochran,
+    Sampling Techniques, 1977). The strata are the tasks. The clusters are blocks: episodes that ran together in one
+    process and so share the state of the machine. Two cases differ:
 
     - If every task has only one block, the tasks are the clusters.
     - If there is only one block in all, its pairs are the clusters. The interval then holds only for the state that the

@@ -26,7 +26,7 @@ SPEEDS = {"episode_speedup": "speed, per episode", "speedup": "speed, per step"}
 """Table column of each kind of speed -> its heading."""
 DIFFERENCE = "change in success"
 MAIN = 5
-"""Number of columns that are always shown. The others are behind `--all` and the page's "more columns"."""
+"""Number of columns that are always shown. `--all`, and "more columns" on the page, show the others."""
 NOTE = (
     "In brackets: 95 % intervals. Change in success: points against the baseline, from the same initial states. Speed: "
     "times as fast as the baseline. Slowest 5 % of decodes: they take at least so many ms."

@@ -134,7 +134,7 @@ def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
     Args:
         x: (B, T, heads, C) queries or keys, or (B, heads, T, C).
         cos: Cosines of the positions, (T, 1, C) for the first shape of x, (T, C) for the second.
-        sin: Sines, likewise. Those of the first half of the channels are negative.
+        sin: Sines, in the shape of `cos`. In the first half of the channels their sign is reversed.
     """
     return torch.addcmul(x * cos, x.roll(x.shape[-1] // 2, -1), sin)
 

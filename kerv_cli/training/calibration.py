@@ -363,7 +363,7 @@ def fit_filters(windows: Windows, held: np.ndarray) -> dict[str, Noise]:
     """Fit the Kalman filters `kalman` and `damped` on the training episodes.
 
     Args:
-        windows: Actions before and after each moment. The filters should predict the latter.
+        windows: Actions before each moment, and after it, which the filters should predict.
         held: (D,) bool. True: predictions hold this DoF at its last value, so it is not fitted.
 
     Returns:

@@ -21,7 +21,7 @@ class View(NamedTuple):
     Attributes:
         name: As in the name of the whole, such as `gripperPOV:75`.
         camera: Name of the camera.
-        fovy: Vertical field of view in degrees. None: that of the camera settings.
+        fovy: Vertical field of view in degrees. None: as in the camera settings.
     """
 
     name: str

@@ -209,7 +209,7 @@ class HybridProposer(Proposer):
     """HeiSD: drafts by retrieval or with the drafter, as the boundary chooses for each chunk (docs/methods.md §4.4).
 
     Attributes:
-        name: Name of the proposer that drafts the present chunk.
+        name: Name of the proposer that drafts the current chunk.
     """
 
     def __init__(self, drafter: Proposer, retrieval: Proposer) -> None:

@@ -150,8 +150,8 @@ def needs_of_variability(settings: KinematicThresholdSettings) -> tuple[str, ...
 class Kinematic:
     """KERV: the acceptance radius r follows the variability K, the mean distance of draft tokens to target tokens.
 
-    r = r_min + (r_max − r_min) · exp(−(K / K_S)^φ). K is that of the last decode in which drafts were compared. K_S is
-    the task's reference level. An episode begins as if K were K_S.
+    r = r_min + (r_max − r_min) · exp(−(K / K_S)^φ). K was measured in the last decode that compared drafts. K_S is the
+    task's reference level. An episode begins as if K were K_S.
 
     Attributes:
         r: The radius of the next decode, in bins, not rounded.

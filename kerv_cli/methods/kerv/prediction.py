@@ -262,7 +262,7 @@ class PredictionProposer(ChainProposer):
         return cls(predictor_of(settings, context))
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Return one chain of up to `depth` predicted tokens, after the committed tokens; none without history."""
+        """Return one chain of up to `depth` predicted tokens, or no chain if the history is too short."""
         whole = len(chunk.tokens) // chunk.dofs
         pending = np.array(chunk.tokens[: whole * chunk.dofs], dtype=np.int64).reshape(whole, chunk.dofs)
         history = chunk.situation.history.values(chunk.space.values_of(pending))

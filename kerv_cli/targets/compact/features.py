@@ -1,7 +1,7 @@
 """Features of the scene and of the privileged state, scaled to about 1 (docs/methods.md §0.1).
 
-A place is a position that the task is about, such as that of the object or the goal. The privileged state is what only
-the simulator knows.
+A place is a position that the task is about: of the object or of the goal, for example. The privileged state is what
+only the simulator knows.
 
 Shapes: B batch, p numbers of proprioception, K places, s numbers of privileged state.
 """

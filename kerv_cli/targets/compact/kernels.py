@@ -187,7 +187,7 @@ def rotate(x, to, cos, sin, channels):
         x: Address of the head's `channels` numbers.
         to: Address of the result.
         cos: Address of the cosines.
-        sin: Address of the sines. Those of the first half are negative.
+        sin: Address of the sines. In the first half of the channels their sign is reversed.
         channels: C, size of the head.
     """
     half = channels // 2

@@ -49,7 +49,7 @@ class Packable(nn.Module):
         super()._load_from_state_dict(*arguments, **keywords)
 
     def requires_grad_(self, requires_grad: bool = True) -> Self:
-        """Freeze or unfreeze all parameters. Unfreezing discards all compiled forms, those of submodules too."""
+        """Freeze or unfreeze all parameters. Unfreezing discards the compiled form of every submodule, too."""
         for part in self.modules():
             if requires_grad and isinstance(part, Packable):
                 part.packed = None

@@ -68,7 +68,7 @@ TOWERS = {
 
 @dataclass(frozen=True)
 class Language:
-    """Shape of the language model. Fields have their names in transformers, defaults are those of Llama-2 7B."""
+    """Shape of the language model. Names are from transformers' LlamaConfig, defaults from Llama-2 7B."""
 
     vocab_size: int = 32064
     hidden_size: int = 4096

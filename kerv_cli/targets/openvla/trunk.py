@@ -22,7 +22,7 @@ Rotary = tuple[Tensor, Tensor]
 def rotation(positions: Tensor, channels: int, theta: float, dtype: torch.dtype) -> Rotary:
     """Return the cosines and sines of the rotary embedding in half-split layout. They are computed in float32.
 
-    The sines of the first half of the channels are negative, as `attention.rotate` requires.
+    In the first half of the channels the sines have the reversed sign, as `attention.rotate` requires.
 
     Args:
         positions: (T,) rotary positions.

@@ -247,8 +247,8 @@ class DemoDataset:
         """Join several datasets into one.
 
         Returns:
-            All episodes of the parts, in order. The manifest is that of the first part, with the tasks of all parts and
-            a hash over all.
+            All episodes of the parts, in order. The manifest is the first part's, with the tasks of all parts and a
+            hash over all.
 
         Raises:
             CheckpointError: The parts have different environments, spaces or cameras.

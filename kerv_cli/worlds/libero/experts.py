@@ -29,7 +29,7 @@ _RIM = 0.05
 _LOW = 0.02
 """Height of the fingertips above the bowl's origin at the grasp, in metres."""
 _ABOVE = 0.1
-"""Height above the grasp at which the hand arrives, in metres. It is higher as long as the hand is far away."""
+"""Height above the grasp at which the hand arrives, in metres. It is higher while the hand is far away."""
 _CARRY = 0.15, 0.28
 """Height of the carried bowl above the plate, in metres: from the table, and from the cabinet."""
 _HELD = 0.2
