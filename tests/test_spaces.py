@@ -18,7 +18,7 @@ from kerv_cli.targets.compact.text import PAD, UNKNOWN, WordTokenizer
 from kerv_cli.worlds import resolve_tasks, spec_of, specs, task_names
 from kerv_cli.worlds.metaworld.spec import SPEC
 from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD
-from kerv_cli.worlds.metaworld.tasks import DIFFICULTIES, SUITES, TASKS
+from kerv_cli.worlds.metaworld.tasks import SUITES, TASKS
 
 WIDTH = 2 / 255  # of a bin
 SPACE = METAWORLD.actions
@@ -131,7 +131,6 @@ def test_instructions_are_distinct_and_short():
 def test_difficulty_groups_have_the_published_sizes():
     sizes = Counter(task.difficulty for task in TASKS.values())
     assert sizes == {"easy": 28, "medium": 11, "hard": 6, "very_hard": 5}
-    assert set(sizes) == set(DIFFICULTIES)
 
 
 def test_suites_expand_in_order_without_duplicates():
@@ -158,7 +157,6 @@ def test_names_are_looked_for_in_every_environment():
 
 def test_every_spec_fits_together():
     for spec in specs().values():
-        assert {task.difficulty for task in spec.tasks.values()} == set(spec.difficulties)
         assert all(name in spec.tasks for suite in spec.suites.values() for name in suite)
         assert set(spec.upside_down) <= set(spec.cameras)
         assert len({task.instruction for task in spec.tasks.values()}) == len(spec.tasks)

@@ -80,7 +80,6 @@ class EnvironmentSpec:
             proprioception.
         tasks: Full name -> task.
         suites: Name of a suite, in capitals -> full names of its tasks.
-        difficulties: Groups of tasks, in the order of tables.
         horizon: Default number of control steps of an episode. The simulator runs no more.
         cameras: Names of the cameras. The first is the default.
         world_class: `module:class` of the `World`. Empty for a recorded dataset, in which nothing can be executed.
@@ -100,7 +99,6 @@ class EnvironmentSpec:
     observation: ObservationSpace
     tasks: Mapping[str, Task]
     suites: Mapping[str, tuple[str, ...]]
-    difficulties: tuple[str, ...]
     horizon: int
     cameras: tuple[str, ...]
     world_class: str = ""

@@ -31,7 +31,6 @@ SPEC = EnvironmentSpec(
     ),
     tasks={"push-point": Task("push-point", "push the point to the goal", "easy")},
     suites={"POINT": ("push-point",)},
-    difficulties=("easy",),
     horizon=60,
     cameras=("above",),
     seeds=Seeds(training=range(50_000), selection=range(50_000, 100_000), evaluation=range(100_000, 2**31)),

@@ -59,10 +59,6 @@ class TokenOutcome:
     limit: int | None = None
 
 
-Chunks = Sequence[Sequence[TokenOutcome]]
-"""For each decode, the outcomes of the tokens of its chunk."""
-
-
 def threshold_of(decode: DecodeRecord) -> tuple[int, ...]:
     """Return the acceptance threshold r of each DoF in a decode, in bins. Empty if the acceptance rule has none."""
     return next((r.threshold for r in decode.rounds if r.threshold), ())

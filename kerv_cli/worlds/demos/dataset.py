@@ -118,7 +118,7 @@ def register_recorded(
     """
     tasks = {task: Task(task, instruction, "recorded") for task, instruction in instructions.items()}
     suites = {name.upper(): tuple(tasks)}
-    spec = EnvironmentSpec(name, actions, observation, tasks, suites, ("recorded",), 10_000, (camera,))
+    spec = EnvironmentSpec(name, actions, observation, tasks, suites, 10_000, (camera,))
     setattr(SPECS, name, spec)
     add("environment", name, f"{__name__}:SPECS.{name}")
     return spec

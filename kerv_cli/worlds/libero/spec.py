@@ -35,7 +35,6 @@ SPEC = EnvironmentSpec(
     ),
     tasks={name: Task(name, text, "spatial") for name, text in INSTRUCTIONS.items()},
     suites={SUITE: tuple(INSTRUCTIONS)},
-    difficulties=("spatial",),
     horizon=220,  # as in OpenVLA's evaluation
     cameras=("agentview", "robot0_eye_in_hand", "frontview", "sideview"),
     world_class="kerv_cli.worlds.libero.world:Libero",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, Place
 from kerv_cli.worlds.metaworld.experts import OURS, VERSION
-from kerv_cli.worlds.metaworld.tasks import DIFFICULTIES, SUFFIX, SUITES, TASKS
+from kerv_cli.worlds.metaworld.tasks import SUFFIX, SUITES, TASKS
 from kerv_cli.worlds.spec import EnvironmentSpec
 
 _STEP = 18  # numbers of a time step: hand xyz, gripper opening, then position and rotation of two objects
@@ -31,7 +31,6 @@ SPEC = EnvironmentSpec(
     ),
     tasks=TASKS,
     suites=SUITES,
-    difficulties=DIFFICULTIES,
     horizon=500,  # the simulator raises at step 501
     # corner4 is the view that publications use
     cameras=("corner4", "corner", "corner2", "corner3", "topview", "behindGripper", "gripperPOV"),

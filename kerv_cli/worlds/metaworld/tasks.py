@@ -14,8 +14,6 @@ from pathlib import Path
 from kerv_cli.worlds.task import Task
 
 SUFFIX = "-v3"
-DIFFICULTIES = ("easy", "medium", "hard", "very_hard")
-"""The difficulty groups over which publications average."""
 
 with Path(__file__).with_name("tasks.csv").open(encoding="utf-8") as _file:
     _rows = sorted((f"{row['task']}{SUFFIX}", row["instruction"], row["difficulty"]) for row in csv.DictReader(_file))

@@ -38,7 +38,6 @@ SPEC = EnvironmentSpec(
         "fetch-peg": Task("fetch-peg", "pick up the peg and put it into the slot", "hard"),
     },
     suites={"INSERTION": ("insert-peg", "fetch-peg")},
-    difficulties=("easy", "hard"),
     horizon=120,
     cameras=("front", "top", "wrist"),
     world_class=f"{__name__}.world:InsertionWorld",
