@@ -9,7 +9,7 @@ CODE := kerv_cli tests scripts
 test test-cpus: export OMP_NUM_THREADS := 1
 
 .NOTPARALLEL:
-.PHONY: help setup test test-cpus demo torture lint format wheel pages docs lock clean
+.PHONY: help setup test test-cpus demo torture lint format release pages docs lock clean
 
 help: ## list these rules
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -45,8 +45,8 @@ format: setup ## rewrite the code in the project's style
 	@$(BIN)/ruff check --fix --quiet $(CODE)
 	@$(BIN)/ruff format $(CODE)
 
-wheel: setup ## build the wheel into dist/
-	@$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --no-build-isolation --wheel-dir dist .
+release: setup ## build the wheel and the source into dist/, and run an episode from each in an empty environment
+	@scripts/release.sh $(BIN)/python
 
 pages: setup ## fill the figures of README.md and results/README.md from results/tables
 	@$(BIN)/python scripts/figures.py README.md results/README.md
