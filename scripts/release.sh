@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# release.sh PYTHON: build the sdist and the wheel into dist/. Each must run an episode in an empty environment, outside
-# the checkout, and hold no path of this machine. Run again after a failure: dist/ is made anew.
+# release.sh PYTHON: build the sdist and the wheel into dist/ and check both. The unpacked source sets itself up in an
+# empty environment and runs an episode; then the wheel does so in the same environment. Neither may hold a path of this machine.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 python=$1
@@ -13,25 +13,28 @@ fail() {
     exit 1
 }
 
-[ -z "$(git status --porcelain)" ] || fail "commit or remove your changes first: git status"
+check_paths() {
+    local found
+    if found=$(grep -rlF -e "$PWD/" -e "$HOME/" "$1"); then fail "a folder of this machine is named in: $found"; fi
+}
+
+run_episode() {
+    mkdir "$scratch/$1"
+    (cd "$scratch/$1" && "$source/.venv/bin/kerv" rollout method=one_pass task=drawer-open episodes=1 record=0)
+}
+
+[ -z "$(git status --porcelain)" ] || fail "commit or stash your changes first: git status"
 rm -rf "$dist"
 "$python" -m hatchling build -d "$dist" >/dev/null
 
-"$python" -m venv "$scratch/venv"
-grep -v '^-e ' requirements/cpu.txt >"$scratch/versions.txt"
-for package in "$dist"/*.tar.gz "$dist"/*.whl; do
-    mkdir -p "$scratch/files" "$scratch/work"
-    case $package in
-        *.whl) "$python" -m zipfile -e "$package" "$scratch/files" ;;
-        *) tar -xzf "$package" -C "$scratch/files" ;;
-    esac
-    if private=$(grep -rlF -e "$PWD" -e "$HOME/" "$scratch/files"); then
-        fail "$(basename "$package") names a folder of this machine, in: $(basename -a $private | tr '\n' ' ')"
-    fi
-    echo "$(basename "$package"): installing"
-    "$scratch/venv/bin/python" -m pip install --quiet --disable-pip-version-check --constraint "$scratch/versions.txt" "$package"
-    (cd "$scratch/work" && "$scratch/venv/bin/kerv" rollout method=one_pass task=drawer-open episodes=1 record=0)
-    "$scratch/venv/bin/python" -m pip uninstall --quiet --yes kerv
-    rm -rf "$scratch/files" "$scratch/work"
-done
+tar -xzf "$dist"/kerv-*.tar.gz -C "$scratch"
+source=$(echo "$scratch"/kerv-*)
+check_paths "$source"
+"$python" -m zipfile -e "$dist"/kerv-*.whl "$scratch/wheel"
+check_paths "$scratch/wheel"
+
+PYTHON=$python make --no-print-directory -C "$source" setup
+run_episode from-source
+"$source/.venv/bin/python" -m pip install --quiet --no-deps --force-reinstall "$dist"/kerv-*.whl
+run_episode from-wheel
 ls -l "$dist"
