@@ -94,6 +94,30 @@ def test_a_report_prices_the_study_on_several_machines(results):
     assert "same tokens in the same control steps" in page
 
 
+def test_a_report_prices_the_study_on_the_machines_that_the_study_names(tmp_path):
+    study = dataclasses.replace(threshold_study(["reach-v3"], radii=(9,)), machines=("there",))
+    swept(tmp_path, study)
+    done = report(tmp_path)
+    assert done.exit_code == 0, done.output
+    assert not (tmp_path / "report/tables/threshold_on.csv").exists(), "a machine without a profile is no error"
+    profile_file(tmp_path)
+    assert "vla-150m, GPU: per episode" in report(tmp_path).stdout
+    assert set(pd.read_csv(tmp_path / "report/tables/threshold_on.csv")["on"]) == {"there"}
+
+
+def test_a_report_compares_with_another_baseline(results):
+    tables = []
+    for words, name in (([], "threshold"), (["baseline='spec_vla r=9'"], "threshold_against_spec_vla_r_9")):
+        done = report(results, *words)
+        assert done.exit_code == 0, done.output
+        table = pd.read_csv(results / f"report/tables/{name}.csv")
+        tables.append(table[table["averaging"] == "micro over tasks"].set_index("label"))
+    usual, other = tables
+    assert other["episode_speedup"]["ar"] == pytest.approx(1 / usual["episode_speedup"]["spec_vla r=9"], rel=1e-3)
+    assert set(other["baseline"]) == {"spec_vla r=9"}
+    assert report(results, "baseline=other").exit_code == 2
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [

@@ -11,7 +11,7 @@ from kerv_cli.base.limits import number, setting
 from kerv_cli.base.places import results_dir
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, end_with_json, print_table
+from kerv_cli.cli.common import AsJson, end_with_json
 
 
 @dataclass
@@ -20,6 +20,7 @@ class ReportSettings(CommandSettings):
 
     only: str | None = setting(None, "one study, by name or file; default: all studies in the results folder")
     on: list[str] = setting([], "profiles of 'kerv bench': estimate the study's times on those machines")
+    baseline: str = setting("", "label of the setting to compare with; empty: the study's baseline")
     loss: float = number(3.0, above=0, most=99.9, help="largest loss of success that is accepted, percentage points")
 
 
@@ -42,7 +43,7 @@ AllColumns = Annotated[bool, typer.Option("--all", help="Print all columns of th
 @command(
     "report",
     ReportSettings,
-    keys="study results on loss",
+    keys="study results on baseline loss",
     examples=("kerv report study=demo", "kerv report --choose study=threshold loss=5"),
     # renamed, because Hydra would take study= as a choice among the files of conf/study
     typed={"study": "only"},
@@ -55,11 +56,10 @@ def report(
     as_json: AsJson = False,
 ) -> None:
     """Write CSV tables (per task and aggregated), plots and an HTML page about the studies."""
-    from kerv_cli.cli.work import print_study, print_verdict
+    from kerv_cli.cli.work import print_prices, print_study, print_verdict
     from kerv_cli.episodes.resolve import study_name
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.report import report as write_report
-    from kerv_cli.report.reprice import ASSUMES, repriced_summary
     from kerv_cli.report.tables import rows_of
 
     settings.only = settings.only and study_name(settings.only)
@@ -67,16 +67,14 @@ def report(
         _print_choice(settings, as_json)
         return
     results = results_dir(settings.results)
-    output = write_report(results, settings.only, publish, settings.on, settings.loss)
+    output = write_report(results, settings.only, publish, settings.on, settings.loss, settings.baseline)
     if as_json:
         tables = {name: rows_of(table) for name, table in output.tables.items()}
         priced = {} if output.priced is None else {"priced": rows_of(output.priced)}
         end_with_json({"files": output.files, "studies": tables, **priced})
     for name, table in output.tables.items():
         print_study(table, StudyStore(results, name), all_columns)
-    if output.priced is not None:
-        summary = repriced_summary(output.priced)
-        print_table(summary.columns, summary.itertuples(index=False), ASSUMES)
+    print_prices(output.priced)
     for name, table in output.tables.items():
         if settings.only is None:
             typer.echo(name)

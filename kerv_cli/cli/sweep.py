@@ -11,7 +11,15 @@ from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UsageError
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, end_with_json, print_rows
-from kerv_cli.cli.work import planned_study, print_settings, print_study, print_study_plan, print_verdict, run_study
+from kerv_cli.cli.work import (
+    planned_study,
+    print_prices,
+    print_settings,
+    print_study,
+    print_study_plan,
+    print_verdict,
+    run_study,
+)
 from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 
 if TYPE_CHECKING:
@@ -93,9 +101,13 @@ def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, planned: Plan, as_
     typer.echo(", ".join(f"{number} {what}" for what, number in counts.items()))
     if data is not None and not failed:
         from kerv_cli.report.report import write_study
+        from kerv_cli.report.reprice import own_prices
 
         # the study in the database may have more tasks, from earlier sweeps
         is_whole = store.counts()[1] == len(data.study.episodes)
-        write_study(store, data if is_whole else load_study(store), resolved.sweep.loss)
+        data = data if is_whole else load_study(store)
+        priced = own_prices(data, store)
+        write_study(store, data, resolved.sweep.loss, priced=priced)
+        print_prices(priced)
         print_verdict(data.table, store, resolved.sweep.loss)
     raise typer.Exit(int(bool(failed)))

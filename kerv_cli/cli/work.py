@@ -16,6 +16,7 @@ from kerv_cli.cli.common import (
     end_with_plan,
     print_figures,
     print_rows,
+    print_table,
     progress_bar,
     settings_yaml,
 )
@@ -204,8 +205,17 @@ def print_study(table: DataFrame, store: StudyStore, all_columns: bool = False) 
         typer.echo(f"\n{note}\n")
 
 
+def print_prices(priced: DataFrame | None) -> None:
+    """Print the speeds on other machines, from `reprice.repriced_table`. Nothing if there are none."""
+    from kerv_cli.report.reprice import ASSUMES, repriced_summary
+
+    if priced is not None:
+        summary = repriced_summary(priced)
+        print_table(summary.columns, summary.itertuples(index=False), ASSUMES)
+
+
 def print_verdict(table: DataFrame, store: StudyStore, loss: float) -> None:
-    """Print the last three lines about a study: the verdict, the page to open, the recording to watch.
+    """Print the last lines about a study: the verdict, the page to open, the recording to watch, the board.
 
     Args:
         table: Summary with one row per setting.
@@ -216,6 +226,9 @@ def print_verdict(table: DataFrame, store: StudyStore, loss: float) -> None:
 
     typer.echo(f"verdict: {verdict_of(table, loss)[0]}")
     typer.echo(f"page: {store.root / 'report.html'}")
+    typer.echo(
+        f"browse: kerv board{'' if store.database.results.name == 'results' else f' results={store.database.results}'}"
+    )
     recordings = store.recordings
     mend = "" if store.kind == "import" else "; the same sweep with record=1 rerun=all does that"
     typer.echo(f"watch: {f'kerv view {recordings[0]}' if recordings else f'nothing is recorded{mend}'}")

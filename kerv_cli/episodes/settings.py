@@ -88,6 +88,7 @@ class StudySettings:
     block: int = number(5, 1, 10_000, help="number of seeds for which the settings take turns in one process")
     repeats: int = number(1, 1, 1_000, help="how often every episode is measured")
     note: str = setting("", "a sentence printed below the table, such as what to look for")
+    machines: list[str] = setting([], "profiles of 'kerv bench': also estimate the study's speeds on those machines")
 
 
 @dataclass

@@ -67,7 +67,7 @@ STUDIES = _table(
     sa.Column("id", sa.Integer, primary_key=True),
     sa.Column("name", sa.Text, nullable=False, unique=True),
     *_required(sa.Text, "kind", "created"),  # kind: sweep, rollout, import
-    *_required(_JSON, "about"),  # title, baseline, axis, note, block
+    *_required(_JSON, "about"),  # title, baseline, axis, note, block, machines
 )
 SETTINGS = _table(
     "settings",  # a row of a study's table

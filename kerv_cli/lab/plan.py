@@ -114,6 +114,7 @@ class Study:
         axis: Configuration key on the x axis of plots. Empty: no plot.
         note: A sentence printed in the report.
         block: Number of seeds for which the settings take turns in one process.
+        machines: Names of cost profiles of other machines, on which the report estimates the speeds.
     """
 
     name: str
@@ -125,6 +126,7 @@ class Study:
     axis: str = ""
     note: str = ""
     block: int = 5
+    machines: Sequence[str] = ()
 
     @property
     def labels(self) -> list[str]:

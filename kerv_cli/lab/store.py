@@ -38,7 +38,8 @@ SWEEP, ROLLOUT, IMPORT = "sweep", "rollout", "import"
 """Kinds of studies, made by `kerv sweep`, `kerv rollout` and `kerv runs import`."""
 _FOLDERS = {SWEEP: "studies", ROLLOUT: "rollouts", IMPORT: "studies"}
 _AT_ONCE = 500  # most values in one SQL IN (…)
-_ABOUT = ("title", "baseline", "axis", "note", "block")
+ABOUT = ("title", "baseline", "axis", "note", "block", "machines")
+"""Fields of a `Study` that are stored as one JSON value."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +167,7 @@ class StudyStore:
     def _save(
         self, connection: sa.Connection, study: Study, existing: Mapping[Episode, StoredEpisode], whole: bool
     ) -> None:
-        about = {name: getattr(study, name) for name in _ABOUT}
+        about = {name: getattr(study, name) for name in ABOUT}
         row = connection.execute(sa.select(STUDIES).where(STUDIES.c.name == self.name)).first()
         if row is None:
             new = sa.insert(STUDIES).values(name=self.name, kind=study.kind, created=now(), about=about)

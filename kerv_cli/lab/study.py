@@ -25,7 +25,7 @@ from kerv_cli.lab.execute import execute
 from kerv_cli.lab.executors import check_executor
 from kerv_cli.lab.plan import ALL, Episode, Setting, Study, all_episodes, plain_settings, seed_blocks, seeds_text
 from kerv_cli.lab.runs import Run, interrupted_since, unfinished
-from kerv_cli.lab.store import ROLLOUT, SWEEP, Plan, StudyStore, plan_study
+from kerv_cli.lab.store import ABOUT, ROLLOUT, SWEEP, Plan, StudyStore, plan_study
 
 InterimAnalysis = Callable[[StudyStore, Sequence[Episode], Sequence[str], int, int], list[str]]
 """Function that is called after each block of seeds. It returns the labels of the settings that continue.
@@ -102,9 +102,8 @@ def study_of(resolved: ResolvedStudy, kind: str = SWEEP) -> Study:
     ]
     settings.sort(key=lambda setting: setting.label != about.baseline)
     episodes = all_episodes(settings, resolved.tasks, about.block, about.repeats)
-    return Study(
-        about.name, tuple(settings), episodes, kind, about.title, about.baseline, about.axis, about.note, about.block
-    )
+    own = {name: getattr(about, name) for name in ABOUT}
+    return Study(about.name, tuple(settings), episodes, kind, **own)
 
 
 def plan(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:

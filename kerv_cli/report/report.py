@@ -14,7 +14,7 @@ from kerv_cli.lab.database import Database
 from kerv_cli.lab.store import ROLLOUT, StudyStore, studies
 from kerv_cli.report.page import LOSS, figures_of, render
 from kerv_cli.report.plots import about, png
-from kerv_cli.report.reprice import open_profiles, repriced_table
+from kerv_cli.report.reprice import open_profiles, own_prices, repriced_table
 from kerv_cli.report.stressed import is_stressed, summed_table
 from kerv_cli.report.tables import CSV_COLUMNS, StudyData, csv_text, further_of, latency_table, load_study, values_of
 
@@ -57,6 +57,7 @@ def report(
     publish: bool = False,
     on: Sequence[str] = (),
     loss: float = LOSS,
+    baseline: str = "",
 ) -> Report:
     """Write the tables, plots and page of one study, or of every study that has an episode.
 
@@ -70,21 +71,24 @@ def report(
             do not meet the conditions for publishing.
         on: Names of cost profiles of other machines. The study's speeds on each are estimated (docs/measuring.md).
         loss: Largest loss of success, in points, that the verdict on the page accepts.
+        baseline: Label of the setting to compare with, in place of the study's baseline.
 
     Raises:
-        UsageError: There is no such study, or nothing to report. The message names what to run.
+        UsageError: There is no such study or setting, or nothing to report. The message names what to run.
         Unpublishable: The study may not be published. None of its files is written.
         CheckpointError: The database is damaged.
         StorageError: The disk is full or read-only.
     """
-    if on and not study:
-        raise UsageError(f"on={','.join(on)}: name the study to price with study=NAME")
+    if (on or baseline) and not study:
+        given = f"on={','.join(on)}" if on else f"baseline={baseline}"
+        raise UsageError(f"{given}: name the study with study=NAME")
     names = names_to_report(results, study)
     profiles, output = open_profiles(results, on), Report([], {})
     for name in names:
         store = StudyStore(results, name)
         data = load_study(store)
-        output.priced = repriced_table(data, store, profiles) if profiles else None
+        data = data.compared_with(baseline) if baseline else data
+        output.priced = repriced_table(data, store, profiles) if profiles else own_prices(data, store)
         output.files += write_study(store, data, loss, publish, output.priced)
         output.tables[name] = data.table
     return output
@@ -106,7 +110,7 @@ def write_study(
         Unpublishable: `publish` is set and the study may not be published.
         StorageError: The disk is full or read-only.
     """
-    results, name, title = store.database.results, store.name, data.study.title or store.name
+    results, name, title = store.database.results, data.study.name, data.study.title or store.name
     if publish:
         check_publishable(data)
     tables = {"": data.table[list(CSV_COLUMNS)], "_per_task": data.per_task[list(CSV_COLUMNS)]}

@@ -96,6 +96,7 @@ def repriced_table(data: StudyData, store: StudyStore, profiles: Sequence[NamedP
     episodes = {str(label): group for label, group in data.episodes.groupby("label", sort=False)}
     labels = [label for label in data.labels if decodes(episodes[label])]
     works = {label: _work_of_label(data, label, store) for label in labels}
+    measured = {row["label"]: row for row in rows_of(data.table, MICRO)}
     rows = []
     for named in profiles:
         for label, work in works.items():
@@ -103,10 +104,7 @@ def repriced_table(data: StudyData, store: StudyStore, profiles: Sequence[NamedP
         priced = {label: _priced(episodes[label], works[label], named.profile) for label in labels}
         for label in labels:
             reference = data.references[label]
-            values, measured = (
-                measure(times[label], times.get(reference, times[label].iloc[:0]), MICRO, all_pairs)
-                for times, all_pairs in ((priced, True), (episodes, False))
-            )
+            values = measure(priced[label], priced.get(reference, priced[label].iloc[:0]), MICRO, all_pairs=True)
             rows.append(
                 {
                     "study": data.study.name,
@@ -117,13 +115,23 @@ def repriced_table(data: StudyData, store: StudyStore, profiles: Sequence[NamedP
                     "projected": bool(named.profile.about.get("projected")),
                     **_speeds(values, ""),
                     **{name: values[name] for name in _TIMES},
-                    **_speeds(measured, "measured_"),
+                    **_speeds(measured[label], "measured_"),
                     "measured_on": ";".join(dict.fromkeys(episodes[label]["device_name"])),
                     "episodes": len(episodes[label]),
                     "pairs": values["pairs"],
                 }
             )
     return pd.DataFrame(rows)
+
+
+def own_prices(data: StudyData, store: StudyStore) -> pd.DataFrame | None:
+    """Estimate the speeds on the machines that the study names. None without names, or if a cost is missing."""
+    if not data.study.machines:
+        return None
+    try:
+        return repriced_table(data, store, open_profiles(store.database.results, data.study.machines))
+    except UsageError:
+        return None
 
 
 def _speeds(values: Row, prefix: str) -> dict[str, float]:

@@ -14,6 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from kerv_cli.base.durations import count
 from kerv_cli.engine.record import PHASES
 from kerv_cli.episodes.identity import batch_of, stress_text
 from kerv_cli.report.measures import MICRO, Row, is_timed, registered_columns
@@ -167,7 +168,7 @@ class SummaryTable:
         """Yield the title, the table and the notes below it."""
         rows = self.table[self.table["averaging"] == MICRO]
         first, tasks = rows.iloc[0], int(rows["tasks"].max())
-        counts = f"{tasks} task{'s' * (tasks != 1)}, {rows['episodes'].max()} episodes per setting"
+        counts = f"{count(tasks, 'task')}, {count(rows['episodes'].max(), 'episode')} per setting"
         yield Text(
             f"{first['study']}: {counts}, {first['device_name']}, {first['runtime.dtype']}", "bold", overflow="fold"
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import math
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from numbers import Real
@@ -88,6 +89,17 @@ class StudyData:
             group = [one for one in self.study.settings if _methods_of(one) == _methods_of(baseline)]
             same = {_conditions_of(one): one.label for one in [*group, baseline]}
         return {label: same.get(_conditions_of(one), self.study.baseline) for label, one in self.settings.items()}
+
+    def compared_with(self, label: str) -> StudyData:
+        """Return the study under the name NAME_against_LABEL, with another baseline.
+
+        Raises:
+            UsageError: The study has no such setting.
+        """
+        if label not in self.settings:
+            raise UsageError(f"baseline={label}: '{self.study.name}' has the settings {', '.join(self.labels)}")
+        name = f"{self.study.name}_against_{re.sub(r'[^A-Za-z0-9.]+', '_', label)}"
+        return replace(self, study=replace(self.study, name=name, baseline=label))
 
     @functools.cached_property
     def unstressed(self) -> dict[str, str]:

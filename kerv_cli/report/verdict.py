@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 
 import pandas as pd
 
+from kerv_cli.base.durations import count
 from kerv_cli.report.matched import SOLVED
 from kerv_cli.report.measures import MICRO, Row
 from kerv_cli.report.statistics import MOST_PAIRS
@@ -124,7 +125,7 @@ def sentence(choice: Choice, loss: float, baseline: str) -> str:
         return f"{choice.chosen} {bound} (95 % confidence, {choice.pairs} pairs){_speed(choice)}"
     if not choice.tested:
         return f"no setting is shown to be faster per episode than {baseline} ({choice.pairs} pairs)"
-    return f"{choice.pairs} pairs do not show a setting that is faster and {bound}; {_missing(choice)}"
+    return f"{count(choice.pairs, 'pair')} cannot show a setting that is faster and {bound}; {_missing(choice)}"
 
 
 def unsolved(baseline: str, success: float) -> str:
@@ -161,8 +162,8 @@ def _missing(choice: Choice) -> str:
     if not choice.candidate:
         return "at these rates, more pairs would not show one either"
     more = max(1, math.ceil(choice.candidate_pairs - choice.pairs))
-    count = f"about {more}" if more <= MOST_PAIRS else f"more than {MOST_PAIRS:,}"
-    return f"at these rates, {count} more pairs would show it for {choice.candidate}"
+    number = f"about {more}" if more <= MOST_PAIRS else f"more than {MOST_PAIRS:,}"
+    return f"at these rates, {number} more pairs would show it for {choice.candidate}"
 
 
 def under_conditions(rows: Sequence[Row], baseline: str) -> str:
