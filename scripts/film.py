@@ -1,4 +1,4 @@
-"""Make the film of README.md: one episode under several settings of a study, side by side, in the time that inference takes.
+"""Make the film of README.md: one episode under several settings of a study, in the time that inference takes.
 
     python scripts/film.py STUDY TASK SEED OUT.webp SETTING… [--results DIR]
 
@@ -24,7 +24,7 @@ from kerv_cli.report.viewing.film import film_of
 from kerv_cli.report.viewing.token_outcomes import OUTCOMES, Chunks, chunk_size, outcomes_of
 
 SIDE, GAP, SQUARE, HEADER, FOOTER = 176, 8, 8, 22, 24
-"""Pixels: edge of a camera image, gap between panels, edge of a token, height of the title and of the line of numbers."""
+"""Pixels: edge of an image, gap between panels, edge of a token, height of the title and of the line of numbers."""
 FPS, STILL = 10, 2.0
 """Frames per second, and seconds that the last frame stays."""
 BACK, TEXT, WON = (24, 26, 30), (235, 235, 235), (123, 203, 143)
