@@ -2,7 +2,7 @@
 
     python scripts/film.py STUDY TASK SEED OUT.webp SETTING… [--results DIR]
 
-Each robot moves when its decode is done; the simulator's own time is left out. Under it, a column of squares per decode,
+Each robot moves when its decode is done; the simulator's time is left out. Under it, a column of squares per decode,
 a square per token. Episodes are recorded first if they have no recording.
 """
 
@@ -25,8 +25,8 @@ from kerv_cli.report.viewing.token_outcomes import OUTCOMES, Chunks, chunk_size,
 
 SIDE, GAP, SQUARE, HEADER, FOOTER = 176, 8, 8, 22, 24
 """Pixels: edge of an image, gap between panels, edge of a token, height of the title and of the line of numbers."""
-FPS, STILL = 10, 2.0
-"""Frames per second, and seconds that the last frame stays."""
+FPS, SLOWER, STILL = 10, 2, 2.5
+"""Frames per second; how many times slower than inference the film plays; seconds that the last frame stays."""
 BACK, TEXT, WON = (24, 26, 30), (235, 235, 235), (123, 203, 143)
 
 
@@ -91,21 +91,21 @@ def draw_panel(draw: ImageDraw.ImageDraw, canvas: Image.Image, panel: Panel, lef
             x, y = left + column * SQUARE, HEADER + SIDE + 4 + line * SQUARE
             draw.rectangle((x, y, x + SQUARE - 2, y + SQUARE - 2), fill=f"#{OUTCOMES[one.kind].color >> 8:06x}")
     passed = min(seconds, panel.ends[-1])
-    text = f"{passed:4.1f} s   {panel.forwards[done - 1] if done else 0} forwards"
+    text = f"{passed:.1f} s   {panel.forwards[done - 1] if done else 0} forwards"
     bottom = HEADER + SIDE + 6 + len(panel.chunks[0]) * SQUARE
     draw.text((left, bottom), text, fill=colour, font=ImageFont.load_default(12))
 
 
 def make_film(panels: list[Panel]) -> bytes:
     """Return the film as an animated WebP that plays again and again."""
-    width = len(panels) * (SIDE + GAP) - GAP
+    width = len(panels) * (SIDE + GAP) + GAP
     height = HEADER + SIDE + 6 + len(panels[0].chunks[0]) * SQUARE + FOOTER
     pictures = []
-    for number in range(int(FPS * max(panel.ends[-1] for panel in panels)) + 2):
+    for number in range(int(FPS * SLOWER * max(panel.ends[-1] for panel in panels)) + 2):
         canvas = Image.new("RGB", (width, height), BACK)
         draw = ImageDraw.Draw(canvas)
         for index, panel in enumerate(panels):
-            draw_panel(draw, canvas, panel, index * (SIDE + GAP), number / FPS)
+            draw_panel(draw, canvas, panel, GAP + index * (SIDE + GAP), number / FPS / SLOWER)
         pictures.append(canvas)
     times = [1000 // FPS] * (len(pictures) - 1) + [int(1000 * STILL)]
     buffer = io.BytesIO()
