@@ -84,7 +84,7 @@ def export_demos(settings: DemosExportSettings) -> None:
 @command(
     "demos import",
     DemosImportSettings,
-    keys="source name environment camera episodes dofs strict tail format results",
+    keys="source name environment camera episodes dofs strict tail results",
     examples=(
         "kerv demos import source=datasets/aloha name=aloha",
         "kerv demos import source=datasets/libero dofs=openvla episodes=50",
