@@ -348,7 +348,7 @@ ANSWERS = [
     ("rollout results=file", "results=file is a file: name a folder"),
     ("view nothing.rrd", "nothing.rrd does not exist or is no recording"),
     ("report study=main", "results/kerv.db: run `kerv sweep study=main`"),
-    ("report on=h100", "on=h100: name the study to price with study=NAME"),
+    ("report on=h100", "on=h100: name the study with study=NAME"),
     ("runs compare a", "name two runs, ID or ID:SETTING: 'kerv runs list' shows them"),
     ("runs rm", "name a run: 'kerv runs list' shows them"),
     ("build drafter", "checkpoint=DIR: name the folder of a drafter"),
