@@ -1,5 +1,6 @@
 """The command line as a user meets it: output, exit codes, and one line for every mistake."""
 
+import importlib
 import json
 import os
 import re
@@ -16,6 +17,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from kerv_cli.base import registry
 from kerv_cli.base.config import groups
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import NoSettings, parts
@@ -196,23 +198,23 @@ def test_a_sweep_without_a_study_lists_the_studies_with_their_sizes(tmp_path):
     assert listed["stress"]["settings"] == 145
 
 
-def test_a_command_from_a_plugin_is_one_like_any_other(tmp_path):
+def test_a_command_from_a_plugin_is_one_like_any_other(tmp_path, monkeypatch):
     """docs/extending.md: tests/examples/own_command.py."""
     path = os.pathsep.join([str(Path(__file__).parent / "examples"), os.environ.get("PYTHONPATH", "")])
-
-    def run(*words, **env):
-        return process(*words, PYTHONPATH=path, KERV_PLUGINS="own_command", **env)
-
-    assert "  seeds      Print the seeds of a task's episodes\n" in run("--help").stdout
-    shown = run("seeds", "--help").stdout
+    listed = process("--help", PYTHONPATH=path, KERV_PLUGINS="own_command")
+    assert "  seeds      Print the seeds of a task's episodes\n" in listed.stdout
+    monkeypatch.setattr(registry, "_PARTS", {kind: dict(parts(kind)) for kind in registry.kinds()})
+    monkeypatch.delitem(sys.modules, "examples.own_command", raising=False)
+    importlib.import_module("examples.own_command")
+    shown = kerv("seeds", "--help").stdout
     assert "  episodes=3      int: seeds per task\n" in shown
     assert "  kerv seeds task=reach\n" in shown
-    assert "episodes: 5  # seeds per task\n" in run("seeds", "episodes=5", "--cfg").stdout
+    assert "episodes: 5  # seeds per task\n" in kerv("seeds", "episodes=5", "--cfg").stdout
     results = f"results={tmp_path}"
-    assert run("seeds", "task=reach", results).stdout == "reach-v3: 100000 to 100002\n"
-    assert json.loads(run("seeds", "task=reach", "episodes=1", results, "--json").stdout) == {"reach-v3": [100000]}
-    assert one_line(run("seeds", "episodes=0"), 2) == "kerv: episodes=0: from 1 to 100"
-    assert one_line(run("seeds", "uses=x"), 2).startswith("kerv: unknown key 'uses': did you mean use")
+    assert kerv("seeds", "task=reach", results).stdout == "reach-v3: 100000 to 100002\n"
+    assert json.loads(kerv("seeds", "task=reach", "episodes=1", results, "--json").stdout) == {"reach-v3": [100000]}
+    assert one_line(kerv("seeds", "episodes=0"), 2) == "kerv: episodes=0: from 1 to 100"
+    assert one_line(kerv("seeds", "uses=x"), 2).startswith("kerv: unknown key 'uses': did you mean use")
 
 
 def test_what_has_no_effect_is_said_in_one_line(policies):
@@ -282,7 +284,6 @@ FILES = {
     "nested.yaml": "settings:\n  ar:\n    method: ar\n",
     "axis.yaml": "axis: threshold.rr\nsettings:\n  ar: method=ar\n  a: method=spec_vla threshold.r=3,9\n",
     "twice.yaml": "settings:\n  ar: method=ar\n  ar: method=kerv\n",
-    "common.yaml": "common: epsodes=3\nsettings:\n  ar: method=ar\n",
     "part.yaml": "# a comment\ndefaults:\n  - override /proposer: draftr\n",
     "range.yaml": "defaults:\n  - override /boundary: fused\nboundary:\n  f_star: 25\n",
     "key.yaml": "defaults:\n  - override /acceptance: relaxed\nthreshold:\n  radius: 5\n",
@@ -302,7 +303,6 @@ ANSWERS = [
     # lists, empty values
     ("rollout reach", "'reach' is not an override: write key=value"),
     ("rollout task=reach, push", "write a list without spaces, task=[reach,push]"),
-    ("rollout task=[reach, push]", "write a list without spaces, task=[reach,push]"),
     ("rollout task=[reach", "cannot read 'task=[reach': write a list without spaces"),
     ("rollout results=~/runs", "quote the value: \"results='~/runs'\""),
     ("rollout results=", "results= is empty: write a value, or leave it out"),
@@ -311,12 +311,7 @@ ANSWERS = [
     # unknown keys and names
     ("rollout nonsense=3", "unknown key 'nonsense': see 'kerv rollout --cfg' for the keys"),
     ("rollout device=cuda", "unknown key 'device': did you mean runtime.device?"),
-    ("rollout target=small", "unknown key 'target': did you mean policy.target?"),
-    ("runs list kindd=x", "unknown key 'kindd': did you mean kind?"),
     ("rollout task=reach-v2", "unknown task or suite 'reach-v2': did you mean reach-v3"),
-    ("rollout task=mt11", "unknown task or suite 'mt11': did you mean MT10"),
-    ("train target target=smal", "unknown target 'smal': did you mean small"),
-    ("sweep study=treshold", "unknown study 'treshold': did you mean threshold"),
     ("rollout method=AR", "unknown method 'AR': did you mean ar?"),
     ("prepare for=kervv", "unknown method 'kervv': did you mean kerv"),
     ("rollout rollout.clock=reel", "unknown rollout.clock 'reel': did you mean real?"),
@@ -325,22 +320,17 @@ ANSWERS = [
     ("rollout episodes=1e400", "episodes: Value 'inf' of type 'float' could not be converted to Integer"),
     ("rollout world.stress=push", "world.stress: Invalid type assigned"),
     ("rollout world.stress.level=9", "world.stress.level=9: from 0 to 4"),
-    ("calibrate success margin=200", "margin=200.0: above 0, at most 99.9"),
-    ("serve port=99999", "port=99999: from 0 to 65535"),
     ("demos episodes=10 seed=100000", "seed 100000 is for evaluation; seeds for training are 0 to 49999"),
     ("runs list since=yesterday", "since=yesterday is not a date: write 2026-11-23"),
-    ("rollout method=heisd boundary.f_star=25", "boundary.f_star=25.0: from 0 to 1"),
     ("rollout method=spec_vla boundary.f_star=0.3", "unknown key 'boundary.f_star'"),
     ("rollout episodes=3 episodes=4", "episodes is given twice"),
     ("rollout seed=5", "seed=5 is a training seed"),
-    ("rollout threshold.r=900 method=spec_vla", "threshold.r=900"),
     ("rollout runtime.device=tpu", "runtime.device=tpu: known are cpu, cuda"),
     # methods
     ("rollout method=part.yaml", "part.yaml:3: unknown proposer 'draftr': did you mean drafter"),
     ("rollout method=range.yaml", "range.yaml:4: boundary.f_star=25.0: from 0 to 1"),
     ("rollout method=key.yaml", "key.yaml:4: unknown key 'threshold.radius'"),
     ("rollout method=type.yaml", "type.yaml:2: threshold.r: Value 'wide' of type 'str'"),
-    ("rollout method=list.yaml", "method=list.yaml holds no keys"),
     ("rollout method=nothing.yaml", "method=nothing.yaml cannot be read: No such file"),
     # what is not there
     ("rollout policy.target=mine", "no target 'mine' in results/artifacts/target/mine"),
@@ -362,9 +352,6 @@ ANSWERS = [
     ("sweep study=nested.yaml", "nested.yaml:1: study.settings={'ar': {'method': 'ar'}}: every element must be"),
     ("sweep study=axis.yaml", "axis.yaml:1: unknown axis 'threshold.rr': did you mean threshold.r?"),
     ("sweep study=twice.yaml", "twice.yaml:3: settings.ar is given twice, also in line 2"),
-    ("sweep study=common.yaml", "common.yaml:1: unknown key 'epsodes': did you mean episodes?"),
-    ("sweep study=main thresold.r=3", "kerv: unknown key 'thresold.r': did you mean threshold.r"),
-    ("sweep study=nothing.yml", "study=nothing.yml cannot be read: No such file"),
     ("sweep study=demo method=ar", "study 'demo' sets method itself: leave it out"),
     ("sweep threshold.r=1,2,3", "of which study? name one, study=NAME: 'kerv sweep' lists them; 'kerv rollout -m'"),
     # artifacts and policies

@@ -27,6 +27,10 @@ TASKS = ("reach-v3", "push-v3")
 Found = dict[tuple[str, str], tuple[list[int], str]]
 
 
+on_sqlite = pytest.mark.parametrize("database", ["sqlite"], indirect=True)
+"""For what is decided after the database has answered."""
+
+
 def work(settings: RolloutSettings, weights: dict[str, str] = IDENTITY) -> str:
     return Setting("x", "", plain_settings(asdict(settings)), weights).work
 
@@ -184,6 +188,7 @@ def test_another_study_runs_only_what_it_does_not_share(database):
     assert len(to_run(plan_study(database, threshold_study(["reach-v3"])))) == 2  # only naive_sd and r=9 are gone
 
 
+@on_sqlite
 def test_two_labels_of_one_result_run_once(database):
     study = study_of({"ar": settings_of("ar"), "again": settings_of("ar")}, ["reach-v3"])
     store, outcome = swept(database.results, study)
@@ -191,6 +196,7 @@ def test_two_labels_of_one_result_run_once(database):
     assert store.counts() == (8, 8)
 
 
+@on_sqlite
 def test_times_of_other_blocks_are_no_ratio_until_they_are_taken_in_turn(database):
     swept(database.results, threshold_study(["reach-v3"], radii=(3,)))
     study = threshold_study(["reach-v3"], radii=(3, 9))
@@ -203,6 +209,7 @@ def test_times_of_other_blocks_are_no_ratio_until_they_are_taken_in_turn(databas
     assert not plan_study(database, study, "timed").missing
 
 
+@on_sqlite
 def test_other_code_runs_again_on_request_only(database, monkeypatch):
     study = threshold_study(["reach-v3"])
     swept(database.results, study)
@@ -239,6 +246,7 @@ def test_an_interrupted_rerun_goes_on(database):
     assert to_run(plan_study(database, study, "all", since)) == rest
 
 
+@on_sqlite
 def test_reasons_name_what_changed(database, monkeypatch):
     swept(database.results, threshold_study(["reach-v3"]))
 
@@ -264,6 +272,7 @@ def test_reasons_name_what_changed(database, monkeypatch):
     assert reason(same) == f"engine {ENGINE} → 4"
 
 
+@on_sqlite
 def test_what_depends_on_the_order_of_episodes_is_reused_whole(database):
     def study(episodes):
         settings = settings_of("retrieval", episodes=episodes)
