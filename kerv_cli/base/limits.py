@@ -131,9 +131,9 @@ def check_settings(settings: Any, what: str = "") -> None:
 
 @functools.cache
 def _declared(kind: type) -> tuple[tuple[Field[Any], type | None], ...]:
-    """Return the fields of a dataclass, each with the type of its elements.
+    """Return (field, type of its elements) for each field of a dataclass.
 
-    That type is None for a field that is not a list or dict of plain values.
+    The type is None unless the field is a list or a dict of plain values.
     """
     hints = get_type_hints(kind)
 

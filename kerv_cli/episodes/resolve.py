@@ -159,10 +159,10 @@ def _line_of(path: Path, typed: Collection[str], place: str, others: Mapping[str
 
 
 def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
-    """Compose the settings of `kerv rollout`: one, or with -m one for each combination of the comma lists' values.
+    """Compose the settings of `kerv rollout`. With -m, compose one for each combination of the values in comma lists.
 
-    Every setting runs on all tasks. The first autoregressive setting is the baseline, or else the first of all. A label
-    consists of the method's name, the parts that replace the method's own, and the values that vary.
+    Every setting runs on all tasks. The baseline is the first autoregressive setting. If there is none, it is the first
+    setting. A label consists of the method's name, the parts that replace the method's own, and the values that vary.
 
     Args:
         overrides: The command line's `key=value` arguments.

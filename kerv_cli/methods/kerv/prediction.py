@@ -236,7 +236,7 @@ PREDICTORS = {kind.name: kind for kind in (Hold, Linear, Kalman, Damped)}
 
 
 def predictor_of(settings: NoSettings, context: Context) -> Predictor:
-    """Return the predictor with the name `settings.kind`, for as many control steps as the target's chunk has.
+    """Return the predictor with the name `settings.kind`. It can predict all control steps of a chunk.
 
     The noise of a Kalman filter comes from the calibration.
     """

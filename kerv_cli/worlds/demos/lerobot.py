@@ -537,7 +537,7 @@ def _task_names(tasks: Mapping[int, str], world: EnvironmentSpec | None) -> dict
 
     Args:
         tasks: task_index -> instruction.
-        world: The environment. None: the tasks are of none of kerv's.
+        world: The environment. None: the tasks belong to no environment of kerv.
 
     Raises:
         UsageError: The environment has no task with this instruction.
