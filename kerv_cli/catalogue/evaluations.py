@@ -323,7 +323,7 @@ def _notes(label: str, one: Evaluation) -> Iterator[str]:
 def _settings(first: Evaluation) -> dict[str, Any]:
     """Return the rollout settings of the evaluation, as nested plain values.
 
-    For a kerv server they are its own. For another server they are the defaults, with the server's name as method.
+    A kerv server sends its settings. For any other server they are the defaults, with the server's name as method.
     """
     stored = first.facts.get("settings")
     plain = dataclasses.asdict(RolloutSettings()) | {"method": first.name}

@@ -329,7 +329,7 @@ class _Sweep:
         return True
 
     def _leave_out_existing(self, attempt: _Attempt) -> bool:
-        """Remove the episodes from a block that other sweeps have run since the plan was made.
+        """Remove from a block the episodes that other sweeps have run since the plan was made.
 
         Returns:
             Whether any episodes are left.

@@ -13,6 +13,7 @@ from typing import Any, Literal
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.methods.artifacts import Artifact, MadeFor, Use, check_sources
 from kerv_cli.methods.heisd.rules import BoundaryRanges
+from kerv_cli.methods.kerv import KinematicThresholdSettings
 from kerv_cli.methods.kerv.prediction import Noise
 
 FILE = "calibration.json"
@@ -218,7 +219,8 @@ class CalibrationArtifact(Artifact[Calibration]):
         Raises:
             CheckpointError: K_S was not measured for a task.
         """
-        if getattr(use.method["threshold"], "k_s", 0.0) is None:
+        threshold = use.method["threshold"]
+        if isinstance(threshold, KinematicThresholdSettings) and threshold.k_s is None:
             for task in use.tasks:
                 description.k_s(task)
 

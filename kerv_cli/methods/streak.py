@@ -56,8 +56,10 @@ class StreakSkip(Skip):
     @classmethod
     def build(cls, settings: StreakSkipSettings, context: Context) -> StreakSkip:
         """Build the part that the setting `skip=streak` chooses."""
+        from kerv_cli.methods.merged import MergedProposer
+
         draft = context.built["prefill_draft"]
-        return cls(settings, getattr(draft, "sources", [draft])[0])  # if the draft is merged, its first source
+        return cls(settings, draft.sources[0] if isinstance(draft, MergedProposer) else draft)
 
     def begin(self, task: str, seed: int) -> None:
         """Begin an episode: allow `opening` decodes without verification."""

@@ -264,9 +264,10 @@ class EagleDrafter(TrainableDrafter):
         if description.public is not None:
             return load_public(path, description.public, artifacts.target)
         network: EagleNetwork = super().load(path, artifacts)
-        if (shape := getattr(artifacts.target, "grown_drafter", None)) is not None:
-            grow_stack(network, shape, layers=network.depth)
-            network.padding = artifacts.target.trunk.padding
+        target = artifacts.target
+        if isinstance(target, CompactTarget) and target.grown_drafter is not None:
+            grow_stack(network, target.grown_drafter, layers=network.depth)
+            network.padding = target.trunk.padding
             pack(network)
         return network
 
