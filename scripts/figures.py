@@ -5,8 +5,9 @@
     <!-- figure main one_pass speedup -->2.04 (1.97–2.11)<!-- /figure -->      one number within a sentence
 
 A study's name is that of `results/tables/<study>.csv`. Behind it `macro` takes the average over difficulty groups
-instead of tasks, and `only=a,b` takes these settings, which are written with `_` for a space. A column `NAME@PROFILE`
-is priced for another machine, from `<study>_on.csv`.
+instead of tasks, and `only=a,b` takes these settings, which are written with `_` for a space. A column `NAME@OTHER`
+is that of the same setting in the table OTHER.csv, or priced for the machine OTHER, from `<study>_on.csv`. Behind a
+column, `=TITLE` is its heading, with `_` for a space.
 """
 
 from __future__ import annotations
@@ -111,17 +112,26 @@ COLUMNS: dict[str, tuple[str, Callable[[Row], str]]] = {
 
 
 def _column(name: str, study: str = "") -> tuple[str, Callable[[Row], str]]:
-    """Title and text. `NAME@PROFILE` is that column of `<study>_on.csv`, priced for another machine and marked so."""
-    name, _, machine = name.partition("@")
+    """Heading and text. `NAME@OTHER=HEADING`: of the same setting, priced for a machine or in another table."""
+    name, _, own = name.partition("=")
+    name, _, other = name.partition("@")
     if name not in COLUMNS:
         raise BadReference(f"no column {name}; known: {', '.join(COLUMNS)}")
     title, text = COLUMNS[name]
-    if not machine:
-        return title, text
-    priced = {row["label"]: row for row in table_of(f"{study}_on", False) if row["on"] == machine}
-    if not priced:
-        raise BadReference(f"{study}_on has no machine {machine}")
-    return f"{title}, ≈ {machine}", lambda row: f"≈ {text(priced[row['label']])}" if row["label"] in priced else ""
+    own = own.replace("_", " ")
+    if not other:
+        return own or title, text
+    if (TABLES / f"{other}.csv").is_file():
+        there, title, mark = table_of(other, False), f"{title}, {other}", ""
+    else:
+        there = tuple(row for row in table_of(f"{study}_on", False) if row["on"] == other)
+        title, mark = f"{title}, ≈ {other}", "≈ "
+    rows = {row["label"]: row for row in there}
+    if not rows:
+        raise BadReference(f"{study}_on has no machine {other}")
+    return own.replace(
+        "_", " "
+    ) or title, lambda row: f"{mark}{text(rows[row['label']])}" if row["label"] in rows else ""
 
 
 def _named(label: str) -> str:

@@ -21,11 +21,11 @@ from kerv_cli.catalogue.episodes import find_episode, outcomes
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.viewing.film import film_of
-from kerv_cli.report.viewing.token_outcomes import OUTCOMES, Chunks, chunk_size, outcomes_of
+from kerv_cli.report.viewing.token_outcomes import OUTCOMES, TokenOutcome, chunk_size, outcomes_of
 
 SIDE, GAP, SQUARE, HEADER, FOOTER = 176, 8, 8, 22, 24
 """Pixels: edge of an image, gap between panels, edge of a token, height of the title and of the line of numbers."""
-FPS, SLOWER, STILL = 10, 2, 2.5
+FPS, SLOWER, STILL = 10, 1, 2.5
 """Frames per second; how many times slower than inference the film plays; seconds that the last frame stays."""
 BACK, TEXT, WON = (24, 26, 30), (235, 235, 235), (123, 203, 143)
 
@@ -49,7 +49,7 @@ class Panel:
     ends: list[float]
     steps: list[int]
     forwards: list[int]
-    chunks: Chunks
+    chunks: list[list[TokenOutcome]]
     frames: list[Image.Image]
 
 
