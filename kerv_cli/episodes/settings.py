@@ -25,7 +25,7 @@ class TimingSettings:
     latency_ms: float = number(0.0, 0, 600_000, help="latency=constant: milliseconds per decode")
     profile: str = setting("", "latency=profile: result file of `kerv bench`: its path, or its name in <results>/bench")
     ar_ms: float = number(
-        0.0, 0, 600_000, help="scale latencies so that an autoregressive decode takes so many ms; 0: no scaling"
+        0.0, 0, 600_000, help="scale latencies so that an autoregressive decode takes this many ms; 0: no scaling"
     )
     delay_compensation: str = choice("none", "none", "chunk", help="chunk: drop actions that come too late")
     batch: int = number(1, 1, 1024, help="episodes that are decoded together; above 1, no times are measured")

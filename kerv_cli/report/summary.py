@@ -30,7 +30,7 @@ MAIN = 5
 """Number of columns that are always shown. `--all`, and "more columns" on the page, show the others."""
 NOTE = (
     "In brackets: 95 % intervals. Change in success: points against the baseline, from the same initial states. Speed: "
-    "times as fast as the baseline. Slowest 5 % of decodes: they take at least so many ms."
+    "times as fast as the baseline. Slowest 5 % of decodes: they take at least this many ms."
 )
 _HEADING = 12
 """Width at which a heading is wrapped, in characters."""

@@ -64,7 +64,7 @@ class TrainTargetSettings(TaskSettings):
     task: list[str] = setting([], "tasks and suites; empty: all tasks of the demonstrations")
     demos: str = setting("", f"{DEMOS}; empty: the name that `kerv demos` gives to these tasks")
     log: str = choice("none", *TRACKERS, help=LOG)
-    target: TargetSettings = setting(TargetSettings, "shapes: nano, tiny, small, base, … (conf/target)")
+    target: TargetSettings = setting(TargetSettings, "shapes: nano, tiny, slim, small, … (conf/target)")
     train: TrainSettings = setting(TrainSettings, "optimisation")
     world: WorldSettings = setting(WorldSettings, "camera and length of an episode")
 

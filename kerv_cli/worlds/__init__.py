@@ -105,7 +105,7 @@ def settled(world: W, spec: EnvironmentSpec) -> W:
 
     Raises:
         UnknownName: The environment has no such camera.
-        UsageError: The simulator cannot run so many control steps.
+        UsageError: The simulator cannot run that many control steps.
     """
     camera = replace(world.camera, name=spec.camera_name(world.camera.name))
     return replace(world, camera=camera, horizon=spec.control_steps(world.horizon))

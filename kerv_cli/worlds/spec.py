@@ -171,7 +171,7 @@ class EnvironmentSpec:
             horizon: The number to check. 0 stands for the environment's default.
 
         Raises:
-            UsageError: The simulator cannot run so many.
+            UsageError: The simulator cannot run that many.
         """
         if not 0 <= horizon <= self.horizon:
             raise UsageError(f"horizon={horizon}: {self.name} runs 1 to {self.horizon} control steps")
@@ -235,7 +235,7 @@ class EnvironmentSpec:
 
         Raises:
             UnknownName: There is no such task or camera.
-            UsageError: The simulator cannot run so many control steps or is not installed, or the environment is a
+            UsageError: The simulator cannot run that many control steps or is not installed, or the environment is a
                 recorded dataset.
         """
         self.check_installed()
