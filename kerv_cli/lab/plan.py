@@ -309,7 +309,7 @@ def _grouped(episodes: Iterable[Episode], key: Callable[[Episode], K]) -> dict[K
 
 
 def _turns(episodes: Iterable[Episode]) -> dict[tuple[str, int, int], list[Episode]]:
-    """Group the episodes in which the settings take turns, by task, seed and repeat."""
+    """Group episodes by task, seed and repeat. In such a group, the settings take turns."""
     return _grouped(episodes, lambda one: (one.task, one.seed, one.repeat))
 
 

@@ -42,7 +42,8 @@ def with_matched_speed(rows: Sequence[Row]) -> list[Row]:
     """Add the column `matched_success_speed`: one figure per method and baseline, in each of the method's rows.
 
     It is the largest `episode_speedup` of the settings that pass the test with a margin of 3 points. It is missing if
-    none does or was timed, for the baseline itself, and if the baseline does not solve the tasks.
+    no setting passes, or if the settings that pass were not timed. It is also missing for the baseline itself, and if
+    the baseline does not solve the tasks.
 
     Args:
         rows: One row per setting, with one way of averaging.

@@ -175,7 +175,7 @@ class TargetRun(TrainingRun):
 
     @functools.cached_property
     def state_range(self) -> list[list[float]]:
-        """Range [low, high] of each of the s state numbers, each (s,): their percentiles 0.1 and 99.9.
+        """The 0.1th percentiles of the states' s numbers, then their 99.9th percentiles, (s,) each.
 
         They are measured on at most STATE_EPISODES episodes.
         """

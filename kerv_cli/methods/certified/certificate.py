@@ -70,7 +70,7 @@ def _part_settings(kind: str, plain: dict[str, Any]) -> Any:
 
 @dataclass(frozen=True)
 class Attempt:
-    """One test of a policy, as a later certificate of the policy records it.
+    """An earlier test of the same policy, in the list that each certificate keeps.
 
     Attributes:
         made: When, ISO 8601. Empty: not recorded.
@@ -161,7 +161,7 @@ class Certificate:
 
     @property
     def attempt(self) -> Attempt:
-        """This test, as a later certificate records it."""
+        """This test, as an entry of the list that later certificates keep."""
         return Attempt(
             self.made,
             self.test,

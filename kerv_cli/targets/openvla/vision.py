@@ -112,7 +112,7 @@ class VisionBackbone(nn.Module):
 
 
 def projector(shape: Shape) -> nn.Sequential:
-    """Return the layers that map patch tokens (B, n, W + W') to vision tokens (B, n, E) of the language model."""
+    """Return the layers that map patch tokens (B, n, both towers' widths) to the language model's tokens (B, n, E)."""
     width, hidden = sum(tower.width for tower in shape.towers), shape.language.hidden_size
     first, second, third = nn.Linear(width, 4 * width), nn.Linear(4 * width, hidden), nn.Linear(hidden, hidden)
     return named(fc1=first, gelu1=nn.GELU(), fc2=second, gelu2=nn.GELU(), fc3=third)
