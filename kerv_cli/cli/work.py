@@ -211,7 +211,7 @@ def print_prices(priced: DataFrame | None) -> None:
 
     if priced is not None:
         summary = repriced_summary(priced)
-        summary = summary[[name for name in summary if not name.endswith("per step")]]  # the page has these
+        summary = summary.filter(regex="setting|per episode")  # the page has the speeds per step
         print_table(summary.columns, summary.itertuples(index=False), ASSUMES)
 
 
