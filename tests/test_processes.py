@@ -40,9 +40,9 @@ GUARD = """
 import os, subprocess, sys, time
 from kerv_cli.lab.executors.clusters import guard
 with guard():
-    server = subprocess.Popen(["sh", "-c", "sleep 60 & echo $!; sleep 1.5"], stdout=-1, text=True)
+    server = subprocess.Popen(["sh", "-c", "sleep 60 & echo $!"], stdout=-1, text=True)
     agent = int(server.stdout.readline())
-    time.sleep(2)  # its parent has ended
+    server.wait()  # the agent has lost its parent
     open(sys.argv[1], "a").write(f"{agent}\\n")
     time.sleep(float(sys.argv[2]))
 """
