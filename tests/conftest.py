@@ -121,11 +121,14 @@ def results(policies, tmp_path):
 
 
 @pytest.fixture
-def few_validations(monkeypatch):
-    """A drafter in training is validated on 4 observations, not on 60 of which each is decoded twice."""
+def quick_training(monkeypatch):
+    """A drafter in training is validated on 4 observations, not on 60 of which each is decoded twice. The picture of a
+    training's curves is empty."""
     from kerv_cli.methods.eagle import drafter
+    from kerv_cli.report import plots
 
     monkeypatch.setattr(drafter, "VALIDATED", 4)
+    monkeypatch.setattr(plots, "png", lambda *_: b"")
 
 
 @contextlib.contextmanager

@@ -24,7 +24,7 @@ def test_a_missing_artifact_with_a_name_is_answered_with_the_command_that_makes_
     assert f"kerv {command} {words.split()[0]}" in run.stderr
 
 
-@pytest.mark.usefixtures("few_validations")
+@pytest.mark.usefixtures("quick_training")
 def test_drafts_of_seven_tasks_are_made_as_the_note_of_their_study_says(results):
     write_dataset(results / "artifacts/demos/mt10", episodes=2, names=resolve_tasks(["MT10"]))
 

@@ -93,7 +93,7 @@ def test_what_was_written_is_read_back(results):
     assert manifest.instructions[text.replace(" ", "-")] == text
 
 
-@pytest.mark.usefixtures("few_validations")
+@pytest.mark.usefixtures("quick_training")
 def test_everything_trains_on_recorded_observations_of_an_openvla(results):
     imported(write_checkpoint(results / "tiny"), results, name="rec", control_hz=20.0)
     common = ["policy.target=rec", "demos=back", f"results={results}"]
@@ -138,7 +138,7 @@ def trained(results: Path, *words: str) -> str:
     return run.output
 
 
-@pytest.mark.usefixtures("few_validations")
+@pytest.mark.usefixtures("quick_training")
 def test_a_policy_of_data_without_object_positions_acts_in_their_world(results, tmp_path):
     source = without_positions(results, tmp_path)
     common = [f"results={tmp_path}", f"world.camera.size={SIZE}"]
@@ -151,6 +151,7 @@ def test_a_policy_of_data_without_object_positions_acts_in_their_world(results, 
     assert kerv("train", "drafter", "policy.target=own", *short, f"results={tmp_path}") == (0, "")
 
 
+@pytest.mark.usefixtures("quick_training")
 def test_a_policy_of_a_recording_without_object_positions_decodes(results):
     assert "waypoint_1_error_cm" in trained(results, "name=recorded", "demos=back", "task=BACK")
     target, description = load_target(results / "artifacts/target/recorded")

@@ -62,7 +62,7 @@ def test_a_fine_tuned_target_must_be_of_the_demonstrations_environment(results):
 
 
 @pytest.mark.bits
-@pytest.mark.usefixtures("few_validations")
+@pytest.mark.usefixtures("quick_training")
 def test_a_policy_of_seven_dofs_is_trained_and_decodes_with_its_drafters(results):
     common = ["demos=pegs", "train.steps=4", "train.batch=4", "train.validate_every=2", "train.held_out=0.34"]
     common.append(f"results={results}")

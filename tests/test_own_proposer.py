@@ -123,6 +123,7 @@ def test_its_weights_are_a_run_of_the_results_folder(results):
     assert set(run.made_from) == {"target"}
 
 
+@pytest.mark.usefixtures("quick_training")
 def test_it_is_trained_from_the_command_line_and_drafts_in_a_rollout(results):
     write_dataset(results / "artifacts/demos/few")
     policy = ("policy.target=nano-state", "policy.artifacts.follow=learnt", f"results={results}")

@@ -85,7 +85,7 @@ def test_a_rollout_and_a_study_run_on_the_tasks_that_the_target_knows():
     assert len(resolve_rollout(["policy=expert"], False).settings["expert"].task) == 10
 
 
-@pytest.mark.usefixtures("few_validations")
+@pytest.mark.usefixtures("quick_training")
 def test_prepare_makes_what_is_missing_and_skips_what_is_there(results):
     plan = told("prepare", MINE, "--plan")
     words = [line.split() for line in plan.splitlines() if "│" in line]
@@ -106,7 +106,7 @@ def test_prepare_makes_what_is_missing_and_skips_what_is_there(results):
     assert "kerv runs rm drafter/mine'" in told("prepare", MINE, "--plan", code=1)
 
 
-@pytest.mark.usefixtures("few_validations")
+@pytest.mark.usefixtures("quick_training")
 def test_a_plan_takes_its_time_from_the_most_similar_command_on_this_machine(results):
     train = ("train", "target", "demos=few", "target=nano", "target.observation=state")
     assert "time unknown" in told(*train, "name=new", "train.steps=4", "--plan")
@@ -124,7 +124,7 @@ def test_a_plan_takes_its_time_from_the_most_similar_command_on_this_machine(res
     assert "early: time unknown" in told("prepare", MINE, "--plan")
 
 
-@pytest.mark.usefixtures("few_validations")
+@pytest.mark.usefixtures("quick_training")
 @pytest.mark.parametrize("file", [RESUME, "log.csv", "curves.png"])
 def test_prepare_ends_with_all_files_after_a_full_disk(results, monkeypatch, file):
     replace = files.os.replace
@@ -147,7 +147,7 @@ def typed(line: str) -> Iterator[list[str]]:
     return (quoted.split() for quoted in re.findall("'kerv ([^']*)'", line))
 
 
-@pytest.mark.usefixtures("few_validations")
+@pytest.mark.usefixtures("quick_training")
 def test_the_remedy_for_weights_of_another_target_works_as_it_is_typed(results):
     rollout = ("rollout", "method=spec_vla", "task=reach", MINE, "--plan")
     fast = ("train.steps=1", "train.batch=2", "drafter.samples=40")
@@ -169,7 +169,7 @@ def test_the_remedy_for_weights_of_another_target_works_as_it_is_typed(results):
     assert ", 400 steps of 64" in few
 
 
-@pytest.mark.usefixtures("results", "few_validations")
+@pytest.mark.usefixtures("results", "quick_training")
 def test_an_artifact_is_shown_with_the_settings_that_it_was_made_with():
     quick = ["demos=few", "task=[reach-v3]", "train.steps=1", "train.batch=2"]
     made = {
@@ -240,6 +240,7 @@ def test_prepare_refuses_what_cannot_be(words, says):
     assert says in told("prepare", *words, code=2)
 
 
+@pytest.mark.usefixtures("quick_training")
 def test_a_target_whose_training_was_interrupted_is_finished_by_the_command_that_is_shown(results):
     train = ["train", "target", "name=new", "demos=few", "target=nano", "target.observation=state", "train.steps=2"]
     told(*train)

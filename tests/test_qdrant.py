@@ -12,7 +12,11 @@ from kerv_cli.methods.heisd.datastore import ExactIndex, best
 
 ROWS = {"a": slice(0, 60), "b": slice(60, 61), "c": slice(61, 300)}
 SEEDS = np.random.default_rng(1).integers(0, 4, 300)
-pytest.importorskip("qdrant_client")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def client():
+    pytest.importorskip("qdrant_client")
 
 
 def searched(vectors: np.ndarray, shards: dict[str, slice] = ROWS, **where: str) -> Any:

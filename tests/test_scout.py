@@ -124,6 +124,7 @@ def test_packed_weights_give_the_same_draft(target, scout, views):
     assert torch.allclose(again, places, atol=1e-4)
 
 
+@pytest.mark.usefixtures("quick_training")
 def test_it_is_trained_from_the_command_line_for_its_target_alone(results):
     words = ["train", "drafter", "drafter=scout", "demos=few", "policy.target=nano-vision"]
     words += ["policy.artifacts.scout=mine", "drafter.width=24", "drafter.rank=4", "train.batch=8", "train.steps=4"]

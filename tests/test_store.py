@@ -62,7 +62,7 @@ def test_a_name_in_use_is_refused_and_a_killed_command_is_listed_with_how_to_go_
     assert listed(tmp_path) == []
 
 
-@pytest.mark.usefixtures("few_validations")
+@pytest.mark.usefixtures("quick_training")
 def test_every_command_that_makes_something_has_a_row(policies, tmp_path):
     import shutil
 

@@ -214,6 +214,7 @@ def train(results: Path, *arguments: str) -> str:
 
 
 @pytest.mark.bits
+@pytest.mark.usefixtures("quick_training")
 def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results):
     settings = ["target=nano", "target.observation=state", "task=drawer-close"]
     settings += ["train.batch=4", "train.validate_every=4", "train.steps=16"]
@@ -234,7 +235,7 @@ def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results
     assert all(torch.equal(a[k], b[k]) for k in a)
 
 
-@pytest.mark.usefixtures("few_validations")
+@pytest.mark.usefixtures("quick_training")
 def test_training_counts_subnormal_numbers_as_zero_and_this_thread_nothing_later(results, monkeypatch):
     halves, loss = [], Imitation.loss
 
@@ -249,6 +250,7 @@ def test_training_counts_subnormal_numbers_as_zero_and_this_thread_nothing_later
     assert float(torch.tensor(1e-39) * 0.5) > 0
 
 
+@pytest.mark.usefixtures("quick_training")
 def test_a_run_learns_the_experts_own_path(results):
     words = ["target=nano", "train=plain", "task=drawer-close", "train.batch=2", "train.steps=3"]
     out = train(results, "target", "name=path", *words, "train.validate_every=3")
@@ -258,7 +260,7 @@ def test_a_run_learns_the_experts_own_path(results):
     assert "waypoint" not in out
 
 
-@pytest.mark.usefixtures("few_validations")
+@pytest.mark.usefixtures("quick_training")
 def test_vision_target_and_its_drafter_train_from_the_command_line(results):
     settings = ["target=nano", "task=drawer-close", "train.batch=2", "train.steps=4", "train.scene_steps=1"]
     settings += ["train.validate_every=2", "train.closed_loop=1", "world.horizon=4"]

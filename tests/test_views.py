@@ -151,6 +151,7 @@ def weights_of(results: Path, name: str) -> str:
     return sha256_of(results / "artifacts/target" / name / "model.safetensors")
 
 
+@pytest.mark.usefixtures("quick_training")
 def test_from_recording_to_rollout_and_export(tmp_path):
     """Every command of a policy that sees two views, as docs/training.md gives them, small."""
     common = ["task=drawer-close", f"world.camera.name={HAND}", "world.camera.size=32", f"results={tmp_path}"]
