@@ -80,7 +80,9 @@ def success(study: Study, where: np.ndarray) -> Estimate:
 
 def difference(study: Study, where: np.ndarray) -> Estimate:
     """Paired difference with Newcombe's interval."""
-    return stats.paired_difference(stats.paired_counts(study.baseline[where], study.method[where]))
+    return stats.paired_difference(
+        stats.PairedCounts(*np.bincount(3 - 2 * study.baseline[where] - study.method[where], minlength=4).tolist())
+    )
 
 
 def speedup(study: Study, per_episode: bool, macro: bool) -> Drawn:

@@ -20,7 +20,7 @@ from kerv_cli.episodes.episode import run_episode
 from kerv_cli.episodes.policy import ExpertDecoder, check
 from kerv_cli.episodes.rows import decodes_table, episode_row, read_decodes, table_blob
 from kerv_cli.episodes.settings import RolloutSettings
-from kerv_cli.report.measures import MACRO, MICRO, measure
+from kerv_cli.report.measures import MACRO, MICRO, measure, paired
 from kerv_cli.report.viewing import save_recording
 from kerv_cli.report.viewing.token_outcomes import summary
 from kerv_cli.worlds.demos.recording import DemoConfig, _identity
@@ -66,9 +66,10 @@ def test_rows_keep_it_and_measures_are_undefined_instead_of_divided_by_zero(epis
     frame = pd.DataFrame([row | {"task": NAME, "seed": EVALUATION_SEED, "repeat": 0, "block": "b"}])
     frame = frame.assign(difficulty=SPEC.task(NAME).difficulty, initial_state=str(row["initial_state"]), **STAMPS)
     frame["decode_seconds"] = [np.array([decode.seconds for decode in episode.decodes])]
-    slow = frame.assign(seconds=frame["seconds"] * 10, success=False)
+    slow = frame.assign(label="slow", seconds=frame["seconds"] * 10, success=False)
+    episodes = pd.concat([frame.assign(label="own"), slow], ignore_index=True)
     for averaging in (MICRO, MACRO):
-        found = measure(frame, slow, averaging)
+        found = measure(episodes, paired(episodes, {"own": "slow"}), averaging=averaging)["own"]
         assert found["success"] == 1.0
         assert (found["only_method"], found["both"]) == (1, 0)
         assert found["time_per_step_ms"] > 0

@@ -17,7 +17,6 @@ from kerv_cli.report.statistics import (
     difference,
     mcnemar,
     mean_of,
-    paired_counts,
     paired_difference,
     pairs_for_power,
     pairs_to_settle,
@@ -64,12 +63,6 @@ def test_the_planned_pairs_are_the_fewest_with_which_the_exact_test_has_its_powe
     pairs = int(pairs_for_power(lost, won))
     assert power(pairs - 1) < 0.8 <= power(pairs)
     assert pairs_for_power(0.0495, 0.0505) == math.inf
-
-
-def test_paired_counts_are_the_four_cells():
-    baseline = np.array([1, 1, 1, 0, 0, 0, 0], bool)
-    method = np.array([1, 1, 0, 1, 1, 1, 0], bool)
-    assert paired_counts(baseline, method) == PairedCounts(both=2, only_baseline=1, only_method=3, neither=1)
 
 
 def test_macro_speedup_weighs_groups_equally():

@@ -156,13 +156,13 @@ def certify(certificate: Certificate, store: StudyStore, wanted: Sequence[Episod
     """
     episodes = load_study(store, wanted).episodes
     episodes = episodes[episodes["repeat"] == 0]  # a repeat measures the same world again: it is no further pair
-    ar = episodes[episodes["label"] == baseline]
-    testing = bool(ar["success"].mean() >= SOLVED_BY_AR)
+    pairs = paired(episodes, {one.label: baseline for one in certificate.candidates})
+    testing = bool(episodes.loc[episodes["label"] == baseline, "success"].mean() >= SOLVED_BY_AR)
     candidates: list[Candidate] = []
     chosen = None
     for planned in certificate.candidates:
-        pairs = paired(episodes[episodes["label"] == planned.label], ar)
-        candidates.append(_candidate(planned, pairs, certificate.margin, certificate.delta, testing))
+        own = pairs[pairs["label"] == planned.label]
+        candidates.append(_candidate(planned, own, certificate.margin, certificate.delta, testing))
         testing = candidates[-1].p is not None and candidates[-1].p <= certificate.delta
         chosen = len(candidates) - 1 if testing else chosen
     return dataclasses.replace(certificate, candidates=candidates, chosen=chosen)

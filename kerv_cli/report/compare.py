@@ -10,7 +10,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.catalogue.entries import RunEntry, description_of, find_run, store_of
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, without
 from kerv_cli.lab.plan import seeds_text
-from kerv_cli.report.measures import MICRO, Row, measure
+from kerv_cli.report.measures import Row, measure, paired
 from kerv_cli.report.summary import DIFFERENCE, SPEEDS
 from kerv_cli.report.tables import StudyData, differences, flatten, is_number, load_study, values_of
 
@@ -148,7 +148,8 @@ def _settings_of(side: ComparedRun) -> Row:
 def _episode_results(first: pd.DataFrame, second: pd.DataFrame) -> list[Row]:
     if first.empty or second.empty:
         raise UsageError("one of the two settings has no episode yet: run it first")
-    a, b = measure(first, first, MICRO), measure(second, first, MICRO)
+    both = pd.concat([first.assign(label="first"), second.assign(label="second")], ignore_index=True)
+    a, b = measure(both, paired(both, {"first": "first", "second": "first"})).values()
     rows = [_change("success", a["success"], b["success"]) | _interval(b, "difference", DIFFERENCE)]
     rows += [
         _change(head, 1.0, b[name]) | _interval(b, name, "ratio of times")

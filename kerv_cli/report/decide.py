@@ -188,10 +188,9 @@ def decisions(data: StudyData, labels: Sequence[str], margin: float, look: int, 
         look: Number of this look, from 1.
         looks: Number of planned looks.
     """
-    episodes = data.episodes[data.episodes["repeat"] == 0]
-    baseline = episodes[episodes["label"] == data.study.baseline]
-    pairs = {label: pair_counts(paired(episodes[episodes["label"] == label], baseline)) for label in labels}
-    return [decision_of(label, counts, margin, look, looks) for label, counts in pairs.items()]
+    pairs = paired(data.episodes, dict.fromkeys(labels, data.study.baseline))
+    counts = {label: pair_counts(pairs[pairs["label"] == label]) for label in labels}
+    return [decision_of(label, one, margin, look, looks) for label, one in counts.items()]
 
 
 def judge(loss: float, tell: Callable[[str], None]) -> InterimAnalysis:

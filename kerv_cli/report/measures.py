@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -37,72 +37,79 @@ _RATIOS = {
     "compensation_rate": ("compensated_decodes", "decodes"),
     "retrieval_share": ("retrieval_decodes", "decodes"),
     "deviation": ("deviation_sum", "deviation_count"),
-    "felt_latency": ("delay_seconds", "delay_decodes"),
+    "felt_latency_ms": ("delay_seconds", "delay_decodes"),
     "felt_latency_steps": ("delay_steps", "delay_decodes"),
     "held_share": ("held_steps", "steps"),
 }
 """Measure -> (numerator, denominator), each a column summed over episodes. NaN if the denominator is 0."""
 
 
-def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, all_pairs: bool = False) -> Row:
-    """Return every measure of a setting.
+def measure(
+    episodes: pd.DataFrame,
+    pairs: pd.DataFrame,
+    by: Sequence[str] = ("label",),
+    averaging: str = MICRO,
+    all_pairs: bool = False,
+) -> dict[Hashable, Row]:
+    """Return every measure of each group of episodes.
 
-    `speedup` compares the time per control step, `episode_speedup` the time per episode. Both are NaN if there are no
-    usable pairs, if an episode was not timed, or if the setting runs no decoder (the scripted expert). `same_run` says
-    whether the two episodes of every pair come from one run. `same_block` is the share of pairs that were measured
-    in one block (side by side in one process).
+    `speedup` compares the time per control step, `episode_speedup` the time per episode. `same_run` says whether the
+    two episodes of every pair come from one run. `same_block` is the share of pairs that were measured in one block
+    (side by side in one process).
 
     Args:
-        episodes: Episodes of the setting, one per row. Columns: those of rows.EPISODE_SCHEMA, `decode_seconds`,
-            `difficulty`, `run`, and those of `COMPARABLE`.
-        baseline: Episodes of the baseline, with the same columns. May be empty.
+        episodes: One row per episode. Columns: those of rows.EPISODE_SCHEMA, `label`, `decode_seconds`, `difficulty`,
+            `run`, `block`, and those of `COMPARABLE`.
+        pairs: Their pairs with the baseline, from `paired`.
+        by: Columns that form the groups: the label, or task and label.
         averaging: MACRO computes a measure for every difficulty group and returns the unweighted mean of the groups.
             Any other value pools all episodes. Paired counts, McNemar's p and `pairs_to_settle` are always pooled.
         all_pairs: Whether speedups also use pairs that were not measured in one block.
 
     Returns:
-        Column name to value. A measure without data is NaN.
+        For each group, column name to value. A measure without data is NaN.
     """
-    pairs = paired(episodes, baseline)
-    macro = averaging == MACRO
-    worlds = pairs[pairs["repeat"] == 0]  # a repeat measures the same world again
-    once = episodes[episodes["repeat"] == 0]
-    success = _averaged(once, macro, lambda group: stats.wilson(int(group["success"].sum()), len(group)))
-    difference = _averaged(worlds, macro, lambda group: stats.paired_difference(pair_counts(group)))
-    speeds = speedups(episodes, pairs, macro, all_pairs)
-    return {
-        "successes": int(once["success"].sum()),
-        **columns_of("success", success),
-        **columns_of("speedup", speeds["speedup"]),
-        **columns_of("episode_speedup", speeds["episode_speedup"]),
-        **(_mean_of_groups(episodes) if macro else _means(episodes)),
-        **paired_columns(pair_counts(worlds), difference),
-        "pairs_to_settle": stats.pairs_to_settle(pair_counts(worlds), MARGIN),
-        "same_run": bool(len(pairs) and pairs["same_run"].all()),
-        "same_block": float(pairs["same_block"].mean()) if len(pairs) else math.nan,
-        "steps": int(episodes["steps"].sum()),
-        "decodes": int(episodes["decodes"].sum()),
-        "deviation_samples": int(episodes["deviation_count"].sum()),
-    }
+    if averaging != MACRO:
+        episodes, pairs = episodes.assign(difficulty=""), pairs.assign(difficulty="")
+    by, outcomes = list(by), list(stats.PairedCounts._fields)
+    parts = [*by, "difficulty"]
+    worlds = episodes["repeat"] == 0  # a repeat measures the same world again
+    counted = episodes.assign(worlds=worlds, successes=worlds & episodes["success"].astype(bool))
+    counts = counted.groupby(parts)[["successes", "worlds", "steps", "decodes", "deviation_count"]].sum()
+    counts = counts.join(pairs.groupby(parts)[outcomes].sum()).fillna(0).astype(int)
+    groups: list[Hashable] = counts.reset_index("difficulty").index.tolist()
+    rates = [stats.wilson(*row) for row in counts[["successes", "worlds"]].to_numpy().tolist()]
+    changes = [stats.paired_difference(stats.PairedCounts(*row)) for row in counts[outcomes].to_numpy().tolist()]
+    success, difference = _averaged(groups, rates), _averaged(groups, changes)
+    sums = counts.groupby(level=by).sum().join(pairs.groupby(by)[["same_run", "same_block"]].mean())
+    means: dict[Hashable, Any] = _means(episodes, parts).groupby(level=by).mean().to_dict("index")
+    speeds = speedups(pairs, by, averaging, all_pairs)
+    rows: dict[Hashable, Row] = {}
+    for group, row in sums.to_dict("index").items():
+        pooled = stats.PairedCounts(*(row[name] for name in outcomes))
+        rows[group] = {
+            "successes": row["successes"],
+            **columns_of("success", success[group]),
+            **columns_of("speedup", speeds["speedup"].get(group, stats.NO_ESTIMATE)),
+            **columns_of("episode_speedup", speeds["episode_speedup"].get(group, stats.NO_ESTIMATE)),
+            **means[group],
+            **paired_columns(pooled, difference[group]),
+            "pairs_to_settle": stats.pairs_to_settle(pooled, MARGIN),
+            "same_run": row["same_run"] == 1,
+            "same_block": row["same_block"],
+            "steps": row["steps"],
+            "decodes": row["decodes"],
+            "deviation_samples": row["deviation_count"],
+        }
+    return rows
 
 
-def _averaged(frame: pd.DataFrame, macro: bool, estimate: Callable[[pd.DataFrame], Estimate]) -> Estimate:
-    """Apply `estimate` to all rows, or average its values over the difficulty groups.
-
-    Args:
-        frame: Episodes or pairs, with a column `difficulty`.
-        macro: Whether to average over difficulty groups. Groups whose estimate is NaN are left out.
-        estimate: Computes an estimate from some rows of `frame`.
-    """
-    if not macro:
-        return estimate(frame)
-    estimates = [estimate(group) for _, group in frame.groupby("difficulty", sort=True)]
-    return stats.mean_of([one for one in estimates if not math.isnan(one.value)])
-
-
-def pair_counts(pairs: pd.DataFrame) -> stats.PairedCounts:
-    """Count how often both, one or none of the two sides succeeded, in a table made by `paired`."""
-    return stats.paired_counts(pairs["success_baseline"].to_numpy(), pairs["success_method"].to_numpy())
+def _averaged(groups: Iterable[Hashable], estimates: Iterable[Estimate]) -> dict[Hashable, Estimate]:
+    """Return the mean of the estimates of each group. Estimates that are NaN are left out."""
+    known: dict[Hashable, list[Estimate]] = {}
+    for group, estimate in zip(groups, estimates, strict=True):
+        known.setdefault(group, []).extend([] if math.isnan(estimate.value) else [estimate])
+    return {group: stats.mean_of(several) for group, several in known.items()}
 
 
 def paired_columns(counts: stats.PairedCounts, difference: Estimate) -> Row:
@@ -130,96 +137,114 @@ def columns_of(name: str, estimate: Estimate) -> dict[str, float]:
     return {name: estimate.value, f"{name}_low": estimate.low, f"{name}_high": estimate.high}
 
 
-def paired(episodes: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
-    """Pair the setting's episodes with the baseline's.
+def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame:
+    """Pair the episodes of settings with those of their baselines.
 
     Two episodes form a pair if they have the same task, seed, repeat, initial state, device, number format and number
     of threads. Episodes that were run by a foreign policy server name no device; they pair with episodes of any device.
 
+    Args:
+        episodes: Episodes of all settings and baselines.
+        baselines: Label of a setting -> label of its baseline. Other settings are left out.
+
     Returns:
-        One row per pair, sorted by task, seed and repeat. Columns: `task`, `difficulty`, `seed`, `repeat`, `same_run`,
-        `same_block`; and, with the endings _baseline and _method: `time` (seconds per control step), `seconds` (of the
-        whole episode), `success`, `block`.
+        One row per pair, sorted by task, seed and repeat. Columns: `label`, `task`, `difficulty`, `seed`, `repeat`,
+        `decodes`, `same_run`, `same_block`; with the endings _baseline and _method: `time` (seconds per control step),
+        `seconds` (of the whole episode), `block`, `success`; and 1 or 0 in the columns of `PairedCounts`. Those are all
+        0 in repeats, which measure the same world again.
     """
     keys = ["task", "seed", "repeat"]
-    columns = [*keys, "difficulty", "run", "block", "success", "seconds", "initial_state", *COMPARABLE]
-    method, other = (side[columns].assign(time=side["seconds"] / side["steps"]) for side in (episodes, baseline))
-    both = method.merge(other, on=keys, suffixes=("_method", "_baseline"))
+    columns = ["label", *keys, "run", "block", "success", "seconds", "initial_state", *COMPARABLE]
+    other = episodes[columns].assign(time=episodes["seconds"] / episodes["steps"])
+    method = other.assign(
+        difficulty=episodes["difficulty"],
+        decodes=(episodes["forwards"] > 0) | (episodes["skipped_decodes"] > 0),  # a scripted expert does neither
+        baseline=other["label"].map(baselines),
+    )
+    other = other.rename(columns={"label": "baseline"})
+    both = method.merge(other, on=["baseline", *keys], suffixes=("_method", "_baseline"))
     agree = both["initial_state_method"] == both["initial_state_baseline"]
     elsewhere = (both["device_name_method"] == "") | (both["device_name_baseline"] == "")
     for name in COMPARABLE:
         agree &= elsewhere | (both[f"{name}_method"] == both[f"{name}_baseline"])
     both = both[agree].sort_values(keys, kind="stable").reset_index(drop=True)
-    both["same_run"] = both["run_method"] == both["run_baseline"]
-    both["same_block"] = both["block_method"] == both["block_baseline"]
-    return both.rename(columns={"difficulty_method": "difficulty"})
+    won, reference = (both[f"success_{side}"].astype(bool) for side in ("method", "baseline"))
+    outcomes = {"both": won & reference, "only_baseline": ~won & reference, "only_method": won & ~reference}
+    outcomes["neither"] = ~won & ~reference
+    return both.assign(
+        same_run=both["run_method"] == both["run_baseline"],
+        same_block=both["block_method"] == both["block_baseline"],
+        **{name: (outcome & (both["repeat"] == 0)).astype(int) for name, outcome in outcomes.items()},
+    )
 
 
-def decodes(episodes: pd.DataFrame) -> bool:
-    """Return whether the episodes ran a decoder. A scripted expert runs none and has no decoding time."""
-    return bool(episodes["forwards"].sum() or episodes["skipped_decodes"].sum())
+def pair_counts(pairs: pd.DataFrame) -> stats.PairedCounts:
+    """Count how often both, one or none of the two sides succeeded, in a table made by `paired`."""
+    return stats.PairedCounts(*(int(pairs[name].sum()) for name in stats.PairedCounts._fields))
 
 
-def is_timed(episodes: pd.DataFrame, column: str = "seconds") -> bool:
-    """Return whether `column` has a time for every episode.
-
-    Episodes that ran in a batch have no times (docs/measuring.md).
-    """
-    return bool(episodes[column].notna().all())
+def is_timed(episodes: pd.DataFrame) -> bool:
+    """Return whether every episode has a time. Episodes that ran in a batch have none (docs/measuring.md)."""
+    return bool(episodes["seconds"].notna().all())
 
 
-def speedups(episodes: pd.DataFrame, pairs: pd.DataFrame, macro: bool, all_pairs: bool = False) -> dict[str, Estimate]:
-    """Return `speedup` and `episode_speedup` of a setting, as `measure` defines them.
+def speedups(
+    pairs: pd.DataFrame, by: list[str], averaging: str, all_pairs: bool = False
+) -> dict[str, dict[Hashable, Estimate]]:
+    """Return `speedup` and `episode_speedup` of each group of pairs.
+
+    A group has none if it has no usable pairs, if an episode was not timed, or if its setting runs no decoder (the
+    scripted expert).
 
     Args:
-        episodes: Episodes of the setting.
         pairs: Table made by `paired`.
-        macro: Whether to average times over difficulty groups.
+        by: Columns that form the groups.
+        averaging: MACRO averages times over difficulty groups.
         all_pairs: Whether to use pairs that were not measured in one block, too.
     """
     timed = pairs if all_pairs else pairs[pairs["same_block"]]
-    if not (decodes(episodes) and is_timed(timed, "time_method") and is_timed(timed, "time_baseline")):
-        return {"speedup": stats.NO_ESTIMATE, "episode_speedup": stats.NO_ESTIMATE}
     blocks = timed["block_method"].astype(str) + "|" + timed["block_baseline"].astype(str)
-    blocks = blocks.groupby([timed["task"], timed["seed"]]).transform("first")  # repeats of a world count once
-    about = list(timed["task"]), list(timed["difficulty"]) if macro else None, list(blocks)
-    return {
-        name: stats.speedup(timed[f"{time}_baseline"].to_numpy(), timed[f"{time}_method"].to_numpy(), *about)
-        for name, time in (("speedup", "time"), ("episode_speedup", "seconds"))
+    # repeats of a world count once
+    blocks = blocks.groupby([timed[name] for name in ("label", "task", "seed")]).transform("first")
+    tasks, difficulties, clusters = (pd.factorize(one)[0] for one in (timed["task"], timed["difficulty"], blocks))
+    decodes = timed["decodes"].to_numpy()
+    times = {
+        name: [timed[f"{column}_{side}"].to_numpy(float) for side in ("baseline", "method")]
+        for name, column in (("speedup", "time"), ("episode_speedup", "seconds"))
     }
+    found: dict[str, dict[Hashable, Estimate]] = {name: {} for name in times}
+    for group, index in timed.groupby(by).indices.items():
+        about = tasks[index], difficulties[index] if averaging == MACRO else None, clusters[index]
+        for name, (baseline, method) in times.items():
+            if decodes[index].any() and not np.isnan(baseline[index] + method[index]).any():
+                found[name][group] = stats.speedup(baseline[index], method[index], *about)
+    return found
 
 
-def _means(episodes: pd.DataFrame) -> dict[str, float]:
-    """Return the measures that need no baseline, pooled over all given episodes. Times are in milliseconds."""
-    per_step = 1000.0 / episodes["steps"]
-    decode_ms = 1000.0 * np.concatenate(list(episodes["decode_seconds"]))
-    middle, late, worst = np.quantile(decode_ms, [0.5, 0.95, 1.0])
-    values = {
-        "time_per_step_ms": float((episodes["seconds"] * per_step).mean()),
-        "time_per_episode_ms": 1000.0 * float(episodes["seconds"].mean()),
-        "latency_p50_ms": float(middle),
-        "latency_p95_ms": float(late),
-        "latency_worst_ms": float(worst),
+def _means(episodes: pd.DataFrame, by: list[str]) -> pd.DataFrame:
+    """Return the measures that need no baseline, pooled over the episodes of each group. Times are in milliseconds."""
+    groups = episodes.groupby(by)
+    per_step, solved = 1000.0 / episodes["steps"], episodes["success"].astype(bool)
+    distances = episodes["closest_approach"].astype(float)
+    each = {
+        "time_per_step_ms": episodes["seconds"] * per_step,
+        "time_per_episode_ms": 1000.0 * episodes["seconds"],
+        **{f"ms.{phase}": episodes[f"seconds.{phase}"] * per_step for phase in PHASES},
+        "steps_to_success": episodes["steps"].where(solved),
+        "path_m": episodes["path_length"].astype(float).where(solved),
+        "near_contact_failure": (distances < NEAR).astype(float).where(~solved & distances.notna()),
     }
-    values |= {f"ms.{phase}": float((episodes[f"seconds.{phase}"] * per_step).mean()) for phase in PHASES}
-    sums = episodes[list({name: 0 for pair in _RATIOS.values() for name in pair})].sum().to_dict()
-    values |= {name: float(sums[a] / sums[b]) if sums[b] else math.nan for name, (a, b) in _RATIOS.items()}
-    values["felt_latency_ms"] = 1000.0 * values.pop("felt_latency")
-    solved = episodes[episodes["success"].astype(bool)]
-    values["steps_to_success"] = float(solved["steps"].mean())
-    values["path_m"] = float(solved["path_length"].astype(float).mean())
-    distances = episodes.loc[~episodes["success"].astype(bool), "closest_approach"].astype(float).dropna()
-    values["near_contact_failure"] = float((distances < NEAR).mean())
-    return values | {name: float(part.built(episodes)) for name, part in registered_columns().items()}
-
-
-def _mean_of_groups(episodes: pd.DataFrame) -> dict[str, float]:
-    """Return the same measures as `_means`, averaged over difficulty groups.
-
-    Each measure is an unweighted mean over the groups in which it is not NaN.
-    """
-    groups = pd.DataFrame([_means(group) for _, group in episodes.groupby("difficulty", sort=True)])
-    return {str(name): float(value) for name, value in groups.mean().items()}
+    quantiles = {"latency_p50_ms": 0.5, "latency_p95_ms": 0.95, "latency_worst_ms": 1.0}
+    decodes = (1000.0 * np.concatenate(list(arrays)) for _, arrays in groups["decode_seconds"])
+    latencies = np.transpose([np.quantile(one, list(quantiles.values())) for one in decodes])
+    means = episodes[by].assign(**each).groupby(by).mean().assign(**dict(zip(quantiles, latencies, strict=True)))
+    sums = groups[list({name: None for pair in _RATIOS.values() for name in pair})].sum()
+    for name, (above, below) in _RATIOS.items():
+        means[name] = sums[above] / sums[below].mask(sums[below] == 0)
+    means["felt_latency_ms"] *= 1000.0
+    for name, part in registered_columns().items():
+        means[name] = [float(part.built(group)) for _, group in groups]
+    return means
 
 
 def registered_columns() -> Mapping[str, Part]:

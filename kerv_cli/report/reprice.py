@@ -19,7 +19,7 @@ from kerv_cli.base.places import as_path
 from kerv_cli.engine.cost import READ_PHASES, Profile, Work, prices, read_profile, work_of
 from kerv_cli.episodes.identity import batch_of
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.measures import MICRO, Row, decodes, measure
+from kerv_cli.report.measures import MICRO, Row, measure, paired
 from kerv_cli.report.summary import SPEEDS, intervals
 from kerv_cli.report.tables import StudyData, is_baseline, rows_of
 from kerv_cli.targets.folders import shipped_dir
@@ -93,34 +93,34 @@ def repriced_table(data: StudyData, store: StudyStore, profiles: Sequence[NamedP
         UsageError: A profile lacks a cost that the study needs, or has costs for shorter chunks only; or a setting has
             no times because its episodes ran in a batch.
     """
-    episodes = {str(label): group for label, group in data.episodes.groupby("label", sort=False)}
-    labels = [label for label in data.labels if decodes(episodes[label])]
+    decoded = data.episodes.groupby("label")[["forwards", "skipped_decodes"]].sum().any(axis=1)
+    labels = [label for label in data.labels if decoded[label]]
+    episodes = {label: data.episodes[data.episodes["label"] == label] for label in labels}
     works = {label: _work_of_label(data, label, store) for label in labels}
     measured = {row["label"]: row for row in rows_of(data.table, MICRO)}
     rows = []
     for named in profiles:
         for label, work in works.items():
             _check(named, label, work)
-        priced = {label: _priced(episodes[label], works[label], named.profile) for label in labels}
-        for label in labels:
-            reference = data.references[label]
-            values = measure(priced[label], priced.get(reference, priced[label].iloc[:0]), MICRO, all_pairs=True)
-            rows.append(
-                {
-                    "study": data.study.name,
-                    "label": label,
-                    "baseline": reference,
-                    "on": named.name,
-                    "machine": named.title,
-                    "projected": bool(named.profile.about.get("projected")),
-                    **_speeds(values, ""),
-                    **{name: values[name] for name in _TIMES},
-                    **_speeds(measured[label], "measured_"),
-                    "measured_on": ";".join(dict.fromkeys(episodes[label]["device_name"])),
-                    "episodes": len(episodes[label]),
-                    "pairs": values["pairs"],
-                }
-            )
+        priced = pd.concat([_priced(episodes[label], works[label], named.profile) for label in labels])
+        estimated = measure(priced, paired(priced, data.references), all_pairs=True)
+        rows += [
+            {
+                "study": data.study.name,
+                "label": label,
+                "baseline": data.references[label],
+                "on": named.name,
+                "machine": named.title,
+                "projected": bool(named.profile.about.get("projected")),
+                **_speeds(estimated[label], ""),
+                **{name: estimated[label][name] for name in _TIMES},
+                **_speeds(measured[label], "measured_"),
+                "measured_on": ";".join(dict.fromkeys(episodes[label]["device_name"])),
+                "episodes": len(episodes[label]),
+                "pairs": estimated[label]["pairs"],
+            }
+            for label in labels
+        ]
     return pd.DataFrame(rows)
 
 

@@ -9,6 +9,7 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 
 class Estimate(NamedTuple):
@@ -85,17 +86,6 @@ def mean_of(groups: Sequence[Estimate]) -> Estimate:
     below, above = (math.sqrt(((bounds - values) ** 2).sum()) / len(groups) for bounds in (lows, highs))
     mean = float(values.mean())
     return Estimate(mean, mean - below, mean + above)
-
-
-def paired_counts(baseline: np.ndarray, method: np.ndarray) -> PairedCounts:
-    """Count the pairs that succeeded in both episodes, in the baseline's alone, in the method's alone, and in none.
-
-    Args:
-        baseline: (pairs,) bool. Whether the baseline's episode succeeded.
-        method: (pairs,) bool. Whether the method's episode from the same initial state succeeded.
-    """
-    a, b = np.asarray(baseline, dtype=bool), np.asarray(method, dtype=bool)
-    return PairedCounts(int((a & b).sum()), int((a & ~b).sum()), int((~a & b).sum()), int((~a & ~b).sum()))
 
 
 def paired_difference(counts: PairedCounts, confidence: float = 0.95) -> Estimate:
@@ -222,9 +212,9 @@ def mcnemar(counts: PairedCounts) -> float:
 def speedup(
     baseline: np.ndarray,
     method: np.ndarray,
-    strata: Sequence[str],
-    groups: Sequence[str] | None = None,
-    blocks: Sequence[str] | None = None,
+    strata: ArrayLike,
+    groups: ArrayLike | None = None,
+    blocks: ArrayLike | None = None,
 ) -> Estimate:
     """Estimate how many times as fast as the baseline a method is: mean time of the baseline / mean time of the method.
 
@@ -253,12 +243,16 @@ def speedup(
         return NO_ESTIMATE
     weights = np.full(a.size, 1.0 / a.size)
     if groups is not None:
-        _, members, sizes = np.unique(np.asarray(groups, dtype=str), return_inverse=True, return_counts=True)
+        _, members, sizes = np.unique(groups, return_inverse=True, return_counts=True)
         weights = 1.0 / (sizes[members] * len(sizes))
     mean_a, mean_b = float(weights @ a), float(weights @ b)
-    if blocks is None or len(set(zip(strata, blocks, strict=True))) == 1:
-        blocks = [str(number) for number in range(a.size)]
-    reach = math.exp(_spread(weights * (a / mean_a - b / mean_b), strata, blocks))
+    strata, clusters = (
+        np.unique(one, return_inverse=True)[1] for one in (strata, range(a.size) if blocks is None else blocks)
+    )
+    clusters = np.unique(strata * a.size + clusters, return_inverse=True)[1]  # blocks are named within their task
+    if not clusters.any():
+        clusters = np.arange(a.size)
+    reach = math.exp(_spread(weights * (a / mean_a - b / mean_b), strata, clusters))
     return Estimate(mean_a / mean_b, mean_a / mean_b / reach, mean_a / mean_b * reach)
 
 
@@ -281,7 +275,7 @@ def over_runs(estimates: Sequence[Estimate]) -> Estimate:
     return Estimate(value, value / reach, value * reach)
 
 
-def _spread(effects: np.ndarray, strata: Sequence[str], clusters: Sequence[str]) -> float:
+def _spread(effects: np.ndarray, strata: np.ndarray, clusters: np.ndarray) -> float:
     """Return half the width of the 95 % interval of a sum over pairs, whose clusters are independent.
 
     The variance of the sum is estimated as follows: within each stratum, take the variance of the clusters' sums; then
@@ -291,23 +285,21 @@ def _spread(effects: np.ndarray, strata: Sequence[str], clusters: Sequence[str])
 
     Args:
         effects: (n,) contribution of each pair to the linearised logarithm of the speedup. They sum to 0.
-        strata: (n,) stratum (task) of each pair.
-        clusters: (n,) cluster (block) of each pair, named within its stratum.
+        strata: (n,) number of each pair's stratum (task), from 0.
+        clusters: (n,) number of each pair's cluster (block), from 0. A cluster is in one stratum.
 
     Returns:
         The half width. NaN if there are no degrees of freedom, for example with a single cluster.
     """
     from scipy.special import stdtrit
 
-    stratum_of_pair = np.unique(np.asarray(strata, dtype=str), return_inverse=True)[1]
-    names = [f"{stratum}|{cluster}" for stratum, cluster in zip(strata, clusters, strict=True)]
-    _, first, cluster_of_pair = np.unique(names, return_index=True, return_inverse=True)
-    sums, stratum = np.bincount(cluster_of_pair, effects), stratum_of_pair[first]
-    stratum = np.where(np.bincount(stratum)[stratum] == 1, -1, stratum)
-    variance, freedom = 0.0, 0
-    for number in np.unique(stratum):
-        parts = sums[stratum == number]
-        # only one stratum has a single cluster: there is no spread to estimate, so its squared sum counts
-        variance += len(parts) * float(parts.var(ddof=1)) if len(parts) > 1 else float(parts[0]) ** 2
-        freedom += len(parts) - 1
+    sums, first = np.bincount(clusters, effects), np.unique(clusters, return_index=True)[1]
+    stratum = strata[first] + 1
+    stratum[np.bincount(stratum)[stratum] == 1] = 0
+    sizes = np.bincount(stratum)
+    # only one stratum has a single cluster: there is no spread to estimate, so its squared sum counts
+    means = np.where(sizes > 1, np.bincount(stratum, sums) / np.maximum(sizes, 1), 0.0)
+    squares = np.bincount(stratum, (sums - means[stratum]) ** 2)
+    variance = float((squares * sizes / np.maximum(sizes - 1, 1)).sum())
+    freedom = len(sums) - np.count_nonzero(sizes)
     return float(stdtrit(freedom, 0.975)) * math.sqrt(variance) if freedom else math.nan

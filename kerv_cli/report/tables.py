@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import json
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from numbers import Real
+from operator import itemgetter
 from typing import Any
 
 import pandas as pd
@@ -19,7 +21,7 @@ from kerv_cli.lab.plan import Episode, Setting, Study, seeds_text
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.matched import with_matched_speed
 from kerv_cli.report.measures import MACRO, MICRO, Row, columns_of, measure, paired, speedups
-from kerv_cli.report.statistics import Estimate, over_runs
+from kerv_cli.report.statistics import NO_ESTIMATE, over_runs
 from kerv_cli.targets.provenance import PACKAGES
 from kerv_cli.worlds import specs
 
@@ -116,15 +118,25 @@ class StudyData:
         }
 
     @functools.cached_property
+    def pairs(self) -> pd.DataFrame:
+        """Pairs of the episodes with those of the settings that they are compared with, see `measures.paired`."""
+        return paired(self.episodes, self.references)
+
+    @functools.cached_property
+    def run_pairs(self) -> list[pd.DataFrame]:
+        """The same pairs for each of `runs`."""
+        return [paired(run, self.references) for run in self.runs]
+
+    @functools.cached_property
     def table(self) -> pd.DataFrame:
         """Two rows per setting: one pools all tasks (micro), one averages over difficulty groups (macro)."""
-        return pd.DataFrame(row for averaging in (MICRO, MACRO) for row in _rows(self, self.episodes, averaging))
+        return pd.DataFrame(row for averaging in (MICRO, MACRO) for row in with_matched_speed(_rows(self, averaging)))
 
     @functools.cached_property
     def per_task(self) -> pd.DataFrame:
         """One row per task and setting. Tasks are sorted by name, settings are in the study's order."""
-        by_task = self.episodes.groupby("task", sort=True)
-        return pd.DataFrame(row for _, episodes in by_task for row in _rows(self, episodes, "one task"))
+        by_task = itertools.groupby(_rows(self, "one task", by_task=True), key=itemgetter("task"))
+        return pd.DataFrame(row for _, rows in by_task for row in with_matched_speed(list(rows)))
 
 
 def _conditions_of(setting: Setting) -> str:
@@ -184,79 +196,76 @@ def difficulty_of(task: str) -> str:
     return next((spec.tasks[task].difficulty for spec in specs().values() if task in spec.tasks), "other")
 
 
-def _rows(data: StudyData, episodes: pd.DataFrame, averaging: str) -> list[Row]:
-    """Return one table row per setting that has episodes among `episodes`.
-
-    Args:
-        data: The study.
-        episodes: Episodes to summarise.
-        averaging: MICRO (pool all episodes), MACRO (average over difficulty groups), or any other name for the episodes
-            of one task.
-    """
-    by_label = {str(label): group for label, group in episodes.groupby("label", sort=False)}
-    none = episodes.iloc[:0]
-    return with_matched_speed(
-        [
-            _row(data, label, by_label[label], by_label.get(data.references[label], none), averaging)
-            for label in data.study.labels
-            if label in by_label
-        ]
-    )
-
-
-def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> Row:
-    """Return the table row of a setting: its name, measures, settings and provenance.
+def _rows(data: StudyData, averaging: str, by_task: bool = False) -> list[Row]:
+    """Return a table row per setting, or per task and setting: its name, measures, settings and provenance.
 
     If the episodes have different values in a provenance column, the values are joined by semicolons.
 
     Args:
         data: The study.
-        label: Label of the setting.
-        episodes: Its episodes.
-        baseline: Episodes of the baseline. May be empty.
         averaging: MICRO (pool all episodes), MACRO (average over difficulty groups), or any other name for the episodes
             of one task.
+        by_task: Whether to return rows per task.
     """
-    tasks, setting = sorted(set(episodes["task"])), data.settings[label]
-    stress, hashes = stress_of(setting.settings), without(setting.identity, {OBSERVATION})
-    varied = [f"{key.split('.')[-1]} {value}" for key, value in setting.varies.items() if key != data.study.axis]
+    by = ["task", "label"] if by_task else ["label"]
+    measured = measure(data.episodes, data.pairs, by, averaging)
+    over_all = _over_runs(data, by, averaging)
+    episodes, indices = data.episodes, data.episodes.groupby(by).indices
+    known = [name for name in ("task", "difficulty", "seed", "repeat", *_PROVENANCE) if name in episodes]
+    columns = {name: episodes[name].astype(object).where(episodes[name].notna(), None).to_numpy() for name in known}
+    groups: Iterable[tuple[Hashable, str]] = ((label, label) for label in data.labels)
+    if by_task:
+        groups = (((task, label), label) for task in sorted(set(episodes["task"])) for label in data.labels)
+    rows = []
+    for group, label in groups:
+        if group not in indices:
+            continue
+        values = {name: pd.unique(column[indices[group]]) for name, column in columns.items()}
+        setting = data.settings[label]
+        stress, hashes = stress_of(setting.settings), without(setting.identity, {OBSERVATION})
+        varied = [f"{key.split('.')[-1]} {value}" for key, value in setting.varies.items() if key != data.study.axis]
+        rows.append(
+            {
+                "study": data.study.name,
+                "averaging": averaging,
+                "label": label,
+                # settings that differ only along the study's axis are one series
+                "series": ", ".join([setting.name.rstrip(", "), *varied]),
+                "unstressed": data.unstressed[label],
+                "method": setting.settings["method"],
+                "task": _joined(sorted(values["task"])),
+                "tasks": len(values["task"]),
+                "difficulty": _joined(sorted(values["difficulty"])),
+                "seeds": seeds_text(values["seed"]),
+                "repeats": len(values["repeat"]),
+                "episodes": len(indices[group]),
+                "baseline": data.references[label],
+                **measured[group],
+                **over_all[group],
+                "overrides": setting.overrides,
+                **flatten(without(setting.settings, NOT_DETERMINING - {"policy"})),
+                "observation": setting.identity.get(OBSERVATION, ""),
+                **{f"{name}_sha256": value for name, value in sorted(hashes.items())},
+                "stress": stress["kind"],
+                "stress_level": stress["level"],
+                **{name: _joined(one for one in values.get(name, ()) if one is not None) for name in _PROVENANCE},
+            }
+        )
+    return rows
+
+
+def _over_runs(data: StudyData, by: list[str], averaging: str) -> dict[Hashable, Row]:
+    """Return the number of runs and, from three on, the speeds over all of them (docs/methods.md §7), by group."""
+    runs = [speedups(pairs, by, averaging) for pairs in data.run_pairs]
     return {
-        "study": data.study.name,
-        "averaging": averaging,
-        "label": label,
-        "series": ", ".join([setting.name.rstrip(", "), *varied]),  # settings that differ only along the study's axis
-        "unstressed": data.unstressed[label],
-        "method": setting.settings["method"],
-        "task": ";".join(tasks),
-        "tasks": len(tasks),
-        "difficulty": _joined(sorted(set(episodes["difficulty"]))),
-        "seeds": seeds_text(episodes["seed"]),
-        "repeats": int(episodes["repeat"].nunique()),
-        "episodes": len(episodes),
-        "baseline": data.references[label],
-        **measure(episodes, baseline, averaging),
-        **_over_runs(data, label, tasks, averaging),
-        "overrides": setting.overrides,
-        **flatten(without(setting.settings, NOT_DETERMINING - {"policy"})),
-        "observation": setting.identity.get(OBSERVATION, ""),
-        **{f"{name}_sha256": value for name, value in sorted(hashes.items())},
-        "stress": stress["kind"],
-        "stress_level": stress["level"],
-        **{key: _joined(episodes[key].dropna()) if key in episodes else "" for key in _PROVENANCE},
+        group: {"runs": max(1, len(runs))}
+        | {
+            key: value
+            for name in (runs[0] if runs else ())
+            for key, value in columns_of(name, over_runs([run[name].get(group, NO_ESTIMATE) for run in runs])).items()
+        }
+        for group in data.episodes.groupby(by).indices
     }
-
-
-def _over_runs(data: StudyData, label: str, tasks: list[str], averaging: str) -> Row:
-    """Return the number of runs and, from three on, the speeds over all of them (docs/methods.md §7)."""
-    parts: list[dict[str, Estimate]] = []
-    for run in data.runs:
-        here = run[run["task"].isin(tasks)]
-        method, baseline = (here[here["label"] == one] for one in (label, data.references[label]))
-        parts.append(speedups(method, paired(method, baseline), averaging == MACRO))
-    row: Row = {"runs": max(1, len(parts))}
-    for name in parts[0] if parts else ():
-        row |= columns_of(name, over_runs([part[name] for part in parts]))
-    return row
 
 
 def flatten(settings: Plain) -> Row:
