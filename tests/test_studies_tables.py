@@ -248,12 +248,13 @@ def test_repeats_are_paired_with_their_own(tmp_path):
 
 def printed(table: pd.DataFrame, width: int = 80, everything: bool = False) -> list[str]:
     console = Console(width=width, file=io.StringIO(), record=True)
-    console.print(SummaryTable(table, everything))
+    console.print(SummaryTable(table, everything, "--all"))
     return console.export_text().splitlines()
 
 
 def test_a_terminal_shows_the_columns_that_people_need_first_and_all_in_parts_that_fit(data):
     few, wide, narrow = printed(data.table), printed(data.table, 200, True), printed(data.table, 60, True)
+    assert ["--all" in " ".join(lines) for lines in (few, wide, narrow)] == [True, False, False]
     assert all(len(line) <= 80 for line in few)
     (line,) = [line for line in few if line.startswith("kerv")]
     assert line.split("  ")[0] == "kerv"

@@ -73,7 +73,7 @@ def report(
         priced = {} if output.priced is None else {"priced": rows_of(output.priced)}
         end_with_json({"files": output.files, "studies": tables, **priced})
     for name, table in output.tables.items():
-        print_study(table, StudyStore(results, name), all_columns)
+        print_study(table, StudyStore(results, name), all_columns, "--all")
     print_prices(output.priced)
     for name, table in output.tables.items():
         if settings.only is None:

@@ -1,16 +1,15 @@
-"""`kerv runs`: list, show, compare, repeat, remove, export and import runs. Runs are sweeps, rollouts and trainings."""
+"""`kerv runs`: list, show, compare, repeat, remove and export runs. Runs are sweeps, rollouts and trainings."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from kerv_cli.base.errors import Interrupted, KervError, UsageError
-from kerv_cli.base.limits import setting
-from kerv_cli.base.places import as_path, results_dir
+from kerv_cli.base.places import results_dir
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import (
@@ -30,15 +29,6 @@ if TYPE_CHECKING:
     from kerv_cli.catalogue.entries import RunEntry
     from kerv_cli.cli.command import F
     from kerv_cli.report.measures import Row
-
-
-@dataclass(kw_only=True)
-class ImportSettings(CommandSettings):
-    """Settings of `kerv runs import`. They are for recordings of vla-eval, which become a study (docs/vla_eval.md)."""
-
-    name: str = setting("", "name of the study; empty: the names of its benchmarks")
-    baseline: str = setting("", "label of the setting that others are compared with; empty: ar, else the first one")
-    labels: list[str] = setting([], "label of each recording, in order; empty: its method, or the name of its server")
 
 
 RUNS = "NAME: runs (id, a unique part of it, or last) and results=DIR."
@@ -247,45 +237,3 @@ def export(
     for name in written:
         typer.echo(name)
     typer.echo(f"{len(written)} {'file' if to in FILES else 'run'}{'s' * (len(written) != 1)} in {folder}")
-
-
-@command(
-    "runs import",
-    ImportSettings,
-    names="NAME: a results folder of kerv 0.1.0, a kerv.db, vla-eval's recording-….sqlite, "
-    "lerobot's eval_info.json, or folders that hold one.",
-    keys="name baseline labels results",
-    examples=("kerv runs import ar/recording-1.sqlite kerv/recording-2.sqlite", "kerv runs import old-results"),
-)
-def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False) -> None:
-    """Import the runs of another results folder, or evaluations of vla-eval or lerobot as a study."""
-    from kerv_cli.catalogue.evaluations import import_evaluations
-    from kerv_cli.catalogue.imports import import_results, is_results
-    from kerv_cli.lab.database import Database
-    from kerv_cli.lab.store import StudyStore
-    from kerv_cli.report.summary import SummaryTable
-    from kerv_cli.report.tables import load_study, rows_of
-
-    if not names:
-        raise UsageError("name what to import: kerv runs import old-results, or kerv runs import recording-ID.sqlite")
-    paths = [as_path(name) for name in names]
-    results = results_dir(settings.results)
-    folders = [path for path in paths if is_results(path)]
-    if folders:
-        if len(folders) < len(paths):
-            raise UsageError("import results folders and evaluations one after the other")
-        studies, notes = import_results(Database(results), folders, settings.name)
-        if as_json:
-            end_with_json({"studies": studies, "notes": notes})
-        for line in [*notes, f"imported {', '.join(studies) or 'nothing'}: kerv runs list"]:
-            typer.echo(line)
-        return
-    words = ["runs", "import", *names]
-    name, notes = import_evaluations(results, paths, settings.name, settings.labels, settings.baseline, words)
-    table = load_study(StudyStore(results, name)).table
-    if as_json:
-        end_with_json({"study": name, "notes": notes, "settings": rows_of(table)})
-    for line in notes:
-        typer.echo(line)
-    console().print(SummaryTable(table))
-    typer.echo(f"study {name}: kerv report study={name}, kerv report --choose study={name}")

@@ -18,6 +18,7 @@ from kerv_cli.cli.common import (
     print_rows,
     print_table,
     progress_bar,
+    results_word,
     settings_yaml,
 )
 
@@ -178,7 +179,7 @@ def event_printer(show: Callable[[int, int, str], None]) -> Callable[[Event], No
     return on_event
 
 
-def print_study(table: DataFrame, store: StudyStore, all_columns: bool = False) -> None:
+def print_study(table: DataFrame, store: StudyStore, all_columns: bool = False, how: str = "") -> None:
     """Print the table of a study and its note.
 
     If times cannot be compared, because they were not measured in turn, print the command that measures them again.
@@ -187,11 +188,14 @@ def print_study(table: DataFrame, store: StudyStore, all_columns: bool = False) 
         table: Summary with one row per setting.
         store: The study in the database.
         all_columns: Print all columns, not only those that people need first.
+        how: What to type to see all columns. Empty: a command of its own.
     """
     from kerv_cli.report.summary import SummaryTable, not_in_turn
     from kerv_cli.report.tables import values_of
 
-    console().print(SummaryTable(table, all_columns))
+    where = results_word([f"results={store.database.results}"] if str(store.database.results) != "results" else [])
+    how = how or f"kerv report study={store.name}{where} --all"
+    console().print(SummaryTable(table, all_columns, how))
     codes, commits = values_of(table, "code"), values_of(table, "git_commit")
     if len(codes) > 1:
         names = ", ".join(sorted(commit[:12] for commit in commits))

@@ -159,10 +159,12 @@ class SummaryTable:
     Attributes:
         table: The study's table.
         all: Print every column. If they do not fit side by side, they are printed in several parts.
+        how: What to type to see every column. Empty: do not say it.
     """
 
     table: pd.DataFrame
     all: bool = False
+    how: str = ""
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
         """Yield the title, the table and the notes below it."""
@@ -174,8 +176,11 @@ class SummaryTable:
         )
         frame = summary_frame(self.table)
         own = [name for name in frame.columns if name.replace(" ", "_") in registered_columns()]  # of plugins
-        for part in _parts(frame if self.all else frame[[*frame.columns[:MAIN], *own]], options.max_width):
+        shown = frame if self.all else frame[[*frame.columns[:MAIN], *own]]
+        for part in _parts(shown, options.max_width):
             yield _printed(part)
+        if self.how and len(shown.columns) < len(frame.columns):
+            yield Text(f"{len(shown.columns)} of {len(frame.columns)} columns; {self.how} shows all")
         several = ", under the same stress and clock" if rows["baseline"].nunique() > 1 else ""
         yield Text(f"{NOTE} {of_runs(self.table)} Baseline: {first['baseline']}{several}.")
         if frame[SPEEDS["episode_speedup"]].str.endswith(APART).any():
