@@ -219,12 +219,8 @@ class QdrantIndex:
             raise UsageError("datastore=qdrant needs the extra: pip install 'kerv[qdrant]'")
         from qdrant_client import QdrantClient, models
 
-        self.store, self.models, self.name, self.settings = (
-            store,
-            models,
-            f"kerv-{store.manifest.content[:32]}",
-            settings,
-        )
+        self.store, self.models, self.settings = store, models, settings
+        self.name = f"kerv-{store.manifest.content[:32]}"
         with self._errors():
             memory = None if settings.url or settings.path else ":memory:"
             self.client = QdrantClient(memory, url=settings.url, path=settings.path, check_compatibility=False)
