@@ -29,7 +29,7 @@ from kerv_cli.lab.study import InterimAnalysis
 from kerv_cli.report import statistics as stats
 from kerv_cli.report import verdict
 from kerv_cli.report.matched import SOLVED, passing, safety
-from kerv_cli.report.measures import MICRO, Row, pair_counts, paired
+from kerv_cli.report.measures import MICRO, Row, paired
 from kerv_cli.report.tables import StudyData, is_baseline, is_number, load_study, rows_of
 from kerv_cli.report.verdict import LARGER, OPEN, SMALLER, Choice, Decision
 
@@ -189,8 +189,9 @@ def decisions(data: StudyData, labels: Sequence[str], margin: float, look: int, 
         looks: Number of planned looks.
     """
     pairs = paired(data.episodes, dict.fromkeys(labels, data.study.baseline))
-    counts = {label: pair_counts(pairs[pairs["label"] == label]) for label in labels}
-    return [decision_of(label, one, margin, look, looks) for label, one in counts.items()]
+    sums = pairs.groupby("label")[list(stats.PairedCounts._fields)].sum().reindex(list(labels), fill_value=0)
+    counts = (stats.PairedCounts(*row) for row in sums.to_numpy().tolist())
+    return [decision_of(label, one, margin, look, looks) for label, one in zip(labels, counts, strict=True)]
 
 
 def judge(loss: float, tell: Callable[[str], None]) -> InterimAnalysis:

@@ -178,16 +178,6 @@ def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame
     )
 
 
-def pair_counts(pairs: pd.DataFrame) -> stats.PairedCounts:
-    """Count how often both, one or none of the two sides succeeded, in a table made by `paired`."""
-    return stats.PairedCounts(*(int(pairs[name].sum()) for name in stats.PairedCounts._fields))
-
-
-def is_timed(episodes: pd.DataFrame) -> bool:
-    """Return whether every episode has a time. Episodes that ran in a batch have none (docs/measuring.md)."""
-    return bool(episodes["seconds"].notna().all())
-
-
 def speedups(
     pairs: pd.DataFrame, by: list[str], averaging: str, all_pairs: bool = False
 ) -> dict[str, dict[Hashable, Estimate]]:

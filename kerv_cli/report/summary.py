@@ -17,7 +17,7 @@ from rich.text import Text
 from kerv_cli.base.durations import count
 from kerv_cli.engine.record import PHASES
 from kerv_cli.episodes.identity import batch_of, stress_text
-from kerv_cli.report.measures import MICRO, Row, is_timed, registered_columns
+from kerv_cli.report.measures import MICRO, Row, registered_columns
 from kerv_cli.report.tables import StudyData, is_baseline, is_number, rows_of
 
 TextOf = Callable[[Row], str]
@@ -236,31 +236,25 @@ def not_in_turn(table: pd.DataFrame) -> list[str]:
     return [str(label) for label in dict.fromkeys(rows["label"])] if of_baseline else []
 
 
-def _task_columns() -> dict[str, TextOf]:
-    """Return heading -> function that formats a cell of the table of tasks."""
-    return {
-        "task": lambda row: str(row["task"]),
-        "success": lambda row: f"{row['successes']}/{row['episodes']}",
-        "steps per episode": lambda row: f"{row['steps'] / row['episodes']:.0f}",
-        "forwards per step": numbers("forwards_per_step"),
-        "tokens per verification": numbers("AL"),
-        "drafts accepted": numbers("accepted_per_round"),
-        "time per step, ms": numbers("time_per_step_ms"),
-    }
-
-
 def setting_tables(data: StudyData) -> Iterator[tuple[Any, Any, str]]:
     """Yield the tables of a study with one setting: results per task, and time per phase of a decode.
 
     Yields:
         Column names, rows and title of each table.
     """
-    episodes, setting, columns = data.episodes, data.study.settings[0], _task_columns()
+    episodes, setting, every = data.episodes, data.study.settings[0], _columns()
+    columns: dict[str, TextOf] = {
+        "task": lambda row: str(row["task"]),
+        "success": lambda row: f"{row['successes']}/{row['episodes']}",
+        **{name: every[name] for name in ("steps per episode", "forwards per step", "tokens per verification")},
+        "drafts accepted": numbers("accepted_per_round"),
+        "time per step, ms": every["time per step, ms"],
+    }
     rows = rows_of(data.per_task) + [row | {"task": "all"} for row in rows_of(data.table, MICRO) if row["tasks"] > 1]
     seeds = f"{episodes['seed'].min()}…{episodes['seed'].max()}"
     observation = setting.identity.get("observation", "")
     title = f"{setting.label}, observation {observation}{stress_text(setting.settings)}, seeds {seeds}"
-    timed = is_timed(episodes)
+    timed = episodes["seconds"].notna().all()
     if not timed:
         title += f"; not timed: {batch_of(setting.settings)} episodes at a time"
     yield columns, ([text(row) for text in columns.values()] for row in rows), title

@@ -7,7 +7,7 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from numbers import Real
 from operator import itemgetter
@@ -21,7 +21,7 @@ from kerv_cli.lab.plan import Episode, Setting, Study, seeds_text
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.matched import with_matched_speed
 from kerv_cli.report.measures import MACRO, MICRO, Row, columns_of, measure, paired, speedups
-from kerv_cli.report.statistics import NO_ESTIMATE, over_runs
+from kerv_cli.report.statistics import NO_ESTIMATE, Estimate, over_runs
 from kerv_cli.targets.provenance import PACKAGES
 from kerv_cli.worlds import specs
 
@@ -209,7 +209,7 @@ def _rows(data: StudyData, averaging: str, by_task: bool = False) -> list[Row]:
     """
     by = ["task", "label"] if by_task else ["label"]
     measured = measure(data.episodes, data.pairs, by, averaging)
-    over_all = _over_runs(data, by, averaging)
+    runs = [speedups(pairs, by, averaging) for pairs in data.run_pairs]
     episodes, indices = data.episodes, data.episodes.groupby(by).indices
     known = [name for name in ("task", "difficulty", "seed", "repeat", *_PROVENANCE) if name in episodes]
     columns = {name: episodes[name].astype(object).where(episodes[name].notna(), None).to_numpy() for name in known}
@@ -241,7 +241,8 @@ def _rows(data: StudyData, averaging: str, by_task: bool = False) -> list[Row]:
                 "episodes": len(indices[group]),
                 "baseline": data.references[label],
                 **measured[group],
-                **over_all[group],
+                "runs": max(1, len(runs)),
+                **_over_runs(runs, group),
                 "overrides": setting.overrides,
                 **flatten(without(setting.settings, NOT_DETERMINING - {"policy"})),
                 "observation": setting.identity.get(OBSERVATION, ""),
@@ -254,18 +255,17 @@ def _rows(data: StudyData, averaging: str, by_task: bool = False) -> list[Row]:
     return rows
 
 
-def _over_runs(data: StudyData, by: list[str], averaging: str) -> dict[Hashable, Row]:
-    """Return the number of runs and, from three on, the speeds over all of them (docs/methods.md §7), by group."""
-    runs = [speedups(pairs, by, averaging) for pairs in data.run_pairs]
-    return {
-        group: {"runs": max(1, len(runs))}
-        | {
-            key: value
-            for name in (runs[0] if runs else ())
-            for key, value in columns_of(name, over_runs([run[name].get(group, NO_ESTIMATE) for run in runs])).items()
-        }
-        for group in data.episodes.groupby(by).indices
-    }
+def _over_runs(runs: Sequence[Mapping[str, Mapping[Hashable, Estimate]]], group: Hashable) -> Row:
+    """Return the speeds of a group over all runs, if there are several (docs/methods.md §7).
+
+    Args:
+        runs: What `measures.speedups` returned for each run.
+        group: The group.
+    """
+    row: Row = {}
+    for name in runs[0] if runs else ():
+        row |= columns_of(name, over_runs([run[name].get(group, NO_ESTIMATE) for run in runs]))
+    return row
 
 
 def flatten(settings: Plain) -> Row:
