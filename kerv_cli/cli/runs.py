@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from kerv_cli.base.durations import count
 from kerv_cli.base.errors import Interrupted, KervError, UsageError
 from kerv_cli.base.places import results_dir
 from kerv_cli.base.settings import CommandSettings
@@ -178,7 +179,6 @@ def rerun(
     if run.kind not in ("sweep", "rollout"):
         made = f", which '{run.command_line}' makes" if run.command else ""
         raise UsageError(f"{run.id} is of the kind {run.kind}{made}: only sweeps, rollouts and trainings are repeated")
-    from kerv_cli.base.durations import count
     from kerv_cli.catalogue.entries import plan_of
     from kerv_cli.cli.work import run_study
     from kerv_cli.report.compare import same_tokens
@@ -236,4 +236,4 @@ def export(
         end_with_json({"folder": folder, "written": written})
     for name in written:
         typer.echo(name)
-    typer.echo(f"{len(written)} {'file' if to in FILES else 'run'}{'s' * (len(written) != 1)} in {folder}")
+    typer.echo(f"{count(len(written), 'file' if to in FILES else 'run')} in {folder}")

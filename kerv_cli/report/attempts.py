@@ -8,6 +8,7 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
+from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UsageError
 from kerv_cli.lab.database import SETTINGS, STUDIES, WANTED
 from kerv_cli.lab.plan import Episode
@@ -42,7 +43,7 @@ def charged(
             return replace(certificate, delta=attempt.delta, earlier=earlier[:number])
     if earlier and not again:
         raise UsageError(
-            f"this policy has had {len(earlier)} test{'s' * (len(earlier) > 1)}, on seeds "
+            f"this policy has had {count(len(earlier), 'test')}, on seeds "
             f"{', '.join(one.seeds for one in earlier)}: another one is another chance to certify falsely. Set "
             f"again=true to test on other seeds at delta={certificate.delta / 2 ** len(earlier):g}"
         )

@@ -16,6 +16,7 @@ import pandas as pd
 import vl_convert
 from PIL import Image
 
+from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import write_bytes
 from kerv_cli.report.measures import MICRO
@@ -72,10 +73,9 @@ def about(table: pd.DataFrame) -> str:
     """Return the subtitle of a chart: policies, number of settings, tasks and episodes, device, number format."""
     first, targets = table.iloc[0], list(map(str, table["policy.target"].unique()))
     names = ", ".join(targets) if len(targets) <= 2 else f"{len(targets)} policies"
-    counts = (table["label"].nunique(), "setting"), (int(table["tasks"].max()), "task")
-    settings, tasks = (f"{number} {what}{'s' * (number != 1)}" for number, what in counts)
-    each = f"{table['episodes'].max()} episodes each"
-    return f"{names} · {settings} on {tasks}, {each} · {first['device_name']}, {first['runtime.dtype']}"
+    counts = f"{count(table['label'].nunique(), 'setting')} on {count(table['tasks'].max(), 'task')}"
+    each = f"{count(table['episodes'].max(), 'episode')} each"
+    return f"{names} · {counts}, {each} · {first['device_name']}, {first['runtime.dtype']}"
 
 
 def _pooled(table: pd.DataFrame) -> pd.DataFrame:
