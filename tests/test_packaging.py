@@ -65,25 +65,46 @@ def test_the_requirements_keep_the_physics_engine_that_results_depend_on(metadat
     assert any(line.startswith("metaworld") and ">=3.1.1" in line for line in requirements)
 
 
-def test_an_installed_wheel_runs_its_main_job_from_another_folder(wheel, tmp_path):
-    site = tmp_path / "site"
-    wheel.extractall(site)
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory):
+    """Variables of a process that imports the wheel and keeps compiled kernels beside its code."""
+    folder = tmp_path_factory.mktemp("installed")
+    wheel.extractall(folder / "site")
+    others = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    return others | {"PYTHONPATH": str(folder / "site"), "TMPDIR": str(folder)}
+
+
+def test_processes_compile_once_and_say_so(installed, tmp_path):
+    """Of two at once one compiles and the other waits. A third, which is given a cache folder that cannot be written,
+    finds what they kept beside the code."""
+    script = "from kerv_cli.targets.compact.program import kernels; kernels()"
+    told = []
+    for changes in ([{}, {}], [{"NUMBA_CACHE_DIR": "/proc/none"}]):
+        processes = [
+            subprocess.Popen([sys.executable, "-c", script], cwd=tmp_path, env=installed | one, stderr=subprocess.PIPE)
+            for one in changes
+        ]
+        told += [process.communicate()[1].decode() for process in processes]
+        assert not any(process.returncode for process in processes), told
+    assert sorted("compiling for this CPU" in text for text in told[:2]) == [False, True]
+    assert "compiling" not in told[2]
+
+
+def test_an_installed_wheel_runs_its_main_job_from_another_folder(wheel, installed, tmp_path):
     sizes = [entry.file_size for entry in wheel.infolist() if entry.filename.startswith("kerv_cli/pretrained/")]
     assert 10e6 < sum(sizes) < 20e6, "docs/install.md and pyproject.toml state its size"
-    work = tmp_path / "work"
-    work.mkdir()
     command = ["rollout", "method=one_pass", "task=drawer-open", "episodes=1", "world.horizon=8", "record=0"]
     run = subprocess.run(
         [sys.executable, "-W", "ignore", "-m", "kerv_cli", *command],
-        cwd=work,
-        env={**os.environ, "PYTHONPATH": str(site)},
+        cwd=tmp_path,
+        env=installed,
         capture_output=True,
         text=True,
         check=False,
     )
     assert run.returncode == 0, run.stderr
     assert "one_pass, observation vision" in run.stdout
-    assert (work / "results/kerv.db").is_file()
+    assert (tmp_path / "results/kerv.db").is_file()
 
 
 # --- make setup ---

@@ -1,11 +1,7 @@
 """The packed weights of a frozen CPU policy compute what its modules do; training and other devices never meet them."""
 
 import copy
-import os
 import pickle
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import plain_decoder
@@ -249,26 +245,6 @@ def test_weights_stay_as_they_are_stored(stored):
     assert sizes == ({1} if stored == "int8" else {2 if kernels().EXPANDS_HALF else 4})
     with torch.inference_mode():
         assert close(plain(x, positions), packed(x, positions))
-
-
-def test_processes_compile_once_and_say_so(tmp_path):
-    """Of two at once one compiles and the other waits. A third, whose cache folder cannot be written, falls back to the
-    folder of the first two."""
-    script = "from kerv_cli.targets.compact.program import kernels; kernels()"
-    variables = os.environ | {"TMPDIR": str(tmp_path), "PYTHONPATH": str(Path(__file__).parent.parent)}
-
-    def begun(cache):
-        environment = variables | {"NUMBA_CACHE_DIR": cache}
-        return subprocess.Popen([sys.executable, "-c", script], env=environment, stderr=subprocess.PIPE)
-
-    fallback = str(tmp_path / f"kerv-{os.getuid()}")
-    told = []
-    for caches in ([fallback, fallback], ["/proc/none"]):
-        processes = [begun(cache) for cache in caches]
-        told += [process.communicate()[1].decode() for process in processes]
-        assert not any(process.returncode for process in processes)
-    assert sorted("compiling for this CPU" in text for text in told[:2]) == [False, True]
-    assert "compiling" not in told[2]
 
 
 def test_a_join_of_two_values_is_copied_together():
