@@ -30,15 +30,7 @@ ENVIRONMENTS = dict(registry.parts("environment"))
 LONGEST = (
     *("test_execute", "test_packaging", "test_cli", "test_training", "test_golden", "test_prepare", "test_program"),
     *("test_documented_commands", "test_board", "test_scout", "test_plan", "test_views", "test_database"),
-    *(
-        "test_extending",
-        "test_vla_eval",
-        "test_lerobot",
-        "test_api",
-        "test_batched",
-        "test_sim_world",
-        "test_calibration",
-    ),
+    *("test_extending", "test_vla_eval", "test_lerobot", "test_api", "test_batched", "test_sim_world"),
 )
 """Files that take longest, begun first: no process is left with one of them at the end while the others idle."""
 
