@@ -18,7 +18,9 @@ from kerv_cli.base.registry import PART_GROUPS, SETTINGS_GROUPS, NoSettings, par
 from kerv_cli.cli.common import settings_yaml
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings
+from kerv_cli.methods.compose import Method
 from kerv_cli.targets.folders import find_target
+from kerv_cli.training.preparation import needs
 
 SCHEMAS = {
     name.replace(" ", "_"): part.settings for name, part in parts("command").items() if part.settings is not NoSettings
@@ -58,6 +60,25 @@ def test_every_config_composes(choice):
     group, name = choice
     command = HOMES.get(name if group == "train" else group, "train_target" if group == "train" else "rollout")
     compose(command, [f"{group}={name}"], SCHEMAS[command])
+
+
+def test_quick_is_a_preset_that_typed_settings_override():
+    def target(*words):
+        return compose("train_target", list(words), SCHEMAS["train_target"])
+
+    usual, quick = target(), target("quick=true")
+    assert (usual.target.observation, quick.target.observation) == ("vision", "state")
+    assert quick.train.steps < usual.train.steps
+    own = target("target=nano", "train.steps=7", "quick=true")
+    assert (own.target.size, own.target.observation) == ("nano", "state")
+    assert (own.train.steps, own.train.batch) == (7, quick.train.batch)
+
+
+def test_a_quick_preparation_makes_what_the_methods_of_the_own_study_need():
+    quick = compose("prepare", ["quick=true"], SCHEMAS["prepare"])
+    assert quick.steps < compose("train_drafter", [], SCHEMAS["train_drafter"]).train.steps
+    of_study = {kind for one in resolve(["study=own"]).settings.values() for kind in Method.of(one).needs}
+    assert set(needs(tuple(quick.methods), True)) == of_study
 
 
 @pytest.mark.parametrize("row", range(max(map(len, PARTS.values()))))

@@ -72,6 +72,7 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
     Args:
         command: The command's name, with `_` instead of a space.
         overrides: Arguments as typed: `method=kerv`, `threshold.r=5`, `task=[reach,push]`. Each key at most once.
+            `quick=true` adds the command's settings in `conf/quick.yaml`, as if they were typed before all others.
         schema: Dataclass of the settings. Its defaults are used for everything that nothing else sets.
 
     Raises:
@@ -82,6 +83,8 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
     from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
     typed = _typed(overrides, schema)
+    if typed.get("quick"):
+        typed = read_yaml_lines(conf_dir() / "quick.yaml", "quick=true")[0].get(command, {}) | typed
     defaults = choices_of(schema)
     chosen = {key: str(value) for key, value in typed.items() if key in defaults}
     preset = next((group for group in PRESETS if group in defaults), "")

@@ -13,15 +13,15 @@ from kerv_cli.cli.command import command, typer_command
 from kerv_cli.cli.common import ShowPlan, print_table, results_word
 from kerv_cli.training.settings import PrepareSettings
 
-NOT_OF_STEPS = ("for", "steps")
+NOT_OF_STEPS = ("for", "steps", "quick")
 """Overrides that are not passed on to the commands of the single steps."""
 
 
 @command(
     "prepare",
     PrepareSettings,
-    keys="policy.target for demos task steps runtime.device results",
-    examples=("kerv prepare policy.target=mine", "kerv prepare policy.target=mine for=one_pass,kerv --plan"),
+    keys="policy.target for demos task quick steps runtime.device results",
+    examples=("kerv prepare policy.target=mine", "kerv prepare policy.target=mine quick=true --plan"),
     typed={"for": "methods"},
 )
 def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = False) -> None:

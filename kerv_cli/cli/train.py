@@ -13,10 +13,10 @@ from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
 @command(
     "train target",
     TrainTargetSettings,
-    keys="name demos task target target.observation train.steps train.init world.camera.name log runtime.device",
+    keys="name demos task quick target target.observation train.steps train.init log runtime.device",
     examples=(
         "kerv train target name=mine demos=mt10",
-        "kerv train target name=quick target=nano train.steps=500 --plan",
+        "kerv train target name=first task=reach quick=true --plan",
     ),
 )
 def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:

@@ -17,6 +17,7 @@ DEMOS = "name of the demonstrations"
 TARGET_DEMOS = f"{DEMOS}; empty: the ones that the target was trained on"
 TRACKERS = ("none", "trackio", "wandb", "tensorboard")
 LOG = "tracker that shows the curves during training"
+QUICK = "a first policy in minutes: adds the settings in conf/quick.yaml"
 FIRST_EPISODES = "episodes used per task, lowest seeds first; 0: all"
 
 
@@ -63,6 +64,7 @@ class TrainTargetSettings(TaskSettings):
     name: str = setting("mt10-vision", "folder below <results>/artifacts/target, or a path")
     task: list[str] = setting([], "tasks and suites; empty: all tasks of the demonstrations")
     demos: str = setting("", f"{DEMOS}; empty: the name that `kerv demos` gives to these tasks")
+    quick: bool = setting(False, QUICK)
     log: str = choice("none", *TRACKERS, help=LOG)
     target: TargetSettings = setting(TargetSettings, "shapes: nano, tiny, slim, small, … (conf/target)")
     train: TrainSettings = setting(TrainSettings, "optimisation")
@@ -121,6 +123,7 @@ class PrepareSettings(DemonstrationSettings):
 
     groups: ClassVar = {"policy": "vision", "runtime": "auto"}
 
+    quick: bool = setting(False, QUICK)
     methods: list[str] = setting([], "names of the methods; empty: all")
     steps: int = number(0, 0, 10**9, help="optimisation steps of each drafter; 0: as kerv train drafter")
 

@@ -93,7 +93,8 @@ class TargetRun(TrainingRun):
         if self.settings.target.observation == "state":
             if not manifest.observation.places:
                 raise UsageError(
-                    f"{where} hold no object positions, which target.observation=state reads: leave it out"
+                    f"{where} hold no object positions, which target.observation=state reads: "
+                    "set target.observation=vision"
                 )
             refuse_unused(train, ("colour", "places"), " needs images, and target.observation=state has none")
         if not manifest.observation.places:
