@@ -99,6 +99,8 @@ def test_prepare_makes_what_is_missing_and_skips_what_is_there(results):
     for place in ("early/mine/early.json", "datastore/mine/manifest.json", "calibration/mine/calibration.json"):
         assert (results / "artifacts" / place).is_file()
     assert told("prepare", MINE, "--plan").count("there") == 4
+    for kind, command in (("datastore", ("build", "datastore")), ("calibration", ("calibrate",))):
+        assert f"at the speed of {kind}/mine" in told(*command, MINE, f"policy.artifacts.{kind}=other", "--plan")
     shutil.rmtree(results / "artifacts/datastore/mine")
     assert "missing" in told("prepare", MINE, "--plan")
     path = results / "artifacts/drafter/mine/drafter.json"

@@ -68,12 +68,12 @@ def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
 )
 def datastore(settings: BuildDatastoreSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Store the demonstrations' action chunks with the target's features as search keys, for drafts by retrieval."""
-    from kerv_cli.lab.runs import making
+    from kerv_cli.lab.runs import making, time_as_before
     from kerv_cli.training.datastore import DatastoreBuild
 
     run = DatastoreBuild(settings)
     if plan:
-        end_with_plan(run.plan(), as_json)
+        end_with_plan(f"{run.plan()}, {time_as_before(settings.results, 'datastore')}", as_json)
     with (
         making(settings.results, "datastore", run.folder) as made,
         progress_bar("encoding demonstrations", made) as advance,

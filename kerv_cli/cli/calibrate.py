@@ -36,9 +36,10 @@ def calibrate(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
     from kerv_cli.training.calibration import CalibrationRun
 
     run = CalibrationRun(settings)
+    from kerv_cli.lab.runs import making, time_as_before
+
     if plan:
-        end_with_plan(run.plan())
-    from kerv_cli.lab.runs import making
+        end_with_plan(f"{run.plan()}, {time_as_before(settings.results, 'calibration')}")
 
     with making(settings.results, "calibration", run.path.parent) as record:
         calibration = run.run(lambda title: progress_bar(title, record))

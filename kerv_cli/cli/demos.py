@@ -36,9 +36,7 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
 
     With policy=NAME a policy acts instead, and the expert labels the states that it reaches (DAgger).
     """
-    from kerv_cli.lab.command import current_command
-    from kerv_cli.lab.database import Database
-    from kerv_cli.lab.runs import making, time_of
+    from kerv_cli.lab.runs import making, time_as_before
     from kerv_cli.training.dagger import recording_of
     from kerv_cli.training.demonstrations import name_of
     from kerv_cli.worlds.demos.recording import record
@@ -47,7 +45,7 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
     folder = artifact(settings.results, "demos", settings.name or name_of(settings.task))
     if plan:
         what = f"{count(len(config.tasks), 'task')} x {count(settings.episodes, 'episode')}"
-        time = time_of(Database(settings.results), "demos", current_command(), len(config.tasks) * settings.episodes)
+        time = time_as_before(settings.results, "demos", len(config.tasks) * settings.episodes)
         end_with_plan(f"{what} -> {folder}, {time}")
     try:
         with making(settings.results, "demos", folder) as made, progress_bar("demonstrations", made) as advance:
