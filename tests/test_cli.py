@@ -237,7 +237,7 @@ def test_an_interrupted_command_says_so_in_one_line(number, late, policies, tmp_
     _, errors = begun.communicate(timeout=120)
     assert begun.returncode == 130, errors
     # an early signal may wait for the end of an import, a late one may come after an episode
-    assert re.fullmatch(r"(ar of .*\n)?((episodes|\d+/50) .*\n)*kerv: interrupted.*\n", errors), errors
+    assert re.fullmatch(r"(ar of .*\n)?(the load .*\n)?((episodes|\d+/50) .*\n)*kerv: interrupted.*\n", errors), errors
 
 
 def test_an_interrupt_that_a_library_made_another_error_of_is_an_interrupt(capsys, monkeypatch):
