@@ -16,3 +16,11 @@ def kerv(*words: str, code: int | None = 0) -> Result:
 def told(*words: str, code: int | None = 0) -> str:
     """Return all that a command prints."""
     return str(kerv(*words, code=code).output)
+
+
+def refusal(*words: str, code: int | None = None) -> str:
+    """Return the one line in which a command refuses, with exit code 1 or 2."""
+    run = kerv(*words, code=code)
+    assert run.exit_code in (1, 2), run.output
+    (line,) = [line for line in run.stderr.splitlines() if line.startswith("kerv: ")]
+    return line

@@ -9,7 +9,8 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import examples.insertion  # noqa: F401 - registers the environment with seven d
 import pytest
 
 from kerv_cli.base import registry
+from kerv_cli.base.errors import KervError
 from kerv_cli.lab.command import STORE
 from kerv_cli.lab.database import Database
 
@@ -129,6 +131,23 @@ def quick_training(monkeypatch):
 
     monkeypatch.setattr(drafter, "VALIDATED", 4)
     monkeypatch.setattr(plots, "png", lambda *_: b"")
+
+
+@contextlib.contextmanager
+def refused(*says: str, error: type[KervError] = KervError) -> Iterator[None]:
+    """Expect that the block is refused in one line that holds these words."""
+    with pytest.raises(error) as caught:
+        yield
+    assert [words for words in says if words not in str(caught.value)] == []
+    assert "\n" not in str(caught.value)
+
+
+def until(condition: Callable[[], Any], seconds: float = 60.0) -> None:
+    """Wait until a condition holds."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.01)
 
 
 @contextlib.contextmanager

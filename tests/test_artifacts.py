@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from conftest import refused
 from test_calibration import TASKS, write_dataset
 
 from kerv_cli.base.config import compose
@@ -110,9 +111,8 @@ def test_only_what_is_needed_is_read(results):
         ("method=spec_vla proposer=kalman", "calibration"),
         ("method=one_pass", "early"),
     ):
-        with pytest.raises(CheckpointError, match=f"no .*{missing}") as refused:
+        with refused(f"no {missing}", error=CheckpointError):
             check(settings_of(results, overrides))
-        assert "\n" not in str(refused.value)
 
 
 def test_a_changed_file_is_another_artifact(results):
@@ -162,13 +162,8 @@ def complete(whole, tmp_path_factory):
 
 OTHER = "f" * 64
 
-FILES = {
-    "drafter": "drafter.json",
-    "early": "early.json",
-    "datastore": "manifest.json",
-    "calibration": "calibration.json",
-}
-MESSAGE = rf"was \w+ for [a-z ]+ {OTHER[:12]}, not for [0-9a-f]{{12}}: (run|build|remove)"
+FILES = {name: f"{name}.json" for name in ("drafter", "early", "calibration")} | {"datastore": "manifest.json"}
+MESSAGE = f" {OTHER[:12]}, not for "
 
 
 @pytest.mark.parametrize("kind", FILES)
@@ -180,9 +175,8 @@ def test_what_was_made_for_another_target_is_refused(complete, tmp_path, kind):
     described = json.loads(path.read_text())
     described["target"] = {**described["target"], "sha256": OTHER} if isinstance(described["target"], dict) else OTHER
     path.write_text(json.dumps(described))
-    with pytest.raises(CheckpointError, match=MESSAGE) as refused:
+    with refused(MESSAGE, error=CheckpointError):
         files.check(FILES)
-    assert "\n" not in str(refused.value)
 
 
 def test_an_early_drafter_of_another_chunk_length_is_refused(complete, tmp_path):
@@ -196,7 +190,6 @@ def test_an_early_drafter_of_another_chunk_length_is_refused(complete, tmp_path)
 def test_what_was_made_from_another_artifact_is_refused_beside_this_one(complete, monkeypatch):
     files = Artifacts(str(complete), PolicySettings(target="nano-state"))
     monkeypatch.setattr(EarlyDrafter, "sources", lambda self, description: {"datastore": OTHER})
-    with pytest.raises(CheckpointError, match=MESSAGE) as refused:
+    with refused(MESSAGE, error=CheckpointError):
         files.check(FILES)
-    assert "\n" not in str(refused.value)
     files.check([kind for kind in FILES if kind != "datastore"])  # what is not in use does not matter

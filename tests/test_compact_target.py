@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from command import kerv
+from conftest import refused
 from examples.own_target import SEVEN
 from hypothesis import given
 from hypothesis import strategies as st
@@ -115,7 +116,7 @@ def damaged(folder: Path, **changes: object) -> Path:
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"actions": {"names": []}}, r"target\.json is damaged: actions"),
+        ({"actions": {"names": []}}, "target.json is damaged: actions"),
         ({"settings": {"chunk": 2, "colour": 1}}, "damaged: colour"),
         ({"settings": {"chunk": 2, "observation": "state", "width": 32, "heads": 2}}, "does not fit its own settings"),
         ({"settings": {"chunk": 2, "width": 32, "heads": 6}}, "width=32 must be a multiple of 2 x heads=6"),
@@ -123,9 +124,8 @@ def damaged(folder: Path, **changes: object) -> Path:
     ],
 )
 def test_a_damaged_description_is_one_line(tmp_path, changes, says):
-    with pytest.raises(CheckpointError, match=says) as caught:
+    with refused(says, error=CheckpointError):
         load_target(damaged(tmp_path, **changes))
-    assert "\n" not in str(caught.value)
 
 
 def test_a_field_of_a_newer_kerv_is_no_damage(tmp_path):

@@ -8,6 +8,7 @@ from typing import Any, get_args, get_type_hints
 
 import pytest
 import yaml
+from conftest import refused
 
 import kerv_cli.cli.app  # noqa: F401 - registers the commands
 from kerv_cli.base.config import _composed, compose, conf_dir, expand, groups, swept_keys
@@ -170,10 +171,8 @@ WRONG = [
 
 @pytest.mark.parametrize(("command", "override", "says"), WRONG)
 def test_what_is_wrong_or_out_of_range_is_refused_in_one_line(command, override, says):
-    with pytest.raises(UsageError) as refused:
+    with refused(says, error=UsageError):
         compose(command, override.split(), SCHEMAS[command])
-    assert says in str(refused.value)
-    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
@@ -189,10 +188,9 @@ def test_what_is_wrong_or_out_of_range_is_refused_in_one_line(command, override,
 )
 def test_a_grid_is_counted_before_it_is_expanded(grid):
     began = time.monotonic()
-    with pytest.raises(UsageError) as refused:
+    with refused(error=UsageError):
         expand(grid.split())
     assert time.monotonic() - began < 5
-    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("name", ["..", ".", "", ".hidden", "a b", "a\0b", "n" * 300, "n" * 300 + "/x", "/a\0b"])

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from command import kerv
+from conftest import refused
 from examples.own_target import SEVEN
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -302,10 +303,8 @@ def cut(path: Path) -> None:
 )
 def test_a_datastore_that_is_damaged_or_not_of_this_target_is_refused(copy, harm, says):
     harm(folder_of(copy))
-    with pytest.raises(CheckpointError) as caught:
+    with refused(says, error=CheckpointError):
         opened(copy)
-    assert says in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -317,9 +316,8 @@ def test_a_datastore_that_is_damaged_or_not_of_this_target_is_refused(copy, harm
     ],
 )
 def test_what_cannot_be_built_is_refused(results, changes, error, says):
-    with pytest.raises(error) as caught:
+    with refused(says, error=error):
         DatastoreBuild(asked(results, **changes)).build()
-    assert says in str(caught.value)
 
 
 def test_demonstrations_that_do_not_fit_the_target_are_refused(copy):

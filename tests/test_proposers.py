@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from examples.own_proposer_table import FollowProposer, FollowTable
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from loaded import datastore_of
@@ -76,49 +77,33 @@ def proposers(target: CompactTarget, prompt: torch.Tensor, truth: list[int], see
         "early": early,
         "retrieval": retrieval,
         "merged": MergedProposer([early, retrieval], int(random.integers(1, 80)), [hold]),
+        "follow": FollowProposer(FollowTable.fit([np.reshape(truth, (-1, D))], SPACE), 12),
         "hybrid": HybridProposer(drafting, retrieval),
     }
 
 
 @pytest.mark.bits
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 10_000), chunk=st.sampled_from([1, 4, 8]), data=st.data())
-@pytest.mark.parametrize("name", ["hold", "linear", "kalman", "early", "retrieval", "merged", "hybrid"])
+@pytest.mark.parametrize("name", ["hold", "linear", "kalman", "early", "retrieval", "merged", "follow", "hybrid"])
 def test_every_proposer_is_lossless(name, seed, chunk, data):
+    """After the prefill, or inside it with and without drafts that follow."""
     target = random_target(seed, 2, 2, chunk)
     prompt = random_prompt(target, seed)
     truth = plain_greedy(target, prompt)
-    proposer = proposers(target, prompt, truth, seed)[name]
+    known = proposers(target, prompt, truth, seed)
+    where = "after" if name == "hybrid" else data.draw(st.sampled_from(["after", "inside", "both"]), "where")
+    before = None if where == "after" else known[name]
+    after = {"after": known[name], "inside": None, "both": known["hybrid"]}[where]
+    boundary = Random(0.5) if after is known["hybrid"] else None
     steps = data.draw(st.integers(0, chunk), "steps decoded, 0: all")
-    boundary = Random(0.5) if name == "hybrid" else None
-    decoder = Decoder(target, Parts(proposer=proposer, boundary=boundary), chunk=steps)
+    decoder = Decoder(target, Parts(prefill_draft=before, proposer=after, boundary=boundary), chunk=steps)
     decoder.situation = situation(np.random.default_rng(seed), data.draw(st.integers(0, 12), "executed"))
     for _ in range(2):  # the second decode finds the parts as the first left them
         result = decoder.decode_prompt(prompt)
         assert result.tokens == truth[: (steps or chunk) * D]
         assert_adds_up(result)
         assert all(len(r.drafted) <= 4 for r in result.rounds if r.proposer == "drafter")  # its depth
-
-
-@pytest.mark.bits
-@settings(max_examples=25, deadline=None)
-@given(
-    seed=st.integers(0, 10_000), chunk=st.sampled_from([1, 4, 8]), executed=st.integers(0, 12), carry_on=st.booleans()
-)
-@pytest.mark.parametrize("name", ["hold", "kalman", "early", "retrieval", "merged"])
-def test_every_in_prefill_draft_is_lossless(name, seed, chunk, executed, carry_on):
-    target = random_target(seed, 2, 2, chunk)
-    prompt = random_prompt(target, seed)
-    truth = plain_greedy(target, prompt)
-    known = proposers(target, prompt, truth, seed)
-    parts = Parts(prefill_draft=known[name])
-    if carry_on:
-        parts = Parts(prefill_draft=known[name], proposer=known["hybrid"], boundary=Random(0.5))
-    decoder = Decoder(target, parts)
-    decoder.situation = situation(np.random.default_rng(seed), executed)
-    result = decoder.decode_prompt(prompt)
-    assert result.tokens == truth
-    assert_adds_up(result)
 
 
 def test_a_prediction_counts_committed_steps_as_executed():

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import refused
 from examples.insertion import SPEC as INSERTION
 from rerun.chunk import RrdReader
 from rerun_synthetic import DOFS, decode_of, episode, prefill, read_recording, verify
@@ -129,10 +130,8 @@ def test_a_failure_leaves_no_file(tmp_path, monkeypatch):
 def test_a_damaged_recording_gets_one_line(share, tmp_path):
     path = saved(episode("drafter"), tmp_path)
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
-    with pytest.raises(KervError) as caught:
+    with refused("record the episode again"):
         read_chunks(path)
-    assert "\n" not in str(caught.value)
-    assert "record the episode again" in str(caught.value)
 
 
 def test_every_place_of_a_chunk_has_its_outcome():

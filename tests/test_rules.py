@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import refused
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -271,18 +272,17 @@ def test_the_reference_level_is_the_tasks_where_none_is_given(kind):
 @pytest.mark.parametrize(
     ("kind", "values", "says"),
     [
-        ("fixed", {"r": -1}, r"threshold\.r=-1"),
-        ("fixed", {"r": 255}, r"threshold\.r=255: bins from 0 to 254"),
-        ("kinematic", {"k_s": 0.0}, r"threshold\.k_s=0\.0"),
-        ("kinematic", {"k_s": math.nan}, r"threshold\.k_s=nan"),
-        ("kinematic", {"r_min": 16}, r"threshold\.r_min=16 threshold\.r_max=15"),
-        ("change", {"r_min": -1}, r"threshold\.r_min=-1"),
-        ("schedule", {"r_max": 255}, r"threshold\.r_max=255"),
-        ("kinematic", {"phi": 0.0}, r"threshold\.phi=0"),
-        ("schedule", {"tau": 0.0}, r"threshold\.tau=0"),
+        ("fixed", {"r": -1}, "threshold.r=-1"),
+        ("fixed", {"r": 255}, "threshold.r=255: bins from 0 to 254"),
+        ("kinematic", {"k_s": 0.0}, "threshold.k_s=0.0"),
+        ("kinematic", {"k_s": math.nan}, "threshold.k_s=nan"),
+        ("kinematic", {"r_min": 16}, "threshold.r_min=16 threshold.r_max=15"),
+        ("change", {"r_min": -1}, "threshold.r_min=-1"),
+        ("schedule", {"r_max": 255}, "threshold.r_max=255"),
+        ("kinematic", {"phi": 0.0}, "threshold.phi=0"),
+        ("schedule", {"tau": 0.0}, "threshold.tau=0"),
     ],
 )
 def test_bad_values_get_one_line(kind, values, says):
-    with pytest.raises(UsageError, match=says) as caught:
+    with refused(says, error=UsageError):
         threshold(kind, **values)
-    assert "\n" not in str(caught.value)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from command import kerv
+from conftest import refused
 from loaded import of_target
 
 from kerv_cli.base.errors import CheckpointError, UsageError
@@ -291,9 +292,8 @@ def test_settings_of_other_conditions_get_no_certificate(policies, tmp_path, ar,
         f"settings:\n  early: method=early_unverified\n  scout: method=scout_unverified {scout}\n  ar: method=ar {ar}\n"
     )
     words = f"policy.target=nano-vision task={TASK} seed=50500 {common} results={policies}"
-    with pytest.raises(UsageError) as refused:
+    with refused(says, error=UsageError):
         folder_of(resolve([f"study={study}", *words.split()]))
-    assert says in str(refused.value)
 
 
 def test_the_shipped_study_of_certificates_passes(policies):

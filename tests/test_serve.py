@@ -9,7 +9,6 @@ import struct
 import subprocess
 import sys
 import threading
-import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -21,6 +20,7 @@ import msgpack
 import numpy as np
 import pytest
 from command import kerv
+from conftest import until
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -94,14 +94,6 @@ def seen(seed: int, **changes: Any) -> dict[str, Any]:
         "prompt": "open a drawer",
         **changes,
     }
-
-
-def until(condition: Any, seconds: float = 5) -> None:
-    """Waits at most that long."""
-    ends = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < ends, "waited in vain"
-        time.sleep(0.01)
 
 
 @pytest.mark.bits

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from command import kerv
+from conftest import refused
 from safetensors.torch import load_file
 from torch import nn
 
@@ -109,9 +110,8 @@ def test_a_damaged_resume_file_is_one_line(tmp_path):
     index = whole.index(loop.module.weight.detach().numpy().tobytes())
     for damaged in (whole[:index] + bytes([whole[index] ^ 1]) + whole[index + 1 :], whole[:-100], b"", b"{}"):
         (tmp_path / RESUME).write_bytes(damaged)
-        with pytest.raises(CheckpointError, match=r"training state at .* damaged") as caught:
+        with refused("damaged", error=CheckpointError):
             quadratic(tmp_path).run()
-        assert "\n" not in str(caught.value)
 
 
 def test_a_kill_between_the_weights_and_the_resume_file_keeps_the_right_best(tmp_path, monkeypatch):
