@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from command import kerv
+from command import kerv, refusal
 from flips import flipped
 
 from kerv_cli.base.errors import CheckpointError
@@ -201,9 +201,7 @@ def test_the_command_ends_with_one_document(tmp_path):
 )
 def test_what_cannot_be_measured_is_refused(words, message, tmp_path, monkeypatch):
     monkeypatch.setattr("kerv_cli.bench.model.memory_of", lambda device: 8e9)
-    done = kerv("bench", *words, f"results={tmp_path}", code=2)
-    assert message in done.stderr
-    assert done.stderr.count("\n") == 1
+    assert message in refusal("bench", *words, f"results={tmp_path}", code=2)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from command import kerv
+from command import refusal, told
 from studies_synthetic import episode, still_episode, swept, threshold_study
 
 from kerv_cli.engine.cost import Profile, prices, work_of_record
@@ -75,8 +75,8 @@ def test_an_episode_costs_its_decodes_at_the_profiles_costs(results, data):
     assert first["decodes"] == len(first["decode_seconds"])
 
 
-def report(results: Path, *words: str) -> Any:
-    return kerv("report", "study=threshold", f"results={results}", *words, code=None)
+def report(results: Path, *words: str) -> str:
+    return told("report", "study=threshold", f"results={results}", *words)
 
 
 def test_a_report_prices_the_study_on_several_machines(results):
@@ -84,9 +84,7 @@ def test_a_report_prices_the_study_on_several_machines(results):
     profile_file(results, "elsewhere")
     document = json.loads((results / "bench/elsewhere.json").read_text())
     (results / "bench/elsewhere.json").write_text(json.dumps({**document, "device_name": "CPU"}))
-    done = report(results, "on=there,elsewhere")
-    assert done.exit_code == 0, done.output
-    assert "vla-150m, GPU: per episode" in done.stdout
+    assert "vla-150m, GPU: per episode" in report(results, "on=there,elsewhere")
     table = pd.read_csv(results / "report/tables/threshold_on.csv")
     assert sorted(set(table["on"])) == ["elsewhere", "there"]
     page = (results / "studies/threshold/report.html").read_text()
@@ -97,25 +95,23 @@ def test_a_report_prices_the_study_on_several_machines(results):
 def test_a_report_prices_the_study_on_the_machines_that_the_study_names(tmp_path):
     study = dataclasses.replace(threshold_study(["reach-v3"], radii=(9,)), machines=("there",))
     swept(tmp_path, study)
-    done = report(tmp_path)
-    assert done.exit_code == 0, done.output
+    report(tmp_path)
     assert not (tmp_path / "report/tables/threshold_on.csv").exists(), "a machine without a profile is no error"
     profile_file(tmp_path)
-    assert "vla-150m, GPU: per episode" in report(tmp_path).stdout
+    assert "vla-150m, GPU: per episode" in report(tmp_path)
     assert set(pd.read_csv(tmp_path / "report/tables/threshold_on.csv")["on"]) == {"there"}
 
 
 def test_a_report_compares_with_another_baseline(results):
     tables = []
     for words, name in (([], "threshold"), (["baseline='spec_vla r=9'"], "threshold_against_spec_vla_r_9")):
-        done = report(results, *words)
-        assert done.exit_code == 0, done.output
+        report(results, *words)
         table = pd.read_csv(results / f"report/tables/{name}.csv")
         tables.append(table[table["averaging"] == "micro over tasks"].set_index("label"))
     usual, other = tables
     assert other["episode_speedup"]["ar"] == pytest.approx(1 / usual["episode_speedup"]["spec_vla r=9"], rel=1e-3)
     assert set(other["baseline"]) == {"spec_vla r=9"}
-    assert report(results, "baseline=other").exit_code == 2
+    refusal("report", "study=threshold", f"results={results}", "baseline=other", code=2)
 
 
 @pytest.mark.parametrize(
@@ -132,19 +128,14 @@ def test_a_report_compares_with_another_baseline(results):
 )
 def test_a_profile_that_cannot_price_the_study_is_refused(results, changes, says):
     profile_file(results, "odd", **changes)
-    done = report(results, "on=odd")
-    assert done.exit_code == 2
-    assert says in done.stderr
-    assert done.stderr.count("\n") == 1
+    assert says in refusal("report", "study=threshold", f"results={results}", "on=odd", code=2)
 
 
 def test_what_is_not_there_is_refused(results):
     profile_file(results)
-    done = report(results, "on=nowhere")
-    assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
-    assert "on=nowhere: no such profile. Make one with 'kerv bench target=TARGET" in done.stderr
-    every = kerv("report", f"results={results}", "on=there", code=2)
-    assert "name the study" in every.stderr
+    absent = refusal("report", "study=threshold", f"results={results}", "on=nowhere", code=2)
+    assert "on=nowhere: no such profile. Make one with 'kerv bench target=TARGET" in absent
+    assert "name the study" in refusal("report", f"results={results}", "on=there", code=2)
 
 
 def test_shipped_profiles_can_price_what_ships(tmp_path):
