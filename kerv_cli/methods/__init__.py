@@ -9,7 +9,7 @@
     early, merged               ours: drafts from the prompt, before the prefill (`method=one_pass`)
     scout                       ours: a drafter with its own vision encoder
     streak                      ours: drafts that are executed without verification
-    certified                   ours: the same, on tasks for which a certificate limits the loss of success
+    certified                   ours: such drafts, on tasks for which a certificate limits the loss of success
     sp_vla                      SP-VLA: a regression replaces the target while the motion is fast
 
 Each file above, and the `__init__.py` of each folder, contains settings and registrations. It imports neither torch nor

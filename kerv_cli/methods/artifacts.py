@@ -29,12 +29,12 @@ TARGET = "target"
 
 T = TypeVar("T")
 _LOADED: dict[tuple[Any, ...], Any] = {}
-"""Artifacts that this process has loaded, by everything that they depend on."""
+"""Artifacts that this process has loaded. The key holds everything on which a loaded artifact depends."""
 
 
 @dataclass(frozen=True)
 class Use:
-    """What a policy's artifacts will be used for. It is checked before anything is loaded.
+    """What a policy's artifacts will be used for. The artifacts check it before any weights are loaded.
 
     Args:
         method: Kind of a part, such as `proposer` -> settings of the method's part.
@@ -77,7 +77,7 @@ class MadeFor:
             target: The policy's target.
             what: Name of the artifact, for the error message.
             made: How the artifact was made, such as `trained`, for the error message.
-            again: What to do, for the error message.
+            again: What the user should do, for the error message, such as `run 'kerv calibrate' again`.
 
         Raises:
             CheckpointError: The action space, its normalisation, the chunk length or the weights differ.
@@ -96,7 +96,7 @@ def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str
             ignored.
         used: Kind -> hash of the policy's target and artifacts.
         what: Beginning of the error message, such as `the early drafter in FOLDER was trained`.
-        again: What to do, for the error message.
+        again: What the user should do, for the error message, such as `run 'kerv calibrate' again`.
 
     Raises:
         CheckpointError: The policy uses an artifact of the same kind with another hash.
@@ -113,10 +113,11 @@ def removal(kind: str, path: Path) -> str:
 
 
 class Artifact(Generic[T]):
-    """Base of the kinds of artifacts. An artifact is made for one target and read by some methods.
+    """Base class of the kinds of artifacts, such as drafter, datastore and calibration.
 
-    Its description is a JSON of the dataclass `schema`. Other files may lie beside the JSON. Drafters with weights
-    derive from the subclass `TrainableDrafter` (`drafters.py`).
+    An artifact consists of files that methods read. It is made for one target. A JSON file, in the format of the
+    dataclass `schema`, describes it. Its other files are beside the JSON file. Drafters with weights derive from the
+    subclass `TrainableDrafter` (`drafters.py`).
 
     Attributes:
         kind: Name of the kind in settings and paths, such as `drafter`.
@@ -156,7 +157,7 @@ class Artifact(Generic[T]):
         return path / f"{self.kind}.json"
 
     def load(self, path: Path, artifacts: Artifacts) -> Any:
-        """Load the artifact in `path`, for the target of `artifacts`. By default return its description.
+        """Load the artifact in `path`, for the target of `artifacts`. By default, only read and check its description.
 
         Raises:
             CheckpointError: The artifact is missing, damaged or made for another target.
@@ -187,20 +188,20 @@ class Artifact(Generic[T]):
     def is_complete(self, description: T, kinds: Collection[str]) -> bool:
         """Return whether the artifact is complete, for a policy that also has artifacts of these `kinds`.
 
-        A calibration, for example, is incomplete if the policy got a datastore after it was made.
+        A calibration, for example, is incomplete if it was made before the policy got a datastore.
         """
         return True
 
     def digest(self, path: Path, description: T) -> str:
-        """Return the artifact's hash. Stored episodes name the artifacts that they used by these hashes."""
+        """Return the artifact's hash. Stored episodes contain the hashes of the artifacts that they used."""
         return sha256_of(self.json(path))
 
     def read(self, path: Path) -> T:
         """Read the description of the artifact in `path`, without checking its target.
 
         Raises:
-            CheckpointError: The description is missing, damaged or of another format. Or the files beside it have other
-                hashes than it names.
+            CheckpointError: The description is missing, damaged or of another format. Or a file beside it has another
+                hash than the description names.
         """
         file = self.json(path)
         if not file.is_file():
@@ -211,8 +212,8 @@ class Artifact(Generic[T]):
         """Read the description in an existing file.
 
         Raises:
-            CheckpointError: The description is damaged or of another format. Or the files beside it have other hashes
-                than it names.
+            CheckpointError: The description is damaged or of another format. Or a file beside it has another hash than
+                the description names.
         """
         try:
             description = read_file(self.schema, file)
@@ -273,7 +274,7 @@ class Artifacts:
             use: The method and the world that they will be used in. None: do not check the use.
 
         Returns:
-            Kind -> hash, for the target, the artifacts and the further artifacts that these need.
+            Kind -> hash, for the target, the artifacts of `kinds` and the further artifacts that they need.
 
         Raises:
             CheckpointError: An artifact is missing, damaged, made for another target, or made from another artifact

@@ -38,7 +38,7 @@ class Demonstrations:
 
 @dataclass(frozen=True)
 class Variability:
-    """The kinematic variability K of a task: the mean distance between draft and target tokens of a decode (§3.2).
+    """What was measured of a task's variability K: the mean distance of a decode's drafts to the target (§3.2).
 
     Attributes:
         k_s: Reference level K_S: the median K over the decodes that were measured, in normalised action units.
@@ -51,11 +51,11 @@ class Variability:
 
 @dataclass(frozen=True)
 class BoundarySection:
-    """Ranges that scale the curvature and the path length of the hybrid boundary (docs/methods.md §4.4).
+    """Ranges by which the hybrid boundary scales a path's radius of curvature and length (docs/methods.md §4.4).
 
     Attributes:
         episodes: Number of episodes that were measured.
-        windows: Number of positions in the boundary's window, as text -> its ranges.
+        windows: Number of positions in the boundary's window, as text such as `15` -> the ranges for this window.
     """
 
     episodes: int
@@ -66,7 +66,8 @@ class BoundarySection:
 class SkipLevel:
     """The threshold s_min of a task: the similarity at which verification is skipped (docs/methods.md §4.3).
 
-    Similarities are cosines. For the measurement, each entry was looked up among the other episodes of the datastore.
+    Similarities are cosines. To measure the threshold, the best neighbour of each entry was searched in the other
+    episodes of the datastore. A neighbour is good if its chunk is close to the entry's chunk (`SkipSection.epsilon`).
 
     Attributes:
         s_min: A chunk is executed without verification if its similarity is at least this.
@@ -74,8 +75,9 @@ class SkipLevel:
         high: Highest value that feedback after an episode may move `s_min` to.
         share: Share of the entries whose best neighbour reaches `s_min`.
         entries: Number of entries that were looked up.
-        within: Of the entries that reach `s_min`, the share whose chunk was good. None: no entry reaches it.
-        error: Mean absolute error of their chunks, in normalised action units. None: no entry reaches `s_min`.
+        within: Share of good neighbours among those that reach `s_min`. None: none reaches it.
+        error: Mean absolute error of the chunks of these neighbours, in normalised action units. None: none reaches
+            `s_min`.
     """
 
     s_min: float
@@ -93,8 +95,9 @@ class SkipSection:
 
     Attributes:
         datastore: Hash of the datastore.
-        epsilon: Largest mean absolute error of a good chunk, in normalised action units.
-        confidence: Minimum share of good chunks among the skipped ones.
+        epsilon: Largest mean absolute error of a good chunk, in normalised action units. Its strict tokens,
+            such as the gripper's, must be equal.
+        confidence: Minimum share of good chunks among the chunks that reach the threshold.
         tasks: Task -> its threshold.
     """
 
@@ -113,9 +116,9 @@ class Calibration:
         demos: The demonstrations.
         window: Number of control steps of history that a predictor sees.
         noise: Kalman filter (`kalman`, `damped`) -> its noise per DoF.
-        errors: Errors of all predictors on held-out episodes.
+        errors: Errors of all predictors on held-out episodes, as described at `Errors`.
         variability: Task -> reference level K_S of the kinematic variability K.
-        boundary: Ranges of the hybrid boundary.
+        boundary: Ranges by which the hybrid boundary scales a path's radius of curvature and length.
         skip: Thresholds at which verification is skipped.
         provenance: How it was made.
     """
@@ -191,7 +194,7 @@ class Calibration:
 
 
 class CalibrationArtifact(Artifact[Calibration]):
-    """The kind of artifact `calibration`: a single file. An artifact's path is that file, not a folder."""
+    """The kind of artifact `calibration`. It is a single file, so its path is that of the file, not of a folder."""
 
     kind = noun = "calibration"
     made, command = "made", ("calibrate",)

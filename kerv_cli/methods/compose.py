@@ -78,8 +78,8 @@ class Method:
     def _check_drafts(self) -> None:
         """Check the proposer, the boundary and the prefill draft.
 
-        A boundary that chooses needs a proposer with two drafters, and the reverse. A prefill draft must not need the
-        target's hidden states, which exist only after the prefill.
+        A boundary that chooses between two drafters needs a proposer that has two, and such a proposer needs such a
+        boundary. A prefill draft must not need the target's hidden states, which exist only after the prefill.
         """
         proposer, boundary, draft = (self.parts[kind] for kind in ("proposer", "boundary", "prefill_draft"))
         if bool(proposer.traits.get("has_boundary")) != bool(boundary.traits.get("chooses")):
@@ -94,7 +94,7 @@ class Method:
             )
 
     def _check_skip(self) -> None:
-        """Check that a skip rule that executes the prefill draft without verification has a draft of whole chunks."""
+        """Check that the prefill draft covers whole chunks, if the skip rule can execute it without verification."""
         skip, draft = self.parts["skip"], self.parts["prefill_draft"]
         joined = skip.traits.get("merges") and draft.traits.get("merged")
         if skip.traits.get("takes_draft") and not draft.traits.get("chains") and not joined:

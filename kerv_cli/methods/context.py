@@ -1,6 +1,7 @@
 """The context in which a method's part is built.
 
-Each part registers a function that takes (settings, context) and returns the part. None stands for no part.
+Each part registers a function that takes (settings, context) and returns the part. It returns None if the method then
+works without a part of this kind.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class Context:
         return self.artifact("calibration")
 
     def check_radius(self, name: str, r: int) -> None:
-        """Refuse an acceptance radius that is larger than the distance of any two tokens.
+        """Refuse an acceptance radius that is larger than the largest distance of two tokens.
 
         Args:
             name: Name of the threshold's setting, for the error message.

@@ -81,7 +81,10 @@ class Training:
 
 @dataclass(frozen=True)
 class Decodes(Rows):
-    """The target's greedy decodes of n observations, in the order of episodes. A drafter adds what its network reads.
+    """Training examples of a drafter: the tokens that the target decodes greedily from n observations.
+
+    The observations are in the order of their episodes. Each kind of drafter adds the inputs of its network in a
+    subclass.
 
     Attributes:
         tokens: (n, N) int64, the target's tokens.
@@ -95,7 +98,7 @@ class Decodes(Rows):
 
 
 def evenly(steps: np.ndarray, share: float) -> np.ndarray:
-    """Return an evenly spread share of the steps (n,). The first step is always included."""
+    """Return a share of the steps (n,), evenly spread. The first step is always included."""
     order = np.arange(len(steps))
     return steps[np.ceil((order + 1) * share - 1e-9) > np.ceil(order * share - 1e-9)]
 
@@ -106,7 +109,7 @@ class TrainableDrafter(Artifact[DrafterDescription]):
     A drafter is a folder with its weights in safetensors and a description `<kind>.json`.
 
     Attributes:
-        settings: Dataclass of the settings of its shapes and training.
+        settings: Dataclass of the settings: shapes of the network, and training.
         any_chunk: Whether one drafter works for any number of control steps per chunk.
     """
 
@@ -134,7 +137,7 @@ class TrainableDrafter(Artifact[DrafterDescription]):
             dataset: The demonstrations. The expert's actions are not used.
             settings: Settings of the drafter.
             held_out: Share of the episodes to hold out.
-            progress: Called with the numbers of episodes done and of all.
+            progress: Called with the number of episodes done and the number of all episodes.
 
         Returns:
             The training examples, and the held-out examples, which come from other episodes.
@@ -171,7 +174,7 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         raise NotImplementedError
 
     def prepare(self, network: Any, examples: Any) -> None:
-        """Set what a network must know of the training examples before training, such as their mean and spread."""
+        """Store numbers from the training examples in the network before training, such as their mean and spread."""
 
     @abstractmethod
     def loss(self, training: Training, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
@@ -198,7 +201,7 @@ class TrainableDrafter(Artifact[DrafterDescription]):
             target: The loaded target, on the device to train on.
             dataset: The demonstrations.
             settings: Settings of `kerv train drafter`.
-            progress: Called with the amounts of work done and of all.
+            progress: Called with the amount of work done and the total amount.
         """
         share = settings.train.held_out
         examples, held_out = self.examples(target, dataset, settings.drafter, share, progress)
@@ -208,9 +211,9 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         return Training(self, network.to(target.device), target, examples, held_out, settings)
 
     def anew(self, path: Path) -> str:
-        """Return text for error messages: how to replace a drafter of another target.
+        """Return text for error messages: how to replace the drafter in `path`, which belongs to another target.
 
-        It must be removed first, because a training resumes only for its own target.
+        The drafter must be removed first, because a training resumes only for its own target.
         """
         return f"{removal(self.kind, path)}, then {self.again}"
 

@@ -26,7 +26,7 @@ class JacobiProposerSettings:
 
 
 class JacobiProposer(ChainProposer):
-    """Guesses the remaining tokens of a chunk. One forward gives the target's argmax at all positions: the next guess.
+    """Guesses the remaining tokens of a chunk. After each forward, the target's tokens become the next guess.
 
     With strict acceptance this ends with the tokens of autoregressive decoding. If a prefill draft was rejected, the
     first guess begins with the target's tokens after the rejection. All other tokens of the first guess are zero

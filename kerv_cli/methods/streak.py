@@ -15,15 +15,15 @@ if TYPE_CHECKING:
     from kerv_cli.methods.context import Context
 
 TRUSTED, STREAK = "trusted", "streak"
-"""Values of `DecodeRecord.reason`. TRUSTED: the draft was executed without verification. STREAK: it was verified,
-because no decode without verification was left."""
+"""Values of `DecodeRecord.reason`. TRUSTED: the draft was executed without verification. STREAK: the target verified or
+decoded the chunk, because no further decode without verification was allowed, or because the draft was incomplete."""
 
 
 @dataclass
 class StreakSkipSettings:
     """Execute 1, then 2, 4, … drafts without verification, as long as each verified chunk agrees with its draft (§4.5).
 
-    The draft is the prefill draft. If that is merged, it is the draft of the first source.
+    The draft is the prefill draft. If the prefill draft merges several sources, only the first source's draft counts.
     """
 
     kind: str = "streak"
@@ -36,14 +36,14 @@ class StreakSkipSettings:
 class StreakSkip(Skip):
     """Executes drafts without verification, as long as verifications agree with the drafts.
 
-    After a first verified chunk that agrees with its draft, 1 decode is not verified. Each further agreement doubles
-    the number, up to `most`. A chunk that does not agree resets it to 0. An episode begins with `opening` decodes
+    After the first verified chunk that agrees with its draft, 1 decode is not verified. Each further agreement doubles
+    this number, up to `most`. A chunk that does not agree resets it to 0. An episode begins with `opening` decodes
     without verification.
 
     Attributes:
         source: The proposer of the drafts.
         allowed: Number of decodes that the last verification allowed without verification.
-        left: How many of these are still to come.
+        left: How many of these decodes are still to come.
         chain: The draft of the current chunk.
     """
 
@@ -66,7 +66,7 @@ class StreakSkip(Skip):
         self.allowed = self.left = self.settings.opening
 
     def take(self, chunk: Chunk) -> bool:
-        """Fill the chunk with the draft, if a decode without verification is left and the draft is a whole chunk.
+        """Fill the chunk with the draft, without verification, if that is still allowed and the draft has all N tokens.
 
         Returns:
             Whether the chunk was filled.
@@ -82,7 +82,7 @@ class StreakSkip(Skip):
         return True
 
     def verified(self, chunk: Chunk) -> None:
-        """Allow twice as many decodes without verification if the verified chunk agrees with its draft, else none."""
+        """Double the number of decodes allowed without verification if the verified draft agrees; else set it to 0."""
         self.allowed = min(self.settings.most, 2 * self.allowed or 1) if self._agrees(chunk) else 0
         self.left = self.allowed
 
@@ -90,7 +90,7 @@ class StreakSkip(Skip):
         """Return whether the draft was accepted whole, or differs from the target's tokens by at most `tolerance`.
 
         The difference is the mean absolute difference, in normalised action units. Strict DoFs, such as the gripper,
-        must be equal.
+        must be equal. A draft that was not verified does not agree.
         """
         targets = chunk.targets_along(self.chain)
         if targets is None:
@@ -113,7 +113,11 @@ class AlwaysSkip(Skip):
         return cls(context.built["prefill_draft"])
 
     def take(self, chunk: Chunk) -> bool:
-        """Fill the chunk with the draft, if it is a whole chunk. Return whether it was filled."""
+        """Fill the chunk with the draft, without verification, if the draft has all N tokens.
+
+        Returns:
+            Whether the chunk was filled.
+        """
         chains = self.source.chains(chunk, chunk.size)
         if not chains or len(chains[0]) < chunk.size:
             return False

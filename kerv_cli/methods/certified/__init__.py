@@ -14,15 +14,15 @@ from kerv_cli.base.registry import PREFILL, add, find, part_of
 
 @dataclass
 class CertifiedSkipSettings:
-    """On the certificate's tasks, use its skip rule. On other tasks, use a streak (docs/methods.md §4.5)."""
+    """On the certificate's tasks, use its skip rule. On other tasks, skip as long as verified drafts agree (§4.5)."""
 
     kind: str = "certified"
-    most: int = number(8, 1)  # longest streak of decodes without verification, on other tasks
+    most: int = number(8, 1)  # on other tasks: maximum number of decodes in a row without verification
 
 
 @dataclass
 class ScopedSettings:
-    """On the certificate's tasks, use its draft. On other tasks, use the draft `outside`."""
+    """On the certificate's tasks, draft with the certified source. On other tasks, draft with `outside`."""
 
     kind: str = "scoped"
     outside: str = "merged"  # prefill draft on other tasks
@@ -31,7 +31,8 @@ class ScopedSettings:
         """Refuse a draft `outside` that cannot draft whole chunks before the prefill.
 
         Raises:
-            UsageError: The draft cannot.
+            UsageError: `outside` cannot draft whole chunks before the prefill.
+            UnknownName: No proposer has the name `outside`.
         """
         outside = find("proposer", self.outside, "prefill_draft.outside")
         if not (outside.traits.get("merged") or outside.traits.get("chains")):
@@ -44,7 +45,7 @@ class ScopedSettings:
 def _needs(settings: ScopedSettings) -> tuple[str, ...]:
     """Return the kinds of artifacts needed: the certificate, and what the draft `outside` needs.
 
-    The certificate itself names what its own draft needs.
+    `CertificateArtifact.needs` adds what the certified draft needs.
     """
     outside = part_of("prefill_draft", settings.outside)
     return "certificate", *outside.needs(outside.default)

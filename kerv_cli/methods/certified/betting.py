@@ -1,10 +1,12 @@
 """Test a mean by betting against it: the predictable plug-in bets of Waudby-Smith and Ramdas (2024).
 
-The hypothesis: each value in [0, 1] has an expectation of at least `bound`, given the values before it. If it is true,
-bets against it do not win on average, because each bet is made before its value is known. A bettor starts with a wealth
-of 1. If the hypothesis is true, the wealth ever reaches 1/δ with a probability of at most δ (Ville's inequality). So
-the test may be checked after each value. Values of different groups, such as tasks, must come in random order. Sorted
-values would reject the hypothesis only because of their order.
+The hypothesis: each value in [0, 1] has an expectation of at least `bound`, given the values before it. A bettor bets
+against the hypothesis. Each bet is made before its value is known. The bettor's wealth starts at 1. If the hypothesis
+is true, the bets do not win on average, and the wealth ever reaches 1/δ with a probability of at most δ (Ville's
+inequality). So a wealth of 1/δ rejects the hypothesis at level δ, and the wealth may be checked after each value.
+
+Values of different groups, such as tasks, must come in random order. Sorted values would reject the hypothesis only
+because of their order.
 
 For a certificate of success, each value comes from a pair of episodes with the same seed, by AR and by the method:
 (1 + AR − method) / 2, so 0, ½ or 1. The bound is (1 + m) / 2. The hypothesis is that the method loses a share m or more
@@ -21,7 +23,7 @@ MOST = 0.75  # largest share of the wealth that a bet may lose
 
 
 def bets(values: np.ndarray, bound: float, delta: float) -> np.ndarray:
-    """Return the bet on each value. A bet wins its size times (bound − value), as a share of the wealth.
+    """Return the size of the bet on each value. A bet multiplies the wealth by 1 + size · (bound − value).
 
     Each bet depends only on the values before it and on the number of values n. So n must be chosen before the test.
 
@@ -42,12 +44,12 @@ def bets(values: np.ndarray, bound: float, delta: float) -> np.ndarray:
 
 
 def wealth(values: np.ndarray, bound: float, delta: float) -> np.ndarray:
-    """Return the wealth after each value, (n,). Large wealth is evidence that the mean is below `bound`.
+    """Return the bettor's wealth after each value, (n,). It starts at 1 and grows if the mean is below `bound`.
 
     Args:
         values: (n,) in [0, 1], in the order in which they came.
         bound: The hypothesis is a mean of at least `bound`, in (0, 1).
-        delta: Error probability δ for which the bets are optimised. The wealth may be compared with any other δ.
+        delta: Error probability δ for which the bets are optimised. Tests of the wealth may use another δ.
     """
     return np.exp(np.cumsum(np.log1p(bets(values, bound, delta) * (bound - values))))
 
@@ -55,7 +57,8 @@ def wealth(values: np.ndarray, bound: float, delta: float) -> np.ndarray:
 def p_value(values: np.ndarray, bound: float, delta: float) -> float:
     """Return the p-value of the hypothesis that the mean is at least `bound`; 1 without values.
 
-    It is 1 / (largest wealth so far), so it stays valid if it is checked after each value.
+    A bettor with an initial wealth of 1 bets against the hypothesis. The p-value is 1 divided by the largest wealth so
+    far. So it stays valid if it is checked after each value.
 
     Args:
         values: (n,) in [0, 1], in the order in which they came.

@@ -1,6 +1,7 @@
 """The certificate of success, and the skip rule and the draft that apply it (docs/methods.md §4.6, ours).
 
-A certificate covers some tasks. Each decoder is built for one task, so this is checked once, when it is built.
+A certificate covers some tasks. A decoder has one task. Whether the certificate covers this task is checked once, when
+the decoder is built.
 """
 
 from __future__ import annotations
@@ -25,9 +26,10 @@ from kerv_cli.methods.streak import StreakSkip, StreakSkipSettings
 
 @dataclass(frozen=True)
 class Candidate:
-    """One candidate for a certificate: a rule that skips verification, tested against autoregressive decoding (AR).
+    """A skip rule and its draft, tested against autoregressive decoding (AR) for a certificate.
 
-    Candidates are tested in a fixed order, until one fails. Both sides of a pair of episodes have the same seed.
+    The test compares pairs of episodes with the same seed: one episode by the candidate, one by AR. Candidates are
+    tested in a fixed order, until one fails.
 
     Attributes:
         label: Name of the candidate.
@@ -39,8 +41,8 @@ class Candidate:
         won: Number of pairs that only the candidate solved.
         p: p-value of the hypothesis that the candidate loses the margin or more. None: not tested, because an earlier
             candidate failed.
-        draft: Settings of the prefill draft, which the rule executes. Old certificates do not store it: they used the
-            scout.
+        draft: Settings of the prefill draft, which the rule executes. Old certificates do not store them. Their draft
+            was the scout, a drafter that reads the image itself.
     """
 
     label: str
@@ -70,15 +72,15 @@ def _part_settings(kind: str, plain: dict[str, Any]) -> Any:
 
 @dataclass(frozen=True)
 class Attempt:
-    """An earlier test of the same policy, in the list that each certificate keeps.
+    """An earlier test of the same policy. Each certificate lists them.
 
     Attributes:
         made: When, ISO 8601. Empty: not recorded.
-        test: Hash of what was tested: `Certificate.test`.
+        test: Hash of the test's set-up: `Certificate.test`.
         order: Labels of the candidates in the order of the tests.
-        seeds: Seeds of the episodes, as text.
+        seeds: Seeds of the episodes, as text such as `1000-1049;1100`.
         margin: Percentage points of success that may be lost.
-        delta: Level of the test.
+        delta: Level of the test: an upper bound of the probability that it certifies falsely.
         pairs: Number of pairs of episodes.
         certified: Label of the boldest certified candidate. Empty if there was none.
     """
@@ -94,7 +96,7 @@ class Attempt:
 
     @property
     def seeds_served(self) -> set[int]:
-        """Seeds of the episodes."""
+        """Seeds of the episodes, as numbers."""
         ends = ([int(end) for end in part.split("-")] for part in self.seeds.split(";"))
         return {seed for part in ends for seed in range(part[0], part[-1] + 1)}
 
@@ -115,7 +117,7 @@ class Certificate:
         dtype: Number format of the models.
         margin: Percentage points of success that may be lost.
         delta: Level of this test: an upper bound of the probability that it certifies falsely.
-        seeds: Seeds of the test episodes, as text.
+        seeds: Seeds of the test episodes, as text such as `1000-1049;1100`.
         candidates: All candidates, from cautious to bold.
         chosen: Index of the boldest certified candidate. None: no candidate was certified.
         provenance: How it was made.
@@ -153,7 +155,10 @@ class Certificate:
 
     @property
     def test(self) -> str:
-        """Hash of everything that was tested, without the results and without delta."""
+        """Hash of the test's set-up: tasks, seeds, margin, drafts, method, chunk, world, dtype and candidates.
+
+        Results and delta are left out, so a repeated test has the same hash.
+        """
         names = ("tasks", "seeds", "margin", "drafts", "method", "chunk", "world", "dtype")
         order = [(one.label, one.skip, one.draft) for one in self.candidates]
         text = json.dumps([*(getattr(self, name) for name in names), order], sort_keys=True)
@@ -161,7 +166,7 @@ class Certificate:
 
     @property
     def attempt(self) -> Attempt:
-        """This test, as an entry of the list that later certificates keep."""
+        """Summary of this test, for the list in later certificates."""
         return Attempt(
             self.made,
             self.test,
@@ -232,7 +237,7 @@ class CertificateArtifact(Artifact[Certificate]):
     schema = Certificate
 
     def made_for(self, description: Certificate) -> MadeFor:
-        """Return the target that was certified. The chunk length is not compared here but when the decoder is built."""
+        """Return the target that was certified. Its chunk length is checked later, when the decoder is built."""
         return MadeFor(description.target, description.actions)
 
     def sources(self, description: Certificate) -> Mapping[str, str]:
@@ -240,12 +245,12 @@ class CertificateArtifact(Artifact[Certificate]):
         return description.drafts
 
     def check_use(self, description: Certificate, use: Use) -> None:
-        """Refuse another environment, camera or horizon than certified, and on the certified tasks another method.
+        """Refuse an environment, camera or horizon that was not certified, and on certified tasks another method.
 
         A stressed world is allowed, although the certificate says nothing about stress.
 
         Raises:
-            UsageError: The use differs. The message names both values.
+            UsageError: The use differs from the certified one. The message names both values.
         """
         if use.environment != description.environment:
             raise UsageError(
@@ -285,7 +290,11 @@ def scoped(settings: ScopedSettings, context: Context) -> Proposer:
 def certified(settings: CertifiedSkipSettings, context: Context) -> Skip | None:
     """Build skip=certified: the certified rule on the certificate's tasks, else a streak.
 
-    None on the certificate's tasks if no rule was certified: then every draft is verified.
+    A streak executes drafts without verification, as long as verified drafts agree with the target
+    (docs/methods.md §4.5).
+
+    Returns:
+        The skip rule. None if the certificate covers the task but no rule was certified: then every draft is verified.
 
     Raises:
         UsageError: The method, the number format or the chunk length is not the certified one.
