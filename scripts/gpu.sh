@@ -79,7 +79,7 @@ fi
 "$PYTHON" -c "import sys, torch; sys.exit(sys.argv[1] == 'cuda' and not torch.cuda.is_available())" "$DEVICE" ||
     { echo "gpu.sh: torch sees no CUDA device with $PYTHON: set PYTHON, or DEVICE=cpu for a trial" >&2; exit 2; }
 
-step tests 240 "$PYTHON" -m pytest -q -p no:cacheprovider tests/test_cuda.py tests/test_clock.py tests/test_bfloat16.py
+step tests 240 "$PYTHON" -m pytest -q -p no:cacheprovider tests/test_cuda.py tests/test_waits.py tests/test_program.py
 place=0
 for shape in $SHAPES; do
     place=$((place + 1))

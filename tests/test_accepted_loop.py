@@ -12,6 +12,7 @@ import torch
 from examples.own_target import SEVEN, MockTarget
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_acceptance import space_of
 from test_decoding_lossless import assert_adds_up, random_prompt, random_target
 
 from kerv_cli.base.spaces import ActionSpace, Observation
@@ -83,7 +84,7 @@ class NearTrees(Proposer):
 
 @dataclass
 class Oracle:
-    """Decodes by the definition; `accepted` holds each verified round's path."""
+    """Decodes by the definition; `judged` holds each verified round's path and the token rejected after it."""
 
     greedy: Greedy
     space: ActionSpace
@@ -91,7 +92,7 @@ class Oracle:
     r: int
     strict_dofs: bool
     tokens: tuple[int, ...] = ()
-    accepted: list[tuple[int, ...]] = field(default_factory=list)
+    judged: list[tuple[int, ...]] = field(default_factory=list)
 
     def allowed(self, path: tuple[int, ...], by_group: bool) -> bool:
         """Whether a drafted path behind the committed tokens may be executed whole."""
@@ -115,11 +116,15 @@ class Oracle:
     def verify(self, tree: TokenTree, name: str, size: int) -> None:
         """Commit the longest allowed path, of those the nearest, of those the first; then the token behind it."""
         by_group = self.kind == "sequence" or (self.kind == "hybrid" and name == "retrieval")
-        paths = [tuple(tree.tokens[i] for i in tree.path_to(node)) for node in range(len(tree))]
-        good = [p for p in paths if self.allowed(p, by_group)]
-        best = min(good, key=lambda p: (-len(p), self.distance(p)), default=())
+        paths = {node: tuple(tree.tokens[i] for i in tree.path_to(node)) for node in range(len(tree))}
+        good = [node for node, path in paths.items() if self.allowed(path, by_group)]
+        node = min(good, key=lambda n: (-len(paths[n]), self.distance(paths[n])), default=ROOT)
+        best = paths.get(node, ())
+        children = [tree.tokens[i] for i, parent in enumerate(tree.parents) if parent == node]
+        wanted = self.greedy.behind(self.tokens + best)
+        nearest = sorted(children, key=lambda token: abs(token - wanted))[:1]
         if len(tree):
-            self.accepted.append(best)
+            self.judged.append((*best, *nearest))
         self.tokens += best
         if len(self.tokens) < size:
             self.tokens = (*self.tokens, self.greedy.behind(self.tokens))
@@ -153,7 +158,7 @@ def assert_same(
         oracle.verify(tree, again.name, size)
     assert tuple(result.tokens) == oracle.tokens
     judged = [r for r in result.rounds if r.tree_size]
-    assert [r.drafted[: r.accepted] for r in judged] == oracle.accepted
+    assert [r.drafted for r in judged] == oracle.judged
     assert_adds_up(result)
     return sum(d != t for r in judged for d, t in zip(r.drafted[: r.accepted], r.target_tokens, strict=False))
 
@@ -161,7 +166,7 @@ def assert_same(
 @pytest.mark.bits
 @settings(max_examples=60, deadline=None)
 @given(
-    space=st.sampled_from([SEVEN, SPEC.actions, None]),
+    space=st.sampled_from([SEVEN, SPEC.actions, space_of(1, 2), space_of(5), None]),
     seed=st.integers(0, 10_000),
     chunk=st.integers(1, 3),
     r=st.integers(0, 5),
@@ -171,7 +176,7 @@ def assert_same(
 )
 @pytest.mark.parametrize("kind", ["relaxed", "sequence", "hybrid"])
 def test_the_loop_accepts_by_definition(kind, space, seed, chunk, r, strict_dofs, inside, nodes):
-    """On mocks of two spaces, and on a transformer."""
+    """On mocks of several spaces, and on a transformer."""
     if space is None:
         target = random_target(seed, 2, 2, chunk)
         prompt = random_prompt(target, seed)

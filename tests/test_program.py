@@ -16,6 +16,7 @@ from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import EagleDrafter
 from kerv_cli.targets.checkpoint import compact, expanded
+from kerv_cli.targets.compact.bfloat16 import Bfloat16Layers, multiplies_bfloat16
 from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.program import Program, kernels
 from kerv_cli.targets.compact.settings import TargetSettings
@@ -80,6 +81,27 @@ def close(a: torch.Tensor, b: torch.Tensor) -> bool:
     return a.shape == b.shape and torch.allclose(a, b, atol=1e-5, rtol=1e-5)
 
 
+def passes(trunk: Trunk, x: torch.Tensor, prompt: int, tree: Draft) -> list[torch.Tensor]:
+    """Outputs of a prefill, of a tree after it, of two single tokens after its commit, of which the second does not see
+    the first of all; of the tree inside the prefill; and without a cache."""
+    nodes = len(tree)
+    cache = trunk.new_cache(len(x), prompt + nodes + 3)
+    found = [trunk(x[:, :prompt], torch.arange(prompt), cache)]
+    positions = tree.positions(prompt, 1, x.device)
+    found.append(trunk(x[:, prompt : prompt + 1 + nodes], positions, cache, tree.visible(1)))
+    path = tree.tree.path_to(nodes - 1) if nodes else []
+    cache.compact(prompt, torch.tensor([prompt, *(prompt + 1 + i for i in path)]))
+    for i in range(2):
+        at = prompt + 1 + len(path) + i
+        visible = np.arange(at + 1)[None] > 0 if i else None
+        found.append(trunk(x[:, -1 - i][:, None], torch.tensor([at]), cache, visible))
+    whole = tree.positions(0, prompt, x.device)
+    cache.length = 0
+    found.append(trunk(x[:, : prompt + nodes], whole, cache, tree.visible(prompt)))
+    found.append(trunk(x[:, :prompt], torch.arange(prompt)))
+    return found
+
+
 @settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 10_000),
@@ -91,31 +113,12 @@ def close(a: torch.Tensor, b: torch.Tensor) -> bool:
     batch=st.integers(1, 3),
 )
 def test_the_packed_trunk_is_the_trunk(seed, layers, heads, channels, prompt, nodes, batch):
-    """A prefill, a tree behind it, its commit, single tokens behind that, one that does not see the first; the tree
-    inside the prefill."""
     plain, packed = both_trunks(seed, layers, heads, channels)
-    random = np.random.default_rng(seed)
-    tree = random_tree(random, nodes)
-    x, outputs = torch.randn(batch, prompt + nodes + 3, heads * channels), []
+    tree = random_tree(np.random.default_rng(seed), nodes)
+    x = torch.randn(batch, prompt + nodes + 3, heads * channels)
     before = x.clone()
     with torch.inference_mode():
-        for trunk in (plain, packed):
-            cache = trunk.new_cache(batch, prompt + nodes + 3)
-            seen = [trunk(x[:, :prompt], torch.arange(prompt), cache)]
-            drafted = x[:, prompt : prompt + 1 + nodes]
-            positions = tree.positions(prompt, 1, x.device)
-            seen.append(trunk(drafted, positions, cache, tree.visible(1)))
-            path = tree.tree.path_to(nodes - 1) if nodes else []
-            cache.compact(prompt, torch.tensor([prompt, *(prompt + 1 + i for i in path)]))
-            for i in range(2):
-                at = prompt + 1 + len(path) + i
-                visible = np.arange(at + 1)[None] > 0 if i else None
-                seen.append(trunk(x[:, -1 - i][:, None], torch.tensor([at]), cache, visible))
-            whole = tree.positions(0, prompt, x.device)
-            cache.length = 0
-            seen.append(trunk(x[:, : prompt + nodes], whole, cache, tree.visible(prompt)))
-            seen.append(trunk(x[:, :prompt], torch.arange(prompt)))
-            outputs.append(seen)
+        outputs = [passes(trunk, x, prompt, tree) for trunk in (plain, packed)]
     assert all(close(a, b) for a, b in zip(*outputs, strict=True))
     assert torch.equal(x, before)  # the caller's tensor is left alone
 
@@ -251,3 +254,57 @@ def test_a_join_of_two_values_is_copied_together():
     x = torch.randn(2, 1, 4)
     program = Program(lambda x: torch.cat([x, x[..., :1].expand(1, 1, 3) * 3.0], -1), (1, 1, 4))
     assert torch.equal(program(x)[0], torch.cat([x, 3.0 * x[..., :1].expand(2, 1, 3)], -1))
+
+
+# --- bfloat16
+
+needs_bfloat16 = pytest.mark.skipif(not multiplies_bfloat16(), reason="this CPU does not multiply bfloat16")
+
+
+@pytest.fixture(scope="module")
+def trunks():
+    """The exact trunk of bfloat16 weights, in float32, and the packed one."""
+    torch.manual_seed(3)
+    trunk = Trunk(128, 3, 4, 320).eval().requires_grad_(False)
+    for parameter in trunk.parameters():
+        parameter.data = 0.1 * torch.randn_like(parameter) if parameter.dim() == 2 else 1 + 0.3 * torch.rand(128)
+    packed = trunk.bfloat16()
+    exact = copy.deepcopy(packed).float()
+    pack(packed)
+    assert isinstance(packed.packed, Bfloat16Layers)
+    return exact, packed
+
+
+@needs_bfloat16
+@pytest.mark.parametrize("prompt", [1, 20])
+def test_the_packed_trunk_of_bfloat16_weights_is_the_trunk_up_to_its_rounding(trunks, prompt):
+    tree, x = Draft.of(range(6), [-1, -1, 0, 1, 3, 2]), torch.randn(1, 32, 128).bfloat16()
+    with torch.inference_mode():
+        outputs = (passes(trunk, x.to(trunk.norm.weight.dtype), prompt, tree) for trunk in trunks)
+        for exact, packed in zip(*outputs, strict=True):
+            assert packed.dtype == torch.bfloat16
+            assert (packed.float() - exact).abs().mean() < 0.02 * exact.abs().mean()
+        batch = x[:, :10].view(2, 5, -1)
+        exact, packed = (trunk(batch.to(trunk.norm.weight.dtype), torch.arange(5)).float() for trunk in trunks)
+        assert (packed - exact).abs().mean() < 0.02 * exact.abs().mean()
+    assert copy.deepcopy(trunks[1]).packed is None, "oneDNN's layouts cannot be copied"
+
+
+@needs_bfloat16
+def test_one_verification_and_single_tokens_agree_but_for_ties(trunks):
+    """Where their argmax differs, the two best logits lie within bfloat16's rounding: no other cause is allowed."""
+    packed, head = trunks[1], torch.randn(50, 128)
+    x, differ = torch.randn(1, 36, 128).bfloat16(), 0
+    with torch.inference_mode():
+        caches = [packed.new_cache(1, 40) for _ in range(2)]
+        for cache in caches:
+            packed(x[:, :20], torch.arange(20), cache)
+        together = packed(x[:, 20:], torch.arange(20, 36), caches[0]).float()[0] @ head.T
+        for i in range(16):
+            alone = packed(x[:, 20 + i][:, None], torch.tensor([20 + i]), caches[1]).float()[0, 0] @ head.T
+            best = np.sort(alone.numpy())[-2:]
+            if alone.argmax() != together[i].argmax():
+                differ += 1
+                assert best[1] - best[0] < 0.05 * alone.abs().max()
+            assert (alone - together[i]).abs().max() < 0.05 * alone.abs().max()
+    assert differ <= 2
