@@ -7,13 +7,11 @@ import sys
 import threading
 import time
 import urllib.request
-from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
-import uvicorn
+from conftest import served
 from starlette.testclient import TestClient
 from studies_synthetic import episode, swept, threshold_study, unhurried
 
@@ -26,7 +24,6 @@ from kerv_cli.lab.runs import Run
 from kerv_cli.lab.store import StudyStore
 
 HERE = "http://127.0.0.1"
-CHROMIUM = Path("/usr/bin/chromium")
 TASKS = ["drawer-open-v3", "reach-v3"]
 
 
@@ -85,8 +82,9 @@ def test_hostile_names_are_text(tmp_path):
     with pytest.raises(KervError), Run(Database(tmp_path), "target", bad, ["train", bad]):
         raise KervError(bad)
     client = client_of(tmp_path)
-    for path in ("/", f"/?text={bad}&sort={bad}&kind={bad}", "/studies/plain/tables",
-                 f"/artifacts/target/{bad}", "/compare?run=plain&run=plain", f"/studies/{bad}"):  # fmt: skip
+    for path in ("/", f"/?text={bad}&sort={bad}&kind={bad}", "/studies/plain/tables", f"/artifacts/target/{bad}",
+                 "/compare?run=plain&run=plain", f"/studies/{bad}", "/studies/plain/episodes",
+                 "/studies/plain/failures", "/episodes/3"):  # fmt: skip
         page = client.get(path).text
         assert "<img" not in page, path
         assert "img" in page, path
@@ -137,7 +135,9 @@ def test_pages_are_quick_with_ten_thousand_episodes(tmp_path):
         connection.execute(sa.update(WANTED).values(episode_id=found.scalar_subquery()))
     client = client_of(tmp_path)
     assert "10000" in client.get("/").text
-    assert max(quickest(client, "/"), quickest(client, "/studies/large")) < 0.5
+    assert client.get("/studies/large/episodes").text.count('href="/episodes/') == 10_000
+    for path in ("/", "/studies/large", "/studies/large/episodes"):
+        assert quickest(client, path) < 0.5, path
 
 
 def test_the_first_page_is_quick_with_two_hundred_runs(tmp_path):
@@ -158,33 +158,6 @@ def test_the_first_page_is_quick_with_two_hundred_runs(tmp_path):
 
 
 # --- in a browser ---
-
-
-@contextmanager
-def served(results):
-    """The address of the app, which runs in a thread."""
-    server = uvicorn.Server(uvicorn.Config(make_app(results), port=0, log_level="error"))
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    try:
-        while not server.started:
-            time.sleep(0.01)
-        yield f"{HERE}:{server.servers[0].sockets[0].getsockname()[1]}"
-    finally:
-        server.should_exit = True
-        thread.join()
-
-
-@pytest.fixture(scope="module")
-def browser():
-    if not CHROMIUM.exists():
-        pytest.skip("no Chromium here: apt-get install chromium")
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield opened
-        opened.close()
 
 
 @pytest.fixture

@@ -4,8 +4,6 @@ import html
 import io
 import json
 import shlex
-import threading
-import time
 from dataclasses import replace
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
@@ -13,10 +11,10 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 import rerun_synthetic
 import sqlalchemy as sa
-import uvicorn
 from command import kerv
+from conftest import served
 from PIL import Image
-from playwright.sync_api import expect, sync_playwright
+from playwright.sync_api import expect
 from starlette.testclient import TestClient
 from studies_synthetic import episode, part, settings_of, study_of, swept, threshold_study
 
@@ -30,7 +28,6 @@ from kerv_cli.episodes.rows import decode_records, decodes_table
 from kerv_cli.episodes.runner import Runner, close_worlds
 from kerv_cli.episodes.settings import settings_from
 from kerv_cli.lab.database import WANTED, Database
-from kerv_cli.lab.plan import all_episodes
 from kerv_cli.lab.store import studies
 from kerv_cli.report.viewing.token_outcomes import outcomes_of, tokens_hash
 
@@ -61,24 +58,13 @@ def client(tmp_path):
 @pytest.fixture(scope="module")
 def address(rolled):
     """The address of a board that shows the real episodes."""
-    server = uvicorn.Server(uvicorn.Config(make_app(rolled.results), port=0, log_level="error"))
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    while not server.started:
-        time.sleep(0.01)
-    yield f"{HERE}:{server.servers[0].sockets[0].getsockname()[1]}"
-    server.should_exit = True
-    thread.join()
+    with served(rolled.results) as address:
+        yield address
 
 
 @pytest.fixture(scope="module")
-def page():
-    """A page of a real browser."""
-    chromium = Path("/usr/bin/chromium")
-    if not chromium.exists():
-        pytest.skip("no browser here: apt-get install chromium")
-    with sync_playwright() as playwright, playwright.chromium.launch(executable_path=chromium) as browser:
-        page = browser.new_page()
+def page(browser):
+    with browser.new_page() as page:
         page.set_default_timeout(120_000)
         yield page
 
@@ -121,42 +107,19 @@ def test_the_grid_says_which_episodes_the_baseline_or_the_setting_alone_solved(d
     assert client.get("/studies/threshold/failures?setting=none").status_code == 404
     number = rows_of_wanted(database)[0]
     assert client.get(f"/episodes/{number}").status_code == 200
-    assert client.get(f"/episodes/{10**30}").status_code == 404
 
 
-def test_ten_thousand_episodes_are_shown_in_half_a_second(tmp_path, client):
-    study = threshold_study(["reach-v3"], episodes=2)
-    store, _ = swept(tmp_path, study)
-    many = replace(study, episodes=all_episodes(study.settings, [f"task-{n}" for n in range(50)]))
-    seeds = [replace(one, seed=seed) for one in many.episodes if one.seed == 100_000 for seed in range(50)]
-    numbers = rows_of_wanted(store.database)
-    store.save(replace(many, episodes=tuple(seeds)))
-    with store.database.writing() as connection:
-        connection.execute(sa.update(WANTED).values(episode_id=numbers[0]))
-    began = time.process_time()
-    answer = client.get("/studies/threshold/episodes")
-    assert time.process_time() - began < 0.5
-    assert answer.text.count('href="/episodes/') == 10_000
-
-
-def test_names_are_escaped_and_what_does_not_exist_is_not_found(tmp_path, client):
-    hostile = '<img src=x onerror="alert(1)">/../../../../x'
+def test_what_does_not_exist_is_not_found(tmp_path, client):
+    hostile = "/../../../../x"
     study = study_of({"ar": settings_of("ar"), hostile: settings_of("spec_vla", 9)}, ["reach-v3"])
     store, _ = swept(tmp_path, study)
-    numbers = rows_of_wanted(store.database)
-    pages = ["/studies/threshold/episodes", "/studies/threshold/failures", *(f"/episodes/{n}" for n in numbers)]
-    for path in pages:
-        answer = client.get(path)
-        assert answer.status_code == 200
-        assert "<img src=x" not in answer.text
     assert {Path(one.recording).name for one in study.episodes} == {one.recording for one in study.episodes}
+    first = f"/episodes/{rows_of_wanted(store.database)[0]}"
     absent = ("/studies/none/episodes", "/studies/..%2f/failures", "/episodes/0", f"/episodes/{10**30}", "/episodes/x")
-    first = f"/episodes/{numbers[0]}"
     absent += (f"{first}/film.gif", f"{first}/frames/0", f"{first}/recording.rrd", "/rerun/x")
     for path in absent:
         assert client.get(path).status_code == 404, path
-    origin = {"origin": "http://attacker.example"}
-    assert client.post(f"{first}/record", headers=origin).status_code == 403
+    assert client.post(f"{first}/record", headers={"origin": "http://attacker.example"}).status_code == 403
 
 
 def test_a_recording_that_is_a_link_out_of_the_results_folder_is_refused(tmp_path):

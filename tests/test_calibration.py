@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from command import kerv
+from command import told
 from conftest import refused
 from examples.own_target import SEVEN
 from hypothesis import given
@@ -114,13 +114,34 @@ def write_dataset(
     write_json(folder / "manifest.json", {**described, "sha256": dataset_hash(tasks), "tasks": tasks})
 
 
+def recognisable_episode(task: str, seed: int) -> DemoEpisode:
+    """What is seen tells the step, nearly: a neighbour is one in time."""
+    episode = made_up_episode(task, seed)
+    seen = np.outer(np.linspace(-0.5, 0.5, STEPS), np.sin(np.arange(39))) + 0.1 * episode.states
+    return replace(episode, states=seen.astype(np.float32))
+
+
 @pytest.fixture(scope="module")
 def results(policies, tmp_path_factory):
     """The small policies and a dataset of two tasks."""
     folder = tmp_path_factory.mktemp("calibration") / "results"
     shutil.copytree(policies, folder)
-    write_dataset(folder / "artifacts/demos/few")
+    write_dataset(folder / "artifacts/demos/few", make=recognisable_episode)
     return folder
+
+
+@pytest.fixture(scope="module")
+def with_datastore(results, tmp_path_factory):
+    """The same with a datastore of the state policy."""
+    folder = Path(shutil.copytree(results, tmp_path_factory.mktemp("skipping") / "results"))
+    policy = PolicySettings(target="nano-state")
+    DatastoreBuild(BuildDatastoreSettings(policy=policy, demos="few", task=list(TASKS), results=str(folder))).build()
+    return folder
+
+
+@pytest.fixture
+def own(with_datastore, tmp_path):
+    return Path(shutil.copytree(with_datastore, tmp_path / "results"))
 
 
 def quiet(title: str) -> AbstractContextManager[Callable[[int, int], object]]:
@@ -128,11 +149,24 @@ def quiet(title: str) -> AbstractContextManager[Callable[[int, int], object]]:
     return nullcontext(lambda done, total: None)
 
 
-def settings(results: Path, *overrides: str, target: str = "nano-state") -> CalibrateSettings:
-    words = ["task=reach,drawer-close", "demos=few", "held_out=0.4", "decodes=4", f"policy.target={target}"]
-    given = {override.split("=")[0] for override in overrides}
-    words = [word for word in words if word.split("=")[0] not in given]
-    return compose("calibrate", [*words, f"results={results}", *overrides], CalibrateSettings)
+def words(results: Path, *overrides: str) -> list[str]:
+    usual = {"task": "reach,drawer-close", "demos": "few", "held_out": "0.4", "decodes": "0"}
+    usual |= {"policy.target": "nano-state", "results": str(results)}
+    given = dict(override.split("=", 1) for override in overrides if "=" in override)
+    return [f"{key}={value}" for key, value in {**usual, **given}.items()]
+
+
+def run_of(results: Path, *overrides: str) -> CalibrationRun:
+    return CalibrationRun(compose("calibrate", words(results, *overrides), CalibrateSettings))
+
+
+def calibrated(
+    results: Path, *overrides: str, levels: dict[str, Variability] | None = None
+) -> tuple[CalibrationRun, Calibration]:
+    """A whole run; `levels` in the place of the pre-sampled variability."""
+    run = run_of(results, *overrides)
+    run.presample = lambda stage: levels or {}  # type: ignore[method-assign]
+    return run, run.run(quiet)
 
 
 def test_windows_hold_the_normalised_labels_before_and_after_each_moment():
@@ -210,7 +244,7 @@ def test_variability_is_the_mean_difference_of_the_judged_tokens():
 
 @pytest.mark.parametrize("target", ["nano-state", "nano-vision"])
 def test_a_run_writes_what_the_next_session_reads(results, target):
-    run = CalibrationRun(settings(results, target=target))
+    run = run_of(results, "decodes=4", f"policy.target={target}")
     assert "8 demonstrations of 2 tasks, tested on 4; 4 decodes per task with drafter drafts" in run.plan()
     made = run.run(quiet)
     assert {row.decodes for row in made.variability.values()} == {4}
@@ -287,16 +321,7 @@ def test_what_does_not_fit_is_refused_in_one_line(change, says, tmp_path):
 )
 def test_wrong_requests_get_one_line(results, override, kind, says):
     with refused(says, error=kind):
-        CalibrationRun(settings(results, override)).run(quiet)
-
-
-def test_the_command_prints_what_it_found(results):
-    words = ["calibrate", "task=reach,drawer-close", "demos=few", "held_out=0.4", "policy.target=nano-state"]
-    done = kerv(*words, f"results={results}", "decodes=0", "policy.artifacts.calibration=without")
-    for said in ("K_S", "held-out error", "damped", "h=4", "decodes=0; left empty\n", "skip levels: no datastore"):
-        assert said in done.output
-    assert "s_min" not in done.output
-    assert (results / "artifacts/calibration/without/calibration.json").is_file()
+        run_of(results, "decodes=4", override).run(quiet)
 
 
 def test_a_task_without_a_reference_level_is_named():
@@ -305,49 +330,6 @@ def test_a_task_without_a_reference_level_is_named():
 
 
 # --- calibration skip
-
-
-def silent(done: int, total: int) -> None:
-    """No progress."""
-
-
-def recognisable_episode(task: str, seed: int) -> DemoEpisode:
-    """What is seen tells the step, nearly: a neighbour is one in time."""
-    episode = made_up_episode(task, seed)
-    seen = np.outer(np.linspace(-0.5, 0.5, STEPS), np.sin(np.arange(39))) + 0.1 * episode.states
-    return replace(episode, states=seen.astype(np.float32))
-
-
-@pytest.fixture(scope="module")
-def with_datastore(policies, tmp_path_factory):
-    """The small policies, a dataset of two tasks and a datastore of the state policy."""
-    folder = tmp_path_factory.mktemp("skipping") / "results"
-    shutil.copytree(policies, folder)
-    write_dataset(folder / "artifacts/demos/few", make=recognisable_episode)
-    asked = BuildDatastoreSettings(
-        policy=PolicySettings(target="nano-state"), demos="few", task=list(TASKS), results=str(folder)
-    )
-    DatastoreBuild(asked).build()
-    return folder
-
-
-@pytest.fixture
-def own(with_datastore, tmp_path):
-    return Path(shutil.copytree(with_datastore, tmp_path / "results"))
-
-
-def words(with_datastore: Path, *overrides: str) -> list[str]:
-    chosen = ["task=reach,drawer-close", "demos=few", "held_out=0.4", "decodes=0", "policy.target=nano-state"]
-    return [*chosen, f"results={with_datastore}", *overrides]
-
-
-def calibrated(
-    with_datastore: Path, *overrides: str, levels: dict[str, Variability] | None = None
-) -> tuple[CalibrationRun, Calibration]:
-    """A whole run; `levels` in the place of the pre-sampled variability."""
-    run = CalibrationRun(compose("calibrate", words(with_datastore, *overrides), CalibrateSettings))
-    run.presample = lambda stage: levels or {}  # type: ignore[method-assign]
-    return run, run.run(quiet)
 
 
 def store_of(similar: np.ndarray, tokens: np.ndarray, seeds: np.ndarray, space: ActionSpace = SPACE) -> Datastore:
@@ -434,7 +416,7 @@ def test_tasks_that_the_datastore_does_not_hold_are_left_out():
     section = skip_section(store, ["b", "a"], 0.1, 0.9, lambda done, total: seen.append(done))
     assert (list(section.tasks), section.datastore) == (["a"], store.manifest.content)
     assert seen == [1, 2]
-    assert skip_section(store, ["b"], 0.1, 0.9, silent) is None
+    assert skip_section(store, ["b"], 0.1, 0.9, lambda done, total: None) is None
 
 
 def test_the_ranges_are_those_of_the_training_episodes(own):
@@ -491,10 +473,14 @@ def test_nothing_is_kept_of_another_target_or_a_damaged_file(own):
     assert calibrated(own)[1].variability == {}
 
 
-def test_the_command_prints_ranges_and_levels(own):
-    done = kerv("calibrate", *words(own, "epsilon=1.9", "confidence=0.5"))
-    for word in ("s_min", "would be skipped", "error ≤ 1.9", "144"):
-        assert word in done.output
-    assert "without datastore" not in kerv("calibrate", *words(own, "--plan")).output
-    never = kerv("calibrate", *words(own, "epsilon=0.0001"))
-    assert never.output.count("never") == 2
+def test_the_command_prints_what_it_found(own):
+    shown = told("calibrate", *words(own, "epsilon=1.9", "confidence=0.5"))
+    for said in ("held-out error", "damped", "h=4", "s_min", "would be skipped", "error ≤ 1.9", "144"):
+        assert said in shown
+    assert "without datastore" not in told("calibrate", *words(own), "--plan")
+    shutil.rmtree(own / "artifacts/datastore")
+    shown = told("calibrate", *words(own, "policy.artifacts.calibration=without"))
+    for said in ("K_S", "decodes=0; left empty\n", "skip levels: no datastore"):
+        assert said in shown
+    assert "s_min" not in shown
+    assert (own / "artifacts/calibration/without/calibration.json").is_file()

@@ -6,12 +6,11 @@ import os
 import resource
 import signal
 import sqlite3
-import time
 
 import pytest
 import sqlalchemy as sa
 from command import kerv
-from conftest import python
+from conftest import python, until
 from studies_synthetic import episode, settings_of, still_episode, study_of, swept, threshold_study
 
 from kerv_cli.base.errors import CheckpointError, KervError, StorageError, UsageError
@@ -261,10 +260,7 @@ def test_a_run_has_a_row_from_its_first_second_to_its_end(database, monkeypatch)
     with Run(database, "target", "mine", ["train", "target"], total=9) as record:
         assert row() == ("running", 0, 9, "")
         record.beat(4)
-        deadline = time.monotonic() + 10
-        while row()[1] == 0:  # until the next heartbeat
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
+        until(lambda: row()[1] > 0)  # at the next heartbeat
         assert row() == ("running", 4, 9, "")
     assert row() == ("complete", 9, 9, "")
     with database.writing() as connection:

@@ -1,7 +1,6 @@
 """The page of a study in a browser without a network: charts, hovering, picking a setting, more columns, sorting."""
 
 import io
-from pathlib import Path
 
 import pytest
 from PIL import Image
@@ -11,27 +10,20 @@ from kerv_cli.report.page import render
 from kerv_cli.report.tables import load_study
 from kerv_cli.report.viewing.film import Film
 
-sync_api = pytest.importorskip("playwright.sync_api")
-CHROMIUM = Path("/usr/bin/chromium")
-pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason="no chromium")
-
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory):
+def page(browser, tmp_path_factory):
     folder = tmp_path_factory.mktemp("page")
     store, _ = swept(folder, threshold_study(["reach-v3", "push-v3"], axis="", note="Made up."))
     path = folder / "page.html"
     path.write_text(render(store, load_study(store), 3.0), encoding="utf-8")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page = browser.new_context(viewport={"width": 1300, "height": 900}, offline=True).new_page()
-        errors: list[str] = []
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.goto(path.as_uri())
-        page.wait_for_selector("figure.chart svg .mark-symbol path")
-        yield page
-        assert not errors
-        browser.close()
+    page = browser.new_context(viewport={"width": 1300, "height": 900}, offline=True).new_page()
+    errors: list[str] = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.goto(path.as_uri())
+    page.wait_for_selector("figure.chart svg .mark-symbol path")
+    yield page
+    assert not errors
 
 
 def test_hovering_a_point_shows_its_numbers_and_intervals(page):

@@ -4,10 +4,10 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
+from conftest import until
 
 LONGEST = 5.0
 
@@ -80,26 +80,16 @@ kerv.main()
 """
 
 
-def ends(pid: int) -> bool:
-    until = time.monotonic() + LONGEST
-    while time.monotonic() < until:
-        try:
-            if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z":
-                return True
-        except FileNotFoundError:
-            return True
-        time.sleep(0.05)
-    return False
+def ended(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except FileNotFoundError:
+        return True
 
 
 def pids(path: Path, count: int) -> list[int]:
-    until = time.monotonic() + 120
-    while time.monotonic() < until:
-        found = path.read_text().split() if path.exists() else []
-        if len(found) >= count:
-            return [int(pid) for pid in found]
-        time.sleep(0.05)
-    raise TimeoutError(f"{path} does not name {count} processes")
+    until(lambda: path.exists() and len(path.read_text().split()) >= count, 120)
+    return [int(pid) for pid in path.read_text().split()]
 
 
 def killed(script: str, path: Path, count: int, *arguments: str) -> list[int]:
@@ -114,25 +104,29 @@ def killed(script: str, path: Path, count: int, *arguments: str) -> list[int]:
     return [*found, *started]
 
 
+def ended_soon(found: list[int]) -> None:
+    until(lambda: all(map(ended, found)), LONGEST)
+
+
 def test_workers_that_record_end_with_a_killed_command(tmp_path):
-    assert all(map(ends, killed(DEMOS, tmp_path / "pids", 2)))
+    ended_soon(killed(DEMOS, tmp_path / "pids", 2))
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
 def test_jobs_on_this_machine_end_with_a_killed_command(tmp_path):
     pytest.importorskip("submitit")
-    assert all(map(ends, killed(JOBS, tmp_path / "pids", 2)))
+    ended_soon(killed(JOBS, tmp_path / "pids", 2))
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
 def test_what_a_library_starts_ends_with_a_killed_command(tmp_path):
-    assert all(map(ends, killed(GUARD, tmp_path / "pids", 1, "60")))
+    ended_soon(killed(GUARD, tmp_path / "pids", 1, "60"))
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
 def test_what_a_library_starts_ends_with_the_block(tmp_path):
     subprocess.run([sys.executable, "-c", GUARD, str(tmp_path / "pids"), "0"], check=True)
-    assert all(map(ends, pids(tmp_path / "pids", 1)))
+    ended_soon(pids(tmp_path / "pids", 1))
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

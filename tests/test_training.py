@@ -6,7 +6,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from command import kerv
-from conftest import refused
+from conftest import refused, until
 from safetensors.torch import load_file
 from torch import nn
 
@@ -223,9 +222,7 @@ def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results
     command = [sys.executable, "-W", "ignore", "-m", "kerv_cli", *words]
     killed = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     folder = results / "artifacts/target/cut"
-    deadline = time.monotonic() + 100
-    while not (folder / RESUME).exists() and time.monotonic() < deadline:
-        time.sleep(0.02)
+    until((folder / RESUME).exists, 100)
     os.kill(killed.pid, signal.SIGKILL)
     killed.wait()
     assert 4 <= read_state(folder / RESUME)["step"] <= 16
