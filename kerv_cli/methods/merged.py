@@ -56,7 +56,8 @@ def needs_of_sources(settings: MergedProposerSettings) -> tuple[str, ...]:
 class MergedProposer(ChainProposer):
     """Merges the drafts of several proposers into one prefix tree of at most `nodes` nodes.
 
-    Each draft is a chain: tokens one after another. If the tree has too many nodes, the last chains are dropped.
+    Each draft is a chain, which is a plain sequence of tokens. If the tree has too many nodes, the last chains are
+    dropped.
 
     Args:
         sources: Proposers that always draft.

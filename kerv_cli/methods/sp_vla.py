@@ -42,7 +42,7 @@ class SpeedSkipSettings:
 class SpeedSkip(Skip):
     """SP-VLA: executes a predicted chunk if the hand is fast and the target decoded enough of the last actions.
 
-    A ridge regression predicts the chunk from the last `buffer` executed actions. Otherwise the target decodes.
+    Otherwise the target decodes the chunk. The prediction is a ridge regression on the last `buffer` executed actions.
 
     Attributes:
         decoded: For each of the last `buffer` actions, whether the target decoded it.

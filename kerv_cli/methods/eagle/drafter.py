@@ -148,7 +148,9 @@ class DrafterProposer(Proposer):
         return self.target.embed(upload([tokens], self.target.device))
 
     def observe(self, following: Tensor, hidden: Tensor, first: int) -> None:
-        """Run the drafter over the target's own hidden states. In its cache they replace the last draft.
+        """Run the drafter over the target's own hidden states, so that the next draft begins after them.
+
+        In the drafter's cache, their positions replace those of the last draft.
 
         Args:
             following: (1, T, E) embedding of the token after each position.
@@ -275,7 +277,7 @@ class EagleDrafter(TrainableDrafter):
     def proposer(cls, settings: Any, context: Context) -> DrafterProposer:
         """Build the part that proposer=drafter chooses, or that proposer=hybrid contains.
 
-        Both settings have the fields shape, depth, top_k and nodes.
+        The settings of both proposers have the fields shape, depth, top_k and nodes.
         """
         top_k, nodes = (settings.top_k, settings.nodes) if settings.shape == "tree" else (1, settings.depth)
         return DrafterProposer(context.artifact(cls.kind), context.target, settings.depth, top_k, nodes)
@@ -320,7 +322,7 @@ class EagleDrafter(TrainableDrafter):
         Args:
             training: The training.
             rows: (B,) indices of the training examples.
-            length: Number of their prompt tokens.
+            length: Number of prompt tokens of each of these examples.
         """
         settings, device, examples = training.settings.drafter, training.target.device, training.examples
         tokens = examples.tokens[rows].to(device)
@@ -356,9 +358,9 @@ class EagleDrafter(TrainableDrafter):
         return F.smooth_l1_loss(predicted, hidden), cross_entropy
 
     def validate(self, training: Training, module: EagleNetwork) -> Metrics:
-        """Decode held-out observations. Return the acceptance length, strict and relaxed (r = 9).
+        """Decode held-out observations. Return the acceptance lengths with strict and relaxed (r = 9) acceptance.
 
-        The acceptance length is the number of tokens committed per verification. The score is the sum of both.
+        The acceptance length is the number of tokens committed per verification. The score is the sum of both lengths.
         """
         target, held_out = training.target, training.held_out
         chosen = torch.linspace(0, len(held_out) - 1, min(VALIDATED, len(held_out))).long().tolist()

@@ -1,7 +1,7 @@
 """Drafters in the file layout of the published EAGLE and Spec-VLA code (docs/methods.md §2.2).
 
 Such a drafter is a linear layer `fc` and one Llama layer, without a norm before or after it. It uses the target's
-embeddings and head, and has the same inputs as our own drafter. Two further differences are switches of `Convention`.
+embeddings and head, and has the same inputs as our own drafter. `Convention` describes two further differences.
 """
 
 from __future__ import annotations
@@ -113,12 +113,12 @@ class PublicDrafter(nn.Module):
         return run_layers(self.layers, self.shape.language, x, positions, cache, seen, mask)
 
     def prompt_mask(self, x: Tensor, cache: DraftCache | None, seen: np.ndarray | Tensor | None) -> Tensor:
-        """Return the additive attention mask for `mask=prompt`. Only the prompt's keys are visible, except its last.
+        """Return the additive attention mask for `mask=prompt`, which hides all keys but the prompt's first P − 1.
 
         Args:
             x: (B, T, E) inputs of the layers.
-            cache: Keys and values of the S tokens before. None: there are none, and x is the prompt.
-            seen: (T, M) bool, which of the last M keys each query may see otherwise. None: causal.
+            cache: Keys and values of S earlier tokens. None: there are none, and x is the prompt.
+            seen: (T, M) bool, which of the last M keys each query may see without this restriction. None: causal.
 
         Returns:
             (T, S + T): 0 for visible keys, −∞ for hidden keys.

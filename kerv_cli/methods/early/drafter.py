@@ -35,7 +35,7 @@ from kerv_cli.worlds.demos.files import DemoEpisode
 SURE = 0.05
 """The early drafter is sure of a chunk if it estimates at least this probability that all tokens are accepted.
 
-The estimate is too low: 89 % of such chunks were accepted whole (mt10-vision, radius 9).
+The estimate is lower than the true probability: 89 % of such chunks were accepted whole (mt10-vision, radius 9).
 """
 
 
@@ -78,7 +78,7 @@ class EarlyNetwork(Packable):
         self.head = nn.Linear(settings.rank, actions.tokens)
 
     def pack_weights(self) -> Program | None:
-        """Return the compiled network; None if the weights are not float32."""
+        """Return the network as a compiled `Program`. None if the weights are not float32."""
         return Program(self.logits, (1, len(self.mean))) if self.mean.dtype == torch.float32 else None
 
     def standardise(self, features: Tensor) -> None:
@@ -125,11 +125,12 @@ class EarlyNetwork(Packable):
 
 
 def choose(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tensor, Tensor]:
-    """Choose the tokens that are most likely to be accepted, and estimate how likely it is that all are.
+    """Choose the tokens that are most likely to be accepted, and estimate the probability that all are accepted.
 
     A token is accepted if the target's token is within ±radius. So the best bin is the one with the most probability
     within ±radius, which need not be the most probable bin. If several bins are about equally good, the one with more
-    probability close by wins: it is nearer to the target's token. For a strict token the most probable bin is chosen.
+    probability close to it wins, because it is likely nearer to the target's token. For a strict token the most
+    probable bin is chosen.
 
     The estimate treats tokens as independent, and training on soft labels makes it too low. Use it only to compare
     chunks.
@@ -241,7 +242,7 @@ class EarlyDrafter(TrainableDrafter):
         return (module(examples.features[indices].to(training.target.device).float()),)
 
     def token_loss(self, training: Training, logits: Tensor, indices: Tensor) -> Tensor:
-        """Return the cross-entropy of logits (B, N, V) with the target's tokens, as labels spread over bins.
+        """Return the cross-entropy of logits with the target's tokens, spread over neighbouring bins as soft labels.
 
         Args:
             training: The training.
@@ -259,9 +260,9 @@ class EarlyDrafter(TrainableDrafter):
         return loss, {"token_loss": float(loss.detach())}
 
     def validate(self, training: Training, module: Any) -> Metrics:
-        """Compare drafts of held-out observations with the target's tokens.
+        """Return metrics that compare drafts of held-out observations with the target's tokens.
 
-        Plain episodes together weigh as much as perturbed episodes together.
+        All plain episodes together weigh as much as all perturbed episodes (executed with noise) together.
         """
         held_out, actions = training.held_out, training.target.actions
         batches = (self.outputs(training, module, held_out, i) for i in torch.arange(len(held_out)).split(256))
@@ -271,7 +272,7 @@ class EarlyDrafter(TrainableDrafter):
         return {"score": score, **metrics, **self.further_metrics(training, *rest)}
 
     def further_metrics(self, training: Training, *outputs: Tensor) -> Metrics:
-        """Return metrics of the network's outputs after the logits. The early drafter has none."""
+        """Return metrics of the network's outputs after the logits. The early drafter has no such outputs."""
         return {}
 
 
@@ -283,7 +284,7 @@ def _labels(tokens: int, sigma: float, device: torch.device) -> Tensor:
 def measure(logits: Tensor, examples: Decodes, strict: Tensor) -> Metrics:
     """Measure how much of the drafts would be accepted, at the radii 0, 3 and 9.
 
-    Accepted is the longest beginning of a draft whose tokens are within the radius of the target's greedy tokens. This
+    A draft is accepted up to its first token that is not within the radius of the target's greedy token. This
     approximates relaxed acceptance, in which the target's later tokens depend on the accepted draft tokens.
 
     Args:

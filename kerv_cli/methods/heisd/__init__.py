@@ -61,7 +61,8 @@ add("datastore", "qdrant", _DATASTORE + "QdrantIndex", QdrantSearchSettings)
 class HybridProposerSettings(DrafterProposerSettings):
     """HeiSD: draft by retrieval or with the drafter, as the boundary chooses (docs/methods.md §4.4).
 
-    The paper's five neighbours make a tree of about 50 nodes, which costs more than it gains on a CPU.
+    The paper's five neighbours make a tree of about 50 nodes, which costs more than it gains on a CPU. So the defaults
+    are smaller.
     """
 
     kind: str = "hybrid"
@@ -114,7 +115,7 @@ add("acceptance", "hybrid", _RULES + "by_proposer", HybridAcceptanceSettings)
 
 @dataclass
 class FusedBoundarySettings:
-    """HeiSD: retrieval drafts if the hand's path is straight and fast, the drafter if it bends or slows down."""
+    """HeiSD: retrieval drafts if the hand moves straight and fast, the drafter if it moves in a curve or slowly."""
 
     kind: str = "fused"
     alpha: float = number(0.5, 0, 1)  # weight of the radius of curvature; the path length has the weight 1 − alpha
@@ -142,10 +143,10 @@ add("boundary", "random", _RULES + "Random.build", RandomBoundarySettings, choos
 
 @dataclass
 class SimilaritySkipSettings:
-    """HeiSD: execute a retrieved chunk without verification if its similarity is at least s_min."""
+    """HeiSD: execute the nearest stored chunk without verification if its observation is similar enough (s_min)."""
 
     kind: str = "similarity"
-    s_min: float | None = number(None, -1e9, 1e9)  # None: the task's calibrated value
+    s_min: float | None = number(None, -1e9, 1e9)  # smallest sufficient cosine; None: the task's calibrated value
     max_skips: int = number(2, 1, MOST_DECODES)  # maximum number of decodes in a row without verification
     # feedback, as a share of the calibrated range: s_min rises by `up` after a failed episode (HeiSD: 0.25) and falls
     # by `down` after a successful episode (usual: 0.05); above 0, results depend on the order of the episodes

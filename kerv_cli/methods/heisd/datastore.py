@@ -1,10 +1,10 @@
 """The datastore: demonstrated action chunks, found by the similarity of observations (docs/methods.md §4.1; HeiSD).
 
 Each entry has a key and a chunk. The key is the observation as the target encodes it. For each chosen segment of the
-prompt, the mean token is L2-normalised. Then they are concatenated and normalised again. Optionally, keys are projected
-onto their leading directions. The default is the segment `scene` alone, which encodes hand, object and goal. On MT10
-this key finds the most similar chunks of other episodes. Adding vision tokens makes it worse. The chunk is the
-expert's next H actions, as tokens.
+prompt, the mean token is L2-normalised. These vectors are concatenated, and the result is normalised again. Optionally,
+keys are projected onto their leading directions. By default the key is made of the segment `scene` alone, which encodes
+hand, object and goal. On MT10 this key finds the most similar chunks of other episodes. A key with vision tokens finds
+less similar ones. The chunk is the expert's next H actions, as tokens.
 
 A datastore is a folder with `vectors.npy` (rows, d) float32 or float16, `payload.parquet`, `manifest.json` and, if keys
 are projected, `projection.npy`. Rows are sorted by task, seed and step.
@@ -47,8 +47,8 @@ class Shard:
     """The entries of one task.
 
     Attributes:
-        rows: First row, and the row after the last.
-        seeds: Seeds of the episodes.
+        rows: The task's first row, and the row after its last one.
+        seeds: Seeds of the task's episodes.
     """
 
     rows: tuple[int, int]
@@ -63,7 +63,7 @@ class Manifest:
         format: Version of the file format.
         kind: Always `datastore`.
         key: Segments of the prompt from which keys are made, such as `scene`.
-        width: Numbers per key.
+        width: How many numbers a key has.
         rows: Number of entries.
         chunk: Number H of control steps per chunk.
         actions: The target's action space.
@@ -102,7 +102,7 @@ def prompt_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) 
         segments: Names of the S segments of the prompt to use, such as `scene`.
 
     Returns:
-        (B, S · E) float32 keys of length 1.
+        (B, S · E) float32 keys, each with the norm 1.
 
     Raises:
         UnknownName: The target's prompt has no such segment.
@@ -120,7 +120,7 @@ def _unit(vectors: Tensor) -> Tensor:
 
 
 def projected(keys: np.ndarray, projection: np.ndarray) -> np.ndarray:
-    """Project keys (n, d) onto the directions `projection` (d, c). Return (n, c) float32 of length 1."""
+    """Project keys (n, d) onto the directions `projection` (d, c). Return (n, c) float32 keys, each with the norm 1."""
     vectors = keys @ projection
     units: np.ndarray = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
     return units.astype(np.float32)
@@ -147,7 +147,7 @@ def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
 
 
 class Index(Protocol):
-    """A search for the rows whose keys are most similar to a key. `best` ranks the rows that it finds."""
+    """A search for the rows whose keys are most similar to a key. The function `best` then ranks these rows."""
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
         """Return the row numbers of the task's k most similar entries, and possibly of more, in ascending order.
@@ -187,7 +187,7 @@ class ExactIndex:
         self.store = store
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return the k most similar rows, and rows as similar as the k-th up to rounding; see `Index.candidates`."""
+        """Return the k most similar rows, and all rows within rounding errors of the k-th; see `Index.candidates`."""
         shard = self.store.shards[task]
         scores = self.store.vectors[shard] @ key
         if without is not None:
@@ -200,9 +200,9 @@ class ExactIndex:
 class QdrantIndex:
     """datastore=qdrant: search with a Qdrant server, or with the client alone, in a folder or in memory.
 
-    It needs the extra `qdrant`. Qdrant searches exactly within a task, and `best` ranks its results again. So the
-    neighbours are those of datastore=exact. The collection is named after the datastore's hash, so that later processes
-    find it on the server or in the folder.
+    It needs the extra `qdrant`. Qdrant searches exactly within a task, and the function `best` ranks its results again.
+    So it finds the same neighbours as datastore=exact. The collection is named after the datastore's hash, so that
+    later processes find it on the server or in the folder.
     """
 
     def __init__(self, store: Datastore, settings: QdrantSearchSettings) -> None:
@@ -234,7 +234,10 @@ class QdrantIndex:
                 self.client.upload_collection(self.name, store.vectors[rows], payloads, rows, wait=True)
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return the k + MARGIN most similar rows, or all if the k-th is not clearly better; see `Index.candidates`."""
+        """Return the k + MARGIN most similar rows; see `Index.candidates`.
+
+        Return all rows of the task if the last of these is as similar as the k-th up to rounding.
+        """
         m, store, shard = self.models, self.store, self.store.shards[task]
         must = [m.FieldCondition(key="task", match=m.MatchValue(value=task))]
         other = [] if without is None else [m.FieldCondition(key="seed", match=m.MatchValue(value=without))]
@@ -334,19 +337,19 @@ class Datastore:
         return self.shards
 
     def pooled(self, prompt: Tensor, target: ReadableTarget) -> Tensor:
-        """Average the prompt's tokens per part (scene, vision, proprioception), to make a search key with `key_of`.
+        """Average the tokens of each segment of the prompt that keys are made from. `key_of` makes the key from this.
 
         Args:
             prompt: (1, P, E) encoded prompt.
             target: The target that encoded it.
 
         Returns:
-            (p,) float32 of length 1, on the target's device.
+            (p,) float32 with the norm 1, on the target's device.
         """
         return prompt_key(prompt, target, self.manifest.key)[0]
 
     def key_of(self, pooled: np.ndarray) -> np.ndarray:
-        """Return the search key (d,) float32 of a pooled prompt (p,). A projection, if any, is applied."""
+        """Return the search key (d,) float32 of a pooled prompt (p,), projected if the datastore has a projection."""
         return pooled if self.projection is None else projected(pooled[None], self.projection)[0]
 
     def query(self, key: np.ndarray, task: str, k: int, without: int | None = None) -> Neighbours:

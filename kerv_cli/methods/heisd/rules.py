@@ -81,6 +81,8 @@ def neighbour_tree(
     tokens: list[int] = []
     parents: list[int] = []
     children: dict[tuple[int, int], int] = {}
+    # groups to add: (−log probability of their path, order of offers, parent node, number of groups before, tokens,
+    # `last` and `whole` as in _Continuations)
     waiting: list[tuple[float, int, int, int, tuple[int, ...], int, int]] = []
     order = count()
 
@@ -112,10 +114,11 @@ def _weight(members: int) -> float:
 
 
 class _Continuations:
-    """The kinematic groups that may follow a path of retrieved groups.
+    """Lists the kinematic groups that may follow the groups chosen so far.
 
-    Two bit sets of neighbours describe a path. `last` are the neighbours that have its last group. `whole` are those
-    among them that also have all its earlier groups. If no neighbour has, `whole` begins again with `last`.
+    A neighbour is a stored chunk. Two bit sets of neighbours describe the chosen groups. `last`: the neighbours whose
+    chunk contains the last chosen group. `whole`: the neighbours whose chunk contains every chosen group. If no
+    neighbour contains all of them, `whole` is set to `last`.
 
     Args:
         rows: Tokens of each neighbour's chunk, most similar neighbour first.
@@ -135,15 +138,15 @@ class _Continuations:
             self.levels.append((strict, list(givers.items())))
 
     def on(self, level: int, last: int, whole: int) -> Iterator[tuple[float, tuple[int, ...], int, int]]:
-        """List the groups that may follow a path, in the order of their best neighbours.
+        """List the groups that may be chosen next, those of the most similar neighbours first.
 
         Args:
-            level: Number of groups that the path has.
-            last: Bit set of the neighbours that have the path's last group.
-            whole: Bit set of the neighbours that have all its groups.
+            level: Number of groups chosen so far.
+            last: Bit set of the neighbours that have the last chosen group.
+            whole: Bit set of the neighbours that have every chosen group.
 
         Yields:
-            (−log probability of the group, its tokens, `last` and `whole` of the longer path).
+            (−log probability of the group, its tokens, and `last` and `whole` if this group is chosen).
         """
         if level == len(self.levels):
             return
@@ -301,11 +304,11 @@ class VerifySkip(Skip):
     """Executes the most similar stored chunk without verification if its similarity is at least s_min.
 
     At most `max_skips` chunks in a row are executed like this. If the method has a boundary, the boundary must choose
-    retrieval. After the last chunk of a stored episode, no further chunk of that stored episode is executed without
-    verification, until the next episode begins.
+    retrieval. Once a chunk that reaches the end of its stored episode was executed like this, that stored episode is
+    not used again until the next episode begins.
 
     With `up` or `down` above 0, s_min changes after each episode. A failure raises it by `up` times the calibrated
-    range, a success lowers it by `down` times the range. Then results depend on the order of the episodes.
+    range (high − low), a success lowers it by `down` times the range. Then results depend on the order of the episodes.
     """
 
     def __init__(
@@ -372,9 +375,9 @@ def radius_of_curvature(points: np.ndarray) -> float:
 
     The radius is infinite for fewer than three points, for a hand at rest and for a straight line. The points are
     projected onto their best plane (by SVD). Taubin's algebraic method, which is exact on arcs, fits the circle. For
-    this, the points (x, y) are centred and scaled to a mean square of 1. With z = x² + y², let (a, b, c) be the right
-    singular vector of the matrix with rows [(z − 1) / 2, x, y] with the smallest singular value. Then the radius is
-    scale / |a|.
+    this, the points (x, y) are centred and divided by a scale, so that their mean square is 1. Let z = x² + y². Let
+    (a, b, c) be the right singular vector for the smallest singular value of the matrix with rows [(z − 1) / 2, x, y].
+    Then the radius is scale / |a|.
 
     Args:
         points: (n, 3) positions, metres.
@@ -423,7 +426,7 @@ class BoundaryRanges:
 
     @classmethod
     def fit(cls, paths: Iterable[np.ndarray], window: int) -> BoundaryRanges:
-        """Measure the ranges over every window that decoding would see, including short ones when an episode begins.
+        """Measure the ranges over all windows that a decoder would see, including short ones when an episode begins.
 
         Args:
             paths: Measured hand positions of each episode, (T, 3) metres.
@@ -483,7 +486,7 @@ class Random(Boundary):
 
     @classmethod
     def always(cls, settings: NoSettings, context: Context) -> Random:
-        """Build the boundary that always chooses one side: boundary=always_retrieval or boundary=always_drafter."""
+        """Build boundary=always_retrieval or boundary=always_drafter, which make the same choice for every chunk."""
         return cls(float(settings.kind == "always_retrieval"))
 
     def reset(self, task: str, seed: int) -> None:

@@ -69,7 +69,7 @@ class CompensateSettings:
     rest: int = number(0, 0, MOST_DECODES)  # after a compensation, number of decodes without one (KERV: 4)
 
     def check_together(self, prefix: str) -> None:
-        """Refuse an unknown predictor, and `predictor=draft` without the target's token before the draft's tokens.
+        """Refuse an unknown predictor, and `predictor=draft` with `use_target_token=false`.
 
         Raises:
             UnknownName: The predictor does not exist.
@@ -206,7 +206,7 @@ class Change(Kinematic):
     """
 
     def next(self, variability: float) -> float:
-        """Return r, moved against the change of K."""
+        """Return r, lowered if K has risen and raised if K has fallen."""
         change = variability - self.last
         return self.r - math.copysign(self.settings.r_max - self.falling(abs(change)), change)
 

@@ -27,8 +27,8 @@ HORIZON = 8  # number of control steps ahead for which weights are computed
 class Noise:
     """Parameters of a Kalman filter, one number per DoF.
 
-    Only the ratio of q and r matters, because the filter's first covariance is r. Numbers of strict DoFs (such as the
-    gripper) are not used, because predictions hold these DoFs at their last value.
+    Only the ratio q / r matters, because the filter's initial covariance is r times the identity. The numbers of strict
+    DoFs (such as the gripper) are not used, because predictions hold these DoFs at their last value.
 
     Attributes:
         q: Process noise: variance of the random acceleration per control step.
@@ -123,7 +123,7 @@ class Predictor:
         self.tables = {m: self._table(m) for m in range(minimum, window + 1)}
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return the weights (horizon, window) for one DoF. Here, all weight is on the newest action.
+        """Return the weights (horizon, window) for one DoF. By default, all weight is on the newest action.
 
         Args:
             dof: Index of the DoF.
@@ -337,8 +337,9 @@ def assemble(
 ) -> np.ndarray | None:
     """Assemble the actions of a compensated chunk: known tokens, then drafted tokens, then predictions.
 
-    The last control step is filled up only if at least `min_verified` of its DoFs are known, or if it is the chunk's
-    first. Otherwise it is dropped.
+    `settings.steps` control steps are filled, beginning with the step in which the known tokens end. One step fewer is
+    filled if fewer than `min_verified` DoFs of that step are known (with `drop`, if none is known), unless it is the
+    chunk's first step.
 
     Args:
         tokens: Known tokens of the chunk: accepted, or the target's.

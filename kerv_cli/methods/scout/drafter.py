@@ -1,9 +1,9 @@
 """The scout: network, proposer and training (docs/methods.md §5.1, ours).
 
-A scout drafts from the image, the hand and the instruction. It needs nothing that the target computes. So chunks
-without verification never pay for the target's encoder, and an error of the target's encoder need not repeat in the
-scout's. A vision encoder (stem) and an estimate of the positions of object and goal feed the network of the early
-drafter.
+A scout is a drafter that reads the image itself, beside the hand and the instruction. It needs nothing that the target
+computes. So chunks without verification never pay for the target's encoder, and a scout need not repeat an error of
+the target's encoder. Its own vision encoder (stem) and its estimate of the positions of object and goal feed the
+network of the early drafter.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class ScoutNetwork(Packable):
         return self.drafter.logits(features.to(self.drafter.head.weight.dtype)), places
 
     def pack_weights(self) -> Program | None:
-        """Return the compiled network after the vision encoders; None if the weights are not float32."""
+        """Return the network without its vision encoders as a compiled `Program`. None if it is not float32."""
         s = self.settings
         of_view = (1, s.grid**2, s.cell_width), (1, 2 * s.keypoints)
         shapes = [(1, len(self.observation.proprioception)), (1, s.word_width), *of_view * len(self.stems)]
@@ -154,9 +154,9 @@ class ScoutExamples(Observations, Decodes):
 
 
 class ScoutDrafter(EarlyDrafter):
-    """The kind of artifact `scout`, for targets with cameras.
+    """The kind of artifact `scout`: a drafter with its own vision encoder, for compact targets with cameras.
 
-    The first `train.scene_steps` steps of its training learn only to estimate positions.
+    In the first `train.scene_steps` steps of its training it learns only to estimate positions.
     """
 
     kind = noun = "scout"
