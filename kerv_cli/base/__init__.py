@@ -1,1 +1,1 @@
-"""What every room uses: errors, files, limits, spaces, the registry, settings. The only place that knows Hydra."""
+"""What all packages of kerv use: errors, files, limits, spaces, the registry, settings. Only `config.py` uses Hydra."""

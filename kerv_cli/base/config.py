@@ -73,7 +73,7 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
         command: The command's name, with `_` instead of a space.
         overrides: Arguments as typed: `method=kerv`, `threshold.r=5`, `task=[reach,push]`. Each key at most once.
             `quick=true` adds the command's settings in `conf/quick.yaml`, as if they were typed before all others.
-        schema: Dataclass of the settings. Its defaults are used for everything that nothing else sets.
+        schema: Dataclass of the settings. Its defaults apply to settings that neither a file nor an override sets.
 
     Raises:
         UsageError: An override cannot be parsed, its key or a name is unknown, or its value is impossible.
@@ -160,8 +160,11 @@ def _read_preset(group: str, name: str) -> tuple[dict[str, str], list[tuple[str,
         name: As for `preset_file`.
 
     Returns:
-        Group -> the part that the file chooses; (key, value) pairs that it sets; key -> `FILE:LINE: ` for error
-        messages.
+        Three values: group -> the part that the file chooses; the (key, value) pairs that the file sets; key -> where
+        the file sets it, as `FILE:LINE: ` for error messages.
+
+    Raises:
+        UsageError: The file is missing, is not YAML, or chooses a part in the wrong form.
     """
     if not group:
         return {}, [], {}
@@ -180,7 +183,11 @@ def _read_preset(group: str, name: str) -> tuple[dict[str, str], list[tuple[str,
 
 
 def _check(settings: Any) -> None:
-    """Check that every setting is in its range and every chosen part is registered. Raises UsageError."""
+    """Check that every setting is in its range and every chosen part is registered.
+
+    Raises:
+        UsageError: A setting is out of range, or a part is not registered.
+    """
     check_settings(settings)
     for group in (name for name in SETTINGS_GROUPS if hasattr(settings, name)):
         part_of(group, getattr(settings, group).kind)

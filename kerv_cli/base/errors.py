@@ -69,7 +69,7 @@ class RenderingUnavailable(KervError):
 
 
 class CheckpointError(KervError):
-    """A stored file is missing, damaged, or does not fit the others: a checkpoint, drafter, dataset or manifest."""
+    """A stored file (checkpoint, drafter, dataset or manifest) is missing, damaged or does not fit other files."""
 
 
 class StorageError(KervError):

@@ -1,6 +1,6 @@
-"""Temporary names for files and folders that are being written, and the removal of those whose process was killed.
+"""Give temporary names to files and folders while they are written, and remove what killed processes left.
 
-A temporary name is hidden and contains the process: `.<name>.<host>.<process id>-<8 digits>.tmp`.
+A temporary name is hidden and names the machine and the process: `.<name>.<host>.<process id>-<8 digits>.tmp`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,10 @@ def temporary_beside(path: Path) -> Path:
 
 
 def is_left_over(path: Path) -> bool:
-    """Return whether `path` has a temporary name and the process that wrote it has ended."""
+    """Return whether `path` has a temporary name and the process that wrote it has ended.
+
+    A file of another machine counts as left over once it is older than OTHER_HOSTS_STALE_HOURS.
+    """
     match = _NAME.fullmatch(path.name)
     if match is None:
         return False
@@ -51,7 +54,7 @@ def clean(folder: Path) -> list[Path]:
     """Remove the temporary files and folders of ended processes from `folder`, not from its subfolders.
 
     Returns:
-        The paths that were left over.
+        The leftover paths that it found and tried to remove.
     """
     paths = [path for path in folder.glob(".*.tmp") if is_left_over(path)]
     for path in paths:

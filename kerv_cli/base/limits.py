@@ -1,4 +1,4 @@
-"""Fields of settings dataclasses, with a description and the allowed values, and the checks of these values."""
+"""Make fields of settings dataclasses, with a description and the allowed values, and check the values."""
 
 from __future__ import annotations
 

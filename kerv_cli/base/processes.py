@@ -35,7 +35,7 @@ def end_with(parent: int) -> None:
 
 
 def begin_worker(parent: int) -> None:
-    """Prepare this process as a worker: it ends when its parent ends, and leaves Ctrl-C to the parent.
+    """Prepare this process as a worker: it ends when its parent ends, and ignores Ctrl-C, which its parent handles.
 
     Args:
         parent: Process id of the parent.

@@ -81,8 +81,8 @@ class Part:
         build: The code that makes it, as `module:function` or `module:Class.method`. For the parts of a method,
             `methods/context.py` describes the arguments. Empty: choosing this name means having no such part.
         settings: Dataclass of its settings, with defaults and limits.
-        needs: Function of its settings that returns the kinds of artifacts that must exist to use it. For an artifact,
-            those that it is made from.
+        needs: Function of the part's settings. It returns the kinds of artifacts that must exist to use the part. For
+            an artifact, it returns the kinds of artifacts from which the artifact is made.
         colour: Colour in tables and plots, 0xRRGGBB. None: no colour of its own.
         traits: Further properties that other modules read. docs/extending.md lists them.
     """

@@ -24,7 +24,7 @@ def chosen(kind: str, name: str = "none") -> Callable[[], Any]:
 def part(kind: str, name: str = "none", help: str = "") -> Any:
     """Return a dataclass field that holds the settings of a part, such as a proposer.
 
-    Its name must be a group of settings, because `NAME=PART` on the command line chooses another part.
+    The field's name must be a group of settings, because `NAME=PART` on the command line chooses another part.
 
     Args:
         kind: Kind of part.
@@ -94,7 +94,8 @@ def read_settings(schema: type[S], plain: Mapping[str, Any]) -> S:
 
     Args:
         schema: The dataclass.
-        plain: Stored settings. Those of a part (such as `proposer`) become an instance of that part's settings class.
+        plain: Stored settings. The settings of a part, such as `proposer`, become an instance of the part's settings
+            class.
 
     Raises:
         CheckpointError: A setting is missing, unknown or of a wrong type.

@@ -285,7 +285,7 @@ class ObservationSpace:
         """Return this space as the robot alone sees it: the state is the proprioception, without object positions.
 
         Args:
-            places: Positions to name nevertheless, which a policy estimates without reading them from the state.
+            places: Positions that the space names although its state does not contain them. A policy estimates them.
         """
         return ObservationSpace(self.proprioception, len(self.proprioception), places, self.centre)
 

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from kerv_cli.base.spaces import ActionSpace
 
 Bounds = Sequence[tuple[int, int]]
-"""Per DoF: the first DoF of its kinematic group, and one past the last (`ActionSpace.bounds`)."""
+"""For each DoF: the index of the first DoF of its kinematic group, and the index after the last one
+(`ActionSpace.bounds`)."""
 
 
 class Accepted(NamedTuple):
@@ -24,8 +25,8 @@ class Accepted(NamedTuple):
 
     Attributes:
         path: Indices of the accepted nodes, from depth 0 down. Empty if none was accepted.
-        rejected: Index of the rejected node after the path. Of several children, the one nearest to the target token.
-            None if the path ends at a leaf.
+        rejected: Index of the rejected node after the path. If several children were rejected, the one nearest to the
+            target token. None if the path ends at a leaf.
     """
 
     path: tuple[int, ...]
@@ -37,7 +38,7 @@ def accept_by_distance(tree: TokenTree, target_tokens: Sequence[int], start: int
 
     Args:
         tree: The draft, n nodes.
-        target_tokens: 1 + n tokens: the target's after the last committed token, then after each node.
+        target_tokens: 1 + n tokens of the target: after the last committed token, then after each node.
         start: Index in the chunk of the nodes at depth 0.
         limits: Largest accepted distance per DoF, in bins. With all zeros, tokens must be equal.
     """
@@ -60,16 +61,16 @@ def accept_by_group(
     its DoF's limit of the target token after its parent, and if these distances sum to at most `group_limit`. A path
     ends before a group that is rejected or that is only partly in the tree.
 
-    `start` may be inside a group, after tokens of the group that the target itself has chosen. These count with
-    distance 0, and the group's remaining tokens are judged without them.
+    If `start` is inside a group, the group's first tokens are committed already. They count with distance 0, and only
+    the group's remaining tokens are judged.
 
     Args:
         tree: The draft, n nodes.
-        target_tokens: 1 + n tokens: the target's after the last committed token, then after each node.
+        target_tokens: 1 + n tokens of the target: after the last committed token, then after each node.
         start: Index in the chunk of the nodes at depth 0.
         limits: Largest accepted distance per DoF, in bins.
         group_limit: Largest accepted sum of a group's distances, in bins.
-        bounds: Per DoF, the first DoF of its group and one past the last.
+        bounds: For each DoF, the index of the first DoF of its group and the index after the last one.
     """
     alive = [False] * len(tree)  # whether no limit is broken on the path to this node
     in_group = [0] * len(tree)  # distances summed within the node's group
@@ -96,7 +97,7 @@ def nearest_child(tree: TokenTree, node: int, target_tokens: Sequence[int]) -> i
     Args:
         tree: The draft, n nodes.
         node: Index of the parent, or −1 (ROOT) for the last committed token.
-        target_tokens: 1 + n tokens: the target's after the last committed token, then after each node.
+        target_tokens: 1 + n tokens of the target: after the last committed token, then after each node.
     """
     children = [i for i, parent in enumerate(tree.parents) if parent == node]
     return min(children, key=lambda i: abs(tree.tokens[i] - target_tokens[node + 1]), default=None)
@@ -104,7 +105,10 @@ def nearest_child(tree: TokenTree, node: int, target_tokens: Sequence[int]) -> i
 
 @dataclass(frozen=True)
 class DistanceRule:
-    """Base class of acceptance rules: accepts a draft token if it is close enough to the target's, per DoF."""
+    """Base class of acceptance rules: accepts a draft token if it is close enough to the target's token.
+
+    Each DoF has its own limit.
+    """
 
     space: ActionSpace
 
@@ -121,7 +125,7 @@ class DistanceRule:
 
         Args:
             tree: The draft, n nodes.
-            target_tokens: 1 + n tokens: the target's after the last committed token, then after each node.
+            target_tokens: 1 + n tokens of the target: after the last committed token, then after each node.
             start: Index in the chunk of the nodes at depth 0.
             r: Acceptance radius, in bins.
         """

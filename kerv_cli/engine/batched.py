@@ -22,8 +22,8 @@ from kerv_cli.engine.record import UNTIMED, DecodeRecord
 class BatchDecoder:
     """Decodes one chunk for each of several episodes, with the target and the method of a decoder.
 
-    In float32 the tokens are those that `Decoder` decodes, unless two logits are equal up to rounding. The records have
-    no times.
+    In float32 it decodes the same tokens as `Decoder`, unless two logits are equal up to rounding. The records have no
+    times.
     """
 
     def __init__(self, decoder: Decoder) -> None:
@@ -34,7 +34,7 @@ class BatchDecoder:
         self._caches: dict[int, Cache] = {}
 
     def new_episode(self) -> EpisodeState:
-        """Return the state of one more episode in the batch, without actions or positions."""
+        """Return a state for one more episode of the batch. It holds no actions or positions yet."""
         return EpisodeState(self.target.actions, self.target.cameras)
 
     @torch.inference_mode()

@@ -108,8 +108,8 @@ class Rejection:
 
     Attributes:
         draft: The draft's tokens after the rejected one.
-        target: The target's tokens after the rejected one and after each token of `draft`. They would be right if the
-            rejected token had been committed.
+        target: The target's tokens after the rejected one and after each token of `draft`. The target predicted them as
+            if the rejected token had been committed.
     """
 
     draft: tuple[int, ...] = ()
@@ -128,8 +128,9 @@ class Choice:
 class Chunk:
     """The N tokens of one decode, filled step by step.
 
-    Parts of a method may read it, and change it only through its methods. The cache holds the prompt and the committed
-    tokens except the newest ones, `uncached`: one token, or several after a rectifier has filled a control step.
+    Parts of a method may read this object, and change it only through its methods. The cache holds the prompt and all
+    committed tokens but the newest ones, which the target has not read yet (`uncached`). Usually this is one token.
+    After a rectifier has filled a control step, it may be several.
     """
 
     encoding: Tensor | Callable[[], Tensor]  # the prompt, or a function that encodes it

@@ -29,7 +29,7 @@ _LEVELS = 5  # assumed depth of such a tree
 
 
 def source_costs() -> dict[str, list[str]]:
-    """Return, for each kind of cost, the names of the proposers whose drafts it prices.
+    """Return, for each kind of cost, the names of the proposers whose drafts have this cost.
 
     A proposer that is not listed costs the seconds that were recorded for its drafts.
     """
@@ -221,8 +221,8 @@ def work_of_record(decode: DecodeRecord) -> Work:
 def prices(work: Work, profile: Profile) -> np.ndarray:
     """Return the seconds (decodes,) of each decode by the cost model.
 
-    Forwards, and everything that the drafter computes, cost what the profile says. So do drafts of other proposers, if
-    the profile has times for them. Everything else costs the recorded seconds.
+    Forwards, and everything that the drafter computes, cost what the profile says. Drafts of other proposers do, too,
+    if the profile has times for them. Everything else costs the seconds that were recorded.
     """
     total = np.array(work.host, dtype=float)
     for kind, (decode, rows, with_prompt) in work.calls.items():

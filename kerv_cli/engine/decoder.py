@@ -59,7 +59,7 @@ class ActionDecoder(EpisodeState):
 
     @abstractmethod
     def decode(self, observation: Observation) -> DecodeRecord:
-        """Return a record with the actions to execute. The observation has the images of `cameras`."""
+        """Return a record with the actions to execute. The observation must have the images of `cameras`."""
 
 
 class Decoder(ActionDecoder):
@@ -120,7 +120,8 @@ class Decoder(ActionDecoder):
     def decode(self, observation: Observation) -> DecodeRecord:
         """Decode one observation, and return a record that holds the actions to execute.
 
-        Its `seconds` are measured from the observation to the actions, with the device synchronised at both ends.
+        The record's `seconds` are measured from the observation to the actions, with the device synchronised at both
+        ends.
         """
         stopwatch = Stopwatch(self.target.device)
         chunk = self.decode_prompt(self._encoding(observation, stopwatch), stopwatch, observation)
@@ -250,7 +251,8 @@ class Decoder(ActionDecoder):
     def verify(self, chunk: Chunk, draft: Draft) -> Verified:
         """Run the target over the draft, preceded by the tokens that are not in its cache yet.
 
-        In the first round these are the prompt, later the last committed token or those that a rectifier has filled.
+        In the first round these tokens are the prompt. Later they are the last committed token, or the tokens that a
+        rectifier has filled.
         """
         target, cache, uncached = self.target, chunk.cache, chunk.uncached
         before = len(uncached) or chunk.prompt_length
@@ -325,7 +327,7 @@ class Decoder(ActionDecoder):
         If several values were filled and the chunk goes on, one forward reads their tokens and gives the next token.
 
         Returns:
-            `hidden`, the target's hidden states of this round, followed by the states of the additional forward.
+            `hidden`, the target's hidden states of this round. The states of the additional forward, if any, follow.
         """
         last, rectifier = chunk.rounds[-1], self.parts.rectifier
         if rectifier is None or last.accepted == len(last.drafted):

@@ -67,7 +67,7 @@ class Draft:
 
     @property
     def remote(self) -> list[Tensor]:
-        """Those of `tokens` and `parents` that are on the GPU, in this order. Empty for drafts on the CPU."""
+        """The tensors among `tokens` and `parents` that are on the GPU, in this order. Empty for drafts on the CPU."""
         return [x for x in (self.tokens, self.parents) if x is not None and x.device != HOST]
 
     def judged(self, remote: Sequence[np.ndarray]) -> TokenTree:
@@ -88,7 +88,7 @@ class Draft:
     def ancestors(self) -> np.ndarray | Tensor | None:
         """Mask (n, n) bool: entry [i, j] says whether token j is token i or one of its ancestors.
 
-        It is on the device of `parents`. None for a chain.
+        The mask is on the device of `parents`. None for a chain.
         """
         if self.parents is None:
             return None

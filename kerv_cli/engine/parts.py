@@ -104,7 +104,7 @@ class Skip(ABC):
 
     @abstractmethod
     def take(self, chunk: Chunk) -> bool:
-        """Complete the chunk with an unverified draft if the rule allows it, and return whether it did."""
+        """Complete the chunk with an unverified draft, if the rule allows it. Return whether it was completed."""
 
     def verified(self, chunk: Chunk) -> None:  # noqa: B027
         """Learn from a verification. Called after the prefill has verified a draft that was not skipped."""

@@ -40,8 +40,8 @@ class Proposer:
             chunk: The chunk, which already holds the round's committed tokens.
             first: Index in the chunk of the last token that was committed before the round.
             hidden: The target's hidden states (1, T, E) of the chunk's tokens first … first + T − 1.
-            target_tokens: The round's 1 + n target tokens: after the last committed token, then after each node,
-                rejected ones included.
+            target_tokens: The round's 1 + n target tokens: after the last committed token, then after each of the
+                draft's n nodes, rejected nodes included.
         """
 
 

@@ -33,8 +33,8 @@ class Round:
         start: Number of tokens committed before this round.
         drafted: The draft tokens that were judged: the accepted ones and, after a rejection, the rejected candidate
             that is nearest to the target token.
-        target_tokens: The target's tokens at the same positions. If all of the draft was accepted and the chunk is not
-            full, one more: the bonus, the target's next token.
+        target_tokens: The target's tokens at the same positions. If the whole draft was accepted and the chunk is not
+            full, the bonus (the target's next token) comes after them.
         accepted: Number of accepted draft tokens.
         committed: Number of committed tokens: the accepted ones and the bonus.
         tree_size: Number of draft tokens in the verified tree.
@@ -59,7 +59,7 @@ class Round:
 
 @dataclass(frozen=True)
 class Delay:
-    """Latency of a decode, and what the robot executed meanwhile. For worlds that do not wait (docs/methods.md §8)."""
+    """Latency of a decode, and what the robot did meanwhile, in a world that does not wait (docs/methods.md §8)."""
 
     seconds: float  # latency of the decode
     steps: int  # latency in control steps, rounded up
@@ -147,7 +147,7 @@ class EpisodeRecord:
     frames: dict[int, np.ndarray] = field(default_factory=dict)  # control step -> (h, w, 3) uint8, if recorded
     closest_approach: float = math.nan  # least distance of fingertips to object, metres; NaN: unknown
     object_moved: float = math.nan  # largest motion of the object after the fingertips came near, metres; NaN: unknown
-    wall_seconds: float = 0.0  # with simulation and rendering; in a batch this episode's share
+    wall_seconds: float = 0.0  # of the whole episode, with simulation and rendering; in a batch, its share
     places: dict[str, np.ndarray] = field(default_factory=dict)  # object, goal, … -> (T + 1, 3) metres, if recorded
 
     @property

@@ -26,7 +26,7 @@ class Stopwatch:
         self.began = self.last = time.perf_counter()
 
     def lap(self, phase: str) -> None:
-        """Add the time since the last lap to `phase`, one of `PHASES`. On CUDA, `stop` adds it instead."""
+        """Add the time since the last lap to `phase`, one of `PHASES`. On CUDA, this time is added by `stop`."""
         if self.events is not None:
             self.events.append((phase, _event()))
             return
