@@ -139,7 +139,7 @@ def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
     return torch.addcmul(x * cos, x.roll(x.shape[-1] // 2, -1), sin)
 
 
-_AT_ONCE = (1, 2, 4, 8, 16, 32, 64)  # buckets that are captured together with the first one
+_AT_ONCE = (1, 2, 4, 8, 16, 32, 64)  # sizes of the graphs that are captured at the first forward
 _WARM_UP = 3  # runs before a capture, in which libraries choose kernels and allocate workspaces
 
 

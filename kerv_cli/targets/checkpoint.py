@@ -81,10 +81,10 @@ class TargetDescription(Description):
 
     @property
     def origin(self) -> Mapping[str, Any]:
-        """The policy that decides which tokens the target decodes. `sha256` is the hash of its weights.
+        """Mapping that describes the policy whose tokens the target decodes. `sha256` is the hash of its weights.
 
-        Usually it is the target itself. For a grown target (docs/methods.md §0.2) it is the policy that was enlarged,
-        and `base` is that policy's folder.
+        Usually this policy is the target itself. A grown target (docs/methods.md §0.2) decodes the tokens of the policy
+        that was enlarged. Then `base` is that policy's folder.
         """
         return self.settings.get("grown") or {"sha256": self.sha256}
 
@@ -251,7 +251,7 @@ def target_fields(
 
 
 def read_description(folder: Path, kind: str, schema: type[T]) -> T:
-    """Return the description of an artifact. Check its fields, and that the weights have the hash in it.
+    """Return the description of an artifact. Check its fields, and that the weights have the hash that it names.
 
     Args:
         folder: Folder of the artifact.

@@ -27,7 +27,8 @@ METHODS = ("encode", "embed", "new_cache", "forward", "head")
 TREE = Draft.of([0] * 7, [-1, 0, 0, 1, 1, 2, 4])
 """A draft tree, of which only the shape is used."""
 Pairs = Iterable[tuple[Tensor, Tensor]]
-"""Pairs of hidden states (…, E): computed as the engine does it, and as expected. Their logits must be equal."""
+"""Pairs of hidden states (…, E): computed as the engine does it, and as expected. Their logits must be equal, up to
+rounding."""
 
 
 @torch.inference_mode()
@@ -212,5 +213,5 @@ CHECKS: tuple[tuple[str, str, Callable[[Trial], Pairs]], ...] = (
 )
 """The checks in order: name, what is wrong if it fails, function.
 
-If the second is empty, all later checks need this one, and a failure ends the checks.
+If the second entry is empty, all later checks need this check, and its failure ends the checks.
 """

@@ -60,7 +60,7 @@ def find_target(results: str, name: str) -> Path:
 
 
 def check_not_shipped(path: Path, word: str) -> None:
-    """Check that writing an artifact does not replace one of a shipped policy.
+    """Check that writing an artifact does not replace an artifact of a shipped policy.
 
     Args:
         path: Folder to write to.

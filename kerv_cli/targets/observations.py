@@ -108,7 +108,7 @@ def read_observations(
 
 
 def read_chunks(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarray:
-    """Return the expert's actions that follow each of some control steps, without added noise.
+    """Return the expert's next H actions from each of several control steps on, without added noise.
 
     A chunk that begins near the end includes actions that were recorded after the success.
 

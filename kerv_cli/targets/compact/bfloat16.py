@@ -62,7 +62,7 @@ def blocked(layer: nn.Module) -> nn.Module:
 class Bfloat16Layers:
     """Decoder layers with blocked bfloat16 weights and a float32 cache.
 
-    Copies and pickles hold None in its place, because oneDNN's layout cannot be copied.
+    A copied or pickled module holds None instead of this object, because oneDNN's layout cannot be copied.
     """
 
     def __init__(self, rotary: tuple[Tensor, Tensor], layers: Iterable[nn.Module]) -> None:

@@ -16,7 +16,7 @@ M = TypeVar("M", bound=nn.Module)
 
 
 def wants_gradient(x: Tensor) -> bool:
-    """Return whether gradients of `x` are needed. Compiled modules compute none, so torch must compute then."""
+    """Return whether gradients of `x` are needed. Then torch must compute, because compiled modules give none."""
     return x.requires_grad and torch.is_grad_enabled()
 
 
@@ -33,7 +33,7 @@ class Packable(nn.Module):
     packed: Any = None
 
     def pack_weights(self) -> Any:
-        """Compile this module and return the result, or None if it cannot be compiled. `pack` calls this."""
+        """Return the compiled form of this module, which `pack` stores in `packed`. None if it cannot be compiled."""
         return None
 
     def is_packed(self, x: Tensor) -> bool:
@@ -60,7 +60,7 @@ class PackableLinear(Packable, nn.Linear):
     """A linear layer that is compiled by itself, not as a part of a larger module. For example an output head."""
 
     def pack_weights(self) -> Any:
-        """Compile a float32 layer. Return None for other number formats."""
+        """Return the layer as a compiled `Program`. None if its weights are not float32."""
         return Program(super().forward, (1, self.in_features)) if self.weight.dtype == torch.float32 else None
 
     def forward(self, x: Tensor) -> Tensor:
@@ -69,9 +69,9 @@ class PackableLinear(Packable, nn.Linear):
 
 
 def pack(module: nn.Module) -> None:
-    """Compile every `Packable` submodule of a module.
+    """Compile every `Packable` submodule of a module, and store the compiled form in its `packed`.
 
-    Does nothing unless all parameters are frozen, on a CPU and in one number format.
+    Nothing happens unless all parameters are frozen, on a CPU and in one number format.
     """
     parameters = list(module.parameters())
     if all(p.device.type == "cpu" and p.dtype == parameters[0].dtype and not p.requires_grad for p in parameters):

@@ -4,7 +4,8 @@ A program computes in *frames*: the float32 memory of one row of a batch. A *pla
 `recording.py` explains both, and how a module becomes a table of operations.
 
 numba compiles the kernels when they are first used on a machine. It stores the machine code in NUMBA_CACHE_DIR if that
-is set, else in `__pycache__`. If that cannot be written it takes the user's cache folder, else a temporary folder.
+is set, else in `__pycache__`. If this folder cannot be written, numba takes the user's cache folder. If that cannot be
+written either, kerv chooses a temporary folder.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ _LOG = logging.getLogger("kerv")
 def kernels() -> ModuleType:
     """Return the module of compiled kernels.
 
-    The first process on a machine compiles them and logs a warning that this takes ten seconds. Others wait for it.
+    The first process on a machine compiles them, and logs a warning that this takes ten seconds. Other processes wait
+    for it.
     """
     import numba
     from numba.core import event
@@ -59,9 +61,10 @@ def kernels() -> ModuleType:
 
 
 class Matrix:
-    """The weights of a linear layer, stored panel by panel: a panel is a block of 64 outputs that lie side by side.
+    """The weights of a linear layer, stored in panels. A panel holds the weights of 64 outputs side by side.
 
-    The format is the smallest that holds the weights without loss: int8 with a scale per output, float16 or float32.
+    The number format is the smallest that holds the weights without loss: int8 with a scale per output, float16 or
+    float32.
 
     Args:
         weight: (outputs, inputs) float32.
@@ -120,7 +123,10 @@ def forget(module: torch.nn.Module) -> None:
 
 
 class Program:
-    """A compiled function of tensors. Copies and pickles hold None in its place, because it holds memory addresses."""
+    """A compiled function of tensors.
+
+    A copied or pickled module holds None instead of its program, because a program contains memory addresses.
+    """
 
     def __init__(self, function: Callable[..., Any], *shapes: Sequence[int], repeats: bool = False) -> None:
         """Record a function as a table of operations.
@@ -162,8 +168,8 @@ class Program:
         Args:
             inputs: (rows, …). With attention (B, T, …), which are B · T rows: B sequences of T tokens.
             positions: (T,) rotary positions. None if the program has no attention.
-            cache: Keys and values of earlier tokens. Those of the new tokens are written after them, but `cache.length`
-                stays as it is. None: there are no earlier tokens.
+            cache: Keys and values of earlier tokens. The keys and values of the new tokens are written after them, but
+                `cache.length` stays as it is. None: there are no earlier tokens.
             mask: Result of `attention_mask`. None: attention is causal.
 
         Returns:
@@ -182,7 +188,8 @@ class Program:
         Args:
             times: Number of executions.
             inputs: Inputs of the first execution, one token of each of B sequences.
-            cache: Keys and values of earlier tokens. Each execution appends those of one token.
+            cache: Keys and values of earlier tokens. Each execution writes those of one more token after them, but
+                `cache.length` stays as it is.
 
         Returns:
             (times, B) float32, the result of the ARGMAX operation in each execution.

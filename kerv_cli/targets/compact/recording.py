@@ -233,7 +233,7 @@ class Tape:
         return first
 
     def arrange(self, kept: Sequence[Recorded]) -> int:
-        """Move the registers so that those that are never needed at the same time share memory. Ends a recording.
+        """End a recording: move the registers, so that registers that are never needed at the same time share memory.
 
         Args:
             kept: Inputs and outputs of the recorded function. Nothing else is ever stored in their registers.

@@ -3,10 +3,11 @@
 The prompt is [vision grid] [instruction] [scene] [proprioception]. The last prompt position predicts token 0. An image
 of several camera views gives one vision grid per view.
 
-Scene tokens encode the places, positions that the task is about, such as object and goal: where each is, and the vector
-to it from the hand. With `observation=vision` these positions are estimated from the image. They are supervised in
-training and never read from the simulator afterwards. With `observation=state` the simulator gives them, together with
-the rest of its state. That is privileged information, and serves to study decoding without perception.
+Scene tokens encode the places: positions that the task is about, such as those of object and goal. They contain where
+each place is, and the vectors from the hand to it. With `observation=vision` these positions are estimated from the
+image. The estimate is trained on the simulator's positions, which are never read afterwards. With `observation=state`
+the simulator gives the positions, together with the rest of its state. This is privileged information. It serves to
+study decoding without perception.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ class Inputs:
 
 
 class Compiled(NamedTuple):
-    """The compiled programs of a target. Copies and pickles hold None in its place.
+    """The compiled programs of a target. A copied or pickled target holds None instead of them.
 
     Attributes:
         prompt: Encodes a prompt.
@@ -92,8 +93,8 @@ class CompactTarget(Packable):
         chunk: H, number of control steps that it was trained to decode at once.
         parallel: Whether it decodes all tokens in one forward (`parallel_pass`), and cannot decode them one by one.
         width: E, width of the embeddings and hidden states.
-        heads: Attention heads of a layer, also of a drafter's.
-        feed_forward: Hidden units of a layer, also of a drafter's.
+        heads: Attention heads of a layer. A drafter's layers have as many.
+        feed_forward: Hidden units of a layer. A drafter's layers have as many.
         grown_drafter: Shape of the drafter if the target was enlarged together with it (docs/methods.md §0.2), else
             None.
     """
@@ -273,7 +274,7 @@ class CompactTarget(Packable):
         return located.to(torch.float32).unflatten(-1, (-1, 3)) * 0.1 + self.centre
 
     def pack_weights(self) -> Compiled | None:
-        """Compile the prompt's encoder and the decoding of a token for a CPU. None if the weights are not float32."""
+        """Return compiled programs that encode a prompt and decode tokens. None if the weights are not float32."""
         if self.dtype != torch.float32:
             return None
         s, space = self.settings, self.observation

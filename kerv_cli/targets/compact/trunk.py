@@ -143,7 +143,8 @@ class LayerStack(Packable):
         """Compile the stack for a CPU. `pack` calls this.
 
         Returns:
-            A program in float32. In bfloat16 layers with blocked weights, if the CPU can multiply bfloat16. Else None.
+            For float32 weights a `Program`. For bfloat16 weights `Bfloat16Layers`, if the CPU can multiply bfloat16.
+            Otherwise None.
         """
         if self.norm.weight.dtype == torch.float32:
             return Program(self.recorded, *[(1, 1, self.outer)] * self.inputs)

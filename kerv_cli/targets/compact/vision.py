@@ -68,7 +68,7 @@ class VisionEncoder(Packable):
         self.register_buffer("columns", torch.linspace(-1, 1, size // 2), persistent=False)
 
     def pack_weights(self) -> Callable[[Tensor], list[Tensor]] | None:
-        """Return this encoder in ONNX Runtime, for one image at a time. None if the weights are not float32."""
+        """Return this encoder as a `PackedVision`, which encodes one image. None if the weights are not float32."""
         return PackedVision(self, 2 * len(self.columns)) if self.columns.dtype == torch.float32 else None
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -109,8 +109,8 @@ class PackedVision:
     smallest drafter has eleven convolutions. Measured on an AMD EPYC, 96 × 96 pixels, 8 channels: 607 µs in torch,
     270 µs here.
 
-    An ONNX session cannot be copied, so copies and pickles hold None in its place. It uses as many threads as torch has
-    at the time of the export.
+    A copied or pickled encoder holds None instead of this object, because an ONNX session cannot be copied. The session
+    uses as many threads as torch has at the time of the export.
     """
 
     def __init__(self, encoder: nn.Module, size: int) -> None:

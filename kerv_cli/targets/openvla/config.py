@@ -1,8 +1,8 @@
 """Read the configuration and the action statistics of a Hugging Face OpenVLA checkpoint.
 
-The `config.json` of a published checkpoint gives only timm's names of its two vision encoders (towers), and of its
-language model only what differs from Llama-2 7B. The rest is filled in here. A checkpoint of a different size must give
-the shapes of its towers in the field `vision_shapes`.
+The `config.json` of a published checkpoint gives timm's names of its two vision encoders (towers), but no shapes. Of
+its language model it gives only what differs from Llama-2 7B. This module fills in the rest. A checkpoint of a
+different size must give the shapes of its towers in the field `vision_shapes`.
 """
 
 from __future__ import annotations

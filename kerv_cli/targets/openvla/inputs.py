@@ -79,8 +79,8 @@ def cropped(image: np.ndarray, size: int) -> np.ndarray:
 def as_in_libero(image: np.ndarray, size: int) -> np.ndarray:
     """Prepare an image (h, w, 3) uint8 as OpenVLA's evaluation on LIBERO does before it crops. Return (size, size, 3).
 
-    This equals `resize_image` of its libero_utils. The image is compressed as JPEG as by TensorFlow (quality 95, colour
-    at half resolution), because the training images were, and then resized by Lanczos with antialiasing.
+    This equals `resize_image` of its libero_utils. The image is first compressed as JPEG, as the training images were,
+    with TensorFlow's settings (quality 95, colour at half resolution). Then it is resized by Lanczos with antialiasing.
     """
     file = io.BytesIO()
     Image.fromarray(image).save(file, "JPEG", quality=95, subsampling="4:2:0")

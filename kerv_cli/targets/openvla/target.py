@@ -2,7 +2,8 @@
 
 The prompt is [begin] [vision patches] [text], as in OpenVLA's own code. Action token t has the id vocabulary - 1 - t.
 The head gives logits for the ids of action tokens only. The published code takes the argmax over all ids, and executes
-any other id as the last bin. Greedy decoding gives the same tokens as long as that code decodes action tokens.
+an id that is no action token as the last bin. As long as the published code decodes action tokens, greedy decoding here
+gives the same tokens.
 """
 
 from __future__ import annotations
@@ -86,7 +87,10 @@ class OpenVLATarget:
 
     @property
     def segments(self) -> Mapping[str, slice]:
-        """Name of a prompt part -> its slice of the prompt. The instruction ends at the end of the prompt."""
+        """Name of each part of the prompt -> the positions of its tokens, as a slice.
+
+        The slice of the instruction has no end, because the length of instructions differs.
+        """
         patches = self.shape.patches
         return {"begin": slice(0, 1), "vision": slice(1, 1 + patches), "instruction": slice(1 + patches, None)}
 
