@@ -25,7 +25,6 @@ from kerv_cli.episodes.resolve import resolve, resolve_rollout, study_name
 from kerv_cli.lab.command import chosen_store
 from kerv_cli.lab.store import ROLLOUT, StudyStore
 from kerv_cli.lab.study import plan, plan_rollout, run
-from kerv_cli.report import decide
 from kerv_cli.report.measures import MICRO, Row
 from kerv_cli.report.report import report as write_report
 from kerv_cli.report.tables import load_study as load_data
@@ -135,8 +134,7 @@ def sweep(study: str | Path, *overrides: str, **settings: object) -> Study:
     with chosen_store(as_overrides(f"study={study}", *overrides, **settings)) as typed:
         resolved = resolve(typed)
         planned = plan(resolved, ["sweep", *typed])
-        analysis = decide.judge(resolved.sweep.loss, print) if resolved.sweep.until == "decided" else None
-        failed = run(planned, save=save_recording, analysis=analysis).failed
+        failed = run(planned, save=save_recording).failed
     if failed:
         one, lost = failed[0].episodes[0], sum(len(failure.episodes) for failure in failed)
         of_all = f"{lost} of {len(planned.study.episodes)} episodes failed"

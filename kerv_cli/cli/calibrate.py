@@ -94,7 +94,7 @@ def success(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_
         print_study_plan(planned, as_json)
         return
     with making(settings.results, "certificate", folder):
-        if run_study(planned, resolved.sweep).failed:
+        if run_study(planned).failed:
             raise typer.Exit(1)
         certificate = certify(certificate, planned.store, planned.study.episodes, resolved.study.baseline)
         path = write(folder, certificate)

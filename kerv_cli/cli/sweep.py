@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 @command(
     "sweep",
     SweepSettings,
-    keys="study task episodes policy until rerun loss runtime.workers results",
+    keys="study task episodes policy rerun loss runtime.workers results",
     examples=("kerv sweep study=demo", "kerv sweep study=threshold task=[reach,push] episodes=5 --plan"),
     each="rollout",
 )
@@ -57,7 +57,7 @@ def sweep(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_js
     if plan:
         print_study_plan(planned, as_json)
         return
-    _print_outcome(run_study(planned, resolved.sweep), resolved, planned, as_json)
+    _print_outcome(run_study(planned), resolved, planned, as_json)
 
 
 def _list_studies(as_json: bool) -> None:

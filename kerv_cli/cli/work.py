@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from kerv_cli.episodes.resolve import ResolvedStudy
-    from kerv_cli.episodes.settings import SweepSettings
     from kerv_cli.lab.events import Event, Outcome
     from kerv_cli.lab.runs import Run
     from kerv_cli.lab.store import Plan, StudyStore
@@ -108,31 +107,18 @@ def print_study_plan(planned: Plan, as_json: bool) -> None:
     typer.echo(f"{count(len(to_run), 'episode')} to run, {len(reused)} reused, {about(seconds, source)}")
 
 
-def run_study(planned: Plan, sweep: SweepSettings | None = None) -> Outcome:
+def run_study(planned: Plan) -> Outcome:
     """Run the missing episodes of a plan and show the progress.
-
-    Args:
-        planned: The plan.
-        sweep: Settings of the sweep. With until=decided the study ends as soon as its results are clear. None: all
-            episodes run.
 
     Raises:
         Interrupted: The user pressed Ctrl-C.
         KervError: The study could not run, see `study.run`.
     """
-    from kerv_cli.lab.plan import seed_blocks
     from kerv_cli.lab.study import run
-    from kerv_cli.report.decide import confidence_of_a_look, judge
-    from kerv_cli.report.verdict import stopping_rule
     from kerv_cli.report.viewing import save_recording
 
-    analysis = None
-    if sweep is not None and sweep.until == "decided":
-        looks = len(seed_blocks(planned.study))
-        typer.echo(stopping_rule(sweep.loss, looks, confidence_of_a_look(looks)), err=True)
-        analysis = judge(sweep.loss, lambda line: typer.echo(line, err=True))
     with progress_bar("episodes") as show:
-        return run(planned, event_printer(show), save=save_recording, analysis=analysis)
+        return run(planned, event_printer(show), save=save_recording)
 
 
 def event_printer(show: Callable[[int, int, str], None]) -> Callable[[Event], None]:
@@ -152,7 +138,7 @@ def event_printer(show: Callable[[int, int, str], None]) -> Callable[[Event], No
         nonlocal total, ended, title
         line = ""
         if isinstance(event, Started):
-            if event.load > BUSY and not total:  # until=decided starts several times
+            if event.load > BUSY:
                 typer.echo(f"the load average is {event.load:g} per core: other programs slow these times", err=True)
             total, ended = event.to_run, 0
             line = f"{count(event.reused, 'episode')} there already" if event.reused else ""

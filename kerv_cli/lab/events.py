@@ -88,13 +88,6 @@ class Outcome:
     failed: list[SettingFailed] = field(default_factory=list)
     seconds: float = 0.0
 
-    def add(self, other: Outcome) -> None:
-        """Add the result of another part of the study to this one."""
-        self.done += other.done
-        self.reused += other.reused
-        self.failed += other.failed
-        self.seconds += other.seconds
-
 
 Event = Started | BlockStarted | BlockWaits | EpisodeEnd | SettingFailed
 OnEvent = Callable[[Event], None]

@@ -371,12 +371,6 @@ def blocks_of(episodes: Iterable[Episode], block: int, workers: int = 1) -> list
     return blocks
 
 
-def seed_blocks(study: Study) -> list[list[Episode]]:
-    """Return a study's episodes grouped by block of seeds, in the order of the seeds."""
-    first = min(one.seed for one in study.episodes)
-    return [part for _, part in sorted(_grouped(study.episodes, lambda one: (one.seed - first) // study.block).items())]
-
-
 def differences(new: Setting, old: Setting | None = None, work: str = "") -> str:
     """Describe in a few words how a setting differs from a stored one with the same label.
 

@@ -150,7 +150,7 @@ class StudyStore:
         with self.database.reading() as connection:
             return stored_study(connection, row)[0]
 
-    def save(self, study: Study, existing: Mapping[Episode, StoredEpisode] | None = None, whole: bool = True) -> None:
+    def save(self, study: Study, existing: Mapping[Episode, StoredEpisode] | None = None) -> None:
         """Write a study's settings and episodes.
 
         A setting that did not change keeps its episodes of other tasks, so that sweeps of one study over different
@@ -159,29 +159,25 @@ class StudyStore:
         Args:
             study: The study.
             existing: Episodes that the database already has, with their rows.
-            whole: Whether to replace the stored study. False adds to it.
         """
         with self.database.writing() as connection:
-            self._save(connection, study, existing or {}, whole)
+            self._save(connection, study, existing or {})
 
-    def _save(
-        self, connection: sa.Connection, study: Study, existing: Mapping[Episode, StoredEpisode], whole: bool
-    ) -> None:
+    def _save(self, connection: sa.Connection, study: Study, existing: Mapping[Episode, StoredEpisode]) -> None:
         about = {name: getattr(study, name) for name in ABOUT}
         row = connection.execute(sa.select(STUDIES).where(STUDIES.c.name == self.name)).first()
         if row is None:
             new = sa.insert(STUDIES).values(name=self.name, kind=study.kind, created=now(), about=about)
             row = connection.execute(new.returning(STUDIES)).one()
-        if whole:
-            kept = study.labels if row.about["baseline"] == study.baseline else []
-            mine = SETTINGS.c.study_id == row.id
-            connection.execute(sa.delete(SETTINGS).where(mine, SETTINGS.c.label.not_in(kept)))
-            connection.execute(sa.update(STUDIES).where(STUDIES.c.id == row.id).values(about=about))
+        kept = study.labels if row.about["baseline"] == study.baseline else []
+        mine = SETTINGS.c.study_id == row.id
+        connection.execute(sa.delete(SETTINGS).where(mine, SETTINGS.c.label.not_in(kept)))
+        connection.execute(sa.update(STUDIES).where(STUDIES.c.id == row.id).values(about=about))
         ids = {
             setting.label: _save_setting(connection, row.id, position, setting)
             for position, setting in enumerate(study.settings)
         }
-        for label, number in ids.items() if whole else ():
+        for label, number in ids.items():
             seeds = [one.seed for one in study.episodes if one.setting.label == label]
             repeats = [one.repeat for one in study.episodes if one.setting.label == label]
             still = sa.and_(
@@ -307,7 +303,7 @@ class StudyStore:
         from kerv_cli.episodes.rows import seconds_blob, table_blob
 
         with Run(self.database, study.kind, self.name, command) as record, self.database.writing() as connection:
-            self._save(connection, study, {}, whole=True)
+            self._save(connection, study, {})
             blocks = set(connection.scalars(sa.select(BLOCKS.c.id)))
             for one in episodes:
                 if one.block not in blocks:

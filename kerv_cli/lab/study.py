@@ -23,16 +23,9 @@ from kerv_cli.lab.database import EPISODES, Database
 from kerv_cli.lab.events import Event, OnEvent, Outcome, SettingFailed
 from kerv_cli.lab.execute import execute
 from kerv_cli.lab.executors import check_executor
-from kerv_cli.lab.plan import ALL, Episode, Setting, Study, all_episodes, plain_settings, seed_blocks, seeds_text
+from kerv_cli.lab.plan import ALL, Episode, Setting, Study, all_episodes, plain_settings, seeds_text
 from kerv_cli.lab.runs import Run, interrupted_since, unfinished
 from kerv_cli.lab.store import ABOUT, ROLLOUT, SWEEP, Plan, StudyStore, plan_study
-
-InterimAnalysis = Callable[[StudyStore, Sequence[Episode], Sequence[str], int, int], list[str]]
-"""Function that is called after each block of seeds. It returns the labels of the settings that continue.
-
-Its arguments are the stored study, the episodes so far, the labels of the settings that have continued so far, the
-number of this analysis (from 1), and the largest possible number of analyses.
-"""
 
 Save = Callable[[EpisodeRecord, Path, str], object]
 """Function that writes an episode to a .rrd file. The last argument is the setting's label."""
@@ -150,20 +143,13 @@ def new_name(database: Database, study: Study) -> str:
     return f"{name}-{secrets.token_hex(2)}" if StudyStore(database, name).exists else name
 
 
-def run(
-    planned: Plan,
-    on_event: OnEvent = lambda event: None,
-    *,
-    save: Save = lambda *_: None,
-    analysis: InterimAnalysis | None = None,
-) -> Outcome:
+def run(planned: Plan, on_event: OnEvent = lambda event: None, *, save: Save = lambda *_: None) -> Outcome:
     """Run the missing episodes of a plan. Each is saved in the database as soon as it ends.
 
     Args:
         planned: The plan.
         on_event: Called with each event, to show progress.
         save: Writes recordings. By default nothing is recorded.
-        analysis: Called after each block of seeds; decides which settings continue. By default all do.
 
     Raises:
         Interrupted: Ctrl-C was pressed.
@@ -180,8 +166,6 @@ def run(
     runner = EpisodeRunner(store.rollouts, save)
     with Run(store.database, planned.study.kind, store.name, planned.command, alone=is_rollout) as record:
         try:
-            if analysis is not None:
-                return _run_until_decided(planned, runner, record, forward, analysis)
             store.save(planned.study, planned.existing)
             return execute(planned, runner, record, forward)
         except KeyboardInterrupt:
@@ -191,37 +175,6 @@ def run(
             ) from None
         finally:
             close_worlds()
-
-
-def _run_until_decided(
-    planned: Plan, runner: EpisodeRunner, record: Run, on_event: OnEvent, analysis: InterimAnalysis
-) -> Outcome:
-    """Run one block of seeds after the other. After each, stop the settings whose question is answered.
-
-    The stored study contains only the episodes that ran.
-    """
-    study, total = planned.study, Outcome()
-    undecided = [label for label in study.labels if label != study.baseline]
-    blocks = seed_blocks(study)
-    so_far: list[Episode] = []
-    for number, block in enumerate(blocks, 1):
-        chosen = [one for one in block if one.setting.label in (study.baseline, *undecided)]
-        so_far += chosen
-        settings = tuple({one.setting.label: one.setting for one in so_far}.values())
-        part = replace(
-            planned,
-            study=replace(study, settings=settings, episodes=tuple(chosen)),
-            existing={one: planned.existing[one] for one in chosen if one in planned.existing},
-            missing={one: planned.missing[one] for one in chosen if one in planned.missing},
-        )
-        planned.store.save(part.study, part.existing, whole=number == 1)
-        total.add(execute(part, runner, record, on_event))
-        if total.failed:
-            break
-        undecided = analysis(planned.store, so_far, undecided, number, len(blocks))
-        if not undecided:
-            break
-    return total
 
 
 def plan_rows(planned: Plan) -> list[dict[str, object]]:

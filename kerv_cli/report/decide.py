@@ -1,37 +1,23 @@
-"""Decide which setting to take (`kerv report --choose`) and which settings a sweep may stop (`until=decided`).
+"""Decide which setting to take (`kerv report --choose`): the fastest that is shown to lose little success.
 
-Both ask whether a setting loses less success against the baseline than a given bound (docs/methods.md §7).
-
-`--choose` works on a finished study. It tests the settings in a fixed order, the safest first, and ends at the first
-that fails (fixed-sequence testing). So all tests together have the error rate of one test.
-
-`until=decided` looks at the results after every block of seeds. The intervals use Pocock's constant boundary
-(Biometrika 64, 1977): if a setting's true loss is exactly the bound, the probability that any of the planned looks
-decides it is at most 5 %.
+It tests the settings of a finished study in a fixed order, the safest first, and ends at the first that fails
+(fixed-sequence testing). So all tests together have the error rate of one test (docs/methods.md §7).
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
-from pathlib import Path
-from statistics import NormalDist
+from collections.abc import Sequence
 
 import pandas as pd
 
-from kerv_cli.base.errors import UsageError
-from kerv_cli.base.files import read_json, write_json
-from kerv_cli.lab.plan import Episode
-from kerv_cli.lab.store import StudyStore
-from kerv_cli.lab.study import InterimAnalysis
 from kerv_cli.report import statistics as stats
 from kerv_cli.report import verdict
 from kerv_cli.report.matched import SOLVED, passing, safety
-from kerv_cli.report.measures import MICRO, Row, paired
-from kerv_cli.report.tables import StudyData, is_baseline, is_number, load_study, rows_of
-from kerv_cli.report.verdict import LARGER, OPEN, SMALLER, Choice, Decision
+from kerv_cli.report.measures import MICRO, Row
+from kerv_cli.report.tables import is_baseline, is_number, rows_of
+from kerv_cli.report.verdict import Choice
 
 POINTS = 100.0
 SPEED = "episode_speedup"
@@ -140,107 +126,3 @@ def pareto(rows: Sequence[Row]) -> list[Row]:
         if not front or row["success"] > front[-1]["success"] or point(row) == point(front[-1]):
             front.append(row)
     return front
-
-
-_CONSTANTS = (1.960, 2.178, 2.289, 2.361, 2.413, 2.453, 2.485, 2.512, 2.535, 2.555, 2.572, 2.588, 2.602, 2.614, 2.626,
-              2.637, 2.646, 2.655, 2.663, 2.671)  # fmt: skip
-"""Pocock's critical values of |z| for 1, 2, … 20 equally spaced looks, at 5 % two-sided in all (Jennison and Turnbull,
-Group Sequential Methods, table 2.1).
-"""
-
-
-def confidence_of_a_look(looks: int) -> float:
-    """Return the confidence level of the interval at each look (interim analysis), for 95 % over all looks together.
-
-    Args:
-        looks: Number of planned looks.
-
-    Raises:
-        UsageError: There are more looks than Pocock's table covers.
-    """
-    if not 1 <= looks <= len(_CONSTANTS):
-        raise UsageError(f"until=decided with {looks} looks: at most {len(_CONSTANTS)}; set study.block higher")
-    return float(1 - 2 * NormalDist().cdf(-_CONSTANTS[looks - 1]))
-
-
-def decision_of(label: str, counts: stats.PairedCounts, margin: float, look: int, looks: int) -> Decision:
-    """Decide whether a setting's loss of success is smaller or larger than a bound, or still open.
-
-    Args:
-        label: The setting's label.
-        counts: Outcomes of its pairs with the baseline so far.
-        margin: The bound, as a share of episodes (0.03: three points).
-        look: Number of this look, from 1.
-        looks: Number of planned looks.
-    """
-    difference = stats.paired_difference(counts, confidence_of_a_look(looks))
-    answer = SMALLER if difference.low > -margin else LARGER if difference.high < -margin else OPEN
-    return Decision(label, answer, int(sum(counts)), look, *difference)
-
-
-def decisions(data: StudyData, labels: Sequence[str], margin: float, look: int, looks: int) -> list[Decision]:
-    """Decide for each setting from all its pairs with the baseline.
-
-    Args:
-        data: The study with the episodes that have run.
-        labels: Settings to decide.
-        margin: Largest acceptable loss of success, as a share of episodes.
-        look: Number of this look, from 1.
-        looks: Number of planned looks.
-    """
-    pairs = paired(data.episodes, dict.fromkeys(labels, data.study.baseline))
-    sums = pairs.groupby("label")[list(stats.PairedCounts._fields)].sum().reindex(list(labels), fill_value=0)
-    counts = (stats.PairedCounts(*row) for row in sums.to_numpy().tolist())
-    return [decision_of(label, one, margin, look, looks) for label, one in zip(labels, counts, strict=True)]
-
-
-def judge(loss: float, tell: Callable[[str], None]) -> InterimAnalysis:
-    """Return the function that a sweep calls after every block of seeds to learn which settings are still open.
-
-    Args:
-        loss: Largest acceptable loss of success against the baseline, in points.
-        tell: Receives one line of progress per look.
-
-    Returns:
-        The `analysis` argument of `study.run`. It writes decided.json and returns the labels to continue with.
-    """
-    latest: dict[str, Decision] = {}
-
-    def ask(store: StudyStore, wanted: Sequence[Episode], labels: Sequence[str], look: int, looks: int) -> list[str]:
-        answers = decisions(load_study(store, wanted), labels, loss / POINTS, look, looks)
-        tell(f"look {look} of {looks}: {verdict.progress_line(answers)}")
-        latest.update({answer.label: answer for answer in answers})
-        write_decisions(store.root, latest, loss, looks)
-        return [answer.label for answer in answers if answer.verdict == OPEN]
-
-    return ask
-
-
-def write_decisions(folder: Path, answers: Mapping[str, Decision], loss: float, looks: int) -> None:
-    """Write decided.json into the study's folder, with the latest decision on every setting.
-
-    Args:
-        folder: The study's folder.
-        answers: Label to decision.
-        loss: Largest acceptable loss of success, in points.
-        looks: Number of planned looks.
-
-    Raises:
-        StorageError: The disk is full or read-only.
-    """
-    rows = [{k: None if v != v else v for k, v in asdict(answer).items()} for answer in answers.values()]
-    head = {"loss_points": loss, "looks": looks, "confidence_of_a_look": confidence_of_a_look(looks)}
-    write_json(folder / "decided.json", {**head, "settings": rows})
-
-
-def read_decisions(folder: Path) -> list[Row]:
-    """Return the latest decision on every setting, as JSON objects. The list is empty without `until=decided`.
-
-    Args:
-        folder: The study's folder.
-
-    Raises:
-        CheckpointError: decided.json is damaged.
-    """
-    path = folder / "decided.json"
-    return list(read_json(path)["settings"]) if path.is_file() else []

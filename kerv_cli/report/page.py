@@ -16,7 +16,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from kerv_cli.episodes.identity import NOT_DETERMINING, without
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.decide import read_decisions, verdict_of
+from kerv_cli.report.decide import verdict_of
 from kerv_cli.report.measures import MACRO, Row
 from kerv_cli.report.plots import about, latency_figure, library, study_figures
 from kerv_cli.report.reprice import ASSUMES, repriced_summary
@@ -91,7 +91,6 @@ def study_parts(
         "suite": _suite(data.table),
         "charts": [figure.to_dict() for figure in figures.values()],
         "has_bounds": "_tradeoff" in figures,
-        "decisions": read_decisions(store.root),
         "tasks": _by_task(data.per_task),
         "cell_link": None,  # the board gives a function: heading of the first column, row, column -> address
         "machines": None if priced is None else repriced_summary(priced),

@@ -88,7 +88,7 @@ def mean_of(groups: Sequence[Estimate]) -> Estimate:
     return Estimate(mean, mean - below, mean + above)
 
 
-def paired_difference(counts: PairedCounts, confidence: float = 0.95) -> Estimate:
+def paired_difference(counts: PairedCounts) -> Estimate:
     """Estimate the method's success rate minus the baseline's, from pairs of episodes.
 
     The interval is Newcombe's hybrid score interval for paired proportions (Statistics in Medicine 17, 1998, method
@@ -96,7 +96,6 @@ def paired_difference(counts: PairedCounts, confidence: float = 0.95) -> Estimat
 
     Args:
         counts: Outcomes of the pairs.
-        confidence: Coverage of the interval.
 
     Returns:
         The difference, from −1 to 1. Negative: the method succeeds less often. All NaN if there are no pairs.
@@ -105,7 +104,7 @@ def paired_difference(counts: PairedCounts, confidence: float = 0.95) -> Estimat
     if not pairs:
         return NO_ESTIMATE
     both, only_baseline, only_method, neither = counts
-    method, baseline = (wilson(both + won, pairs, confidence) for won in (only_method, only_baseline))
+    method, baseline = (wilson(both + won, pairs) for won in (only_method, only_baseline))
     surplus = float(both * neither - only_method * only_baseline)
     if surplus > 0:
         surplus = max(surplus - pairs / 2, 0.0)  # correction for continuity

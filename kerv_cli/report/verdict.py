@@ -18,8 +18,6 @@ from kerv_cli.report.measures import MICRO, Row
 from kerv_cli.report.statistics import MOST_PAIRS
 from kerv_cli.report.tables import is_baseline, is_number, rows_of
 
-SMALLER, LARGER, OPEN = "loss is smaller", "loss is larger", "open"
-
 
 @dataclass(frozen=True)
 class Choice:
@@ -70,29 +68,6 @@ class Choice:
     def as_dict(self) -> Row:
         """Return the choice as JSON values."""
         return {**asdict(self), "front": ";".join(self.front)}
-
-
-@dataclass(frozen=True)
-class Decision:
-    """Whether a setting's loss of success is shown to be below or above a bound (`until=decided`).
-
-    Attributes:
-        label: The setting.
-        verdict: SMALLER, LARGER or OPEN.
-        pairs: Number of its pairs with the baseline.
-        look: Number of the look at the results, from 1.
-        difference: Success rate of the setting minus the baseline's.
-        low: Lower end of the difference's interval, at the confidence of one look.
-        high: Upper end of that interval.
-    """
-
-    label: str
-    verdict: str
-    pairs: int
-    look: int
-    difference: float
-    low: float
-    high: float
 
 
 def question(table: pd.DataFrame, loss: float) -> str:
@@ -199,24 +174,3 @@ def caution(table: pd.DataFrame) -> str:
     if unverified:
         clauses.append(f"{', '.join(unverified)}: nothing is verified")
     return "; ".join(clauses)
-
-
-def stopping_rule(loss: float, looks: int, confidence: float) -> str:
-    """Describe the stopping rule of `until=decided` in a sentence.
-
-    Args:
-        loss: Largest acceptable loss of success, in points.
-        looks: Number of planned looks at the results.
-        confidence: Confidence of the interval at each look, from 0 to 1.
-    """
-    return (
-        f"until=decided: at most {looks} looks, one after each block of seeds, each at {100 * confidence:.1f} % "
-        "confidence (Pocock's boundary, 95 % over all looks). A setting stops when its loss of success is shown to be "
-        f"below or above {loss:g} points"
-    )
-
-
-def progress_line(decisions: Sequence[Decision]) -> str:
-    """Return the decisions as one line that shows a sweep's progress."""
-    clauses = [f"{one.label}: {one.verdict} after {one.pairs} pairs" for one in decisions if one.verdict != OPEN]
-    return "; ".join([*clauses, f"{sum(one.verdict == OPEN for one in decisions)} open"])
