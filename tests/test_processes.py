@@ -23,29 +23,6 @@ class Config:
 recording._record_seeds = sleep
 list(recording._run_jobs(Config, None, [("a", range(1)), ("b", range(1))], None))
 """
-JOBS = """
-import os, sys, time
-from kerv_cli.lab.executors import SlurmOptions
-from kerv_cli.lab.executors.clusters import build_slurm as build
-def work(path):
-    open(path, "a").write(f"{os.getpid()}\\n{os.getppid()}\\n")
-    time.sleep(60)
-from functools import partial
-from pathlib import Path
-jobs = build(SlurmOptions(cluster="local"), 1, 1, Path(sys.argv[1]).with_name("jobs"))
-jobs.submit(partial(work, sys.argv[1]))
-time.sleep(60)
-"""
-GUARD = """
-import os, subprocess, sys, time
-from kerv_cli.lab.executors.clusters import guard
-with guard():
-    server = subprocess.Popen(["sh", "-c", "sleep 60 & echo $!"], stdout=-1, text=True)
-    agent = int(server.stdout.readline())
-    server.wait()  # the agent has lost its parent
-    open(sys.argv[1], "a").write(f"{agent}\\n")
-    time.sleep(float(sys.argv[2]))
-"""
 IMPORT = """
 import os, sys, time
 os.kill(os.getpid(), int(sys.argv[1]))
@@ -110,23 +87,6 @@ def ended_soon(found: list[int]) -> None:
 
 def test_workers_that_record_end_with_a_killed_command(tmp_path):
     ended_soon(killed(DEMOS, tmp_path / "pids", 2))
-
-
-@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
-def test_jobs_on_this_machine_end_with_a_killed_command(tmp_path):
-    pytest.importorskip("submitit")
-    ended_soon(killed(JOBS, tmp_path / "pids", 2))
-
-
-@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
-def test_what_a_library_starts_ends_with_a_killed_command(tmp_path):
-    ended_soon(killed(GUARD, tmp_path / "pids", 1, "60"))
-
-
-@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
-def test_what_a_library_starts_ends_with_the_block(tmp_path):
-    subprocess.run([sys.executable, "-c", GUARD, str(tmp_path / "pids"), "0"], check=True)
-    ended_soon(pids(tmp_path / "pids", 1))
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -41,9 +41,9 @@ class RuntimeSettings:
     device: str = setting("cpu", "cpu, cuda or auto")
     dtype: str = choice("float32", "float32", "bfloat16", "float16", help="number format of the models")
     threads: int = number(1, 1, 256, help="torch's threads in each process")
-    executor: str = setting("local", "sweeps: where episodes run: local (processes on this machine), slurm, ray")
+    executor: str = setting("local", "sweeps: where episodes run: local (processes on this machine) or slurm")
     workers: int = number(1, 1, 4096, help="sweeps: number of processes that run episodes at the same time")
-    executor_options: dict[str, Any] = setting({}, "options of slurm or ray (kerv_cli/lab/executors/__init__.py)")
+    executor_options: dict[str, Any] = setting({}, "options of slurm (kerv_cli/lab/executors/__init__.py)")
 
 
 @dataclass(kw_only=True)

@@ -104,14 +104,5 @@ class SlurmOptions:
     setup: list[str] = field(default_factory=list)  # shell lines before the job's Python starts
 
 
-@dataclass
-class RayOptions:
-    """Options of the Ray executor, which runs each block of episodes as a task."""
-
-    address: str = ""  # running cluster, e.g. auto or ray://host:10001; empty: start Ray on this machine
-    gpus: float = number(0.0, 0, 1024)  # GPUs per block
-
-
 add("executor", "local", "kerv_cli.lab.executors.local:build", LocalOptions)
-add("executor", "slurm", "kerv_cli.lab.executors.clusters:build_slurm", SlurmOptions, package="submitit", extra="slurm")
-add("executor", "ray", "kerv_cli.lab.executors.clusters:build_ray", RayOptions, package="ray", extra="ray")
+add("executor", "slurm", "kerv_cli.lab.executors.slurm:build", SlurmOptions, package="submitit", extra="slurm")
