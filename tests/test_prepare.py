@@ -219,7 +219,8 @@ class Tracker:
 
 def test_a_training_is_logged_as_it_runs_and_draws_its_curves(results, monkeypatch):
     words = ("train", "target", "name=short", "demos=few", "target=nano", "target.observation=state", "train.steps=3")
-    assert "pip install 'kerv[trackio]'" in told(*words, "log=trackio", code=2)
+    monkeypatch.setitem(sys.modules, "wandb", None)  # not installed
+    assert "pip install 'kerv[wandb]'" in told(*words, "log=wandb", code=2)
     tracker = Tracker()
     monkeypatch.setitem(sys.modules, "wandb", tracker)
     told(*words, "log=wandb")

@@ -3,14 +3,12 @@ policy in this process, recordings left out."""
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pandas as pd
@@ -23,7 +21,6 @@ from kerv_cli.catalogue.entries import find_runs, matching
 from kerv_cli.lab.database import EPISODES, RUNS, WANTED, Database
 from kerv_cli.lab.runs import INTERRUPTED
 from kerv_cli.lab.study import EpisodeRunner
-from kerv_cli.report.export import TRACKERS, export
 
 FAST = ["policy=state", "policy.target=nano-state", "task=reach-v3", "world.horizon=8", "record=0"]
 
@@ -196,55 +193,13 @@ def test_a_method_composed_on_the_command_line_is_called_what_it_is(words, label
 # --- export ---
 
 
-class Calls(ModuleType):
-    """A stand-in for a tracker's package that notes what is called."""
-
-    def __init__(self, name: str) -> None:
-        super().__init__(name)
-        self.calls: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-
-        def called(*args: Any, **kwargs: Any) -> Any:
-            self.calls.append((name, args, kwargs))
-            return self
-
-        return called
-
-    def __enter__(self) -> Calls:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.calls.append(("end", (), {}))
-
-    @property
-    def summary(self) -> Calls:
-        return self
-
-
-@pytest.mark.parametrize("tracker", ["trackio", "wandb", "mlflow"])
-def test_a_tracker_gets_settings_every_episode_and_the_summary(tracker, results, tmp_path, monkeypatch):
-    fake = Calls(tracker)
-    monkeypatch.setitem(sys.modules, tracker, fake)
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+def test_episodes_are_exported_as_csv(results, tmp_path):
     grid = next(run for run in find_runs(results) if "spec_vla" in run.methods)
-    assert export(grid, tracker, tmp_path) == [f"{grid.id} spec_vla r=5", f"{grid.id} spec_vla r=9"]
-    steps = [kwargs["step"] for _, _, kwargs in fake.calls if "step" in kwargs]
-    assert steps == [0, 1, 0, 1]
-    text = repr(fake.calls)
-    assert "threshold.r" in text
-    assert "forwards_per_step" in text
-
-
-def test_csv_and_a_missing_package(results, tmp_path):
-    written = works("runs", "export", "target/nano-state", "--dir", str(tmp_path), f"results={results}")
-    assert list(pd.read_csv(written.splitlines()[0])["score"]) == [0.1, 0.3]
-    for name in TRACKERS.keys() - {"csv"}:
-        if importlib.util.find_spec(name) is None:
-            refused = kerv("runs", "export", "target/nano-state", "--to", name, f"results={results}", code=2)
-            assert f"pip install 'kerv[{name}]'" in refused.stderr
+    (path,) = works("runs", "export", grid.id, "--dir", str(tmp_path), f"results={results}").split()
+    table = pd.read_csv(path)
+    assert list(table["label"]) == ["spec_vla r=5", "spec_vla r=5", "spec_vla r=9", "spec_vla r=9"]
+    assert set(table["steps"]) == {8}
+    kerv("runs", "export", "target/nano-state", f"results={results}", code=2)
 
 
 # --- removal ---

@@ -36,7 +36,7 @@ RUNS = "NAME: runs (id, a unique part of it, or last) and results=DIR."
 FILTERS = "NAME: kind=, method=, task=, state=, since= and results=DIR narrow the list."
 
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask; names must be whole.")]
-To = Annotated[str, typer.Option("--to", help="csv, parquet, db, trackio, wandb (offline) or mlflow.")]
+To = Annotated[str, typer.Option("--to", help="csv, parquet or db.")]
 Folder = Annotated[Path | None, typer.Option("--dir", help="Folder to write to; default results/exports/FORMAT.")]
 
 
@@ -224,9 +224,8 @@ def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
 def export(
     settings: CommandSettings, names: list[str], to: To = "csv", folder: Folder = None, as_json: AsJson = False
 ) -> None:
-    """Send a run to a tracker, or write it as CSV, Parquet or a database that 'kerv runs import' reads."""
+    """Write the episodes of a run as CSV, Parquet or a database that 'kerv runs import' reads."""
     from kerv_cli.catalogue.entries import find_run
-    from kerv_cli.report.export import FILES
     from kerv_cli.report.export import export as hand_over
 
     (name,) = _run_names(names)
@@ -234,6 +233,5 @@ def export(
     written = hand_over(find_run(settings.results, name), to, folder)
     if as_json:
         end_with_json({"folder": folder, "written": written})
-    for name in written:
-        typer.echo(name)
-    typer.echo(f"{count(len(written), 'file' if to in FILES else 'run')} in {folder}")
+    for path in written:
+        typer.echo(path)

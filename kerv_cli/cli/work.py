@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
@@ -259,7 +260,7 @@ def run_training(
 
 def _train(run: TrainingRun, record: Run, loading: str, training: str) -> tuple[dict[str, float], Path]:
     from kerv_cli.training.loop import without_subnormals
-    from kerv_cli.training.trackers import tracked
+    from kerv_cli.training.tracker import logged
 
     with without_subnormals(), progress_bar(loading, record) as advance:
         run.load(advance)
@@ -275,12 +276,10 @@ def _train(run: TrainingRun, record: Run, loading: str, training: str) -> tuple[
         line = " ".join(f"{name} {value:.4g}" for name, value in list(now.items())[:6] if name != "step")
         advance(step, settings.train.steps, line)
 
-    name = f"{run.kind}/{run.folder.name}"
-    with (
-        without_subnormals(),
-        tracked(settings.log, name, run.folder, settings.train.steps, asdict(settings)) as log,
-        progress_bar(training, record) as advance,
-    ):
+    curves: AbstractContextManager[Callable[[int, dict[str, float]], object]] = nullcontext(lambda step, now: None)
+    if settings.log == "wandb":
+        curves = logged(f"{run.kind}/{run.folder.name}", settings.train.steps, asdict(settings))
+    with without_subnormals(), curves as log, progress_bar(training, record) as advance:
         metrics = run.train(on_step)
     from kerv_cli.report.plots import save_curves
 
