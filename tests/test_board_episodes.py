@@ -1,9 +1,11 @@
 """The board's pages of episodes and failures, their films and recordings, in a real browser."""
 
+import contextlib
 import html
 import io
 import json
 import shlex
+import sqlite3
 from dataclasses import replace
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
@@ -171,9 +173,15 @@ def test_the_command_on_the_page_repeats_the_episode(rolled):
 
 
 def test_an_imported_episode_has_a_page_and_no_film(tmp_path, client):
-    facts = {"per_episode": [{"episode_ix": 0, "success": False, "seed": 7}], "aggregated": {"eval_ep_s": 1.0}}
-    (tmp_path / "eval_info.json").write_text(json.dumps(facts))
-    kerv("runs", "import", str(tmp_path / "eval_info.json"), "name=libero", f"results={tmp_path}")
+    recording = tmp_path / "recording-1.sqlite"
+    with contextlib.closing(sqlite3.connect(recording)) as file, file:
+        file.execute("CREATE TABLE eval_metadata (eval_id, metadata)")
+        file.execute("CREATE TABLE work_queue (eval_id)")
+        columns = "eval_id, task_name, episode_id, metrics, steps, elapsed_sec, eid, failure_reason"
+        file.execute(f"CREATE TABLE episode_results ({columns})")
+        file.execute("INSERT INTO eval_metadata VALUES ('1', ?)", (json.dumps({"benchmark": "LIBERO"}),))
+        file.execute("INSERT INTO episode_results VALUES ('1', 'bowl', 0, '{\"success\": false}', 9, 1.0, 'a', '')")
+    kerv("runs", "import", str(recording), "name=libero", f"results={tmp_path}")
     (number,) = rows_of_wanted(Database(tmp_path))
     text = client.get(f"/episodes/{number}").text
     assert text.count("another program ran it") == 2

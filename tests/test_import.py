@@ -1,4 +1,4 @@
-"""Runs from elsewhere: a results folder of 0.1.0, another kerv.db, lerobot's results; what is handed on, and limits."""
+"""Runs from elsewhere: a results folder of 0.1.0, another kerv.db; what is handed on, and limits."""
 
 import contextlib
 import json
@@ -17,7 +17,6 @@ import pytest
 from command import kerv
 from studies_synthetic import swept, threshold_study
 
-from kerv_cli.catalogue.evaluations import read_evaluations
 from kerv_cli.catalogue.imports import connect_foreign
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MACRO
@@ -155,31 +154,6 @@ def test_episodes_and_decodes_as_parquet(made, tmp_path):
     assert len(episodes) == len(StudyStore(made, "threshold").frame()) == 32
     counted = decodes.groupby(["label", "task", "seed", "repeat"]).size()
     assert counted.to_dict() == episodes.set_index(["label", "task", "seed", "repeat"])["decodes"].to_dict()
-
-
-def info(folder: Path, successes: list[list[bool]]) -> Path:
-    folder.mkdir()
-    metrics = [{"sum_rewards": [1.0] * len(one), "max_rewards": [1.0], "successes": one} for one in successes]
-    tasks = [{"task_group": "libero_10", "task_id": i, "metrics": one} for i, one in enumerate(metrics)]
-    overall = {"pc_success": 50.0, "eval_ep_s": 2.5, "avg_sum_reward": float("nan"), "video_paths": []}
-    (folder / "eval_info.json").write_text(json.dumps({"per_task": tasks, "per_group": {}, "overall": overall}))
-    return folder
-
-
-def test_results_of_lerobot_are_compared_as_pairs(tmp_path):
-    act = info(tmp_path / "act", [[True, False], [True, True]])
-    pi0 = info(tmp_path / "pi0", [[False, False], [True, True]])
-    told = answer("runs", "import", str(act), str(pi0), "name=libero", "baseline=act", f"results={tmp_path}/new")
-    rows = {row["label"]: row for row in told["settings"] if row["averaging"].startswith("micro")}
-    assert (rows["act"]["successes"], rows["pi0"]["successes"]) == (3, 2)
-    assert (rows["pi0"]["pairs"], rows["pi0"]["only_baseline"], rows["pi0"]["episodes"]) == (4, 1, 4)
-    assert rows["pi0"]["steps_to_success"] is None
-    answer("report", "study=libero", f"results={tmp_path}/new")
-    single = {"per_episode": [{"episode_ix": 0, "success": True, "seed": 7}], "aggregated": {"eval_ep_s": 1.0}}
-    (tmp_path / "act/eval_info.json").write_text(json.dumps(single))
-    assert [one.seed for one in read_evaluations(tmp_path / "act/eval_info.json")[0].episodes] == [7]
-    (tmp_path / "act/eval_info.json").write_text(json.dumps({"per_task": [{"metrics": 3}]}))
-    assert "lerobot-eval" in refusal("runs", "import", str(act), f"results={tmp_path}/new")
 
 
 def test_a_foreign_database_that_never_ends_is_refused(tmp_path):

@@ -1,8 +1,7 @@
-"""Imports evaluations that vla-eval or lerobot-eval ran. They become one study, with one setting per imported path.
+"""Imports evaluations that vla-eval ran. They become one study, with one setting per imported path.
 
 A vla-eval recording is a SQLite file. If a kerv server decoded the episodes, their decodes are imported too
-(`read_served`). Of other servers only success and number of steps are known. lerobot-eval writes `eval_info.json`,
-which only has successes.
+(`read_served`). Of other servers only success and number of steps are known.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from typing import Any
 import pyarrow as pa
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
-from kerv_cli.base.files import atomic_path, read_mapping, visible
+from kerv_cli.base.files import atomic_path, visible
 from kerv_cli.catalogue.imports import connect_foreign
 from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.episodes.identity import ENGINE, OBSERVATION, flat
@@ -32,8 +31,8 @@ from kerv_cli.episodes.settings import RolloutSettings, settings_from
 from kerv_cli.lab.plan import Episode, Setting, Study
 from kerv_cli.lab.store import IMPORT, ImportedEpisode, StudyStore
 
-LEROBOT_FILE = "eval_info.json"
-"""Name of the file with lerobot-eval's results."""
+HARNESS = "vla-eval"
+"""Name of the evaluation program."""
 _DAMAGE = (sqlite3.Error, OSError, ValueError, KeyError, TypeError, AttributeError)
 
 _UNKNOWN_DECODE = {"index": 0, "step": 0, "mode": "elsewhere", "forwards": 0, "seconds": math.nan, "tokens": [],
@@ -50,7 +49,7 @@ class RecordedEpisode:
         index: Number of the episode within the task.
         seed: Seed of the initial state. If the benchmark does not name it, the index.
         success: Whether the task was solved.
-        steps: Number of control steps; None if unknown.
+        steps: Number of control steps.
         seconds: Wall time.
         id: The episode's id in the evaluation program.
         start: Numbers that describe the initial state.
@@ -61,7 +60,7 @@ class RecordedEpisode:
     index: int
     seed: int
     success: bool
-    steps: int | None
+    steps: int
     seconds: float
     id: str
     start: tuple[float, ...] = ()
@@ -80,7 +79,6 @@ class Evaluation:
         server: What the model server said about itself.
         episodes: The recorded episodes.
         planned: Number of episodes that were planned, as far as the recording says.
-        harness: Name of the evaluation program.
     """
 
     source: Path
@@ -90,7 +88,6 @@ class Evaluation:
     server: dict[str, Any]
     episodes: tuple[RecordedEpisode, ...]
     planned: int
-    harness: str = "vla-eval"
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -111,7 +108,7 @@ def import_evaluations(
 
     Args:
         results: The results folder.
-        paths: One path per setting: a vla-eval recording, a result of lerobot-eval, or a folder that contains some.
+        paths: One path per setting: a vla-eval recording, or a folder that contains some.
         name: Name of the study. Empty: made from the benchmarks' names.
         labels: A label for each path. Empty: the servers' names.
         baseline: Label of the baseline. Empty: ar if there is one, or else the first label.
@@ -143,7 +140,7 @@ def import_evaluations(
         for episode, recorded in _episodes(settings[label], one, len(benchmarks) > 1)
     }
     notes = [line for label, one in evaluations for line in _notes(label, one)]
-    title = f"{', '.join(dict.fromkeys(one.harness for _, one in evaluations))}: {', '.join(benchmarks)}"
+    title = f"{HARNESS}: {', '.join(benchmarks)}"
     study = Study(name, tuple(settings.values()), tuple(episodes), IMPORT, title, baseline, note="; ".join(notes))
     existing = (
         _imported(results, episode, one, recorded)
@@ -155,65 +152,28 @@ def import_evaluations(
 
 
 def read_evaluations(path: Path) -> list[Evaluation]:
-    """Read the evaluations in a file or folder of vla-eval or lerobot-eval. All must be of the same model server.
+    """Read the evaluations in a recording, or in a folder of recordings. All must be of the same model server.
 
     Raises:
         UsageError: There is no recording, no recording has an episode, or they are of several servers.
         CheckpointError: A file is damaged or incomplete.
     """
-    info = path / LEROBOT_FILE if path.is_dir() else path
-    if info.name == LEROBOT_FILE and info.is_file():
-        files, read, what = [info], _read_lerobot, "file of lerobot-eval"
-    else:
-        files = [file for file in visible(path) if file.suffix == ".sqlite"] if path.is_dir() else [path]
-        read, what = _read_recording, "recording of vla-eval"
+    files = [file for file in visible(path) if file.suffix == ".sqlite"] if path.is_dir() else [path]
     if not files:
         raise UsageError(f"{path} holds no recording of vla-eval (recording-….sqlite)")
     evaluations: list[Evaluation] = []
     for file in files:
         try:
-            evaluations += [one for one in read(file) if one.episodes]
+            evaluations += [one for one in _read_recording(file) if one.episodes]
         except _DAMAGE as error:
             why = " ".join(f"{type(error).__name__} {error}".split())[:120]
-            raise CheckpointError(f"{file} is damaged, cut short or no {what} ({why})") from error
+            raise CheckpointError(f"{file} is damaged, cut short or no recording of vla-eval ({why})") from error
     if not evaluations:
         raise UsageError(f"{path}: the recording holds no episode")
     benchmarks = {one.benchmark for one in evaluations}
     if len(benchmarks) < len(evaluations) or any(one.server != evaluations[0].server for one in evaluations):
         raise UsageError(f"{path} holds several evaluations of a benchmark, or of several servers: name each file")
     return evaluations
-
-
-def _read_lerobot(path: Path) -> list[Evaluation]:
-    """Read the results of lerobot-eval. Return one evaluation per group of tasks.
-
-    A file with several tasks has `per_task` (task_group, task_id and lists of metrics). A file with a single task has
-    `per_episode`. The file does not name the policy, so the name of its folder is used. Without a seed in the file, an
-    episode's number is its seed, because lerobot-eval gives the episodes of every task the same seeds in order.
-    """
-    value = read_mapping(path)
-    groups: dict[str, list[RecordedEpisode]] = {}
-    overall = value.get("overall") or value.get("aggregated") or {}
-    seconds = float(overall.get("eval_ep_s") or 0.0)
-
-    def add(group: str, task: str, index: int, seed: int, success: Any) -> None:
-        if not isinstance(success, bool | int | float) or math.isnan(success):
-            raise ValueError(f"success {success!r} of episode {index}")
-        episode = RecordedEpisode(task, index, seed, bool(success), None, seconds, str(index), (float(seed),))
-        groups.setdefault(group, []).append(episode)
-
-    for one in value.get("per_task") or ():
-        for index, success in enumerate(one["metrics"]["successes"]):
-            add(str(one["task_group"]), f"task {one['task_id']}", index, index, success)
-    for index, row in enumerate(value["per_episode"] if not groups else ()):
-        add("lerobot", "task", index, index if row.get("seed") is None else int(row["seed"]), row["success"])
-    figures = {key: value for key, value in overall.items() if isinstance(value, int | float) and math.isfinite(value)}
-    name = path.resolve().parent.name
-    about = figures, {"model_server": name}
-    return [
-        Evaluation(path, f"{name} {group}", group, *about, tuple(episodes), len(episodes), "lerobot-eval")
-        for group, episodes in groups.items()
-    ]
 
 
 def _read_recording(path: Path) -> list[Evaluation]:
@@ -376,7 +336,7 @@ def _imported(results: Path, episode: Episode, one: Evaluation, recorded: Record
         "device_name": "",
         **dict(one.facts.get("machine") or {}),
         "workers": 1,
-        "executor": one.harness,
+        "executor": HARNESS,
         "engine": ENGINE,
         "server": one.server.get("model_server", ""),
         "harness_version": one.server.get("harness_version", ""),

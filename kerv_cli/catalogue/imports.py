@@ -109,9 +109,7 @@ def is_results(path: Path) -> bool:
         UsageError: The path does not exist.
     """
     if not path.exists():
-        raise UsageError(
-            f"{path} does not exist: name a results folder, a kerv.db, or evaluations of vla-eval or lerobot"
-        )
+        raise UsageError(f"{path} does not exist: name a results folder, a kerv.db, or a recording of vla-eval")
     return _database_of(path) is not None or any(path.glob("*/*/plan.yaml"))
 
 

@@ -1,4 +1,4 @@
-"""`kerv runs import`: take over runs of another results folder, or evaluations of other programs."""
+"""`kerv runs import`: take over runs of another results folder, or evaluations of vla-eval."""
 
 from __future__ import annotations
 
@@ -26,13 +26,12 @@ class ImportSettings(CommandSettings):
 @command(
     "runs import",
     ImportSettings,
-    names="NAME: a results folder of kerv 0.1.0, a kerv.db, vla-eval's recording-….sqlite, "
-    "lerobot's eval_info.json, or folders that hold one.",
+    names="NAME: a results folder of kerv 0.1.0, a kerv.db, vla-eval's recording-….sqlite, or folders that hold one.",
     keys="name baseline labels results",
     examples=("kerv runs import ar/recording-1.sqlite kerv/recording-2.sqlite", "kerv runs import old-results"),
 )
 def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False) -> None:
-    """Import the runs of another results folder, or evaluations of vla-eval or lerobot as a study."""
+    """Import the runs of another results folder, or evaluations of vla-eval as a study."""
     from kerv_cli.catalogue.evaluations import import_evaluations
     from kerv_cli.catalogue.imports import import_results, is_results
     from kerv_cli.lab.database import Database
