@@ -37,7 +37,7 @@ class Use:
     """What a policy's artifacts will be used for. The artifacts check it before any weights are loaded.
 
     Args:
-        method: Kind of a part, such as `proposer` -> settings of the method's part.
+        method: Settings of the method's parts, by the kind of the part, such as `proposer`.
         dtype: Number format of the models.
         environment: Name of the policy's environment.
         tasks: Full names of the tasks. Empty if a client of `kerv serve` names the tasks later.
@@ -92,9 +92,9 @@ def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str
     """Check that an artifact was made from the same artifacts that the policy uses.
 
     Args:
-        sources: Kind -> hash of each artifact that the artifact was made from. Kinds that the policy does not use are
-            ignored.
-        used: Kind -> hash of the policy's target and artifacts.
+        sources: Hashes of the artifacts that the artifact was made from, by kind. Kinds that the policy does not use
+            are ignored.
+        used: Hashes of the policy's target and artifacts, by kind.
         what: Beginning of the error message, such as `the early drafter in FOLDER was trained`.
         again: What the user should do, for the error message, such as `run 'kerv calibrate' again`.
 
@@ -170,7 +170,7 @@ class Artifact(Generic[T]):
         return MadeFor(fields.target, fields.actions, fields.chunk)
 
     def sources(self, description: T) -> Mapping[str, str]:
-        """Return kind -> hash of the other artifacts that this artifact was made from."""
+        """Return the hashes of the other artifacts that this artifact was made from, by kind."""
         return {}
 
     def needs(self, description: T) -> tuple[str, ...]:
@@ -274,7 +274,7 @@ class Artifacts:
             use: The method and the world that they will be used in. None: do not check the use.
 
         Returns:
-            Kind -> hash, for the target, the artifacts of `kinds` and the further artifacts that they need.
+            The hashes, by kind, of the target, the artifacts of `kinds` and the further artifacts that they need.
 
         Raises:
             CheckpointError: An artifact is missing, damaged, made for another target, or made from another artifact

@@ -20,7 +20,7 @@ FILE = "calibration.json"
 NEVER = 1.01  # s_min of a task that never skips: cosines do not exceed 1
 AGAIN = "run 'kerv calibrate' again"
 Errors = dict[str, dict[str, dict[str, list[float]]]]
-"""Predictor -> task -> DoF -> mean absolute errors 1 to H control steps ahead, in normalised action units."""
+"""`errors[predictor][task][dof]`: the mean absolute errors 1 to H control steps ahead, in normalised action units."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Demonstrations:
 
 @dataclass(frozen=True)
 class Variability:
-    """What was measured of a task's variability K: the mean distance of a decode's drafts to the target (§3.2).
+    """Typical variability K of a task. K is the mean distance of a decode's drafts to the target's tokens (§3.2).
 
     Attributes:
         k_s: Reference level K_S: the median K over the decodes that were measured, in normalised action units.
@@ -117,7 +117,7 @@ class Calibration:
         window: Number of control steps of history that a predictor sees.
         noise: Kalman filter (`kalman`, `damped`) -> its noise per DoF.
         errors: Errors of all predictors on held-out episodes, as described at `Errors`.
-        variability: Task -> reference level K_S of the kinematic variability K.
+        variability: Task -> its typical kinematic variability K, with the reference level K_S.
         boundary: Ranges by which the hybrid boundary scales a path's radius of curvature and length.
         skip: Thresholds at which verification is skipped.
         provenance: How it was made.

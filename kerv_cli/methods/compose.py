@@ -24,7 +24,7 @@ class Method:
     """A decoding method: one part of each kind, such as proposer, acceptance and skip.
 
     Attributes:
-        settings: Kind of each part in METHOD_KINDS -> the part's settings.
+        settings: Settings of the parts, by kind, for all kinds in METHOD_KINDS.
         chunk: Number of control steps per chunk. 0: as many as the target was trained for.
         name: Name of the method, for messages.
     """
@@ -40,7 +40,7 @@ class Method:
 
     @functools.cached_property
     def parts(self) -> dict[str, Part]:
-        """Kind -> the registered part, for every kind in METHOD_KINDS.
+        """The registered parts, by kind, for all kinds in METHOD_KINDS.
 
         Raises:
             UnknownName: The settings name a part that does not exist.
@@ -78,8 +78,8 @@ class Method:
     def _check_drafts(self) -> None:
         """Check the proposer, the boundary and the prefill draft.
 
-        A boundary that chooses between two drafters needs a proposer that has two, and such a proposer needs such a
-        boundary. A prefill draft must not need the target's hidden states, which exist only after the prefill.
+        A boundary that chooses between two drafters, and a proposer that has two, need each other. A prefill draft must
+        not need the target's hidden states, which exist only after the prefill.
         """
         proposer, boundary, draft = (self.parts[kind] for kind in ("proposer", "boundary", "prefill_draft"))
         if bool(proposer.traits.get("has_boundary")) != bool(boundary.traits.get("chooses")):

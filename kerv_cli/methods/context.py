@@ -15,14 +15,14 @@ from kerv_cli.base.errors import UsageError
 
 @dataclass(frozen=True)
 class Context:
-    """Everything besides its own settings that a part is built from.
+    """What a part is built from, besides its own settings.
 
     Attributes:
         target: A `Target`. Some parts need a `ReadableTarget` (`engine/protocol.py`).
         artifact: Returns the loaded artifact of a kind, such as `drafter`.
         task: Full name of the task. Empty: unknown.
-        built: Kind -> part, for the parts of the method that are built already.
-        method: Kind -> settings, for all parts of the method.
+        built: The parts of the method that are built already, by kind.
+        method: Settings of all parts of the method, by kind.
         chunk: Number of control steps per chunk. 0: as many as the target was trained for.
     """
 

@@ -48,7 +48,7 @@ def check_parallel(parts: Mapping[str, Part], parallel: bool) -> None:
     """Check that a parallel target has skip=parallel and no drafts, and that no other target has skip=parallel.
 
     Args:
-        parts: Kind -> part, for all parts of the method.
+        parts: All parts of the method, by kind.
         parallel: Whether the target decodes all tokens in one forward.
 
     Raises:

@@ -63,5 +63,5 @@ class MethodSettings(RunSettings):
     datastore: Any = part("datastore", "exact", "how stored chunks are searched: exact, qdrant")
 
     def parts(self) -> dict[str, Any]:
-        """Return kind -> settings, for all parts of the method."""
+        """Return the settings of all parts of the method, by kind."""
         return {kind: getattr(self, kind) for kind in METHOD_KINDS}

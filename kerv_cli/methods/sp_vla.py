@@ -85,7 +85,7 @@ class SpeedSkip(Skip):
         return True
 
     def _is_intuitive(self, situation: Situation, control_hz: float) -> bool:
-        """Return whether the hand's speed is in range, and the target decoded more than `share` of the last actions."""
+        """Return whether the hand is fast enough, and the target decoded more than `share` of the last actions."""
         speed = control_hz * math.dist(situation.path[-1], situation.path[-2])
         s = self.settings
         return s.v_min <= speed <= s.v_max and sum(self.decoded) > s.share * s.buffer

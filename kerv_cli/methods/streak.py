@@ -1,4 +1,4 @@
-"""Execute drafts without verification: always (docs/methods.md §6), or as long as verifications agree (§4.5, ours)."""
+"""Execute drafts without verification: always (docs/methods.md §6), or while verified drafts agree (§4.5, ours)."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class StreakSkipSettings:
 
 
 class StreakSkip(Skip):
-    """Executes drafts without verification, as long as verifications agree with the drafts.
+    """Executes drafts without verification, as long as verified drafts agree with the target.
 
     After the first verified chunk that agrees with its draft, 1 decode is not verified. Each further agreement doubles
     this number, up to `most`. A chunk that does not agree resets it to 0. An episode begins with `opening` decodes

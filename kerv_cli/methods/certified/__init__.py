@@ -14,7 +14,11 @@ from kerv_cli.base.registry import PREFILL, add, find, part_of
 
 @dataclass
 class CertifiedSkipSettings:
-    """On the certificate's tasks, use its skip rule. On other tasks, skip as long as verified drafts agree (§4.5)."""
+    """On the certificate's tasks, use its skip rule. On other tasks, use a streak.
+
+    A streak executes drafts without verification, as long as verified drafts agree with the target
+    (docs/methods.md §4.5).
+    """
 
     kind: str = "certified"
     most: int = number(8, 1)  # on other tasks: maximum number of decodes in a row without verification

@@ -72,7 +72,7 @@ def _part_settings(kind: str, plain: dict[str, Any]) -> Any:
 
 @dataclass(frozen=True)
 class Attempt:
-    """An earlier test of the same policy. Each certificate lists them.
+    """Summary of one test of a policy. Each certificate lists the policy's earlier tests.
 
     Attributes:
         made: When, ISO 8601. Empty: not recorded.
@@ -111,14 +111,14 @@ class Certificate:
         chunk: Number of control steps per chunk.
         environment: Name of the environment.
         tasks: Full names of the tasks.
-        drafts: Kind -> hash of the artifacts that drafted.
-        method: Kind of each part except draft and skip rule -> its settings.
+        drafts: Hashes of the artifacts that drafted, by kind.
+        method: Settings of the method's parts except draft and skip rule, by kind.
         world: Camera and horizon (maximum episode length).
         dtype: Number format of the models.
         margin: Percentage points of success that may be lost.
         delta: Level of this test: an upper bound of the probability that it certifies falsely.
         seeds: Seeds of the test episodes, as text such as `1000-1049;1100`.
-        candidates: All candidates, from cautious to bold.
+        candidates: All candidates in the order of the tests, from cautious to bold.
         chosen: Index of the boldest certified candidate. None: no candidate was certified.
         provenance: How it was made.
         made: When, ISO 8601. Empty in certificates of older versions.
@@ -187,7 +187,7 @@ class Certificate:
         """Refuse a method that decodes differently from the certified method.
 
         Args:
-            method: Kind -> settings of the method's parts.
+            method: Settings of the method's parts, by kind.
             dtype: Number format of the models.
 
         Raises:
@@ -241,7 +241,7 @@ class CertificateArtifact(Artifact[Certificate]):
         return MadeFor(description.target, description.actions)
 
     def sources(self, description: Certificate) -> Mapping[str, str]:
-        """Return kind -> hash of the drafters whose drafts were certified."""
+        """Return the hashes of the drafters whose drafts were certified, by kind."""
         return description.drafts
 
     def check_use(self, description: Certificate, use: Use) -> None:

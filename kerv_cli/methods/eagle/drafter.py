@@ -223,7 +223,7 @@ def _best(tokens: Tensor, parents: Tensor, scores: Tensor, nodes: int, depth: in
 
 @dataclass(frozen=True)
 class EagleExamples(Decodes):
-    """The n training examples of an EAGLE-style drafter. Prompts may have different lengths, so zeros follow them.
+    """The n training examples of an EAGLE-style drafter. Shorter prompts are followed by zeros.
 
     Attributes:
         lengths: (n,) int64, number of prompt tokens P.

@@ -102,8 +102,8 @@ class PublicDrafter(nn.Module):
             following: (B, T, E) embedding of the token after each position.
             hidden: (B, T, E) hidden state at each position.
             positions: (T,) rotary positions.
-            cache: Keys and values of earlier positions. If it is empty, this call must pass the whole prompt. None:
-                there are none.
+            cache: Keys and values of earlier positions. If the cache is empty, `hidden` must be that of the whole
+                prompt. None: there are no earlier positions.
             seen: (T, M) bool, which of the last M keys each query sees. None: causal.
         """
         if cache is not None and not cache.length:
@@ -133,7 +133,7 @@ class PublicDrafter(nn.Module):
 
 
 def layout_of(shape: PublicShape) -> dict[str, Sizes]:
-    """Return name -> size of each tensor that a published drafter of this shape must contain."""
+    """Return the size of each tensor that a published drafter of this shape must contain, by the tensor's name."""
     with torch.device("meta"):
         return sizes_of(PublicDrafter(shape))
 

@@ -236,7 +236,7 @@ class QdrantIndex:
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
         """Return the k + MARGIN most similar rows; see `Index.candidates`.
 
-        Return all rows of the task if the last of these is as similar as the k-th up to rounding.
+        If the last of these rows is as similar as the k-th, up to rounding, return all rows of the task instead.
         """
         m, store, shard = self.models, self.store, self.store.shards[task]
         must = [m.FieldCondition(key="task", match=m.MatchValue(value=task))]
@@ -297,7 +297,7 @@ class Datastore:
 
     @functools.cached_property
     def longest(self) -> float:
-        """Euclidean length of the longest key. It bounds the rounding errors of the search."""
+        """Euclidean length of the longest key. This length bounds the rounding errors of the search."""
         return float(np.linalg.norm(self.vectors, axis=1).max(initial=0.0))
 
     @classmethod

@@ -122,7 +122,7 @@ class _Continuations:
 
     Args:
         rows: Tokens of each neighbour's chunk, most similar neighbour first.
-        cuts: (first token, token after the last, whether it is strict) of each group.
+        cuts: For each group: index of its first token, index after its last token, whether its DoFs are strict.
         cross: Probability that a path changes to another neighbour after a group.
     """
 
@@ -304,8 +304,8 @@ class VerifySkip(Skip):
     """Executes the most similar stored chunk without verification if its similarity is at least s_min.
 
     At most `max_skips` chunks in a row are executed like this. If the method has a boundary, the boundary must choose
-    retrieval. Once a chunk that reaches the end of its stored episode was executed like this, that stored episode is
-    not used again until the next episode begins.
+    retrieval. Once a chunk that reaches the end of its stored episode was executed like this, the other chunks of that
+    stored episode are not, until the next episode begins.
 
     With `up` or `down` above 0, s_min changes after each episode. A failure raises it by `up` times the calibrated
     range (high − low), a success lowers it by `down` times the range. Then results depend on the order of the episodes.
@@ -375,9 +375,9 @@ def radius_of_curvature(points: np.ndarray) -> float:
 
     The radius is infinite for fewer than three points, for a hand at rest and for a straight line. The points are
     projected onto their best plane (by SVD). Taubin's algebraic method, which is exact on arcs, fits the circle. For
-    this, the points (x, y) are centred and divided by a scale, so that their mean square is 1. Let z = x² + y². Let
-    (a, b, c) be the right singular vector for the smallest singular value of the matrix with rows [(z − 1) / 2, x, y].
-    Then the radius is scale / |a|.
+    this, the points (x, y) are centred, and divided by `scale`, their root mean square distance from the centre. Let
+    z = x² + y². Let (a, b, c) be the right singular vector for the smallest singular value of the matrix with rows
+    [(z − 1) / 2, x, y]. Then the radius is scale / |a|.
 
     Args:
         points: (n, 3) positions, metres.

@@ -169,7 +169,7 @@ class Predictor:
 
 
 class Hold(Predictor):
-    """Repeats the last action: the baseline of every other prediction."""
+    """Repeats the last action: a baseline for all other predictions."""
 
     name = "hold"
 

@@ -87,7 +87,7 @@ class ScoutNetwork(Packable):
         return self.network(*given)
 
     def views(self, inputs: Inputs) -> list[Tensor]:
-        """Encode observations.
+        """Encode the images and the instructions of observations.
 
         Returns:
             The proprioception, the mean word embedding of the instruction, and for each camera view the features of its
