@@ -5,10 +5,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from examples.own_target import MockTarget
 from studies_synthetic import still_episode
+from test_accepted_loop import Greedy, NearTrees
 
+from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.record import PHASES, DecodeRecord, EpisodeRecord, Round
+from kerv_cli.methods.kerv import CompensateSettings
+from kerv_cli.methods.kerv.prediction import Compensation, Hold, PredictionProposer
+from kerv_cli.methods.spec_vla import RelaxedRule
+from kerv_cli.methods.streak import AlwaysSkip
 from kerv_cli.report.viewing.viewer import read_chunks
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 DOFS = 4
 
@@ -61,70 +72,29 @@ def decode_of(tokens: tuple[int, ...], rounds: tuple[Round, ...], steps: int, **
     return DecodeRecord(**values)  # type: ignore[arg-type]
 
 
-def ar_decode(random: np.random.Generator, chunk: int = 4) -> DecodeRecord:
-    tokens = tuple(int(t) for t in random.integers(0, 255, chunk * DOFS))
-    later = (Round("decode", "none", i, (), (t,), 0, 1, 0, ()) for i, t in enumerate(tokens[1:], 1))
-    return decode_of(tokens, (prefill(tokens[0]), *later), chunk, mode="ar")
-
-
-def drafted_decode(random: np.random.Generator, chunk: int = 4, compensate: bool = False) -> DecodeRecord:
-    """Drafts of up to five tokens against random target_tokens; a rejection ends a round, and maybe the chunk."""
-    size = chunk * DOFS
-    targets = random.integers(20, 235, size)
-    tokens, rounds, compensated = [int(targets[0])], [prefill(int(targets[0]))], 0
-    variability = 0.0
-    while len(tokens) < size:
-        start = len(tokens)
-        depth = min(5, size - start - 1)
-        if depth == 0:
-            rounds.append(Round("decode", "none", start, (), (int(targets[start]),), 0, 1, 0, ()))
-            tokens.append(int(targets[start]))
-            continue
-        off = random.choice([0, 0, 0, 0, 3, -6, 25], depth)
-        limits = [0 if (start + i) % DOFS == 3 else 9 for i in range(depth)]
-        accepted = next((i for i in range(depth) if abs(off[i]) > limits[i]), depth)
-        judged = min(accepted + 1, depth)
-        drafted = tuple(int(targets[start + i] + off[i]) for i in range(judged))
-        seen = tuple(int(v) for v in targets[start : start + (judged if accepted < depth else depth + 1)])
-        rounds.append(verify(start, drafted, seen, accepted))
-        tokens += [*drafted[:accepted], int(targets[start + accepted])]
-        variability += float(np.abs(off[:judged]).sum()) / 128
-        if accepted < depth and compensate:
-            compensated = -len(tokens) % DOFS
-            break
-    return decode_of(
-        tuple(tokens),
-        tuple(rounds),
-        (len(tokens) + compensated) // DOFS,
-        size=size,
-        variability=variability,
-        compensated=compensated,
-        mode="compensate" if compensated else "drafter",
-        metric=float(random.random()),
-    )
-
-
-def skipped_decode(random: np.random.Generator, chunk: int = 4) -> DecodeRecord:
-    tokens = tuple(int(t) for t in random.integers(0, 255, chunk * DOFS))
-    played = Round("skip", "retrieval", 0, tokens, (), len(tokens), len(tokens), 0, ())
-    similarity = float(0.97 + 0.02 * random.random())
-    return decode_of(tokens, (played,), chunk, mode="skip", forwards=0, skipped=True, similarity=similarity, metric=0.9)
-
-
-def episode(kind: str, horizon: int = 60, chunk: int = 4, frames: int = 0, seed: int = 0) -> EpisodeRecord:
-    """kind: `ar`, `drafter`, `mixed` (drafter, compensation, verify-skip). frames: side in pixels, 0 for none."""
-    random = np.random.default_rng(seed)
+def episode(kind: str, horizon: int = 60, frames: int = 0, seed: int = 0) -> EpisodeRecord:
+    """Decodes of a target that is no network. kind: `ar`, `drafter`, `mixed` (drafts, compensations, skips).
+    frames: side in pixels, 0 for none."""
+    target, space = MockTarget(SPEC.actions, 4, seed=seed), SPEC.actions
+    drafts = NearTrees(Greedy(target, torch.zeros(1, 0, 8)), "drafter", seed, 20, 12)
+    whole = PredictionProposer(Hold(space.is_strict, minimum=1, horizon=4))
+    rectifier = Compensation(CompensateSettings(), Hold(space.is_strict, minimum=1)) if kind == "mixed" else None
+    proposer = None if kind == "ar" else drafts
+    usual = Decoder(target, Parts(RelaxedRule(space), Fixed(9), proposer=proposer, rectifier=rectifier))
+    skipping = Decoder(target, Parts(prefill_draft=whole, skip=AlwaysSkip(whole)))
     decodes, starts, actions, step = [], [], [], 0
+    for decoder in (usual, skipping):
+        decoder.reset("drawer-open-v3", 7, np.zeros(3))
     while step < horizon:
-        if kind == "ar":
-            decode = ar_decode(random, chunk)
-        elif kind == "mixed" and len(decodes) % 7 in (3, 4):
-            decode = skipped_decode(random, chunk)
-        else:
-            decode = drafted_decode(random, chunk, compensate=kind == "mixed")
-        decodes.append(decode)
+        seen = Observation(np.array([0.1 * step]), np.zeros(0), "open the drawer")
+        drafts.greedy = Greedy(target, target.encode(seen))
+        decoder = skipping if kind == "mixed" and len(decodes) % 7 in (3, 4) else usual
+        decodes.append(decoder.decode(seen))
         starts.append(step)
-        actions += list(decode.actions[: horizon - step])
+        for action in decodes[-1].actions[: horizon - step]:
+            actions.append(action)
+            for one in (usual, skipping):
+                one.observe(action, np.zeros(3))
         step = len(actions)
     angle = np.linspace(0, 4, step + 1)
     path = np.stack([0.1 * np.cos(angle), 0.6 + 0.1 * np.sin(angle), 0.05 + 0.04 * angle], axis=1)
