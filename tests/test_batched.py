@@ -15,8 +15,8 @@ import torch
 from command import kerv
 from examples.own_target import MockTarget
 from studies_synthetic import episode, swept, threshold_study
+from test_compact_target import small, some_observation
 from test_episode import settings
-from test_parallel import some_observation, target
 
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.spaces import Observation
@@ -26,7 +26,6 @@ from kerv_cli.engine.cost import Profile
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.record import UNTIMED, EpisodeRecord
-from kerv_cli.episodes import policy as policies_of
 from kerv_cli.episodes import runner as run
 from kerv_cli.episodes.runner import Request, run_together
 from kerv_cli.lab.execute import RunEpisode
@@ -86,7 +85,7 @@ def same(alone: Sequence[Any], together: Sequence[Any]) -> None:
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("batch", [1, 2, 7])
 def test_autoregressive_tokens_of_a_batch_are_those_of_its_rows(packed, batch):
-    policy = target()
+    policy = small()
     if packed:
         policy.requires_grad_(False)
         pack(policy)
@@ -99,7 +98,7 @@ def test_autoregressive_tokens_of_a_batch_are_those_of_its_rows(packed, batch):
 @pytest.mark.bits
 @pytest.mark.parametrize("parallel", [False, True])
 def test_a_smaller_batch_after_a_larger_one(parallel):
-    policy = target(f"target.parallel={str(parallel).lower()}")
+    policy = small(f"target.parallel={str(parallel).lower()}")
     decoder = Decoder(policy, Parts(skip=ParallelPass(policy))) if parallel else Decoder(policy, chunk=1)
     for count in (5, 1, 2):
         same(*decoded(decoder, shown(count)))
@@ -108,7 +107,7 @@ def test_a_smaller_batch_after_a_larger_one(parallel):
 @pytest.mark.bits
 @pytest.mark.parametrize(("radius", "history"), [(0, 0), (9, 1), (9, 30)])
 def test_early_drafts_of_a_batch_follow_each_episodes_own_history(radius, history):
-    policy = target()
+    policy = small()
     torch.manual_seed(3)
     drafter = EarlyDrafter().network(EarlySettings(layers=1, width=32), policy).eval()
     torch.nn.init.normal_(drafter.head.weight, std=1.0)
@@ -178,7 +177,7 @@ class Forwards(BatchDecoder):
 
 
 def test_the_next_episode_begins_where_one_ends_and_every_world_is_closed(stubs):
-    decoder = Forwards(Decoder(target(), chunk=1))
+    decoder = Forwards(Decoder(small(), chunk=1))
     decoder.sizes = []
     requests = [Request((task, seed), task, seed) for task in ("a", "b", "c") for seed in range(1, 7)]
     ended = list(run_together(decoder, requests, 4, stubs))
@@ -197,7 +196,7 @@ def test_the_next_episode_begins_where_one_ends_and_every_world_is_closed(stubs)
 
 def test_a_world_that_fails_ends_its_own_episode(stubs):
     requests = [Request(seed, "a", seed) for seed in (10, 11, 12, 13, 15)]
-    decoder = BatchDecoder(Decoder(target(), chunk=1))
+    decoder = BatchDecoder(Decoder(small(), chunk=1))
     ended = {request.key: result for request, result in run_together(decoder, requests, 2, stubs)}
     assert str(ended.pop(13)) == "the table broke"
     assert {seed: record.steps for seed, record in ended.items()} == {10: 3, 11: 4, 12: 5, 15: 1}
@@ -205,7 +204,7 @@ def test_a_world_that_fails_ends_its_own_episode(stubs):
 
 
 def test_stopping_early_closes_the_worlds(stubs):
-    running = run_together(BatchDecoder(Decoder(target(), chunk=1)), [Request(0, "a", 1), Request(1, "b", 6)], 2, stubs)
+    running = run_together(BatchDecoder(Decoder(small(), chunk=1)), [Request(0, "a", 1), Request(1, "b", 6)], 2, stubs)
     next(running)
     running.close()
     assert sorted(stubs.opened) == sorted(stubs.closed) == ["a", "b"]
@@ -234,26 +233,6 @@ def test_a_batch_of_real_episodes_is_what_they_are_one_by_one(policies, policy):
         assert (record.actions == one.actions).all()
         assert (record.path == one.path).all()
         assert (record.initial_state == one.initial_state).all()
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["method=spec_vla"],
-        ["method=early_unverified", "threshold=schedule"],
-        ["policy=expert"],
-        ["rollout.clock=real"],
-        ["deviation_every=2"],
-    ],
-)
-def test_what_cannot_be_batched_is_refused(policies, words):
-    target = [] if words == ["policy=expert"] else ["policy.target=nano-state"]
-    with pytest.raises(UsageError, match=words[-1]):
-        policies_of.check(settings(policies, *target, "rollout.batch=8", *words))
-
-
-def test_a_threshold_that_nothing_reads_may_be_batched(policies):
-    policies_of.check(settings(policies, "policy.target=nano-state", "rollout.batch=8", "threshold=schedule"))
 
 
 # --- studies

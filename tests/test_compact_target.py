@@ -1,4 +1,4 @@
-"""The compact target reads its spaces, its checkpoints, and grows without changing a token."""
+"""The compact target reads its spaces, its checkpoints, grows without changing a token, and decodes all at once."""
 
 import json
 from pathlib import Path
@@ -13,12 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from loaded import of_target
 
+from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.early.drafter import EarlyDrafter
+from kerv_cli.methods.parallel import ParallelPass
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.attention import CapturedCache, attention_mask, bucket
 from kerv_cli.targets.checkpoint import load_target
@@ -26,12 +28,14 @@ from kerv_cli.targets.compact.features import places_of, privileged_features, sc
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.settings import TargetSettings
-from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Trunk
 from kerv_cli.targets.folders import find_target, shipped_dir
 from kerv_cli.targets.grown import grow_stack
 from kerv_cli.targets.settings import GrowSettings
+from kerv_cli.training.imitation import check_init, continued_target
+from kerv_cli.training.settings import TrainTargetSettings
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 ARM = ObservationSpace(
@@ -265,3 +269,80 @@ def test_a_grown_target_whose_policy_changed_is_refused(policies, tmp_path):
     path.write_text(json.dumps(content))
     run = kerv("doctor", f"policy.target={tmp_path}/large", f"results={policies}", code=1)
     assert "build it again" in run.output
+
+
+# --- all tokens at once (docs/methods.md §6)
+
+
+SENTENCE = WordTokenizer.build(["pull the drawer open"])
+
+
+def shape_of(*overrides: str) -> TargetSettings:
+    words = ["target=nano", "target.observation=state", "target.chunk=2", *overrides]
+    return compose("train_target", words, TrainTargetSettings).target
+
+
+def small(*overrides: str) -> CompactTarget:
+    torch.manual_seed(1)
+    made = CompactTarget(shape_of(*overrides), SPEC.actions, SPEC.observation, SENTENCE)
+    torch.nn.init.normal_(made.head.weight, std=1.0)
+    return made.eval()
+
+
+def some_observation(seed: int = 0) -> Observation:
+    rng = np.random.default_rng(seed)
+    space = SPEC.observation
+    return Observation(
+        rng.normal(size=len(space.proprioception)), rng.normal(size=space.state), "pull the drawer open", {}
+    )
+
+
+def in_parallel(policy: CompactTarget, prompt: torch.Tensor) -> list[int]:
+    """The tokens by explicit loops over rows: the prompt is causal, every query sees everything."""
+    x = torch.cat([prompt, policy.queries[None]], 1)
+    length, size = x.shape[1], prompt.shape[1]
+    mask = torch.full((length, length), -torch.inf)
+    for row in range(length):
+        mask[row, : row + 1 if row < size else length] = 0
+    rotary = policy.trunk.rotary(torch.arange(length))
+    for layer in policy.trunk.layers:
+        x = layer(x, rotary, mask=mask)
+    return policy.head(policy.trunk.norm(x))[0, size:].argmax(-1).tolist()
+
+
+@pytest.mark.bits
+@torch.inference_mode()
+@pytest.mark.parametrize("packed", [False, True])
+def test_all_tokens_come_from_one_forward_in_which_they_see_each_other(packed):
+    policy = small("target.parallel=true")
+    wanted = in_parallel(policy, policy.encode(some_observation()))
+    if packed:
+        pack(policy)
+    decoder = Decoder(policy, Parts(skip=ParallelPass(policy)))
+    decoder.reset("", 0, np.zeros(3))
+    record = decoder.decode(some_observation())
+    assert list(record.tokens) == wanted
+    assert len(set(wanted)) > 1
+    assert (record.forwards, record.mode, record.unverified) == (1, "parallel", policy.chunk * policy.actions.dofs)
+    assert record.phases["prefill"] > 0
+
+
+@pytest.mark.bits
+def test_training_shows_it_no_action_token():
+    policy = small("target.parallel=true")
+    one = some_observation()
+    inputs: Inputs = policy.inputs(one)
+    first = torch.zeros(1, 8, dtype=torch.long)
+    logits = [policy.teacher_forced(inputs, tokens)[0] for tokens in (first, first + 5)]
+    assert torch.equal(*logits)
+
+
+def test_it_continues_an_autoregressive_target_with_fresh_queries():
+    plain = small()
+    made = continued_target(shape_of("target.parallel=true"), plain, "")
+    assert torch.equal(made.head.weight, plain.head.weight)
+    assert made.queries.shape == (8, plain.width)
+    described = type("D", (), {"settings": vars(plain.settings), "cameras": plain.cameras})()
+    check_init(shape_of("target.parallel=true"), "", described, Path("x"))
+    with pytest.raises(UsageError):
+        check_init(shape_of("target.parallel=true", "target.width=64"), "", described, Path("x"))

@@ -137,11 +137,25 @@ def test_only_what_needs_no_states_can_be_chosen_before_the_prefill():
         ("episodes=0", "episodes=0"),
         ("seed=7", "seed=7 is a training seed: evaluation begins at 100000"),
         ("seed=99999 episodes=2", "seed 100000 is for evaluation"),
+        ("policy=state method=parallel", "decodes token by token"),
+        ("policy=parallel method=ar", "use method=parallel"),
+        ("policy=parallel method=spec_vla", "use method=parallel"),
+        ("policy=parallel method=parallel proposer=jacobi", "proposer=jacobi: nothing is drafted"),
+        ("policy=parallel method=parallel deviation_every=2", "no AR to differ from"),
+        ("policy=state rollout.batch=8 method=spec_vla", "method=spec_vla"),
+        ("policy=state rollout.batch=8 method=early_unverified threshold=schedule", "threshold=schedule"),
+        ("policy=expert rollout.batch=8", "policy=expert"),
+        ("policy=state rollout.batch=8 rollout.clock=real", "rollout.clock=real"),
+        ("policy=state rollout.batch=8 deviation_every=2", "deviation_every=2"),
     ],
 )
-def test_a_rollout_that_cannot_be_is_refused_before_a_policy_is_read(overrides, says):
+def test_a_rollout_that_cannot_be_is_refused(overrides, says):
     with refused(says, error=UsageError):
         check_rollout(composed("task=reach", *overrides.split()))
+
+
+def test_a_threshold_that_nothing_reads_may_be_batched():
+    check_rollout(composed("task=reach", "policy=state", "rollout.batch=8", "threshold=schedule"))
 
 
 @pytest.mark.parametrize(
