@@ -117,6 +117,15 @@ def recorded(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def demonstrated(policies, recorded, tmp_path_factory):
+    """The policies and the demonstrations in one folder, which a module may change."""
+    folder = tmp_path_factory.mktemp("demonstrated")
+    for one in (policies, recorded):
+        shutil.copytree(one, folder, dirs_exist_ok=True)
+    return folder
+
+
 @pytest.fixture
 def results(policies, tmp_path):
     """A results folder with a copy of the policies, which a test may change."""

@@ -190,18 +190,10 @@ def test_the_command_ends_with_one_document(tmp_path):
     assert there.decode(8) > 8 * 12 * 15e-6
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["target=vla-15m"], "did you mean vla-150m"),
-        (["tokens=[]"], "tokens=[]: name at least one N"),
-        (["target=openvla-7b", "dtype=float32"], "cpu has 8.0 GB"),
-        (["projections.mine=[1]"], "GB/s and TFLOP/s"),
-    ],
-)
-def test_what_cannot_be_measured_is_refused(words, message, tmp_path, monkeypatch):
+def test_a_model_that_does_not_fit_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("kerv_cli.bench.model.memory_of", lambda device: 8e9)
-    assert message in refusal("bench", *words, f"results={tmp_path}", code=2)
+    words = ("target=openvla-7b", "dtype=float32", f"results={tmp_path}")
+    assert "cpu has 8.0 GB" in refusal("bench", *words, code=2)
 
 
 @pytest.mark.parametrize(

@@ -320,6 +320,15 @@ ANSWERS = [
     ("serve method=heisd", "its calibration or drafts differ between tasks: name one with task=NAME"),
     ("serve method=spec_vla proposer=retrieval task=rech", "unknown task 'rech': did you mean reach-v3?"),
     ("serve policy=expert", "policy=expert: it needs the simulator and cannot be served"),
+    ("prepare policy=state for=scout_unverified", "needs a target that sees"),
+    ("prepare policy=parallel", "decodes all tokens at once"),
+    ("train drafter drafter=erly", "unknown drafter 'erly': did you mean early"),
+    ("train drafter drafter.kind=early", "drafter.kind=early: choose drafter=early, each has settings of its own"),
+    ("bench target=vla-15m", "did you mean vla-150m"),
+    ("bench tokens=[]", "tokens=[]: name at least one N"),
+    ("bench projections.mine=[1]", "GB/s and TFLOP/s"),
+    ("serve gripper=loose", "unknown gripper 'loose'"),
+    ("serve port=70000", "port=70000"),
     ("demos policy=vision policy.target=nope task=reach", "train it with 'kerv train target name=nope'"),
 ]
 """A line as typed -> what its answer says."""

@@ -1,7 +1,6 @@
 """Drafters: the dynamic tree against one that walks every path alone, and the early drafter's training."""
 
 import dataclasses
-import shutil
 from typing import Any
 
 import pytest
@@ -12,7 +11,7 @@ from loaded import of_target
 from test_decoding_lossless import random_prompt, random_target
 
 from kerv_cli.base.config import compose
-from kerv_cli.base.errors import CheckpointError, UnknownName
+from kerv_cli.base.errors import CheckpointError
 from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.methods.artifacts import MadeFor
 from kerv_cli.methods.eagle import DrafterSettings
@@ -25,7 +24,6 @@ from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.observations import split
-from kerv_cli.training.drafter import DrafterRun
 from kerv_cli.training.imitation import load_samples
 from kerv_cli.training.settings import TrainDrafterSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset
@@ -213,15 +211,6 @@ def test_the_odds_are_those_of_independent_tokens(seed, radius):
 # what it is trained on
 
 
-@pytest.fixture(scope="module")
-def results(tmp_path_factory, policies, recorded):
-    """The nano policies' results folder with a few real demonstrations."""
-    folder = tmp_path_factory.mktemp("early")
-    shutil.copytree(policies, folder, dirs_exist_ok=True)
-    shutil.copytree(recorded, folder, dirs_exist_ok=True)
-    return folder
-
-
 def examples_of(
     target: CompactTarget, dataset: DemoDataset, settings: EarlySettings
 ) -> tuple[EarlyExamples, EarlyExamples]:
@@ -231,12 +220,12 @@ def examples_of(
 
 @pytest.mark.bits
 @pytest.mark.parametrize("name", ["nano-vision", "nano-state"])
-def test_the_teachers_tokens_are_the_targets_own_decodes(results, name):
+def test_the_teachers_tokens_are_the_targets_own_decodes(demonstrated, name):
     """Batched over episodes, yet sample by sample what the decoder gives for that observation."""
     from kerv_cli.engine.decoder import Decoder
 
-    target = load_target(results / "artifacts/target" / name)[0]
-    dataset = DemoDataset.open(results / "artifacts/demos/few")
+    target = load_target(demonstrated / "artifacts/target" / name)[0]
+    dataset = DemoDataset.open(demonstrated / "artifacts/demos/few")
     taught, held = examples_of(target, dataset, SMALL)
     every = load_samples(dataset, target.settings, target.words, ("drawer-close-v3",))
     samples, unseen = split(every, 0.34)
@@ -279,5 +268,3 @@ def test_a_saved_drafter_drafts_the_same_and_a_missing_one_says_what_to_run(tmp_
 def test_the_config_brings_its_own_optimisation_and_yields_to_the_command_line():
     assert compose("train_drafter", ["drafter=early"], TrainDrafterSettings).train.batch == 256
     assert compose("train_drafter", ["drafter=early", "train.batch=9"], TrainDrafterSettings).train.batch == 9
-    with pytest.raises(UnknownName, match=r"drafter\.kind"):
-        DrafterRun(compose("train_drafter", ["drafter.kind=late"], TrainDrafterSettings))

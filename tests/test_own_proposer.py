@@ -13,7 +13,6 @@ from examples.own_proposer_table import FollowDrafter, FollowTable
 from test_calibration import write_dataset
 
 from kerv_cli.base.config import compose
-from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import Observation
 from kerv_cli.catalogue.entries import find_runs, matching
 from kerv_cli.engine.decoder import Decoder
@@ -21,8 +20,6 @@ from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.settings import RolloutSettings, settings_from
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.compose import Method
-from kerv_cli.training.drafter import DrafterRun
-from kerv_cli.training.settings import TrainDrafterSettings
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 
@@ -99,15 +96,3 @@ def test_it_is_trained_from_the_command_line_and_drafts_in_a_rollout(results):
     files = files_of(settings_of(results, name="learnt"))
     assert files.check(["follow"])["follow"] == described["sha256"]
     assert not torch.equal(files.load("follow").logits, FollowTable(4, 255).logits)
-
-
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["drafter=folow"], "unknown drafter 'folow': did you mean follow"),
-        (["drafter.kind=follow"], "drafter.kind=follow: choose drafter=follow, each has settings of its own"),
-    ],
-)
-def test_its_training_has_settings_of_its_own(words, says):
-    with pytest.raises(UsageError, match=says):
-        DrafterRun(compose("train_drafter", words, TrainDrafterSettings))

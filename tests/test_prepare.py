@@ -229,20 +229,6 @@ def test_a_training_is_logged_as_it_runs_and_draws_its_curves(results, monkeypat
     assert (results / "artifacts/target/short/curves.png").is_file()
 
 
-@pytest.mark.usefixtures("results")
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["policy.target=min"], "no target 'min'"),
-        ([MINE, "for=heisdd"], "did you mean heisd"),
-        ([MINE, "for=scout_unverified"], "needs a target that sees"),
-        (["policy=parallel"], "decodes all tokens at once"),
-    ],
-)
-def test_prepare_refuses_what_cannot_be(words, says):
-    assert says in told("prepare", *words, code=2)
-
-
 @pytest.mark.usefixtures("quick_training")
 def test_a_target_whose_training_was_interrupted_is_finished_by_the_command_that_is_shown(results):
     train = ["train", "target", "name=new", "demos=few", "target=nano", "target.observation=state", "train.steps=2"]

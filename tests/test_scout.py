@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import shutil
 from typing import Any
 
 import numpy as np
@@ -39,15 +38,6 @@ from kerv_cli.training.settings import PrepareSettings
 
 SMALL = ScoutSettings(width=24, rank=4, keypoints=4, cell_width=8, cell_features=2, word_width=4)
 TASK = "drawer-close-v3"
-
-
-@pytest.fixture(scope="module")
-def results(tmp_path_factory, policies, recorded):
-    """The nano policies' results folder with a few real demonstrations."""
-    folder = tmp_path_factory.mktemp("scout")
-    shutil.copytree(policies, folder, dirs_exist_ok=True)
-    shutil.copytree(recorded, folder, dirs_exist_ok=True)
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -126,20 +116,20 @@ def test_packed_weights_give_the_same_draft(target, scout, views):
 
 
 @pytest.mark.usefixtures("quick_training")
-def test_it_is_trained_from_the_command_line_for_its_target_alone(results):
+def test_it_is_trained_from_the_command_line_for_its_target_alone(demonstrated):
     words = ["train", "drafter", "drafter=scout", "demos=few", "policy.target=nano-vision"]
     words += ["policy.artifacts.scout=mine", "drafter.width=24", "drafter.rank=4", "train.batch=8", "train.steps=4"]
     words += ["train.scene_steps=2", "train.held_out=0.34", "train.validate_every=4"]
-    done = kerv(*words, f"results={results}")
+    done = kerv(*words, f"results={demonstrated}")
     assert "object_error_cm" in done.stdout
-    target, description = load_target(results / "artifacts/target/nano-vision")
-    files, folder = ScoutDrafter(), results / "artifacts/scout/mine"
+    target, description = load_target(demonstrated / "artifacts/target/nano-vision")
+    files, folder = ScoutDrafter(), demonstrated / "artifacts/scout/mine"
     assert files.load(folder, of_target(description, target)).settings.width == 24
-    state = load_target(results / "artifacts/target/nano-state")[0]
+    state = load_target(demonstrated / "artifacts/target/nano-state")[0]
     with pytest.raises(CheckpointError):
         check_sees(state)
     rollout = ["rollout", "method=scout_unverified", f"task={TASK}", "episodes=1", "record=0", "world.horizon=12"]
-    rollout += ["policy.target=nano-vision", f"results={results}"]
+    rollout += ["policy.target=nano-vision", f"results={demonstrated}"]
     kerv(*rollout, "policy.artifacts.scout=mine")
     missing = kerv(*rollout, code=1)
     assert "no scout in" in missing.stderr
@@ -223,30 +213,34 @@ def test_a_certificate_of_another_draft_method_chunk_format_or_world_is_refused(
         CertificateArtifact().check_use(issued, Use({}, "float32", "metaworld", world={**world, "horizon": 120}))
 
 
-def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results, monkeypatch):
-    study = results / "tiny.yaml"
+def test_a_study_becomes_a_certificate_and_the_certificate_a_method(demonstrated, monkeypatch):
+    study = demonstrated / "tiny.yaml"
     study.write_text(
         "common: method=early_unverified prefill_draft=hold proposer=none threshold.r=9 "
         f"task={TASK} seed=50500 episodes=2 record=0 world.horizon=8 policy.target=nano-vision\n"
         "block: 2\nsettings:\n  ar: method=ar prefill_draft=none\n  half: skip=streak skip.most=1\n  all: skip=always\n"
     )
-    words = ["calibrate", "success", f"study={study}", "study.repeats=2", f"results={results}"]
+    words = ["calibrate", "success", f"study={study}", "study.repeats=2", f"results={demonstrated}"]
     words += ["margin=99", "delta=0.5"]
     unsolved = kerv(*words)
     assert "nothing is certified: AR solved 0 of 2 episodes" in unsolved.stdout
-    prepared = PrepareSettings(results=str(results), policy=PolicySettings(target="nano-vision"))
+    prepared = PrepareSettings(results=str(demonstrated), policy=PolicySettings(target="nano-vision"))
     assert "autoregressive decoding does not solve these tasks (0 % of its" in unsolved_by(prepared)
     monkeypatch.setattr("kerv_cli.report.certificate.SOLVED_BY_AR", 0.0)
     done = kerv(*words)
-    path = results / "artifacts/target/nano-vision"  # beside the target
     assert "0/2" in done.stdout  # a repeat is no pair
-    written = next(results.rglob("certificate.json"))
-    assert written.is_file(), path
-    serve = ["serve", "--plan", "policy.target=nano-vision", f"results={results}", "port=0"]
+    written = next(demonstrated.rglob("certificate.json"))
+    serve = ["serve", "--plan", "policy.target=nano-vision", f"results={demonstrated}", "port=0"]
     serve += ["prefill_draft=scoped", "prefill_draft.outside=hold", "skip=certified"]
     kerv(*serve)
     deploy = ["rollout", "--plan", "method=one_pass_certified", "prefill_draft.outside=hold"]
-    deploy += ["policy.target=nano-vision", f"task={TASK}", "threshold.r=9", "world.horizon=8", f"results={results}"]
+    deploy += [
+        "policy.target=nano-vision",
+        f"task={TASK}",
+        "threshold.r=9",
+        "world.horizon=8",
+        f"results={demonstrated}",
+    ]
     other = kerv(*deploy, code=2)  # before anything runs
     assert "with proposer.kind=drafter: the certificate is of none" in other.stderr
     kerv(*deploy, "proposer=none")
@@ -259,7 +253,7 @@ def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results, mon
     assert read_json(written)["earlier"] == []
     few = [*words[:-2], "margin=1", "delta=0.5", "policy.artifacts.certificate=few"]
     rollout = ["rollout", "method=ar", "policy.target=nano-vision", f"task={TASK}", "seed=50510", "episodes=1"]
-    kerv(*rollout, "record=0", "world.horizon=8", f"results={results}")
+    kerv(*rollout, "record=0", "world.horizon=8", f"results={demonstrated}")
     for more, says in (
         ([], "again=true to test on other seeds at delta=0.25"),
         (["again=true"], "seeds 50500-50501 served an earlier test"),
@@ -267,7 +261,7 @@ def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results, mon
     ):
         assert says in kerv(*few, *more, code=2).stderr
     assert "nothing is certified" in kerv(*few, "again=true", "seed=50520", "--json").stdout
-    issued = read_json(results / "artifacts/certificate/few/certificate.json")
+    issued = read_json(demonstrated / "artifacts/certificate/few/certificate.json")
     (earlier,) = issued["earlier"]
     assert (issued["delta"], issued["seeds"]) == (0.25, "50520-50521")
     assert (earlier["seeds"], earlier["delta"], earlier["margin"]) == ("50500-50501", 0.5, 99.0)

@@ -229,19 +229,10 @@ def test_grippers(policy, gripper, values):
     np.testing.assert_allclose(made[:, 0], [0.3, 0])
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["gripper=loose"], "unknown gripper 'loose'"),
-        (["port=70000"], "port=70000"),
-        (["policy.target=nobody"], "no target 'nobody'"),
-        (["method=one_pass"], "no early drafter in"),
-        (["host=256.1.1.1", "port=0"], "cannot listen on 256.1.1.1:0"),
-    ],
-)
-def test_a_server_that_cannot_start_says_so(policies, words, said):
-    target = [] if "policy.target=nobody" in words else ["policy.target=nano-vision"]
-    assert said in refusal("serve", *target, f"results={policies}", *words)
+def test_a_server_that_cannot_start_says_so(policies):
+    words = ("serve", "policy.target=nano-vision", f"results={policies}")
+    assert "no early drafter in" in refusal(*words, "method=one_pass", code=1)
+    assert "cannot listen on 256.1.1.1:0" in refusal(*words, "host=256.1.1.1", "port=0")
 
 
 def test_the_command_answers_and_stops_when_told(policies, tmp_path):
