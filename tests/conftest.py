@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import examples.insertion  # noqa: F401 - registers the environment with seven degrees of freedom
+import hypothesis
 import pytest
 
 from kerv_cli.base import registry
@@ -25,6 +26,8 @@ from kerv_cli.lab.command import STORE
 from kerv_cli.lab.database import Database
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+hypothesis.settings.register_profile("shared machine", deadline=None)
+hypothesis.settings.load_profile("shared machine")
 
 ENVIRONMENTS = dict(registry.parts("environment"))
 """kerv's own and the example `insertion`, taken before test modules are imported."""

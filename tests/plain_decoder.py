@@ -82,17 +82,9 @@ class PlainC:
         """Compile it into a folder. Raises OSError without a compiler."""
         library, source = folder / "plain_decoder.so", Path(__file__).with_suffix(".c")
         # not -ffast-math: linked, it would flush subnormal numbers to zero in the whole process
-        flags = [
-            "-O3",
-            "-march=native",
-            "-fno-math-errno",
-            "-fno-trapping-math",
-            "-fassociative-math",
-            "-fno-signed-zeros",
-            "-freciprocal-math",
-        ]
-        flags += ["-shared", "-fPIC"]
-        subprocess.run(["gcc", *flags, str(source), "-o", str(library), "-lm"], check=True)
+        flags = "-O3 -march=native -fno-math-errno -fno-trapping-math -fassociative-math -fno-signed-zeros"
+        flags += " -freciprocal-math -shared -fPIC"
+        subprocess.run(["gcc", *flags.split(), str(source), "-o", str(library), "-lm"], check=True)
         self.decode, self.plain = ctypes.CDLL(str(library)).decode, plain
         matrices = [w[name] for w, _ in plain.layers for name in ("qkv", "out", "gate_up", "down")] + [plain.head]
         self.weights = np.concatenate([matrix.ravel() for matrix in matrices]).astype(np.float16)

@@ -18,7 +18,6 @@ from command import told
 from conftest import refused
 from examples.own_target import SEVEN
 from hypothesis import given
-from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from loaded import datastore_of
 
@@ -338,7 +337,6 @@ def store_of(similar: np.ndarray, tokens: np.ndarray, seeds: np.ndarray, space: 
     return datastore_of(vectors, tokens, {"a": slice(0, len(tokens))}, seeds, space=space)
 
 
-@hypothesis_settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 60), st.sampled_from([0.5, 0.7, 0.9, 0.97]), st.integers(1, 25))
 def test_the_lowest_level_is_the_definitions(seed, n, confidence, least):
     """Against every level tried one by one; few distinct similarities, so that ties are many."""
@@ -351,7 +349,6 @@ def test_the_lowest_level_is_the_definitions(seed, n, confidence, least):
     assert lowest_level(Matches(similarity, good * 1.0, good), confidence, least) == (min(levels) if levels else None)
 
 
-@hypothesis_settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.5, 0.6, 0.8, 0.9, 0.95, 0.99]), st.floats(0.05, 1.0))
 def test_the_bounds_hold_the_level(seed, confidence, share):
     rng = np.random.default_rng(seed)

@@ -111,7 +111,6 @@ def store_of(vectors: np.ndarray, shards: dict[str, slice], seeds: np.ndarray | 
 
 
 @pytest.mark.bits
-@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(0, 20), st.integers(1, 12), st.integers(1, 4))
 def test_the_search_is_brute_force_with_ties_in_stored_order(seed, n, before, k, span):
     """Small whole numbers, so that scores are exact and ties are many."""
@@ -132,7 +131,7 @@ def test_the_search_is_brute_force_with_ties_in_stored_order(seed, n, before, k,
 
 
 @pytest.mark.bits
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(
     seed=st.integers(0, 2**32 - 1),
     size=st.sampled_from([(500, 64), (9001, 192), (10, 1024)]),
@@ -420,7 +419,7 @@ def ranked_paths(
     return sorted(below(0, (), 1.0, everyone, everyone), reverse=True)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     st.integers(0, 2**32 - 1),
     st.sampled_from([SPACE, SEVEN]),

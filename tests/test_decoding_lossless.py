@@ -115,7 +115,7 @@ def assert_adds_up(chunk: Chunk) -> None:
         start += r.committed
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     seed=st.integers(0, 10_000),
     layers=st.integers(1, 3),
@@ -207,7 +207,7 @@ def spaces(draw: st.DrawFn) -> ActionSpace:
     return ActionSpace(names, groups, names[-1:], 20.0, tuple(-x for x in unit), unit, bins=draw(st.integers(3, 40)))
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(
     seed=st.integers(0, 10_000),
     actions=spaces(),

@@ -58,25 +58,32 @@ def write(folder: Path, text: str) -> None:
     write_folder(folder, lambda new: (new / "file").write_text(text))
 
 
-def test_a_folder_is_exchanged_in_one_step(tmp_path, monkeypatch):
-    folder = tmp_path / "store"
-    write(folder, "old")
+@pytest.fixture
+def store(tmp_path):
+    """A folder that holds "old"."""
+    write(tmp_path / "store", "old")
+    return tmp_path / "store"
+
+
+def assert_alone(store: Path, text: str) -> None:
+    """It holds this text, and nothing is beside it."""
+    assert (store / "file").read_text() == text
+    assert [path.name for path in store.parent.iterdir()] == ["store"]
+
+
+def test_a_folder_is_exchanged_in_one_step(store, monkeypatch):
     renames: list[object] = []
     rename = os.rename
     monkeypatch.setattr(os, "rename", lambda a, b: (renames.append(a), rename(a, b)))
-    write(folder, "new")
-    assert (folder / "file").read_text() == "new"
+    write(store, "new")
+    assert_alone(store, "new")
     assert renames == []  # no moment without a folder
-    assert [path.name for path in tmp_path.iterdir()] == ["store"]
 
 
-def test_where_folders_cannot_be_exchanged_two_renames_do(tmp_path, monkeypatch):
-    folder = tmp_path / "store"
-    write(folder, "old")
+def test_where_folders_cannot_be_exchanged_two_renames_do(store, monkeypatch):
     monkeypatch.setattr(files.ctypes, "CDLL", lambda name, use_errno: object())
-    write(folder, "new")
-    assert (folder / "file").read_text() == "new"
-    assert [path.name for path in tmp_path.iterdir()] == ["store"]
+    write(store, "new")
+    assert_alone(store, "new")
 
 
 def fail(folder: Path) -> None:
@@ -84,13 +91,10 @@ def fail(folder: Path) -> None:
     raise KeyboardInterrupt
 
 
-def test_a_folder_that_fails_leaves_the_old_one(tmp_path):
-    folder = tmp_path / "store"
-    write(folder, "old")
+def test_a_folder_that_fails_leaves_the_old_one(store):
     with pytest.raises(KeyboardInterrupt):
-        write_folder(folder, fail)
-    assert (folder / "file").read_text() == "old"
-    assert [path.name for path in tmp_path.iterdir()] == ["store"]
+        write_folder(store, fail)
+    assert_alone(store, "old")
 
 
 SIGKILLED = """
@@ -110,16 +114,14 @@ files.write_folder(Path(sys.argv[1]), lambda new: (new / "file").write_text("new
 
 
 @pytest.mark.parametrize("moment", [1, 2, 3])
-def test_a_kill_while_a_folder_is_replaced_leaves_a_whole_one(tmp_path, moment):
-    folder = tmp_path / "store"
-    write(folder, "old")
-    run = subprocess.run([sys.executable, "-c", SIGKILLED, str(folder), str(moment)], check=False)
+def test_a_kill_while_a_folder_is_replaced_leaves_a_whole_one(store, moment):
+    run = subprocess.run([sys.executable, "-c", SIGKILLED, str(store), str(moment)], check=False)
     assert run.returncode < 0
-    assert (folder / "file").read_text() == ("new" if moment == 3 else "old")
-    assert len(list(left_over(tmp_path))) == 1
-    write(folder, "newest")
-    clean(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["store"]
+    assert (store / "file").read_text() == ("new" if moment == 3 else "old")
+    assert len(list(left_over(store.parent))) == 1
+    write(store, "newest")
+    clean(store.parent)
+    assert_alone(store, "newest")
 
 
 # --- sim files

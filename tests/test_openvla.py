@@ -310,7 +310,7 @@ def test_the_crop_is_tensorflows(target):
 
 
 @pytest.mark.bits
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 10_000), nodes=st.integers(0, 24), inside=st.booleans(), fixed=st.booleans())
 def test_strict_decoding_equals_ar(target, monkeypatch, seed, nodes, inside, fixed):
     monkeypatch.setattr(target, "new_cache", lambda batch, size: OpenVLATarget.new_cache(target, batch, size, fixed))

@@ -94,16 +94,8 @@ def test_an_installed_wheel_runs_its_main_job_from_another_folder(wheel, install
     sizes = [entry.file_size for entry in wheel.infolist() if entry.filename.startswith("kerv_cli/pretrained/")]
     assert 10e6 < sum(sizes) < 20e6, "docs/install.md and pyproject.toml state its size"
     command = ["rollout", "method=one_pass", "task=drawer-open", "episodes=1", "world.horizon=8", "record=0"]
-    run = subprocess.run(
-        [sys.executable, "-W", "ignore", "-m", "kerv_cli", *command],
-        cwd=tmp_path,
-        env=installed,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert run.returncode == 0, run.stderr
-    assert "one_pass, observation vision" in run.stdout
+    command = [sys.executable, "-W", "ignore", "-m", "kerv_cli", *command]
+    assert "one_pass, observation vision" in subprocess.check_output(command, cwd=tmp_path, env=installed, text=True)
     assert (tmp_path / "results/kerv.db").is_file()
 
 
@@ -158,18 +150,11 @@ class Checkout:
     def user(self, uid: int) -> None:
         executable(self.bin / "id", f"echo {uid}")
 
-    def environment(self, **extra: str) -> dict[str, str]:
-        return {
-            "PATH": str(self.bin),
-            "HOME": str(self.root),
-            "KERV_TEST_PYTHON": sys.executable,
-            "KERV_NVIDIA": str(self.root / "driver"),
-            **extra,
-        }
-
     def setup(self, **extra: str) -> subprocess.CompletedProcess[str]:
+        own = {"PATH": str(self.bin), "HOME": str(self.root), "KERV_TEST_PYTHON": sys.executable}
+        environment = {**own, "KERV_NVIDIA": str(self.root / "driver"), **extra}
         return subprocess.run(
-            ["make", "setup"], cwd=self.root, env=self.environment(**extra), capture_output=True, text=True, check=False
+            ["make", "setup"], cwd=self.root, env=environment, capture_output=True, text=True, check=False
         )
 
     @property

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from examples.own_target import MockTarget
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from test_decoding_lossless import plain_greedy
@@ -262,7 +262,6 @@ def most_probable_path(window: np.ndarray, q: float, r: float, steps: int, dampi
 log_scale = st.floats(-4, 3).map(lambda x: 10.0**x)
 
 
-@settings(deadline=None)  # the machine is shared
 @given(
     arrays(np.float64, st.tuples(st.integers(2, 14), st.just(DOFS)), elements=st.floats(-1, 1)),
     log_scale,
@@ -288,7 +287,6 @@ def test_hold_and_linear():
     )
 
 
-@settings(deadline=None)  # the machine is shared
 @given(
     st.sampled_from(tuple(PREDICTORS)),
     arrays(np.float64, (7, DOFS), elements=st.floats(-1, 1)),

@@ -102,7 +102,7 @@ def passes(trunk: Trunk, x: torch.Tensor, prompt: int, tree: Draft) -> list[torc
     return found
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     seed=st.integers(0, 10_000),
     layers=st.integers(1, 2),
@@ -123,7 +123,7 @@ def test_the_packed_trunk_is_the_trunk(seed, layers, heads, channels, prompt, no
     assert torch.equal(x, before)  # the caller's tensor is left alone
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(
     seed=st.integers(0, 10_000),
     grid=st.sampled_from([1, 2, 3]),

@@ -83,7 +83,7 @@ def proposers(target: CompactTarget, prompt: torch.Tensor, truth: list[int], see
 
 
 @pytest.mark.bits
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 10_000), chunk=st.sampled_from([1, 4, 8]), data=st.data())
 @pytest.mark.parametrize("name", ["hold", "linear", "kalman", "early", "retrieval", "merged", "follow", "hybrid"])
 def test_every_proposer_is_lossless(name, seed, chunk, data):

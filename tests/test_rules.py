@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import refused
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from kerv_cli.base.config import compose
@@ -62,14 +62,12 @@ def line(rng: np.random.Generator, length: float, n: int = WINDOW) -> np.ndarray
     return np.linspace(0, length, n)[:, None] * direction + rng.uniform(-1, 1, 3)
 
 
-@settings(deadline=None)
 @given(seeds, st.floats(0.005, 5.0), st.floats(0.2, 2 * np.pi), st.integers(3, 30))
 def test_the_radius_is_exact_on_arcs(seed, radius, angle, n):
     points = arc(np.random.default_rng(seed), radius, radius * angle * (n - 1) / n, n)
     assert radius_of_curvature(points) == pytest.approx(radius, rel=1e-6)
 
 
-@settings(deadline=None)
 @given(seeds, st.floats(0.01, 0.5), st.integers(3, 30))
 def test_a_line_has_no_finite_radius(seed, length, n):
     points = line(np.random.default_rng(seed), length, n)
@@ -211,7 +209,6 @@ def rounded(r: float) -> int:
     return math.floor(r + 0.5)
 
 
-@settings(deadline=None)  # the machine is shared
 @given(levels, st.floats(0.01, 5), st.floats(0.5, 4))
 def test_kinematic_is_the_level_form(k, k_s, phi):
     r = radius_after(threshold("kinematic", k_s=k_s, phi=phi), k)
@@ -230,7 +227,6 @@ def test_kinematic_at_its_landmarks():
     assert chosen.radius() == 9
 
 
-@settings(deadline=None)  # the machine is shared
 @given(st.lists(st.one_of(st.none(), levels, st.floats(0, 1)), max_size=20))
 def test_change_is_its_closed_form(history):
     chosen = threshold("change")

@@ -7,8 +7,8 @@ import shutil
 import sqlite3
 import subprocess
 import sys
-import threading
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -210,18 +210,8 @@ def test_clients_of_a_batch_get_the_actions_that_each_would_alone(results):
     states = [np.random.default_rng(seed).normal(size=39) for seed in range(3)]
 
     def actions(policy):
-        made: dict[int, np.ndarray] = {}
-
-        def client(i, port):
-            made[i] = Client(port).act(images={}, state=states[i])
-
-        with serving(policy) as (port, _):
-            threads = [threading.Thread(target=client, args=(i, port)) for i in range(3)]
-            for thread in threads:
-                thread.start()
-            for thread in threads:
-                thread.join()
-        return [made[i] for i in range(3)]
+        with serving(policy) as (port, _), ThreadPoolExecutor(3) as pool:
+            return list(pool.map(lambda state: Client(port).act(images={}, state=state), states))
 
     np.testing.assert_allclose(actions(together), actions(alone), atol=1e-5)
     with pytest.raises(UsageError, match=r"^batch=3: method=naive_sd"):
@@ -230,25 +220,19 @@ def test_clients_of_a_batch_get_the_actions_that_each_would_alone(results):
 
 def test_one_bad_observation_of_a_batch_is_no_others_fault(results):
     policy = policy_of(results, "nano-state", "batch=2")
-    outcomes: dict[str, Any] = {}
 
-    def ask(instruction):
+    def outcome(instruction):
         client = VlaEval(policy)
         client.begin("reach-v3", 0, np.zeros(3))
         try:
-            seen = Observation(np.zeros(4), np.zeros(39), instruction)
-            outcomes[instruction] = policy.decode(client.decoder, seen).actions.shape
+            return policy.decode(client.decoder, Observation(np.zeros(4), np.zeros(39), instruction)).actions.shape
         except UsageError as error:
-            outcomes[instruction] = str(error)
+            return str(error)
 
-    long = "word " * 40
-    threads = [threading.Thread(target=ask, args=(instruction,)) for instruction in ("reach", long)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert outcomes["reach"] == (4, 4)
-    assert "40 words" in outcomes[long]
+    with ThreadPoolExecutor(2) as pool:
+        good, bad = pool.map(outcome, ("reach", "word " * 40))
+    assert good == (4, 4)
+    assert "40 words" in bad
 
 
 # --- Meta-World as a benchmark
