@@ -37,7 +37,7 @@ def check_writable(results: str) -> Path:
     if not parent.is_dir():
         raise UsageError(f"results={results}: {parent} is a file, name a folder")
     try:
-        # a file without a name, if the file system has such: nothing is left if the process is killed here
+        # an unnamed file, if the file system supports that: nothing is left if the process is killed here
         with storage_errors(folder), tempfile.TemporaryFile(dir=parent):
             pass
     except OSError as error:

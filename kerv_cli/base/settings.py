@@ -51,7 +51,7 @@ class CommandSettings:
     """Settings of every command."""
 
     groups: ClassVar[Mapping[str, str]] = {}
-    """Group of conf/ -> the file that is chosen by default. If two groups set the same key, the later one wins."""
+    """The file that is chosen by default in each group of conf/. If two groups set the same key, the later one wins."""
 
     results: str = setting("results", "folder that kerv writes everything to")
     store: str = setting(

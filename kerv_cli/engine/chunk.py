@@ -276,7 +276,7 @@ class Chunk:
         """End the chunk with actions that are partly predicted.
 
         Args:
-            values: Normalised actions (steps, D): those of the committed tokens, then predicted ones.
+            values: Normalised actions (steps, D): first the values of the committed tokens, then predicted values.
             with_target_token: Whether the target's token at the rejected position stays committed.
         """
         self._remove_bonus(with_target_token)
@@ -289,7 +289,7 @@ class Chunk:
         The values are executed as they are. The target reads their nearest tokens.
 
         Args:
-            values: Normalised actions (steps, D): those of the committed tokens, then predicted ones.
+            values: Normalised actions (steps, D): first the values of the committed tokens, then predicted values.
             with_target_token: Whether the target's token at the rejected position stays committed.
         """
         self._remove_bonus(with_target_token)

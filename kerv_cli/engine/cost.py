@@ -46,7 +46,7 @@ class Profile:
 
     Attributes:
         prompt: Number of prompt tokens P.
-        phases: Kind of cost -> the measured numbers of rows, increasing, and the seconds of each.
+        phases: For each kind of cost, the measured numbers of rows, increasing, and the seconds for each number.
         tokens: Number of tokens N in a chunk.
         about: What was measured: target, machine, versions.
     """
@@ -133,8 +133,8 @@ class Work:
     """What several decodes computed: forwards, drafts, and recorded seconds of everything else.
 
     Attributes:
-        calls: Kind of cost -> its forwards or drafts, for the kinds that depend on the target's size (`FORWARDS`).
-        sources: Kind of cost -> (decodes,) bool, whether the decode used a proposer with this kind of cost.
+        calls: For each kind of cost that depends on the target's size (`FORWARDS`), its forwards or drafts.
+        sources: For each other kind of cost, (decodes,) bool: whether the decode used a proposer with this cost.
         host: (decodes,) recorded seconds that do not depend on the target's size, without proposing.
         propose: (decodes,) recorded seconds of proposing. 0 if the drafter drafted, because its cost is in `calls`.
     """
@@ -161,7 +161,7 @@ def work_of(
     """Return what several decodes computed, from the columns of their records.
 
     Args:
-        rounds: Name of a `Round` attribute -> its values (n,) over all rounds of all decodes: mode, proposer, start,
+        rounds: Values (n,) over the n rounds of all decodes, for each of the `Round` attributes mode, proposer, start,
             tree_size and accepted.
         counts: Number of rounds of each decode, (decodes,).
         phases: Recorded seconds of each of `READ_PHASES`, (decodes,).

@@ -249,10 +249,10 @@ class Decoder(ActionDecoder):
         return draft
 
     def verify(self, chunk: Chunk, draft: Draft) -> Verified:
-        """Run the target over the draft, preceded by the tokens that are not in its cache yet.
+        """Run the target over the tokens that are not in its cache yet, and then over the draft.
 
-        In the first round these tokens are the prompt. Later they are the last committed token, or the tokens that a
-        rectifier has filled.
+        In the first round, the tokens that are not in the cache are the prompt. Later they are the last committed
+        token, or the tokens that a rectifier has filled.
         """
         target, cache, uncached = self.target, chunk.cache, chunk.uncached
         before = len(uncached) or chunk.prompt_length

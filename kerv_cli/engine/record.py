@@ -100,7 +100,7 @@ class DecodeRecord:
     def unverified(self) -> int:
         """Number of executed tokens that the target did not verify.
 
-        In a skipped or parallel decode these are all tokens. In any other decode they are those that a rectifier
+        In a skipped or parallel decode these are all tokens. In any other decode they are the tokens that a rectifier
         predicted.
         """
         return len(self.tokens) if self.skipped or self.mode == PARALLEL else self.compensated

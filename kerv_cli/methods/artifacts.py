@@ -243,7 +243,7 @@ class Artifacts:
     ) -> None:
         self.results, self.policy, self.search, self.device, self.dtype = results, policy, search, device, dtype
         for kind, name in policy.artifacts.items():
-            if name is not None:  # settings stored beside a plugin name its kinds, which need not be here now
+            if name is not None:  # stored settings may list kinds of a plugin that is missing now
                 find("artifact", kind, "policy.artifacts")
         self.folder = find_target(results, policy.target)
 

@@ -24,7 +24,7 @@ class SpeedSkipSettings:
 
     kind: str = "speed"
     v_min: float = number(0.3, 0, 1000)  # lowest hand speed at which the regression is used, metres per second
-    v_max: float = number(1000.0, 0, 1000)  # highest such speed
+    v_max: float = number(1000.0, 0, 1000)  # highest hand speed at which the regression is used
     buffer: int = number(6, 2, 10)  # number of last actions that the regression reads (paper: n)
     share: float = number(0.5, 0, 1)  # the target must have decoded more than this share of them (paper: τ)
     penalty: float = number(1e-4, 0, 1e6)  # ridge penalty λ

@@ -162,7 +162,7 @@ class CapturedCache(Cache):
     attends to. The batch size is 1. On a CPU the same computation runs without graphs, for tests.
 
     Attributes:
-        steps: Number of rows of a graph (its bucket) -> the graph. Empty before the first forward.
+        steps: The graphs, by their number of rows (bucket). Empty before the first forward.
     """
 
     def __init__(self, layers: int, batch: int, heads: int, capacity: int, channels: int, like: Tensor) -> None:

@@ -29,8 +29,8 @@ def find_target(results: str, name: str) -> Path:
 
     Args:
         results: The results folder.
-        name: Path of the folder, or the name of a target in the results folder, or of a shipped policy. They are tried
-            in this order. A path contains a slash.
+        name: Path of the folder, which must contain a slash, or a name. A name is first looked up among the targets in
+            the results folder, then among the shipped policies.
 
     Raises:
         UsageError: There is no such target. The message lists the existing ones.

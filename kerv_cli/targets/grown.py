@@ -114,7 +114,7 @@ def _grown_layer(old: Layer | None, stack: LayerStack, shape: GrowSettings, gene
 
 
 def _head_rows(heads: int, channels: int, wide: int) -> Tensor:
-    """Return the index of each old head channel among the new ones, (heads · channels,).
+    """Return for each channel of the old heads its index among the channels of the new heads, (heads · channels,).
 
     A channel must keep its rotary frequency: pair i of the old head becomes pair i · wide / channels.
 
@@ -174,7 +174,7 @@ def grow(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
     """Make a grown target, for `kerv build target grow=SHAPE policy.target=NAME`: write its recipe.
 
     Returns:
-        The target's folder; name -> number for the user, such as the number of weights.
+        The target's folder, and numbers to print by name, such as the number of weights.
 
     Raises:
         UsageError: The policy is no compact target, or it does not fit into the new shape.

@@ -360,7 +360,7 @@ def assemble(
     flat[: len(values)] = values
     actions: np.ndarray = flat.reshape(steps, dofs)
     history = chunk.situation.history.values(actions[:whole])
-    if len(history):  # strict DoFs keep their last value; only without one the draft's tokens are used for them
+    if len(history):  # strict DoFs keep their last value; if there is none, they take the draft's tokens
         flat[len(tokens) :][chunk.space.strict_tokens(flat.size)[len(tokens) :]] = np.nan
     if np.isnan(actions).any():
         predicted = predictor.predict(history, steps - whole)

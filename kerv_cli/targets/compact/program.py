@@ -97,7 +97,7 @@ class Matrix:
 
 
 _MATRICES = WeakIdKeyDictionary()
-"""Weight tensor -> its `Matrix`. Programs with the same layer share it."""
+"""The `Matrix` of each weight tensor. Programs with the same layer share the matrix."""
 
 
 def matrix_of(weight: Tensor, bias: Tensor | None) -> Matrix:

@@ -88,7 +88,7 @@ class CompactTarget(Packable):
     Attributes:
         cameras: The camera whose images are read. Empty if the policy reads the state.
         frame_shape: Shape (height, width, 3) of an image.
-        segments: Name of a prompt part -> its slice of the prompt.
+        segments: Name of each part of the prompt -> the positions of its tokens, as a slice.
         sha256: Hash of the weights that were loaded. Empty if none were.
         chunk: H, number of control steps that it was trained to decode at once.
         parallel: Whether it decodes all tokens in one forward (`parallel_pass`), and cannot decode them one by one.

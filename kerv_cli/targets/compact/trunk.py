@@ -48,7 +48,7 @@ class Rotary(nn.Module):
 
 
 class Layer(nn.Module):
-    """One pre-norm decoder layer. One matrix gives q, k and v, another one both halves of the SwiGLU."""
+    """One pre-norm decoder layer. One matrix gives q, k and v. Another matrix gives both halves of the SwiGLU."""
 
     def __init__(self, width: int, heads: int, feed_forward: int) -> None:
         super().__init__()

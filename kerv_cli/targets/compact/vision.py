@@ -24,7 +24,7 @@ class Residual(nn.Module):
     Args:
         channels: C, number of channels.
         norm: `group` normalises eight groups of channels. `instance` normalises each channel by itself, which makes the
-            output least sensitive to light and colour. The weights have the same shapes.
+            output least sensitive to light and colour. Both have weights of the same shapes.
     """
 
     def __init__(self, channels: int, norm: str = "group") -> None:

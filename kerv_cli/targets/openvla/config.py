@@ -63,7 +63,7 @@ TOWERS = {
     "vit_large_patch14_reg4_dinov2.lvd142m": Tower(1024, 24, 16, 4096, registers=4, scaled=True),
     "vit_so400m_patch14_siglip_224": Tower(1152, 27, 16, 4304),
 }
-"""timm's name -> shape of the towers of OpenVLA: DINOv2 ViT-L/14 with registers, and SigLIP So400m/14."""
+"""Shapes of OpenVLA's two towers, by timm's name: DINOv2 ViT-L/14 with registers, and SigLIP So400m/14."""
 
 
 @dataclass(frozen=True)

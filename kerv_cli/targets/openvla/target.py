@@ -178,7 +178,7 @@ def read_settings(folder: Path, description: TargetDescription) -> OpenVLASettin
     """Return the settings in a target's description.
 
     Raises:
-        CheckpointError: They are not those of an OpenVLA target, or it has not exactly one camera.
+        CheckpointError: The settings are not those of an OpenVLA target, or they do not name exactly one camera.
     """
     path = str(folder / "target.json")
     if len(description.cameras) != 1:
@@ -210,7 +210,7 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
     """Make a target from an OpenVLA checkpoint: check all its weights, and write `target.json`.
 
     Returns:
-        The target's folder; name -> number for the user, such as the number of parameters.
+        The target's folder, and numbers to print by name, such as the number of parameters.
 
     Raises:
         UsageError: No checkpoint is named, or it has statistics of several data sets and none is chosen.
