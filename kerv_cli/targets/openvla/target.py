@@ -178,7 +178,7 @@ def read_settings(folder: Path, description: TargetDescription) -> OpenVLASettin
     """Return the settings in a target's description.
 
     Raises:
-        CheckpointError: The settings are not those of an OpenVLA target, or they do not name exactly one camera.
+        CheckpointError: The settings are not those of an OpenVLA target, or not exactly one camera is named.
     """
     path = str(folder / "target.json")
     if len(description.cameras) != 1:
