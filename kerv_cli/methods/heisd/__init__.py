@@ -29,15 +29,6 @@ class RetrievalProposerSettings:
     nodes: int = number(50, 1, MOST_TOKENS)  # maximum number of tree nodes
 
 
-@dataclass
-class QdrantSearchSettings:
-    """Search the datastore with Qdrant (pip install 'kerv[qdrant]'). Without url and path it searches in memory."""
-
-    kind: str = "qdrant"
-    url: str | None = None  # address of a server, such as http://localhost:6333
-    path: str | None = None  # folder for qdrant-client's local mode, which only one process at a time can use
-
-
 add("artifact", "datastore", _DATASTORE + "DatastoreArtifact", by_task=True, needs_task=True, described_by=MANIFEST)
 add(
     "proposer",
@@ -54,7 +45,6 @@ add(
     measured_by="retrieval_unverified",
 )
 add("datastore", "exact", _DATASTORE + "ExactIndex")
-add("datastore", "qdrant", _DATASTORE + "QdrantIndex", QdrantSearchSettings)
 
 
 @dataclass

@@ -14,10 +14,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -26,19 +24,18 @@ import torch
 from torch import Tensor
 
 from kerv_cli.base import registry
-from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.methods.artifacts import Artifact, Artifacts
-from kerv_cli.methods.heisd import MANIFEST, QdrantSearchSettings
+from kerv_cli.methods.heisd import MANIFEST
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.worlds import spec_of
 
 VECTORS, PAYLOAD, PROJECTION = "vectors.npy", "payload.parquet", "projection.npy"
 COLUMNS = {"seeds": "seed", "steps": "step", "left": "left"}
 AGAIN = "build one with 'kerv build datastore'"
-MARGIN = 8  # rows asked of Qdrant beyond k; if the last of them may tie with the k-th, all rows of the task are ranked
 ROUNDING = 1e-5  # largest rounding error of a float32 dot product of two unit vectors
 
 
@@ -197,72 +194,6 @@ class ExactIndex:
         return np.flatnonzero((scores >= least - slack) & (scores > -np.inf)) + shard.start
 
 
-class QdrantIndex:
-    """datastore=qdrant: search with a Qdrant server, or with the client alone, in a folder or in memory.
-
-    It needs the extra `qdrant`. Qdrant searches exactly within a task, and the function `best` ranks its results again.
-    So it finds the same neighbours as datastore=exact. The collection is named after the datastore's hash, so that
-    later processes find it on the server or in the folder.
-    """
-
-    def __init__(self, store: Datastore, settings: QdrantSearchSettings) -> None:
-        """Open the Qdrant collection of this datastore, and fill it if it is incomplete.
-
-        Args:
-            store: The datastore.
-            settings: Address of the server, or the folder.
-
-        Raises:
-            UsageError: qdrant-client is not installed, or the server or the folder cannot be used.
-        """
-        if find_spec("qdrant_client") is None:
-            raise UsageError("datastore=qdrant needs the extra: pip install 'kerv[qdrant]'")
-        from qdrant_client import QdrantClient, models
-
-        self.store, self.models, self.settings = store, models, settings
-        self.name = f"kerv-{store.manifest.content[:32]}"
-        with self._errors():
-            memory = None if settings.url or settings.path else ":memory:"
-            self.client = QdrantClient(memory, url=settings.url, path=settings.path, check_compatibility=False)
-            if not self.client.collection_exists(self.name):
-                parameters = models.VectorParams(size=store.vectors.shape[1], distance=models.Distance.DOT)
-                self.client.create_collection(self.name, parameters)
-            if self.client.count(self.name).count != len(store.vectors):  # new, or filled in part
-                tasks = [(task, row) for task, shard in store.shards.items() for row in range(shard.start, shard.stop)]
-                payloads = [{"task": task, "seed": int(store.seeds[row])} for task, row in tasks]
-                rows = [row for _, row in tasks]
-                self.client.upload_collection(self.name, store.vectors[rows], payloads, rows, wait=True)
-
-    def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return the k + MARGIN most similar rows; see `Index.candidates`.
-
-        If the last of these rows is as similar as the k-th, up to rounding, return all rows of the task instead.
-        """
-        m, store, shard = self.models, self.store, self.store.shards[task]
-        must = [m.FieldCondition(key="task", match=m.MatchValue(value=task))]
-        other = [] if without is None else [m.FieldCondition(key="seed", match=m.MatchValue(value=without))]
-        exact = m.SearchParams(exact=True) if self.settings.url else None  # local mode has no other search
-        how = {"search_params": exact, "limit": k + MARGIN, "with_payload": False}
-        with self._errors():
-            chosen = m.Filter(must=must, must_not=other)
-            found = self.client.query_points(self.name, key.tolist(), query_filter=chosen, **how).points
-        rows = np.sort(np.array([point.id for point in found], dtype=np.int64))
-        if len(found) < k + MARGIN:
-            return rows
-        slack = 2 * ROUNDING * store.longest * math.sqrt(key @ key)
-        if found[-1].score < best(store.vectors, rows, key, k)[1][-1] - slack:
-            return rows
-        return np.flatnonzero(store.seeds[shard] != without) + shard.start
-
-    @contextmanager
-    def _errors(self) -> Iterator[None]:
-        try:
-            yield
-        except Exception as error:  # the client raises errors of many libraries
-            where = " ".join(f"datastore.{name}={value}" for name, value in vars(self.settings).items() if value)
-            raise UsageError(f"{where}: Qdrant cannot search here ({' '.join(str(error).split())})") from error
-
-
 @dataclass(frozen=True)
 class Neighbours:
     """The k entries most similar to a key, most similar first. Equally similar entries keep the datastore's order."""
@@ -290,7 +221,7 @@ class Datastore:
 
     @functools.cached_property
     def index(self) -> Index:
-        """The search for similar keys that the setting `datastore=` chooses, such as exact or Qdrant."""
+        """The search for similar keys that the setting `datastore=` chooses."""
         kind = self.search.kind if self.search else "exact"
         index: Index = registry.find("datastore", kind, "datastore.kind").built(self, self.search)
         return index
@@ -312,7 +243,7 @@ class Datastore:
         Raises:
             CheckpointError: The datastore is missing or damaged. Or it was built for another target, other action
                 statistics or another chunk length. Or it was built from evaluation seeds.
-            UsageError: The search is unknown, its packages are not installed, or its server does not answer.
+            UsageError: The search is unknown or cannot be used.
         """
         manifest = DatastoreArtifact().checked(folder, description)
         rows, size = manifest.rows, manifest.chunk * manifest.actions.dofs
