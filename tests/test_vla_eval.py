@@ -8,7 +8,6 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,13 +31,12 @@ from websockets.sync.client import connect
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.spaces import Observation
 from kerv_cli.catalogue.evaluations import labelled, read_evaluations, read_served
 from kerv_cli.episodes.runner import Runner
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.serve.policy import Policy
 from kerv_cli.serve.settings import ServeSettings
-from kerv_cli.serve.vla_eval import VlaEval, dim_specs
+from kerv_cli.serve.vla_eval import dim_specs
 from kerv_cli.worlds.vla_eval import MetaWorld
 
 HORIZON = 10
@@ -203,36 +201,6 @@ def test_names_that_are_no_file_names_are_not_kept(policy, results):
         client.tell("episode_end", {"metrics": {"success": True}})
         client.act()
     assert not list(results.parent.rglob("x.arrow"))
-
-
-def test_clients_of_a_batch_get_the_actions_that_each_would_alone(results):
-    alone, together = policy_of(results, "nano-state"), policy_of(results, "nano-state", "batch=3")
-    states = [np.random.default_rng(seed).normal(size=39) for seed in range(3)]
-
-    def actions(policy):
-        with serving(policy) as (port, _), ThreadPoolExecutor(3) as pool:
-            return list(pool.map(lambda state: Client(port).act(images={}, state=state), states))
-
-    np.testing.assert_allclose(actions(together), actions(alone), atol=1e-5)
-    with pytest.raises(UsageError, match=r"^batch=3: method=naive_sd"):
-        policy_of(results, "nano-state", "batch=3", "method=naive_sd")
-
-
-def test_one_bad_observation_of_a_batch_is_no_others_fault(results):
-    policy = policy_of(results, "nano-state", "batch=2")
-
-    def outcome(instruction):
-        client = VlaEval(policy)
-        client.begin("reach-v3", 0, np.zeros(3))
-        try:
-            return policy.decode(client.decoder, Observation(np.zeros(4), np.zeros(39), instruction)).actions.shape
-        except UsageError as error:
-            return str(error)
-
-    with ThreadPoolExecutor(2) as pool:
-        good, bad = pool.map(outcome, ("reach", "word " * 40))
-    assert good == (4, 4)
-    assert "40 words" in bad
 
 
 # --- Meta-World as a benchmark

@@ -16,7 +16,7 @@ from kerv_cli.serve.settings import ServeSettings
 @command(
     "serve",
     ServeSettings,
-    keys="protocol policy method task host port gripper batch origins",
+    keys="protocol policy method task host port gripper origins",
     examples=("kerv serve policy=vision method=one_pass", "kerv serve protocol=vla_eval policy=state method=spec_vla"),
     typed={"task": "task_name"},  # renamed, because task= of other commands is a list
 )

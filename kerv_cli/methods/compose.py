@@ -53,13 +53,12 @@ class Method:
         kinds = (need for kind, part in self.parts.items() for need in part.needs(self.settings[kind]))
         return tuple(dict.fromkeys(kinds))
 
-    def check(self, target: Target | TargetDescription, batch: int = 1, key: str = "rollout.batch") -> None:
+    def check(self, target: Target | TargetDescription, batch: int = 1) -> None:
         """Refuse parts that do not work together or with the target, and numbers out of range. Loads no weights.
 
         Args:
             target: A loaded target, or a target's description.
             batch: Number of episodes that are decoded together.
-            key: The setting with that number, for the error message.
 
         Raises:
             UnknownName: The settings name a part that does not exist.
@@ -73,7 +72,7 @@ class Method:
         self._check_drafts()
         check_parallel(self.parts, is_parallel(target))
         self._check_skip()
-        self._check_batch(batch, key)
+        self._check_batch(batch)
 
     def _check_drafts(self) -> None:
         """Check the proposer, the boundary and the prefill draft.
@@ -102,16 +101,18 @@ class Method:
                 f"skip={skip.name} with prefill_draft={draft.name}: it executes a draft from before the prefill"
             )
 
-    def _check_batch(self, batch: int, key: str) -> None:
+    def _check_batch(self, batch: int) -> None:
         """Check that the method can decode several episodes together, if `batch` is not 1."""
         if batch == 1:
             return
         draft, proposer, skip, threshold = (self.parts[k] for k in ("prefill_draft", "proposer", "skip", "threshold"))
         is_used = draft.absent or skip.traits.get("takes_draft")
         if not (proposer.absent and skip.traits.get("batchable") and is_used):
-            raise UsageError(f"{key}={batch}: method={self.name} decodes one episode at a time. Leave {key} out")
+            raise UsageError(
+                f"rollout.batch={batch}: method={self.name} decodes one episode at a time. Leave rollout.batch out"
+            )
         if not draft.absent and not threshold.traits.get("batchable"):
-            raise UsageError(f"{key}={batch}: threshold={threshold.name} follows one episode. Use another")
+            raise UsageError(f"rollout.batch={batch}: threshold={threshold.name} follows one episode. Use another")
 
     def decoder(self, target: Target, artifact: Callable[[str], Any], task: str = "") -> Decoder:
         """Build the decoder of this method for a target.

@@ -5,9 +5,8 @@ from __future__ import annotations
 import abc
 import math
 import threading
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Callable
+from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
@@ -17,8 +16,6 @@ from torch import Tensor
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.registry import find
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.batched import BatchDecoder
-from kerv_cli.engine.chunk import EpisodeState
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.record import DecodeRecord
@@ -37,15 +34,12 @@ VLA_EVAL = "vla_eval"
 """The protocol in which clients name the task of every episode."""
 WARM_UP = 4
 """Number of decodes before a new decoder serves. The first calls are slow: they allocate memory and choose kernels."""
-GATHER = 0.005
-"""Seconds that a batch waits for the observations of more clients."""
 
 
 class Policy:
     """The policy and method that the server runs.
 
-    Every client gets its own decoder. All decoders share the weights. Only one decodes at a time, unless `batch` is
-    above 1: then the observations of several clients are decoded together.
+    Every client gets its own decoder. All decoders share the weights. Only one decodes at a time.
 
     Attributes:
         chunk: H, number of control steps in an answer.
@@ -68,7 +62,7 @@ class Policy:
         spec, name = specs().get(self.description.environment), settings.task_name
         self.task = spec.task(name).name if spec and name else name
         self.method = Method.of(settings)
-        self.method.check(self.description, settings.batch, "batch")
+        self.method.check(self.description)
         use = Use(self.method.settings, settings.runtime.dtype, self.description.environment)
         self.identity = self.artifacts.check(self.method.needs, use)
         self.interface = self._interface(spec)
@@ -81,7 +75,6 @@ class Policy:
         self._turn = threading.Lock()
         first = self._new_decoder(self._any_task())
         self.chunk = first.steps
-        self._together = Together(BatchDecoder(first), settings.batch) if settings.batch > 1 else None
         self._idle: list[Decoder] = [] if self.by_task else [first]
 
     def _interface(self, spec: EnvironmentSpec | None) -> Interface:
@@ -125,18 +118,16 @@ class Policy:
         artifact = self.artifacts.load(self._artifacts_with("by_task")[0])
         return next(iter(artifact.tasks), "")
 
-    def lend_decoder(self, task: str) -> Decoder | EpisodeState:
-        """Return a decoder for a new client. If clients are decoded together, return a new episode's state instead."""
-        if self._together is not None:
-            return self._together.decoder.new_episode()
+    def lend_decoder(self, task: str) -> Decoder:
+        """Return a decoder for a new client."""
         return self._idle.pop() if self._idle else self._new_decoder(task)
 
-    def take_back(self, decoder: Any) -> None:
+    def take_back(self, decoder: Decoder) -> None:
         """Keep a client's decoder for the next client. A decoder that depends on the task is dropped."""
-        if isinstance(decoder, Decoder) and not self.by_task:
+        if not self.by_task:
             self._idle.append(decoder)
 
-    def decode(self, decoder: Any, observation: Observation) -> DecodeRecord:
+    def decode(self, decoder: Decoder, observation: Observation) -> DecodeRecord:
         """Decode the observation of one client. Calls from several threads wait for each other.
 
         Args:
@@ -146,11 +137,10 @@ class Policy:
         Raises:
             KervError: The decode computed NaN or infinite numbers.
         """
-        if self._together is not None:
-            return self._together.decode(decoder, observation)
         with self._turn:
-            record: DecodeRecord = decoder.decode(observation)
-            decoder.target.check()
+            record = decoder.decode(observation)
+            target: Any = decoder.target
+            target.check()
         return record
 
     def _new_decoder(self, task: str) -> Decoder:
@@ -169,61 +159,6 @@ class Policy:
         if self.interface.size:
             settings["world"]["camera"] |= {"name": self.interface.cameras[0], "size": self.interface.size}
         return {"settings": settings, "identity": self.identity, "machine": stamp(self.artifacts.device)}
-
-
-@dataclass(frozen=True)
-class _Request:
-    """A client's observation that waits to be decoded in a batch."""
-
-    episode: EpisodeState
-    observation: Observation
-    answer: Future[DecodeRecord] = field(default_factory=Future)
-
-
-class Together:
-    """Decode the observations of several clients as one batch.
-
-    Args:
-        decoder: Decodes a batch.
-        most: Largest number of clients in a batch.
-    """
-
-    def __init__(self, decoder: BatchDecoder, most: int) -> None:
-        self.decoder, self.most = decoder, most
-        self._turn, self._arrived = threading.Lock(), threading.Condition()
-        self._waiting: list[_Request] = []
-
-    def decode(self, episode: EpisodeState, observation: Observation) -> DecodeRecord:
-        """Decode one client's observation, together with those of other clients that wait at the same time.
-
-        Each client calls this in its own thread. The first to get the lock decodes for all that wait.
-        """
-        mine = _Request(episode, observation)
-        with self._arrived:
-            self._waiting.append(mine)
-            self._arrived.notify_all()
-        with self._turn:
-            while not mine.answer.done():
-                with self._arrived:
-                    self._arrived.wait_for(lambda: len(self._waiting) >= self.most, GATHER)
-                    batch, self._waiting = self._waiting[: self.most], self._waiting[self.most :]
-                self._answer(batch)
-        return mine.answer.result()
-
-    def _answer(self, batch: Sequence[_Request]) -> None:
-        """Decode a batch. If that fails, decode one by one, so that one client's error does not reach the others."""
-        target: Any = self.decoder.target
-        try:
-            records = self.decoder.decode([one.episode for one in batch], [one.observation for one in batch])
-            target.check()
-            for one, record in zip(batch, records, strict=True):
-                one.answer.set_result(record)
-        except Exception as error:  # noqa: BLE001 - it is raised in its client's thread
-            if len(batch) == 1:
-                batch[0].answer.set_exception(error)
-                return
-            for one in batch:
-                self._answer([one])
 
 
 LEAST_WIDTH = 1.0

@@ -22,6 +22,5 @@ class ServeSettings(MethodSettings):
         "as_is", "as_is", "signed", "signed_inverted", help="how the gripper (0 closed to 1 open) is sent"
     )
     task_name: str = setting("", "name of the task, if its calibration is read; vla_eval's clients send it")
-    batch: int = number(1, 1, 1024, help="number of clients decoded together; above 1, nothing is timed")
     origins: list[str] = setting([], "addresses of web pages that may connect; programs always may")
     margin: float = number(1.0, 0, 1e6, help="how far a state may be out of range, in widths of the range")
