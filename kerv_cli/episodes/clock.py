@@ -166,7 +166,7 @@ def _profile_path(settings: RolloutSettings) -> Path:
     for path in (Path(name).expanduser(), results_dir(results) / "bench" / f"{name}.json"):
         if path.is_file():
             return path
-    raise UsageError(f"rollout.profile={name}: no such document, neither here nor in {results}/bench; 'kerv bench' writes one")
+    raise UsageError(f"rollout.profile={name}: no such document, nor in {results}/bench: 'kerv bench' writes one")
 
 
 def _open_profile(settings: RolloutSettings) -> Profile:
