@@ -1,4 +1,4 @@
-"""LeRobot datasets of version 3: written, read back, with images and with videos; what was read can be trained on."""
+"""LeRobot datasets of version 3 are read, with images and with videos; what was read can be trained on."""
 
 import json
 import shutil
@@ -17,7 +17,10 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.openvla.config import Bounds, action_space
+from kerv_cli.worlds import instruction_of
 from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.files import encode_png
+from kerv_cli.worlds.demos.lerobot import DATA, VIDEO
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.settings import CameraSettings
 
@@ -26,14 +29,49 @@ SIZE = 56
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
-    """Demonstrations of insertion, the same as a LeRobot dataset, and read back under the name `back`."""
+    """Demonstrations of insertion, the same as a LeRobot dataset, and imported under the name `back`."""
     results = tmp_path_factory.mktemp("lerobot")
     config = DemoConfig(("insert-peg", "fetch-peg"), 2, camera=CameraSettings(size=SIZE), workers=1)
     record(config, results / "artifacts/demos/pegs")
-    kerv("demos", "export", "format=lerobot", "demos=pegs", f"results={results}")
+    write_lerobot(DemoDataset.open(results / "artifacts/demos/pegs"), results / "lerobot/pegs")
     read = ["demos", "import", f"source={results}/lerobot/pegs", "name=back", "dofs=openvla", "tail=3"]
     kerv(*read, f"results={results}")
     return results
+
+
+def write_lerobot(dataset: DemoDataset, folder: Path) -> None:
+    """Write demonstrations as a LeRobot dataset with images in its table."""
+    tasks, rows, episodes = list(dataset.manifest.tasks), [], []
+    for number in range(len(dataset.episodes)):
+        episode, first = dataset.load(number), len(rows)
+        width = len(dataset.manifest.observation.proprioception)
+        for step, frame in zip(episode.frame_steps, episode.frames, strict=True):
+            vectors = {
+                "observation.state": episode.states[step, :width],
+                "observation.environment_state": episode.states[step],
+                "action": episode.labels[step],
+                "action.executed": episode.executed[step],
+            }
+            picture = {"bytes": encode_png(frame), "path": None}
+            index = {"episode_index": number, "task_index": tasks.index(episode.task)}
+            rows.append({"observation.images.front": picture, **index, **{k: v.tolist() for k, v in vectors.items()}})
+        about = {"episode_index": number, "length": len(rows) - first, "data/chunk_index": 0, "data/file_index": 0}
+        episodes.append({**about, "dataset_from_index": first, "dataset_to_index": len(rows)})
+    features = {name: {"dtype": "float32", "shape": [len(rows[0][name])], "names": None} for name in vectors}
+    features["action"]["names"] = list(dataset.manifest.actions.names)
+    features["observation.images.front"] = {"dtype": "image", "shape": [SIZE, SIZE, 3], "names": None}
+    info = {"codebase_version": "v3.0", "fps": 20, "features": features}
+    info |= {"data_path": DATA, "video_path": VIDEO}
+    names = {"task": [instruction_of(task) for task in tasks], "task_index": list(range(len(tasks)))}
+    tables = {
+        folder / DATA.format(chunk_index=0, file_index=0): pa.Table.from_pylist(rows),
+        folder / "meta/episodes/chunk-000/file-000.parquet": pa.Table.from_pylist(episodes),
+        folder / "meta/tasks.parquet": pa.table(names),
+    }
+    for path, table in tables.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(table, path)
+    (folder / "meta/info.json").write_text(json.dumps(info))
 
 
 def both(results: Path) -> tuple[DemoDataset, DemoDataset]:
@@ -41,40 +79,7 @@ def both(results: Path) -> tuple[DemoDataset, DemoDataset]:
     return DemoDataset.open(folder / "pegs"), DemoDataset.open(folder / "back")
 
 
-def test_the_published_layout(results):
-    """Against the format's description: paths, columns and their types, tasks by the index, statistics."""
-    import pandas as pd
-
-    folder = results / "lerobot/pegs"
-    info = json.loads((folder / "meta/info.json").read_text())
-    assert info["codebase_version"] == "v3.0"
-    assert (info["total_episodes"], info["total_tasks"], info["fps"]) == (4, 2, 20)
-    path = folder / info["data_path"].format(chunk_index=0, file_index=0)
-    table = pq.read_table(path)
-    assert set(table.column_names) == set(info["features"])
-    assert len(table) == info["total_frames"]
-    for name, feature in info["features"].items():
-        kind = table.schema.field(name).type
-        if feature["dtype"] == "image":
-            assert kind == pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-        elif feature["shape"] != [1]:
-            assert kind == pa.list_(pa.float32(), feature["shape"][0])
-            assert len(feature["names"]) == feature["shape"][0]
-        else:
-            assert kind == {"float32": pa.float32(), "int64": pa.int64(), "bool": pa.bool_()}[feature["dtype"]]
-    episodes = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    assert [e["dataset_from_index"] for e in episodes[1:]] == [e["dataset_to_index"] for e in episodes[:-1]]
-    assert table["index"].to_pylist() == list(range(len(table)))
-    tasks = pd.read_parquet(folder / "meta/tasks.parquet")
-    assert tasks.iloc[0].name == "turn the peg and push it into the tilted slot"
-    assert episodes[0]["tasks"] == [tasks.iloc[0].name]
-    stats = json.loads((folder / "meta/stats.json").read_text())
-    actions = np.stack(table["action"].to_pylist())
-    np.testing.assert_allclose(stats["action"]["mean"], actions.mean(0), atol=1e-6)
-    assert np.shape(stats["observation.images.front"]["mean"]) == (3, 1, 1)
-
-
-def test_what_was_written_is_read_back(results):
+def test_every_number_and_picture_is_read(results):
     before, after = both(results)
     assert len(before.episodes) == len(after.episodes) == 4
     for index in range(4):

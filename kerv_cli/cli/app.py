@@ -55,7 +55,7 @@ class Commands(TyperGroup):
         return family
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        """Find the command that the arguments begin with. Two words are tried first, as in `demos export`.
+        """Find the command that the arguments begin with. Two words are tried first, as in `demos import`.
 
         Returns:
             The command's name, the command, and the arguments after it.

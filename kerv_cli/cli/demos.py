@@ -1,28 +1,16 @@
-"""`kerv demos`: record demonstrations of scripted experts, and export or import LeRobot datasets."""
+"""`kerv demos`: record demonstrations of scripted experts, and import LeRobot datasets."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import Interrupted, UsageError
-from kerv_cli.base.limits import choice, setting
-from kerv_cli.base.places import artifact, results_dir
-from kerv_cli.base.settings import CommandSettings
+from kerv_cli.base.places import artifact
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import ShowPlan, end_with_plan, print_figures, print_table, progress_bar
-from kerv_cli.training.settings import DEMOS, DemosSettings
+from kerv_cli.cli.common import ShowPlan, end_with_plan, print_table, progress_bar
+from kerv_cli.training.settings import DemosSettings
 from kerv_cli.worlds.settings import DemosImportSettings
-
-
-@dataclass
-class DemosExportSettings(CommandSettings):
-    """Settings of `kerv demos export`."""
-
-    format: str = choice("lerobot", "lerobot", help="a LeRobot dataset of version 3")
-    demos: str = setting("mt10", DEMOS)
-    to: str = setting("", "folder to write to; empty: <results>/lerobot/<demos>")
 
 
 @command(
@@ -56,27 +44,6 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
         ) from None
     rows = ((n, len(row.episodes), f"{row.mean_steps:.0f}", len(row.failed_seeds)) for n, row in manifest.tasks.items())
     print_table(("task", "episodes", "mean steps", "failed seeds"), rows, f"demonstrations in {folder}")
-
-
-@command(
-    "demos export",
-    DemosExportSettings,
-    keys="demos to format results",
-    examples=("kerv demos export demos=mt10", "kerv demos export demos=mt10 to=lerobot/mt10"),
-)
-def export_demos(settings: DemosExportSettings) -> None:
-    """Write demonstrations as a LeRobot dataset."""
-    from kerv_cli.worlds.demos.dataset import DemoDataset
-    from kerv_cli.worlds.demos.lerobot import export
-
-    dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
-    folder = (
-        Path(settings.to).expanduser() if settings.to else results_dir(settings.results) / "lerobot" / settings.demos
-    )
-    with progress_bar("export") as advance:
-        info = export(dataset, folder, advance)
-    figures = {"episodes": len(info.episodes), "frames": info.rows, "tasks": len(info.tasks), "frames/s": info.rate}
-    print_figures("LeRobot dataset", figures, folder)
 
 
 @command(
