@@ -157,15 +157,10 @@ WRONG = [
     ("sweep", "study.block=0", "study.block=0"),
     ("sweep", "study.settings=${oc.env:HOME}", ": a list or a mapping is wanted"),
     ("calibrate", "boundary_windows=[5,2]", "boundary_windows=2: from 3 to"),
-    *(
-        ("rollout", f"method=heisd {key}={value}", key)
-        for key, value in (
-            ("boundary.f_star", "nan"),
-            ("boundary.window", 2),
-            ("boundary.alpha", 1.5),
-            ("skip.up", "inf"),
-        )
-    ),
+    ("rollout", "method=heisd boundary.f_star=nan", "boundary.f_star"),
+    ("rollout", "method=heisd boundary.window=2", "boundary.window"),
+    ("rollout", "method=heisd boundary.alpha=1.5", "boundary.alpha"),
+    ("rollout", "method=heisd skip.up=inf", "skip.up"),
 ]
 
 

@@ -55,8 +55,16 @@ def loaded(folder: Path, dtype: torch.dtype = torch.float32) -> OpenVLATarget:
 
 
 @pytest.fixture(scope="module")
-def target(checkpoint, tmp_path_factory):
-    return loaded(imported(checkpoint, tmp_path_factory.mktemp("results")))
+def results(checkpoint, tmp_path_factory):
+    """A results folder with the checkpoint imported as `openvla`."""
+    folder = tmp_path_factory.mktemp("results")
+    imported(checkpoint, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def target(results):
+    return loaded(results / "artifacts/target/openvla")
 
 
 def shown(seed: int, instruction: str = "pick up the cup", size: tuple[int, int] = (40, 64)) -> Observation:
@@ -464,18 +472,6 @@ PATCHES = 16
 
 
 @pytest.fixture(scope="module")
-def public_results(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("public")
-    imported(write_checkpoint(folder / "tiny"), folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def public_target(public_results):
-    return loaded(public_results / "artifacts/target/openvla")
-
-
-@pytest.fixture(scope="module")
 def drafter():
     """Untrained: what is drafted does not matter to what these tests say."""
     torch.manual_seed(1)
@@ -497,7 +493,7 @@ def written(folder: Path, drafter: PublicDrafter, embedding: Tensor) -> Path:
 
 
 @pytest.mark.bits
-def test_it_computes_what_the_public_layer_does(public_target):
+def test_it_computes_what_the_public_layer_does(target):
     """EAGLE's forward, spelt out with transformers' layer: fc over (embedding, state), no norm in front or behind."""
     from transformers import LlamaConfig
     from transformers.models.llama.modeling_llama import LlamaDecoderLayer, LlamaRotaryEmbedding
@@ -523,13 +519,13 @@ def test_it_computes_what_the_public_layer_does(public_target):
 @pytest.mark.bits
 @pytest.mark.parametrize("convention", [KERV, TEXT, PROMPT, Convention("text", "prompt")])
 @pytest.mark.parametrize("top_k", [1, 3])
-def test_decoding_with_it_is_lossless_under_every_convention(public_target, drafter, convention, top_k):
+def test_decoding_with_it_is_lossless_under_every_convention(target, drafter, convention, top_k):
     own = with_convention(drafter, convention)
     for seed in (100, 101):
         with torch.inference_mode():
-            prompt = public_target.encode(shown(seed))
-            truth = plain_greedy(public_target, prompt)
-        assert decode(public_target, DrafterProposer(own, public_target, 5, top_k, 16), prompt).tokens == truth
+            prompt = target.encode(shown(seed))
+            truth = plain_greedy(target, prompt)
+        assert decode(target, DrafterProposer(own, target, 5, top_k, 16), prompt).tokens == truth
 
 
 def test_the_prompt_mask_hides_every_key_behind_the_prompt(drafter):
@@ -544,15 +540,15 @@ def test_the_prompt_mask_hides_every_key_behind_the_prompt(drafter):
     torch.testing.assert_close(outputs[0], outputs[1])
 
 
-def test_it_is_imported_beside_its_target(public_results, public_target, drafter, tmp_path):
-    folder = written(tmp_path / "eagle", drafter, public_target.model.language_model.model.embed_tokens.weight)
-    words = [f"checkpoint={folder}", "policy.target=openvla", f"results={public_results}"]
+def test_it_is_imported_beside_its_target(results, target, drafter, tmp_path):
+    folder = written(tmp_path / "eagle", drafter, target.model.language_model.model.embed_tokens.weight)
+    words = [f"checkpoint={folder}", "policy.target=openvla", f"results={results}"]
     kerv("build", "drafter", *words, "positions=text")
-    description = json.loads((public_results / "artifacts/drafter/openvla/drafter.json").read_text())
+    description = json.loads((results / "artifacts/drafter/openvla/drafter.json").read_text())
     assert description["public"]["convention"] == {"positions": "text", "mask": "causal"}
-    described = read_target(public_results / "artifacts/target/openvla")
-    described_target = of_target(described, public_target)
-    own: Any = EagleDrafter().load(public_results / "artifacts/drafter/openvla", described_target)
+    described = read_target(results / "artifacts/target/openvla")
+    described_target = of_target(described, target)
+    own: Any = EagleDrafter().load(results / "artifacts/drafter/openvla", described_target)
     assert (own.draft_position(40), drafter.draft_position(40)) == (24, 40)
     for name, tensor in own.state_dict().items():
         torch.testing.assert_close(tensor, drafter.state_dict()[name])
@@ -578,9 +574,9 @@ def widened(folder: Path) -> None:
         (None, ["checkpoint="], "checkpoint=DIR"),
     ],
 )
-def test_a_drafter_that_does_not_fit_is_refused_in_one_line(public_results, drafter, tmp_path, harm, words, said):
+def test_a_drafter_that_does_not_fit_is_refused_in_one_line(results, drafter, tmp_path, harm, words, said):
     folder = written(tmp_path / "eagle", drafter, torch.zeros(704, 64))
     if harm:
         harm(folder)
     words = words if "checkpoint=" in words else [f"checkpoint={folder}", *words]
-    assert said in refusal("build", "drafter", *words, "policy.target=openvla", f"results={public_results}")
+    assert said in refusal("build", "drafter", *words, "policy.target=openvla", f"results={results}")

@@ -66,12 +66,17 @@ FAMILIES = (
 )  # fmt: skip
 
 
-def modules(parts: Parts) -> list[torch.nn.Module]:
-    """The networks of a method."""
+def members(parts: Parts) -> list[Any]:
+    """The parts of a method that draft, and those that they are made of."""
     found: list[Any] = [parts.prefill_draft, parts.proposer]
     for part in found:
         found += [*getattr(part, "sources", ()), *getattr(part, "proposers", {}).values()]
-    networks = [getattr(part, name, None) for part in found for name in ("drafter", "early")]
+    return found
+
+
+def modules(parts: Parts) -> list[torch.nn.Module]:
+    """The networks of a method."""
+    networks = [getattr(part, name, None) for part in members(parts) for name in ("drafter", "early")]
     return [network for network in networks if isinstance(network, torch.nn.Module)]
 
 
@@ -99,7 +104,10 @@ def test_a_round_waits_once(family, captured, monkeypatch):
     for module in (target, *modules(parts)):
         move(module)
     with torch.inference_mode(), Device() as device:
-        decoder = Decoder(target, parts_of_device(parts))
+        for part in members(parts):  # their target is there now
+            if isinstance(part, DrafterProposer):
+                part.cache = part.drafter.new_cache(1, part.cache.capacity)
+        decoder = Decoder(target, parts)
         waits: list[int] = []
 
         def counted(work):
@@ -124,16 +132,6 @@ def test_a_round_waits_once(family, captured, monkeypatch):
     assert sum(waits) == len(device.waits), "waits outside of the rounds"
     alone = parts.proposer is None  # what is left is then read at once
     assert len(waits) == (2 if alone else len(found.rounds))
-
-
-def parts_of_device(parts: Parts) -> Parts:
-    """The parts, told that their target is there."""
-    known: list[Any] = [parts.prefill_draft, parts.proposer]
-    for part in known:
-        known += [*getattr(part, "sources", ()), *getattr(part, "proposers", {}).values()]
-        if isinstance(part, DrafterProposer):
-            part.cache = part.drafter.new_cache(1, part.cache.capacity)
-    return parts
 
 
 # --- stopwatch
