@@ -104,7 +104,6 @@ def test_a_policy_answers_observations(mine):
     ("call", "says"),
     [
         (lambda mine: kerv.rollout(**{**mine, "task": "raech"}), "unknown task or suite 'raech': did you mean reach"),
-        (lambda mine: kerv.rollout(**mine, threshold={"q": 5}), "unknown key 'threshold.q'"),
         (lambda mine: kerv.sweep("dmeo", **mine), "unknown study 'dmeo': did you mean demo"),
         (lambda mine: kerv.load_study("other", results=mine["results"]), "other"),
         (lambda mine: kerv.runs(mine["results"], colour="red"), "unknown filter 'colour'"),

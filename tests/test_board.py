@@ -160,6 +160,12 @@ def test_the_first_page_is_quick_with_two_hundred_runs(tmp_path):
 # --- in a browser ---
 
 
+@pytest.fixture(scope="module")
+def address(folder):
+    with served(folder) as address:
+        yield address
+
+
 @pytest.fixture
 def open_page(browser):
     """Opens an address. A page must raise no error and must ask nobody else."""
@@ -182,54 +188,51 @@ def names_in(page):
     return page.locator(".runs tbody a").all_inner_texts()
 
 
-def test_runs_are_filtered_sorted_and_compared_with_the_keyboard(folder, open_page):
-    with served(folder) as address:
-        page = open_page(address)
-        assert sorted(names_in(page)) == ["few", "radii", "target/mine"]
-        page.get_by_label("Search").press_sequentially("naive")
-        page.locator("text=target/mine").wait_for(state="detached")
-        assert sorted(names_in(page)) == ["few", "radii"]
-        page.get_by_label("Search").fill("")
-        page.get_by_label("State").select_option("unfinished")
-        page.locator("text=radii").wait_for(state="detached")
-        assert names_in(page) == ["target/mine"]
-        page.get_by_label("State").select_option("any")
-        page.locator("text=radii").wait_for()
-        page.get_by_role("link", name="episodes").click()
-        page.locator("th[aria-sort]", has_text="episodes").wait_for()
-        assert names_in(page) == ["radii", "few", "target/mine"]
-        assert page.get_by_role("button", name="Compare two").is_disabled()
-        for name in ("radii", "few"):
-            page.get_by_label(f"compare {name}").focus()
-            page.keyboard.press("Space")
-        page.get_by_role("button", name="Compare two").press("Enter")
-        page.wait_for_url("**/compare?*")
-        assert "radii:ar" in page.locator("main").inner_text()
-        page.goto(address)
-        page.keyboard.press("Tab")
-        page.keyboard.press("Enter")
-        assert page.url.endswith("#main"), "the first key skips the navigation"
+def test_runs_are_filtered_sorted_and_compared_with_the_keyboard(address, open_page):
+    page = open_page(address)
+    assert sorted(names_in(page)) == ["few", "radii", "target/mine"]
+    page.get_by_label("Search").press_sequentially("naive")
+    page.locator("text=target/mine").wait_for(state="detached")
+    assert sorted(names_in(page)) == ["few", "radii"]
+    page.get_by_label("Search").fill("")
+    page.get_by_label("State").select_option("unfinished")
+    page.locator("text=radii").wait_for(state="detached")
+    assert names_in(page) == ["target/mine"]
+    page.get_by_label("State").select_option("any")
+    page.locator("text=radii").wait_for()
+    page.get_by_role("link", name="episodes").click()
+    page.locator("th[aria-sort]", has_text="episodes").wait_for()
+    assert names_in(page) == ["radii", "few", "target/mine"]
+    assert page.get_by_role("button", name="Compare two").is_disabled()
+    for name in ("radii", "few"):
+        page.get_by_label(f"compare {name}").focus()
+        page.keyboard.press("Space")
+    page.get_by_role("button", name="Compare two").press("Enter")
+    page.wait_for_url("**/compare?*")
+    assert "radii:ar" in page.locator("main").inner_text()
+    page.goto(address)
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    assert page.url.endswith("#main"), "the first key skips the navigation"
 
 
-def test_a_failed_training_shows_its_curves_why_it_failed_and_what_to_type(folder, open_page):
-    with served(folder) as address:
-        page = open_page(address)
-        page.get_by_role("link", name="target/mine").click()
-        assert "the disk is full" in page.locator("main").inner_text()
-        assert "kerv train target name=mine" in page.locator(".command").inner_text()
-        page.locator(".chart svg").get_by_text("train_loss").wait_for()
+def test_a_failed_training_shows_its_curves_why_it_failed_and_what_to_type(address, open_page):
+    page = open_page(address)
+    page.get_by_role("link", name="target/mine").click()
+    assert "the disk is full" in page.locator("main").inner_text()
+    assert "kerv train target name=mine" in page.locator(".command").inner_text()
+    page.locator(".chart svg").get_by_text("train_loss").wait_for()
 
 
-def test_a_study_shows_numbers_on_hovering_and_differences_on_a_click(folder, open_page):
-    with served(folder) as address:
-        page = open_page(f"{address}/studies/radii")
-        page.locator(".chart svg").first.wait_for()
-        page.locator(".chart svg path[aria-roledescription=point]").last.hover(force=True)
-        assert re.search(r"success\n\d", page.locator(".tip").inner_text())
-        page.get_by_role("button", name="spec_vla r=9").click()
-        assert "threshold.r" in page.locator("tr.detail").inner_text()
-        page.locator("a[href='/studies/radii/episodes?setting=spec_vla+r%3D9&task=reach-v3']").click()
-        page.get_by_role("heading", name="Episodes").wait_for()
+def test_a_study_shows_numbers_on_hovering_and_differences_on_a_click(address, open_page):
+    page = open_page(f"{address}/studies/radii")
+    page.locator(".chart svg").first.wait_for()
+    page.locator(".chart svg path[aria-roledescription=point]").last.hover(force=True)
+    assert re.search(r"success\n\d", page.locator(".tip").inner_text())
+    page.get_by_role("button", name="spec_vla r=9").click()
+    assert "threshold.r" in page.locator("tr.detail").inner_text()
+    page.locator("a[href='/studies/radii/episodes?setting=spec_vla+r%3D9&task=reach-v3']").click()
+    page.get_by_role("heading", name="Episodes").wait_for()
 
 
 def test_a_running_sweep_is_watched_until_it_ends(tmp_path, open_page, monkeypatch):
@@ -254,11 +257,12 @@ def test_a_running_sweep_is_watched_until_it_ends(tmp_path, open_page, monkeypat
         assert not asked, "nothing runs: nothing is asked"
 
 
-@pytest.mark.parametrize("path", ["/", "/studies/radii", "/artifacts/target/mine", "/compare?run=radii&run=few"])
-def test_pages_fit_a_phone_and_the_dark(folder, open_page, path):
-    with served(folder) as address:
-        page = open_page(address + path, viewport={"width": 360, "height": 740}, color_scheme="dark")
+def test_pages_fit_a_phone_and_the_dark(address, open_page):
+    page = open_page(address, viewport={"width": 360, "height": 740}, color_scheme="dark")
+    for path in ("/", "/studies/radii", "/artifacts/target/mine", "/compare?run=radii&run=few",
+                 "/studies/radii/episodes", "/studies/radii/failures", "/episodes/1"):  # fmt: skip
+        page.goto(address + path)
         page.wait_for_load_state("networkidle")
-        assert page.evaluate("document.documentElement.scrollWidth") <= 360
+        assert page.evaluate("document.documentElement.scrollWidth") <= 360, path
         background = page.evaluate("getComputedStyle(document.body).backgroundColor")
-        assert max(int(part) for part in re.findall(r"\d+", background)) < 64
+        assert max(int(part) for part in re.findall(r"\d+", background)) < 64, path

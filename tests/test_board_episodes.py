@@ -253,11 +253,3 @@ def test_a_person_gets_from_a_failure_to_its_film_a_decode_and_rerun(page, addre
     assert answer.value.ok
     assert all(url.startswith(address) for url in asked)
     assert path.stat().st_mtime_ns == written
-
-
-def test_a_phone_scrolls_tables_and_not_the_page(page, address, rolled):
-    (store,) = studies(rolled)
-    page.set_viewport_size({"width": 390, "height": 844})
-    for path in (f"/studies/{store.name}/episodes", f"/studies/{store.name}/failures", "/episodes/1"):
-        page.goto(address + path)
-        assert page.evaluate("document.documentElement.scrollWidth") == 390

@@ -18,6 +18,8 @@ from test_calibration import write_dataset
 from kerv_cli.base import files
 from kerv_cli.episodes.resolve import resolve, resolve_rollout
 from kerv_cli.lab.database import RUNS, Database
+from kerv_cli.lab.runs import run_rows
+from kerv_cli.report.plots import read_log
 from kerv_cli.targets.folders import RESUME
 from kerv_cli.training.preparation import needs
 
@@ -171,18 +173,23 @@ def test_the_remedy_for_weights_of_another_target_works_as_it_is_typed(results):
     assert ", 400 steps of 64" in few
 
 
-@pytest.mark.usefixtures("results", "quick_training")
-def test_an_artifact_is_shown_with_the_settings_that_it_was_made_with():
-    quick = ["demos=few", "task=[reach-v3]", "train.steps=1", "train.batch=2"]
+@pytest.mark.usefixtures("quick_training")
+def test_an_artifact_has_a_row_and_is_shown_with_the_settings_that_it_was_made_with(results):
+    quick = ["demos=few", "task=[reach-v3]", "train.steps=2", "train.batch=2", "train.validate_every=1"]
     made = {
         "target/new": ["train", "target", "target=nano", "name=new", "target.observation=state", *quick],
         "early/one": ["train", "drafter", "drafter=early", "policy.target=new", "policy.artifacts.early=one", *quick],
+        "datastore/new": ["build", "datastore", "policy.target=new", *quick[:2]],
         "calibration/new": ["calibrate", "policy.target=new", *quick[:2], "decodes=0", "held_out=0.5"],
     }
     for name, words in made.items():
         told(*words)
         assert sorted(json.loads(told("runs", "show", name, "--json"))["command"]) == sorted(["kerv", *words])
     assert "made by   kerv train target target=nano " in told("runs", "show", "target/new")
+    rows = {f"{row.kind}/{row.name}": row for row in run_rows(Database(results))}
+    assert {name: row.status for name, row in rows.items()} == dict.fromkeys(made, "complete")
+    assert (rows["target/new"].done, rows["target/new"].total) == (2, 2)
+    assert read_log(results / "artifacts/target/new")["step"].tolist() == [1, 2]
 
 
 @pytest.mark.parametrize("command", ["train drafter", "train drafter drafter=early", "calibrate"])

@@ -9,13 +9,11 @@ from typing import Any
 
 import pytest
 from command import told
-from test_calibration import write_dataset
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.lab.command import STORE
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import making, run_rows
-from kerv_cli.report.plots import read_log
 from kerv_cli.training.demonstrations import open_demos
 
 HOLD = """
@@ -60,27 +58,6 @@ def test_a_name_in_use_is_refused_and_a_killed_command_is_listed_with_how_to_go_
         open_demos(str(tmp_path), "mine")
     told("runs", "rm", "demos/mine", "--yes", f"results={tmp_path}")
     assert listed(tmp_path) == []
-
-
-@pytest.mark.usefixtures("quick_training")
-def test_every_command_that_makes_something_has_a_row(policies, tmp_path):
-    import shutil
-
-    shutil.copytree(policies / "artifacts", tmp_path / "artifacts")
-    write_dataset(tmp_path / "artifacts/demos/few", episodes=4)
-    where = (f"results={tmp_path}", "policy.target=nano-state", "demos=few")
-    told("build", "datastore", *where)
-    told("calibrate", *where, "decodes=0")
-    told("train", "target", "name=mine", "target=nano", "target.observation=state", "train.steps=2",
-         "train.validate_every=1", *where[::2])  # fmt: skip
-    rows = {(row.kind, row.name): row for row in run_rows(Database(tmp_path))}
-    assert {key: row.status for key, row in rows.items()} == dict.fromkeys(
-        [("datastore", "nano-state"), ("calibration", "nano-state"), ("target", "mine")], "complete"
-    )
-    assert rows["target", "mine"].command[:3] == ("train", "target", "name=mine")
-    assert (rows["target", "mine"].done, rows["target", "mine"].total) == (2, 2)
-    folder = tmp_path / "artifacts/target/mine"
-    assert read_log(folder)["step"].tolist() == [1, 2]
 
 
 def test_a_store_is_used_by_one_command_and_no_password_is_kept(tmp_path, monkeypatch):
