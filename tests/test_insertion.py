@@ -109,51 +109,37 @@ class Forgetful(Remembered):
         self.length = start + len(slots)
 
 
-def broken(name: str) -> OwnPolicy:
-    target: Any = OwnPolicy()
+class Right(OwnPolicy):
+    """Where a broken target does what it should."""
 
-    def right(x, positions, cache=None, seen=None):
-        return OwnPolicy.forward(target, x, positions, cache, seen)
+    right = OwnPolicy.forward
 
-    def everything(x):
-        return np.ones((x.shape[1],) * 2, dtype=bool)
 
-    wrong: dict[str, dict[str, Any]] = {
-        "mask": {"forward": lambda x, p, cache=None, seen=None: right(x, p, cache)},
-        "positions": {
-            "forward": lambda x, p, cache=None, seen=None: right(x, torch.arange(len(p)) if cache else p, cache, seen)
-        },
-        "causality": {
-            "forward": lambda x, p, cache=None, seen=None: right(x, p, cache, everything(x) if seen is None else seen)
-        },
-        "compact": {"new_cache": lambda batch, capacity: Forgetful(batch, capacity, target.width)},
-        "training": {"encode": lambda observation: OwnPolicy.encode(target, observation) + torch.randn(())},
-        "head": {"head": lambda hidden: hidden},
-        "prompt": {"max_prompt": 3, "encode": lambda observation: torch.zeros(1, 5, target.width)},
-        "members": {},
-    }
-    for attribute, value in wrong[name].items():
-        setattr(target, attribute, value)
-    if name == "members":
-        del target.actions
-    return target  # type: ignore[no-any-return]
+def every(x: torch.Tensor, seen: np.ndarray | None) -> np.ndarray:
+    """A token sees those after it, unless it is told."""
+    return np.ones((x.shape[1],) * 2, dtype=bool) if seen is None else seen
 
 
 @pytest.mark.parametrize(
-    ("name", "what"),
+    ("member", "wrong", "what"),
     [
-        ("mask", "tree attention"),
-        ("positions", "cache"),
-        ("causality", "causality"),
-        ("compact", "commit of a path"),
-        ("training", "encode"),
-        ("head", "embed and head"),
-        ("prompt", "encode"),
-        ("members", "members"),
+        ("forward", lambda t, x, p, cache=None, seen=None: t.right(x, p, cache), "tree attention"),
+        ("forward", lambda t, x, p, c=None, seen=None: t.right(x, torch.arange(len(p)) if c else p, c, seen), "cache"),
+        (
+            "forward",
+            lambda t, x, p, c=None, seen=None: t.right(x, p, c, every(x, seen)),
+            "causality",
+        ),
+        ("new_cache", lambda t, batch, capacity: Forgetful(batch, capacity, t.width), "commit of a path"),
+        ("encode", lambda t, observation: OwnPolicy.encode(t, observation) + torch.randn(()), "encode"),
+        ("head", lambda t, hidden: hidden, "embed and head"),
+        ("encode", lambda t, observation: torch.zeros(1, t.max_prompt + 1, t.width), "encode"),
+        ("cameras", property(), "members"),
     ],
 )
-def test_every_way_of_breaking_it_is_found(name, what):
-    assert what in failures(check_target(broken(name), SEEN))
+def test_every_way_of_breaking_it_is_found(member, wrong, what):
+    target = type("Broken", (Right,), {member: wrong})()
+    assert what in failures(check_target(target, SEEN))
 
 
 def test_doctor_checks_a_policy_on_disk(policies):
