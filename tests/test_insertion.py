@@ -125,11 +125,7 @@ def every(x: torch.Tensor, seen: np.ndarray | None) -> np.ndarray:
     [
         ("forward", lambda t, x, p, cache=None, seen=None: t.right(x, p, cache), "tree attention"),
         ("forward", lambda t, x, p, c=None, seen=None: t.right(x, torch.arange(len(p)) if c else p, c, seen), "cache"),
-        (
-            "forward",
-            lambda t, x, p, c=None, seen=None: t.right(x, p, c, every(x, seen)),
-            "causality",
-        ),
+        ("forward", lambda t, x, p, c=None, seen=None: t.right(x, p, c, every(x, seen)), "causality"),
         ("new_cache", lambda t, batch, capacity: Forgetful(batch, capacity, t.width), "commit of a path"),
         ("encode", lambda t, observation: OwnPolicy.encode(t, observation) + torch.randn(()), "encode"),
         ("head", lambda t, hidden: hidden, "embed and head"),

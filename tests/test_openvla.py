@@ -425,10 +425,7 @@ def pickled(folder: Path) -> None:
     ("harm", "said"),
     [
         (truncated, "cut short"),
-        (
-            rewritten(lambda tensors: tensors.update(norm=tensors.pop(NORM))),
-            f"1 missing: {NORM}; 1 unknown: norm",
-        ),
+        (rewritten(lambda tensors: tensors.update(norm=tensors.pop(NORM))), f"1 missing: {NORM}; 1 unknown: norm"),
         (rewritten(lambda tensors: tensors[NORM].fill_(math.nan)), f"numbers in {NORM} that are not finite"),
         (pickled, "holds pickled weights (pytorch_model.bin)"),
         (lambda folder: (folder / "tokenizer.json").unlink(), "no tokenizer.json in"),

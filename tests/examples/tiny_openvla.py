@@ -25,10 +25,7 @@ from kerv_cli.targets.openvla.inputs import BEGIN, BOUNDARY, DEFAULTS, PREPROCES
 from kerv_cli.targets.openvla.loading import Sizes, layout
 
 TINY = Shape(
-    towers=(
-        Tower(32, 4, 2, 64, registers=4, scaled=True, image=56),
-        Tower(48, 3, 3, 80, image=56),
-    ),
+    towers=(Tower(32, 4, 2, 64, registers=4, scaled=True, image=56), Tower(48, 3, 3, 80, image=56)),
     language=Language(704, 64, 96, 3, 4),
 )
 """16 patches; a trunk of 3 layers and 64 channels."""

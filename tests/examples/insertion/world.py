@@ -17,17 +17,7 @@ from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.vectors import length
 
-from .pose import (
-    GRASP,
-    PEG_HALF,
-    Pose,
-    limited,
-    misfit,
-    mujoco,
-    product,
-    quaternion_of,
-    turn_between,
-)
+from .pose import GRASP, PEG_HALF, Pose, limited, misfit, mujoco, product, quaternion_of, turn_between
 
 INSERTED = 0.03
 """Metres that the tip must be below the mouth."""
