@@ -279,7 +279,7 @@ def test_evaluations_of_the_same_episodes_are_paired(results, recordings):
     assert "three" in told("report", "--choose", "study=three", "loss=50", f"results={results}")
     about = json.loads((results / "report/tables/three.json").read_text())["labels"].values()
     assert {one["provenance"]["executor"] for one in about} == {"vla-eval"}
-    assert "only sweeps, rollouts and trainings" in told("runs", "rerun", "three", f"results={results}", code=2)
+    assert "only sweeps and rollouts" in told("runs", "rerun", "three", f"results={results}", code=2)
 
 
 def test_an_import_again_replaces_the_study_and_no_other(results, recordings):

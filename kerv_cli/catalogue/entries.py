@@ -402,7 +402,7 @@ def remove(run: RunEntry, results: str | Path) -> None:
 
 
 def again_words(run: RunEntry, results: str) -> list[str]:
-    """Return the arguments after `kerv` that repeat a run. The same arguments resume an interrupted repetition."""
+    """Return the arguments after `kerv` that repeat a study. The same arguments resume an interrupted repetition."""
     return ["runs", "rerun", run.id, *([] if results == CommandSettings().results else [f"results={results}"])]
 
 

@@ -163,22 +163,14 @@ def _result_cells(row: Row) -> dict[str, str]:
 def rerun(
     settings: CommandSettings, names: list[str], overrides: list[str], plan: ShowPlan = False, as_json: AsJson = False
 ) -> None:
-    """Repeat a run with its stored settings under a new name, and say whether the tokens are the same."""
+    """Repeat a sweep or rollout under a new name, and say whether the tokens are the same."""
     from kerv_cli.catalogue.entries import find_run
 
     results, (name,) = settings.results, _run_names(names)
     run = find_run(results, name)
-    if run.is_training:
-        from kerv_cli.catalogue.entries import again_words
-        from kerv_cli.cli.work import run_training
-        from kerv_cli.training.again import training_again
-
-        command = again_words(run, results)
-        run_training(training_again(run, results), plan, as_json, "reading what it needs", "training again", command)
-        return
     if run.kind not in ("sweep", "rollout"):
         made = f", which '{run.command_line}' makes" if run.command else ""
-        raise UsageError(f"{run.id} is of the kind {run.kind}{made}: only sweeps, rollouts and trainings are repeated")
+        raise UsageError(f"{run.id} is of the kind {run.kind}{made}: only sweeps and rollouts are repeated")
     from kerv_cli.catalogue.entries import plan_of
     from kerv_cli.cli.work import run_study
     from kerv_cli.report.compare import same_tokens

@@ -226,9 +226,7 @@ def print_verdict(table: DataFrame, store: StudyStore, loss: float) -> None:
     typer.echo(f"watch: {f'kerv view {recordings[0]}' if recordings else f'nothing is recorded{mend}'}")
 
 
-def run_training(
-    run: TrainingRun, plan: bool, as_json: bool, loading: str, training: str, command: Sequence[str] = ()
-) -> None:
+def run_training(run: TrainingRun, plan: bool, as_json: bool, loading: str, training: str) -> None:
     """Run a training and show its progress, or print the plan.
 
     Args:
@@ -237,20 +235,16 @@ def run_training(
         as_json: Print the result as JSON.
         loading: Title of the progress bar while data are read.
         training: Title of the progress bar during training.
-        command: Command-line arguments after `kerv` that resume this training. Empty: those that were typed.
 
     Raises:
         UsageError: Another process is training the same artifact.
     """
-    from kerv_cli.lab.command import current_command
-    from kerv_cli.lab.database import Database
-    from kerv_cli.lab.runs import making, time_of
+    from kerv_cli.lab.runs import making, time_as_before
 
     if plan:
-        database, words = Database(run.settings.results), list(command) or current_command()
-        time = time_of(database, run.artifact_kind, words, run.settings.train.steps)
+        time = time_as_before(run.settings.results, run.artifact_kind, run.settings.train.steps)
         end_with_plan(f"{run.plan()}, {time}", as_json)
-    with making(run.settings.results, run.artifact_kind, run.folder, command) as record:
+    with making(run.settings.results, run.artifact_kind, run.folder) as record:
         metrics, plot = _train(run, record, loading, training)
     if as_json:
         end_with_json({"folder": run.folder, "best": metrics, "curves": plot})

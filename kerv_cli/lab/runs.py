@@ -275,16 +275,15 @@ def name_in(results: str | Path, kind: str, folder: Path) -> str:
     return folder.name if folder.parent == results_dir(str(results)) / "artifacts" / kind else str(folder.absolute())
 
 
-def making(results: str | Path, kind: str, folder: Path, command: Sequence[str] = ()) -> Run:
+def making(results: str | Path, kind: str, folder: Path) -> Run:
     """Return the run (see `Run`) of a command that makes an artifact (weights or data).
 
     Args:
         results: The results folder.
         kind: Kind of the artifact.
         folder: Folder of the artifact.
-        command: Command-line arguments (without `kerv`) that resume the command. Empty: `current_command()`.
     """
-    return Run(Database(results), kind, name_in(results, kind, folder), command)
+    return Run(Database(results), kind, name_in(results, kind, folder))
 
 
 def command_to_go_on(results: str | Path, kind: str, folder: Path) -> tuple[str, ...]:
