@@ -44,7 +44,7 @@ _FURTHER = ("order", "started", "worker_pid")
 _ROW = (*(column.name for column in MEASURES), *_FURTHER)
 
 MOST_STEPS = 20_000_000
-"""Limit on steps of SQLite's virtual machine per connection, about a second. STEPS_PER_BYTE is added."""
+"""Limit on steps of SQLite's virtual machine per connection, about a second. It grows by STEPS_PER_BYTE per byte."""
 STEPS_PER_BYTE = 20
 _EVERY = 10_000
 
@@ -72,13 +72,14 @@ def import_results(results: Database, paths: Sequence[Path], name: str = "") -> 
     Args:
         results: The database to copy to.
         paths: Results folders of this version or 0.1.0, or database files.
-        name: New name of the study, if there is only one. Empty: keep the names.
+        name: New name of the study. Each path must then hold exactly one. Empty: keep the names.
 
     Returns:
         Names of the imported studies, and a line of text about each study or cell that was left out.
 
     Raises:
-        UsageError: A path is the results folder itself, or `name` is given and there are several studies.
+        UsageError: A path is the folder or file of `results`. Or `name` is given, and a path does not hold exactly one
+            study.
         CheckpointError: A database is damaged, or was written by a newer version of kerv.
     """
     names: list[str] = []
@@ -114,7 +115,7 @@ def is_results(path: Path) -> bool:
 
 
 def _database_of(path: Path) -> Path | None:
-    """Find a database: `path` itself, or kerv.db in the folder `path`. Return None if there is none."""
+    """Return the database file: `path` itself, or kerv.db in the folder `path`. None if there is none."""
     file = path / FILE if path.is_dir() else path
     return file if file.is_file() and file.suffix == Path(FILE).suffix else None
 
@@ -166,7 +167,8 @@ def completed(stored: Mapping[str, Any]) -> dict[str, Any]:
     """Convert the settings of a rollout of version 0.1.0 to the current format, without the task.
 
     Missing settings get their defaults. Settings that no longer exist are removed. Settings of a part that is not
-    installed stay as they are. Our presets have been renamed since 0.1.0, and `top_k` decided the shape of a draft.
+    installed stay as they are. Renamed presets get their new names. A draft is a tree if its `top_k` is above 1,
+    because 0.1.0 had no setting `shape`.
     """
     stored = {**stored, "method": _RENAMED.get(str(stored.get("method")), stored.get("method"))}
     plain = dataclasses.asdict(read(RolloutSettings, with_artifacts(stored), "a stored setting", tolerant=True))
@@ -217,8 +219,8 @@ def _in_cell(cell: Path, episodes: list[Episode]) -> Iterator[ImportedEpisode]:
 def connect_foreign(path: Path, **options: Any) -> sqlite3.Connection:
     """Open a SQLite file from somebody else, read-only.
 
-    A small file can contain an endless query. So every query fails after a number of steps that depends on the file's
-    size.
+    A small file can contain an endless query. So a connection may take only a limited number of steps, which grows
+    with the file's size. After that, its queries fail.
 
     Args:
         path: The file.

@@ -115,8 +115,8 @@ def run_together(
 ) -> Iterator[EpisodeEnd[K]]:
     """Run several episodes at once. Yield each request when its episode ends, with the record or the error.
 
-    A world is opened when an episode needs one, and closed when its task has no episodes left. The places in the batch
-    go to different tasks if possible, because opening a world takes longer than resetting one.
+    The batch has up to `batch` places. Each place runs one episode after another. A place opens a world when an episode
+    needs one, and keeps it while the task has episodes left, because opening a world takes longer than resetting one.
 
     Args:
         decoder: Decodes the observations of all running episodes together.
@@ -152,14 +152,14 @@ def run_together(
 def _one_after_another(
     state: EpisodeState, waiting: list[Request[K]], ended: list[EpisodeEnd[K]], open_world: OpenWorld
 ) -> Generator[Observation, DecodeRecord, None]:
-    """Run episodes one after another in one place of the batch, as long as some are waiting.
+    """Run waiting episodes one after another, until none is left.
 
-    This is a generator. It yields each observation, and expects the decode's record from `send`.
+    A batch runs several of these generators. Each yields an observation and is sent the record of its decode.
 
     Args:
-        state: The running episode, for the batch decoder.
-        waiting: Requests that have not begun. Those of the task that runs now are taken first.
-        ended: Gets each request, with the record of its episode or its error.
+        state: State that the batch decoder keeps for this place. Each episode reuses it.
+        waiting: Requests that have not begun. If possible, the next one has the same task as the last.
+        ended: Each request is appended when it ends, with the record of its episode or its error.
         open_world: Opens a world for a task.
     """
     world: World | None = None
@@ -185,7 +185,7 @@ def _one_after_another(
 
 
 def _take(waiting: list[Request[K]], task: str) -> Request[K]:
-    """Remove and return a request of `task`. If it has none, take one of the task with the most requests."""
+    """Remove and return a waiting request of `task`. If there is none, take one of the task that has the most."""
     counts = Counter(request.task for request in waiting)
     wanted = task if counts[task] else counts.most_common(1)[0][0]
     return waiting.pop(next(i for i, request in enumerate(waiting) if request.task == wanted))
@@ -207,7 +207,8 @@ def run_batch(settings: RolloutSettings, requests: Iterable[Request[K]]) -> Iter
 def is_recorded(settings: RolloutSettings, seed: int) -> bool:
     """Return whether images of the episode with this seed are recorded.
 
-    They are for the first `settings.record` episodes of a task, or for all if it is negative. In a batch, never.
+    The first `settings.record` episodes of each task are recorded, or all if the number is negative. A batch of several
+    episodes is never recorded.
     """
     return settings.rollout.batch == 1 and (settings.record < 0 or seed - settings.seed < settings.record)
 

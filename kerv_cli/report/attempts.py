@@ -19,23 +19,23 @@ from kerv_cli.methods.certified.certificate import Attempt, Certificate, Certifi
 def charged(
     certificate: Certificate, store: StudyStore, episodes: Sequence[Episode], paths: Iterable[Path], again: bool
 ) -> Certificate:
-    """Check a planned certificate against earlier tests of the same policy, and note them in it.
+    """Set the error probability of a planned test, and record the policy's earlier tests.
 
-    The n-th test of a policy has the level delta / 2^(n − 1). A test that is repeated without any change is not counted
-    again.
+    The n-th test of a policy gets delta / 2^(n − 1). An identical repeat does not count as a new test.
 
     Args:
-        certificate: The planned certificate. Its `delta` is the level that a first test would have.
-        store: The study that gives the certificate.
-        episodes: Its episodes.
-        paths: Folders of existing certificates. Those of other policies do not count.
+        certificate: The planned certificate. Its `delta` is the error probability of a first test.
+        store: The study whose episodes are the test.
+        episodes: The episodes of the test.
+        paths: Folders of existing certificates. Certificates of other policies do not count.
         again: Whether a further test of the policy is wanted.
 
     Returns:
-        The certificate with `earlier` and the `delta` of this test.
+        The certificate with its `earlier` tests and the `delta` of this test.
 
     Raises:
-        UsageError: The policy was tested before and `again` is not set, or another study ran episodes with these seeds.
+        UsageError: The policy was tested before and `again` is not set. Or an earlier test of this policy used one of
+            these seeds. Or another study ran the policy on one of these tasks and seeds.
     """
     earlier = attempts_on(certificate.target, paths)
     for number, attempt in enumerate(earlier):
@@ -56,7 +56,7 @@ def charged(
 
 
 def attempts_on(target: str, folders: Iterable[Path]) -> list[Attempt]:
-    """Return all tests of a policy, the first one first.
+    """Return all tests of a policy, the oldest first.
 
     Args:
         target: Hash of the policy's weights.

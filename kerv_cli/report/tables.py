@@ -53,9 +53,10 @@ class StudyData:
 
     Attributes:
         study: The settings, and the episodes that the study asks for.
-        episodes: One row per stored episode (label, task, seed and repeat). Columns: those of `StudyStore.frame`, with
+        episodes: One row per stored episode (label, task, seed and repeat). Columns: those of `StudyStore.frame`, and
             difficulty, device, number format and threads.
-        runs: The same table for each command that ran all of the episodes, if there are at least three.
+        runs: One such table for each run (command) that measured all of the episodes, if all ran the same code on the
+            same machine. Empty if there are fewer than three runs.
     """
 
     study: Study
@@ -84,7 +85,7 @@ class StudyData:
     def references(self) -> dict[str, str]:
         """Label of each setting -> label of the setting that it is compared with.
 
-        That is the baseline under the same stress and clock, if the study has it. Otherwise it is the plain baseline.
+        That is the baseline under the same stress and clock, if the study has it. Otherwise it is the study's baseline.
         """
         same: dict[str, str] = {}
         if baseline := self.settings.get(self.study.baseline):
@@ -119,12 +120,12 @@ class StudyData:
 
     @functools.cached_property
     def pairs(self) -> pd.DataFrame:
-        """Pairs of the episodes with those of the settings that they are compared with, see `measures.paired`."""
+        """Pairs of episodes: one of each setting with one of its reference, see `measures.paired`."""
         return paired(self.episodes, self.references)
 
     @functools.cached_property
     def run_pairs(self) -> list[pd.DataFrame]:
-        """The same pairs for each of `runs`."""
+        """As `pairs`, but one table for each of `runs`."""
         return [paired(run, self.references) for run in self.runs]
 
     @functools.cached_property
@@ -260,7 +261,7 @@ def _over_runs(runs: Sequence[Mapping[str, Mapping[Hashable, Estimate]]], group:
 
     Args:
         runs: What `measures.speedups` returned for each run.
-        group: The group.
+        group: Key of the group in those results.
     """
     row: Row = {}
     for name in runs[0] if runs else ():
@@ -277,7 +278,7 @@ def flatten(settings: Plain) -> Row:
 
 
 def differences(first: Row, second: Row) -> list[tuple[str, Any, Any]]:
-    """Return every key whose values differ, with both values. None: one side does not have the key."""
+    """Return every key whose values differ, with both values. A value is None if that side does not have the key."""
     pairs = ((key, first.get(key), second.get(key)) for key in first | second)
     return [pair for pair in pairs if pair[1] != pair[2]]
 
@@ -287,7 +288,7 @@ def _joined(values: Iterable[object]) -> str:
 
 
 def values_of(table: pd.DataFrame, column: str) -> set[str]:
-    """Return all values in a column whose cells may hold several values joined by semicolons."""
+    """Return all different values in a column. A cell may hold several values, joined by semicolons."""
     return {value for text in table[column].astype(str) for value in text.split(";")}
 
 

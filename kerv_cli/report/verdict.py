@@ -25,7 +25,7 @@ class Choice:
 
     Attributes:
         where: The task, or `all tasks`.
-        pairs: Number of pairs of the setting that has most.
+        pairs: Number of pairs of the setting with the most pairs.
         baseline_success: Success rate of the baseline.
         front: Settings that no other setting beats in both speed and success, the fastest first.
         chosen: Fastest setting that is shown to lose less success than the bound. Empty if there is none.
@@ -66,7 +66,7 @@ class Choice:
         return self.baseline_success < SOLVED
 
     def as_dict(self) -> Row:
-        """Return the choice as JSON values."""
+        """Return all fields by name, as JSON values. `front` becomes one text, joined by semicolons."""
         return {**asdict(self), "front": ";".join(self.front)}
 
 

@@ -4,7 +4,7 @@ The JSON holds:
 
 - the noise of the kinematic predictors, and their errors on held-out episodes,
 - each task's K_S, the reference level of the kinematic variability K (how far drafts are from the target's tokens),
-- the ranges that scale the curvature and the path length of the hybrid boundary,
+- the ranges by which the boundary between retrieval and drafter scales curvature and path length,
 - for each task the smallest similarity at which a retrieved chunk is executed without verification.
 """
 
@@ -60,7 +60,7 @@ On MT10, skip levels from 1000 entries did not hold on other episodes.
 LEAST = 20
 """Minimum number of entries at or above a skip level."""
 LOW, HIGH = 2.0, 1 / 3
-"""The lower bound of s_min allows twice the share of wrong chunks that s_min allows, the upper bound a third."""
+"""Share of wrong chunks that the lower and the upper bound of s_min allow, relative to the share that s_min allows."""
 
 RATIOS = np.logspace(-3, 3, 49)
 """Grid of the Kalman filter's ratio q / r (process noise to measurement noise), with r = 1."""
@@ -177,7 +177,7 @@ class CalibrationRun:
         return earlier
 
     def skip(self, stage: Stage) -> SkipSection | None:
-        """Return per task the lowest similarity at which verification is skipped. None without a datastore."""
+        """Return per task the lowest similarity at which verification is skipped. None without a datastore of them."""
         if "datastore" in self.missing:
             return None
         store = self.artifacts.load("datastore")
@@ -291,7 +291,7 @@ def read_windows(
         progress: Called with the numbers of episodes read and of all.
 
     Raises:
-        KervError: All training episodes of a task, or all its held-out episodes, are shorter than the window.
+        KervError: A task has no training episode, or no held-out episode, that is longer than the window.
     """
     tasks = tuple(dict.fromkeys(dataset.episodes[i].task for i in chosen))
     counts = {task: {"training": 0, "held_out": 0} for task in tasks}
@@ -314,7 +314,7 @@ def read_windows(
 def choose_episodes(dataset: DemoDataset, tasks: Sequence[str], limit: int, share: float) -> dict[int, bool]:
     """Choose the first episodes of each task, and hold some of them out.
 
-    Every k-th of a task's plain episodes is held out, and every k-th of its perturbed episodes.
+    The share is held out evenly from a task's plain episodes and from its perturbed episodes.
 
     Args:
         dataset: The demonstrations.
@@ -340,7 +340,9 @@ def choose_episodes(dataset: DemoDataset, tasks: Sequence[str], limit: int, shar
 
 
 def fit_noise(past: np.ndarray, future: np.ndarray, dampings: Sequence[float]) -> tuple[float, float]:
-    """Fit the Kalman filter of one DoF on a grid: the smallest mean absolute error of its predictions.
+    """Find the noise and damping of one DoF's Kalman filter.
+
+    Try every pair of a noise in `RATIOS` and a damping. Return the pair with the smallest mean absolute error.
 
     Args:
         past: (n, window) normalised actions before each moment.
@@ -423,10 +425,11 @@ class Matches:
 
 
 def match(store: Datastore, task: str, epsilon: float) -> Matches:
-    """Look up each of up to ENTRIES entries of a task in the task's other episodes (docs/methods.md §4.3).
+    """Compare entries of a task with their most similar entries of the task's other episodes (docs/methods.md §4.3).
 
-    The best neighbour's chunk is the one that would be executed without verification. It is compared with the entry's
-    own chunk, the expert's next actions. With a single episode of the task there are no matches.
+    The most similar entry's chunk is the one that would be executed without verification. It is compared with the
+    entry's own chunk, the expert's next actions. At most ENTRIES entries are looked up. With a single episode of the
+    task there are no matches.
 
     Args:
         store: The datastore.
@@ -466,12 +469,12 @@ def lowest_level(matches: Matches, confidence: float, least: int = LEAST) -> flo
 
 
 def task_levels(matches: Matches, confidence: float) -> SkipLevel:
-    """Return a task's s_min, the smallest similarity at which verification is skipped, and the bounds of its feedback.
+    """Return a task's s_min, the smallest similarity at which verification is skipped, and its bounds.
 
     Feedback after each episode may move s_min between `low` and `high`. `low` allows twice the share of wrong chunks
-    that s_min allows, and `high` a third: for a confidence of 0.9, at least 0.8 and 0.967 of the chunks are good.
-    If no similarity is that good, `high` is the largest similarity seen. If none is good enough for s_min, all three
-    are NEVER, and the task never skips.
+    that s_min allows, and `high` a third of it. With a confidence of 0.9, that is 0.2 and 0.033. If no similarity is
+    good enough for `high`, `high` is the largest similarity seen. If none is good enough for s_min, all three are
+    NEVER, and the task never skips.
 
     Args:
         matches: The task's matches.
@@ -507,7 +510,7 @@ def skip_section(
         progress: Called with the numbers of tasks done and of all.
 
     Returns:
-        None if the datastore holds none of the tasks.
+        The thresholds. None if the datastore holds none of the tasks.
     """
     levels = {}
     for done, task in enumerate(tasks, 1):

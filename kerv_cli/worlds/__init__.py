@@ -82,7 +82,7 @@ def resolve_tasks(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def stands_for_tasks(name: str) -> bool:
-    """Return whether `name` is a task or suite in small letters. Demonstrations have such a name by default."""
+    """Return whether `name` is a task or suite in small letters. By default, demonstrations have such a name."""
     return name == name.lower() and any(spec.expand(name) for spec in specs().values())
 
 
@@ -105,7 +105,7 @@ def settled(world: W, spec: EnvironmentSpec) -> W:
 
     Raises:
         UnknownName: The environment has no such camera.
-        UsageError: The simulator cannot run that many control steps.
+        UsageError: The horizon is longer than the simulator can run.
     """
     camera = replace(world.camera, name=spec.camera_name(world.camera.name))
     return replace(world, camera=camera, horizon=spec.control_steps(world.horizon))

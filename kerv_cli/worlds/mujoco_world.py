@@ -185,8 +185,8 @@ class Camera:
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
         self._pixels = np.empty((pixels, pixels, 3), dtype=np.uint8)
-        # An open context at interpreter exit prints an EGLError. This was registered after mujoco.egl was imported, so
-        # it runs before mujoco's own handler ends the display.
+        # An open context at interpreter exit prints an EGLError. This handler is registered after the import of
+        # mujoco.egl, so it runs before mujoco's own handler, which ends the display.
         atexit.register(self.close)
 
     def render(self, data: mujoco.MjData) -> NDArray[np.uint8]:

@@ -75,19 +75,19 @@ class EnvironmentSpec:
 
     Attributes:
         name: Name in the registry.
-        actions: Action space, normalised by the environment's limits.
+        actions: Action space, with the environment's limits.
         observation: Observation space. The privileged state (all numbers of the simulator) begins with the
             proprioception.
         tasks: Full name -> task.
         suites: Name of a suite, in capitals -> full names of its tasks.
-        horizon: Default number of control steps of an episode. The simulator runs no more.
+        horizon: Default number of control steps of an episode, which is also the largest.
         cameras: Names of the cameras. The first is the default.
         world_class: `module:class` of the `World`. Empty for a recorded dataset, in which nothing can be executed.
-        expert_class: `module:class` that is called with (spec, task) and returns an `Expert`. Empty if there are none.
+        expert_class: `module:class` that is called with (spec, task) and returns an `Expert`. Empty: no experts.
         upside_down: Cameras whose raw images must be rotated by 180 degrees.
         suffix: Ending of all full task names. Users may leave it out.
         packages: Python packages whose versions determine the physics. The first one is the simulator's.
-        extra: Extra of kerv that installs the simulator: `pip install 'kerv[EXTRA]'`. Empty: kerv itself does.
+        extra: Extra of kerv that installs the simulator: `pip install 'kerv[EXTRA]'`. Empty: kerv itself installs it.
         grip: Two values of the gripper's DoF: the one that closes it and the one that opens it. Empty if there is no
             gripper.
         seeds: Ranges of episode seeds.
@@ -151,7 +151,7 @@ class EnvironmentSpec:
         return name or self.cameras[0]
 
     def camera(self, settings: CameraSettings | None = None) -> CameraSettings:
-        """Check camera settings and return them with the environment's first camera as default.
+        """Check camera settings and return them. An empty name becomes the environment's first camera.
 
         Args:
             settings: The settings. None: all defaults.
@@ -171,7 +171,7 @@ class EnvironmentSpec:
             horizon: The number to check. 0 stands for the environment's default.
 
         Raises:
-            UsageError: The simulator cannot run that many.
+            UsageError: The simulator cannot run that many control steps.
         """
         if not 0 <= horizon <= self.horizon:
             raise UsageError(f"horizon={horizon}: {self.name} runs 1 to {self.horizon} control steps")
@@ -333,12 +333,12 @@ class World(ABC):
 
     @property
     def grip_point(self) -> NDArray[np.float64]:
-        """Position (3,) where the hand grips, in metres. The end effector's, unless a subclass knows the fingertips."""
+        """Position (3,) where the hand grips, in metres. It is `end_effector` unless a subclass knows a better one."""
         return self.end_effector
 
     @property
     def object_position(self) -> NDArray[np.float64]:
-        """Position (3,) of the place `object`, in metres. NaN if the task has no such place."""
+        """Position (3,) of the object, in metres. NaN if the observation space has no place `object`."""
         for place in self.spec.observation.places:
             if place.name == "object":
                 return self.observation.state[place.first : place.first + 3].copy()
@@ -346,7 +346,7 @@ class World(ABC):
 
     @property
     def object_distance(self) -> float:
-        """Distance between `grip_point` and the place `object`, in metres. NaN if the task has no such place."""
+        """Distance between `grip_point` and `object_position`, in metres. NaN if there is no object."""
         return float(np.linalg.norm(self.grip_point - self.object_position))
 
     @property
@@ -398,7 +398,7 @@ class World(ABC):
     def frame(self, camera: CameraSettings | None = None) -> NDArray[np.uint8]:
         """Return the current image (size, size x views, 3) as uint8 RGB, for a recording.
 
-        A stress of images does not change it.
+        A stress that disturbs images does not change it.
 
         Args:
             camera: The view to draw. None: the world's own view.
@@ -424,7 +424,7 @@ class World(ABC):
 
         Args:
             camera: The views and their size.
-            stressed: Whether a stress of images changes the image.
+            stressed: Whether the stress may change the image.
         """
         parts = []
         for view in views_of(camera.name):

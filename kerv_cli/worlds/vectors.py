@@ -18,7 +18,7 @@ def length(vector: NDArray[np.float64]) -> float:
     """Return the length of a vector (n,).
 
     Each square is computed and added with a single rounding (fused multiply-add). OpenBLAS worked like this on the CPUs
-    that recorded the first datasets (AVX-512, up to 31 numbers). So these can be recorded again bit by bit.
+    that recorded the first datasets (AVX-512, up to 31 numbers). So those datasets can be recorded again bit by bit.
     """
     total = 0.0
     for number in vector.tolist():

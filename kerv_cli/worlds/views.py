@@ -19,9 +19,9 @@ class View(NamedTuple):
     """One of the views of an image.
 
     Attributes:
-        name: As in the name of the whole, such as `gripperPOV:75`.
+        name: This view's part of the full camera name, such as `gripperPOV:75` in `corner4+gripperPOV:75`.
         camera: Name of the camera.
-        fovy: Vertical field of view in degrees. None: as in the camera settings.
+        fovy: Vertical field of view in degrees. None: the camera settings decide.
     """
 
     name: str

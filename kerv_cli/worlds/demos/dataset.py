@@ -29,7 +29,7 @@ FORMAT = 2
 """Version of the manifest's format."""
 
 SPECS = SimpleNamespace()
-"""Specifications of environments that exist only as recorded datasets, as attributes."""
+"""Environments that exist only as recorded datasets: one attribute per specification, with the environment's name."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def episode_path(folder: Path, task: str, seed: int) -> Path:
 
 
 def dataset_hash(tasks: Mapping[str, Any]) -> str:
-    """Return a SHA-256 over the hashes of all episode files.
+    """Return the SHA-256 of a text with one line per episode: its task, its seed and the hash of its file.
 
     Args:
         tasks: The entry `tasks` of a manifest's JSON.
@@ -193,8 +193,8 @@ class DemoDataset:
     Attributes:
         path: The dataset's folder.
         manifest: What was recorded.
-        episodes: One entry per episode, by task in the order of recording, then by seed.
-        views: If images show several views side by side: how many of them to read, from the left. 0: all.
+        episodes: One entry per episode, in the order of the manifest's tasks. Within a task, seeds ascend.
+        views: Number of views to read from images that show several side by side, from the left. 0: all.
     """
 
     path: Path
@@ -247,8 +247,8 @@ class DemoDataset:
         """Join several datasets into one.
 
         Returns:
-            All episodes of the parts, in order. The manifest is the first part's, with the tasks of all parts and a
-            hash over all.
+            A dataset with all episodes, part by part. Its manifest is the first part's, but with the tasks of all parts.
+            The manifest's hash is over the hashes of the parts.
 
         Raises:
             CheckpointError: The parts have different environments, spaces or cameras.

@@ -1,4 +1,7 @@
-"""Files of demonstrations: episodes (safetensors with lossless PNG images, docs/formats.md), and Parquet of others."""
+"""Read and write episode files, and read Parquet files that other programs wrote.
+
+An episode file is a safetensors file with lossless PNG images (docs/formats.md).
+"""
 
 from __future__ import annotations
 
@@ -103,7 +106,7 @@ def save_episode(path: Path, episode: DemoEpisode) -> None:
 
 
 def _with_sorted_metadata(data: bytes) -> bytes:
-    """Sort the keys of the metadata in a safetensors file, given and returned as bytes.
+    """Return the bytes of a safetensors file with the keys of its metadata sorted.
 
     safetensors writes the keys in random order. Without sorting, two recordings of the same episode would have
     different hashes.
@@ -147,7 +150,7 @@ class EncodedFrames:
         spans: (n, 3) int64. For each image: index into `files`, position of the PNG's first byte, position after its
             last.
         size: Height in pixels.
-        width: Width in pixels. Parts of a PNG further to the right are cut off.
+        width: Width in pixels. A wider PNG is cut off at the right.
     """
 
     def __init__(self, files: Sequence[Path], spans: NDArray[np.int64], size: int, width: int) -> None:
@@ -205,7 +208,7 @@ class EncodedFrames:
         return EncodedFrames(self.files, self.spans[rows], self.size, self.width)
 
     def left(self, width: int) -> EncodedFrames:
-        """Return the same images, cut off at the right to a smaller `width`, so that only the first views remain."""
+        """Return the leftmost `width` pixels of the same images, so that only the first views remain."""
         return EncodedFrames(self.files, self.spans, self.size, width)
 
     def pixels(self) -> NDArray[np.uint8]:
@@ -251,7 +254,7 @@ _BATCH = 1024  # rows
 
 
 def foreign_table(source: Path | bytes, where: tuple[str, Any] | None = None) -> pa.Table:
-    """Read a table from a Parquet file, part by part.
+    """Read a table from a Parquet file of any origin. It is read part by part, so that its size can be limited.
 
     Args:
         source: The file's path or its bytes.
@@ -275,7 +278,10 @@ def foreign_table(source: Path | bytes, where: tuple[str, Any] | None = None) ->
 
 
 def _may_hold(group: pq.RowGroupMetaData, column: str, value: Any) -> bool:
-    """Return whether a part of a file (row group) can contain the value in a column, according to its statistics."""
+    """Return whether a row group (a part of a Parquet file) can contain `value` in `column`.
+
+    The group's statistics decide. Without statistics, it can.
+    """
     for number in range(group.num_columns):
         chunk = group.column(number)
         if chunk.path_in_schema == column and chunk.statistics is not None and chunk.statistics.has_min_max:

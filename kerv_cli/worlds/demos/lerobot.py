@@ -132,8 +132,9 @@ class Source:
 
         Args:
             episode: The episode's row in meta/episodes.
-            columns: The columns `columns`/chunk_index and `columns`/file_index of that row say which file it is.
-            form: Template of the path.
+            columns: Prefix of the two columns of that row that say which file it is. `data` stands for
+                `data/chunk_index` and `data/file_index`.
+            form: Template of the path, such as `DATA`.
         """
         indices = {f"{x}_index": int(episode[f"{columns}/{x}_index"]) for x in ("chunk", "file")}
         return self.folder / form.format(video_key=self.key, **indices)
@@ -242,11 +243,11 @@ def _import(source: Source, settings: DemosImportSettings, folder: Path, progres
 
 
 def _world_of(source: Source, settings: DemosImportSettings) -> EnvironmentSpec | None:
-    """Return the environment that the data were recorded in. None without the setting `environment`.
+    """Return the environment that the data were recorded in. None if the setting `environment` is empty.
 
     Raises:
         UnknownName: There is no such environment, or it has no such camera.
-        UsageError: The data have other actions than the environment, or another rate.
+        UsageError: The dataset has another number of DoFs than the environment, or another rate.
     """
     if not settings.environment:
         return None
@@ -262,15 +263,15 @@ def _world_of(source: Source, settings: DemosImportSettings) -> EnvironmentSpec 
 
 
 def _observation(source: Source, state: int, world: EnvironmentSpec) -> ObservationSpace:
-    """Return what the data hold of an environment's observations: everything, or the proprioception alone.
+    """Return the observation space of a dataset: that of the environment, or only its proprioception.
 
     Args:
         source: The dataset.
-        state: Numbers of state in its rows.
+        state: Number of state values in each row of the dataset.
         world: The environment.
 
     Raises:
-        CheckpointError: The rows hold another number of values.
+        CheckpointError: `state` fits neither of the two.
     """
     whole = world.observation
     alone = whole.without_state()
@@ -291,6 +292,9 @@ def _episode(source: Source, row: Row, names: Mapping[int, str], tail: int) -> D
         row: The episode's row in meta/episodes.
         names: task_index -> name of the task.
         tail: Number of copies of the last action to append to the labels.
+
+    Raises:
+        CheckpointError: Rows are missing, a file is damaged, or a number is not finite.
     """
     table = source.table(row)
     number = int(row["episode_index"])
@@ -345,8 +349,8 @@ def action_space(source: Source, settings: DemosImportSettings, actions: np.ndar
 def _groups(names: Sequence[str], strict: Sequence[str]) -> tuple[Group, ...]:
     """Divide the DoFs into groups.
 
-    If there are seven and only the last is strict, the groups are position, rotation and gripper. Otherwise each run of
-    neighbouring strict or other DoFs is a group.
+    If there are seven and only the last is strict, the groups are position, rotation and gripper. Otherwise,
+    neighbouring DoFs of the same sort (strict or not strict) form one group.
     """
     if len(names) == 7 and tuple(strict) == tuple(names[-1:]):
         return Group("position", 3), Group("rotation", 3), Group("gripper", 1)
@@ -355,9 +359,10 @@ def _groups(names: Sequence[str], strict: Sequence[str]) -> tuple[Group, ...]:
 
 
 def _task_names(tasks: Mapping[int, str], world: EnvironmentSpec | None) -> dict[int, str]:
-    """Return task_index -> name of the task: the environment's, or made from the instruction.
+    """Return the names of a dataset's tasks: task_index -> name.
 
-    A made name contains only characters that folders and settings allow.
+    In an environment, the name is that of the task with the same instruction. Otherwise it is made from the
+    instruction, with only the characters that folders and settings allow.
 
     Args:
         tasks: task_index -> instruction.
@@ -380,7 +385,7 @@ def _task_names(tasks: Mapping[int, str], world: EnvironmentSpec | None) -> dict
 
 
 def _table(path: Path, where: tuple[str, Any] | None = None) -> pa.Table:
-    """Read a table. `where` is as in `foreign_table`.
+    """Read a Parquet file with `foreign_table`, which explains `where`.
 
     Raises:
         CheckpointError: The file is missing or damaged.

@@ -103,7 +103,7 @@ class Actor(Protocol):
 
 
 MakeActor = Callable[[DemoConfig], Actor]
-"""Creates the actor, in the process that records. It must be picklable."""
+"""Creates the actor in the process that records. The function must be picklable."""
 
 
 def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None) -> DemoEpisode | None:
@@ -116,8 +116,8 @@ def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None)
         actor: Moves the robot. None: the expert does.
 
     Returns:
-        The episode. None if the expert did not succeed in time: within `config.horizon`, and early enough for the
-        simulator to run `config.tail` more steps. An actor's episode is kept even if it did not succeed.
+        The episode. None if the expert did not succeed within `config.horizon` steps, or too late for the simulator to
+        run `config.tail` more. An actor's episode is returned even if it did not succeed.
     """
     expert = world.spec.expert(world.task)
     observation = world.reset(seed)

@@ -50,7 +50,7 @@ class LiberoExpert:
         name = spec.task(task).name
         angle = math.radians(_SIDES.get(name, _LEFT))
         self._side = np.array([_RIM * math.cos(angle), _RIM * math.sin(angle), _LOW])
-        # a hand that is not turned opens its fingers along y, and they open alike after half a turn
+        # the fingers of a hand that is not turned open along y; half a turn changes nothing
         yaw = (angle - math.pi / 2 + math.pi / 2) % math.pi - math.pi / 2
         self._turn = Rotation.from_rotvec([0.0, 0.0, yaw])
         self._carry = _CARRY[name in _HIGH]

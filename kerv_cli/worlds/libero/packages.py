@@ -17,7 +17,7 @@ def check_packages() -> None:
     """Check that LIBERO, its five asset packages and its simulator are installed in versions that work together.
 
     Raises:
-        UsageError: A package is missing, has another version, or shares the import name `libero`.
+        UsageError: A package is missing or has another version. Or another package has the import name `libero`, too.
     """
     for owner in packages_distributions().get("libero", ()):
         if owner != PACKAGE:

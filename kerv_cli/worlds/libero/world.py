@@ -1,12 +1,12 @@
 """Run LIBERO's tasks as kerv's worlds.
 
 Evaluation seeds are the benchmark's own initial states, in order. Other seeds draw object positions from the task's
-regions, as LIBERO did for its demonstrations. The poses of furniture are drawn in both cases, because the initial
-states do not contain them. Each episode begins after ten control steps without motion, as in OpenVLA's evaluation:
-objects fall into place.
+regions, as LIBERO did for its demonstrations. The poses of furniture are random in both cases, because the initial
+states do not contain them. Each episode begins after ten control steps without motion, as in OpenVLA's evaluation, so
+that objects fall into place.
 
-robosuite computes every physics step three times, twice of them for the controller. kerv computes it once, which halves
-the time of a control step.
+robosuite computes every physics step three times, twice for the controller. kerv computes it once, which halves the
+time of a control step.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ _DOWN = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _OPEN = 0.08
 """Distance of the fingers of an open gripper, in metres."""
 _NOISE = 0.02
-"""Standard deviation of the arm's first joint angles in drawn states, radians; the benchmark's states have it, too."""
+"""Standard deviation of the arm's joint angles at the start, in radians. The benchmark's states already contain it."""
 
 
 @contextlib.contextmanager
 def _private_random() -> Iterator[None]:
-    """Keep numpy's global random numbers, which LIBERO seeds and draws from, as they were."""
+    """Restore numpy's global random state afterwards, because LIBERO seeds it and draws from it."""
     state = np.random.get_state()  # noqa: NPY002
     try:
         yield
@@ -117,7 +117,7 @@ class Libero(MujocoWorld):
         """Execute a control step: 25 physics steps, in each of which the controller computes new torques."""
         import mujoco
 
-        # robosuite recomputes positions and forces before every physics step. The first half of a step has done it.
+        # robosuite recomputes positions and forces before every physics step. mj_step1 has already done that.
         self._sim.forward = lambda: None
         try:
             for first in (True, *(False,) * 24):
@@ -130,7 +130,7 @@ class Libero(MujocoWorld):
         self._env._post_process()
 
     def _numbers(self) -> NDArray[np.float64]:
-        """Return the state (13,) without the part that repeats the previous step."""
+        """Return the 13 numbers of the state that describe the current step: hand (7), object (3) and goal (3)."""
         from scipy.spatial.transform import Rotation
 
         site, bodies = self._robot.eef_site_id, self._env.obj_body_id

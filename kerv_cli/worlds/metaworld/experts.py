@@ -55,8 +55,8 @@ class HandlePullSide:
 class PegInsertSide:
     """Opens the gripper before going down, carries the peg slowly, and continues if the peg slips a little.
 
-    Meta-World's expert jerks the peg so that it slips. Once the peg hangs more than 2.5 cm below the hand, it goes down
-    to the peg with closed fingers and drags it along the table for the rest of the episode.
+    Meta-World's expert jerks the peg so that it slips. Once the peg hangs more than 2.5 cm below the hand, the expert
+    goes down to it with closed fingers and drags it along the table for the rest of the episode.
     """
 
     above = 0.15
@@ -72,7 +72,7 @@ class PegInsertSide:
     carry = 0.7
     """Largest action while carrying the peg."""
     before, behind, height = 0.05, -0.35, 0.16
-    """Goals of the hand in metres: x before the hole, x after it, and height z."""
+    """Goals of the hand in metres: x before the hole, x beyond the hole, and height z."""
 
     def get_action(self, state: Array) -> Array:
         """Return the action (4,) for a state (39,), not clipped."""

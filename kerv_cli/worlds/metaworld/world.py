@@ -62,7 +62,7 @@ class MetaWorld(MujocoWorld):
 
     @property
     def grip_point(self) -> NDArray[np.float64]:
-        """Position (3,) between the fingertips, in metres. The end effector's is 4.5 cm above it."""
+        """Position (3,) between the fingertips, in metres. The end effector is 4.5 cm above it."""
         return np.array(self._env.tcp_center, dtype=np.float64)
 
     def _start(self, seed: int) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Base class of every kind of stress: what it may change in an episode, its random numbers, and changes of a model."""
+"""The base class of every kind of stress, and a class that undoes changes of a MuJoCo model."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def factor_or_inverse(random: np.random.Generator, factor: float) -> float:
 
 
 def robot_roots(model: Model) -> set[int]:
-    """Return the ids of the root bodies of robots, which are the bodies that an actuator moves."""
+    """Return the ids of the robots' root bodies: the root above every body that an actuator moves."""
     import mujoco
 
     joints = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)

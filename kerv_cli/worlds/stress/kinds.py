@@ -12,7 +12,7 @@ from kerv_cli.worlds.stress.base import Array, Model, ModelChanges, Stress, fact
 from kerv_cli.worlds.vectors import unit_vector
 
 WIDE = 0.35
-"""A fixed geom is background or table if it is a plane or its bounding sphere has at least this radius, in metres."""
+"""A fixed geom (shape) is scenery if it is a plane, or if its bounding sphere has at least this radius in metres."""
 _FROM_MATERIAL = 0.5, 0.5, 0.5, 1.0  # rgba of a geom that takes its colour from its material
 
 
@@ -21,7 +21,7 @@ class Light(Stress):
 
     Each level is (gain, degrees):
 
-    - gain: factor for the strength of all lights, or its inverse
+    - gain: the strength of all lights is multiplied or divided by it
     - degrees: angle by which each lamp is rotated about a random axis through the origin
     """
 
@@ -93,7 +93,7 @@ def _random_turn(random: np.random.Generator, degrees: float) -> Rotation:
 
 
 def scenery_of(model: Model) -> list[int]:
-    """Return the ids of the geoms that are background or table."""
+    """Return the ids of the geoms (shapes) that are scenery, which is background or table."""
     import mujoco
 
     robots, plane = robot_roots(model), mujoco.mjtGeom.mjGEOM_PLANE
