@@ -79,7 +79,7 @@ class Study:
         return data.table[data.table["averaging"] == MICRO].reset_index(drop=True)
 
     def episodes(self) -> list[Row]:
-        """Return the rows of the table `episodes` as dictionaries; errors as `to_pandas`."""
+        """Return the rows of the table `episodes` as dictionaries. It raises the same errors as `to_pandas`."""
         return rows_of(self.to_pandas("episodes"))
 
     def report(self) -> list[Path]:
@@ -123,7 +123,7 @@ def sweep(study: str | Path, *overrides: str, **settings: object) -> Study:
     Args:
         study: Name of a file in conf/study, or the path of such a file.
         *overrides: Settings as text, such as `"episodes=5"`. They apply to each of the study's settings.
-        **settings: Settings as keywords, likewise.
+        **settings: Settings as keywords. They, too, apply to each of the study's settings.
 
     Raises:
         UsageError: A setting does not exist, or its value is impossible.

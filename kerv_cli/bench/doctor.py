@@ -101,8 +101,8 @@ def check_environment_of(settings: DoctorSettings) -> list[Finding]:
 def _rendering(spec: EnvironmentSpec, settings: DoctorSettings) -> str:
     """Render frames of an environment and time them. Return the result as text.
 
-    A frame must not be empty: a broken OpenGL backend can load without an error and render nothing. An environment of
-    an extra need not be installed, and its frames may take longer.
+    A frame must not be empty: a broken OpenGL backend can load without an error and render nothing. An environment that
+    needs an extra of kerv may be missing, and its frames may take longer.
     """
     from kerv_cli.worlds.mujoco_world import choose_backend
 

@@ -34,7 +34,7 @@ class Machine:
     caches: tuple[tuple[float, float], ...] = ()
 
     def bandwidth_of(self, read: float) -> float:
-        """Return the bandwidth of reading `read` bytes repeatedly, measured with the smallest buffer of that size."""
+        """Return the bandwidth of reading `read` bytes repeatedly, that of the smallest buffer with as many bytes."""
         return next((rate for size, rate in self.caches if read <= size), self.bandwidth)
 
     def bounds(self, read: float, flops: float) -> tuple[float, float]:
@@ -42,7 +42,7 @@ class Machine:
         return read / self.bandwidth_of(read), flops / self.flops
 
     def best_of(self, other: Machine) -> Machine:
-        """Return the higher rate of two measurements in each field, because other programs can only slow one down."""
+        """Return the better value of two measurements in each field. Other programs can only make a value worse."""
         caches = [(size, max(a, b)) for (size, a), (_, b) in zip(self.caches, other.caches, strict=True)]
         return Machine(max(self.bandwidth, other.bandwidth), max(self.flops, other.flops), tuple(caches))
 

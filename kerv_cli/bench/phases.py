@@ -173,8 +173,8 @@ def costs_of(
         yield ("verify", 1 + nodes.pop()), seconds["verify"] / (len(rounds) - 1)
     drafter = decoder.parts.proposer
     if isinstance(drafter, DrafterProposer):
-        # after a first lap for the thresholds: the prompt's states are read; then in turn a draft is made, and the
-        # states of its tokens are read
+        # The first lap computes thresholds. In the second, the drafter reads the prompt's states. After that, drafting
+        # and reading the states of accepted tokens take turns.
         _, prompt_states, *turns = (s for name, s in laps if name == "propose")
         yield ("feed", prompt), prompt_states
         for one, drafting in zip(rounds[1:], turns[::2], strict=False):
@@ -260,7 +260,7 @@ def needs_of_draft(decoder: Any) -> tuple[float, float]:
 
 
 def source_methods() -> dict[str, str]:
-    """Return the drafts that have a phase of their own, such as `early`, and for each a method to measure it with."""
+    """Return kind of phase -> method to measure it with, for the drafts that have their own phase, such as `early`."""
     measured = [part.traits for part in parts("proposer").values() if "measured_by" in part.traits]
     return {traits["cost"]: traits["measured_by"] for traits in measured}
 

@@ -121,7 +121,7 @@ def show_film(request: Request) -> Response:
 
 
 def record(request: Request) -> Response:
-    """Begin to record an episode, unless that is under way."""
+    """Start to record an episode, unless it is being recorded already."""
     found = _found(request)
     if found.store.kind == IMPORT:
         raise HTTPException(409, "an imported episode cannot be recorded: another program ran it")
@@ -162,7 +162,7 @@ _VIEWER_SECONDS = 20.0
 def viewer_files() -> dict[str, tuple[bytes, str]]:
     """Return the files of Rerun's web viewer: name -> content and media type.
 
-    The package of Rerun gives them only through its own server. It runs for a moment, for this machine alone.
+    Rerun's package gives them only through its own server, which runs for a moment, for this machine alone.
 
     Raises:
         KervError: The server does not start.

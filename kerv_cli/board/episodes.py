@@ -79,7 +79,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Grid:
-    """The episodes of one task: label of a setting -> seed -> cell. The seeds that fail most often come first."""
+    """The episodes of one task. `rows` maps labels to seed -> cell. `seeds` begins with those that fail most."""
 
     task: str
     seeds: list[int]
@@ -138,9 +138,10 @@ def grids_of(cells: Sequence[Cell]) -> list[Grid]:
 
 
 def clusters_of(cells: Sequence[Cell]) -> list[tuple[list[Cell], int]]:
-    """Return failures of one task, setting, stress and phase, and how many episodes of that task and setting have run.
+    """Group failures by task, setting and phase, the largest group first.
 
-    The largest groups come first.
+    Returns:
+        Each group, with the number of episodes of its task and setting that have run.
     """
     groups: dict[tuple[str, ...], list[Cell]] = defaultdict(list)
     for cell in cells:

@@ -57,7 +57,7 @@ class Recorder:
         return self._jobs.get(path)
 
     def record(self, found: FoundEpisode) -> None:
-        """Begin to record an episode, unless that is under way."""
+        """Start to record an episode, unless it is being recorded already."""
         from joblib.externals.loky import get_reusable_executor
 
         path = found.recording

@@ -68,7 +68,8 @@ class RunEntry:
         figures: Its main numbers by name, such as the success rate.
         command: Command-line arguments (without `kerv`) that made it. Empty if unknown.
         sha256: Hash by which other artifacts refer to it.
-        made_from: Kind -> hash, for the artifacts that it was made from. `KIND of LABEL` for a second one of a kind.
+        made_from: Kind -> hash of each artifact that it was made from. If a study uses a second artifact of a kind, the
+            key is `KIND of LABEL`, with the label of its setting.
     """
 
     id: str
@@ -162,8 +163,8 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
 
     Args:
         runs: Entries to choose from.
-        filters: Name of a filter -> its value. kind: equal. method and task: equal, or a pattern such as `drawer*`.
-            state: how the state begins. since: earliest start (ISO 8601).
+        filters: Name of a filter -> its value. `kind` is a whole kind. `method` and `task` are names, or patterns such
+            as `drawer*`. `state` is the beginning of a state, and `since` the earliest start (ISO 8601).
 
     Raises:
         UnknownName: A filter, kind or state does not exist.
@@ -315,7 +316,7 @@ def _artifact(folder: Path, kind: str) -> RunEntry:
 
 
 def _hash_of(path: Path, value: Mapping[str, Any]) -> str:
-    """Return the hash of an artifact's weights or data. If it names none, return the hash of its description.
+    """Return the hash of an artifact's weights or data. If the description names none, return the description's hash.
 
     Args:
         path: File of the description.
@@ -437,7 +438,7 @@ def plan_of(run: RunEntry, results: str) -> Plan:
 
 
 def checked(setting: Setting, tasks: list[str], results: str) -> Setting:
-    """Return a stored setting for this results folder.
+    """Check that a stored setting still has the same weights and data. Return it for this results folder.
 
     Raises:
         CheckpointError: Its weights or data have changed.

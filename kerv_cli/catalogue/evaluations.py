@@ -358,7 +358,7 @@ def path_of(results: Path, evaluation: str, episode: str) -> Path | None:
 
 
 def write_served(path: Path, record: EpisodeRecord, started: str, by: Mapping[str, Any]) -> None:
-    """Write one episode.
+    """Write an episode that a kerv server decoded to a file.
 
     Args:
         path: The file.
@@ -380,7 +380,7 @@ def write_served(path: Path, record: EpisodeRecord, started: str, by: Mapping[st
 
 
 def read_served(path: Path) -> tuple[dict[str, Any], pa.Table] | None:
-    """Read one episode.
+    """Read an episode that `write_served` wrote.
 
     Returns:
         The episode's columns, and the table of its decodes. None if the file does not exist.

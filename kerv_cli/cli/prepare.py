@@ -62,7 +62,7 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
 
 
 def unsolved_by(settings: PrepareSettings) -> str:
-    """Say that the policy does not solve its tasks, if the test for its certificate has shown it. Else return ""."""
+    """Return a sentence if the test for the certificate has shown that the policy does not solve its tasks, else ""."""
     from kerv_cli.methods.artifacts import Artifacts
     from kerv_cli.methods.certified.certificate import CertificateArtifact
     from kerv_cli.report.matched import SOLVED

@@ -175,7 +175,7 @@ def print_study(table: DataFrame, store: StudyStore, all_columns: bool = False, 
         table: Summary with one row per setting.
         store: The study in the database.
         all_columns: Print all columns, not only those that people need first.
-        how: What to type to see all columns. Empty: a command of its own.
+        how: What to type to see all columns. Empty: `kerv report study=NAME --all`.
     """
     from kerv_cli.report.summary import SummaryTable, not_in_turn
     from kerv_cli.report.tables import values_of

@@ -25,7 +25,7 @@ CHUNK = "chunk"
 """Value of `rollout.delay_compensation`: do not execute actions of a new chunk that are already too old."""
 
 Latency = Callable[[DecodeRecord], float]
-"""Function that returns the seconds from a decode's observation to its first action."""
+"""Function that takes a decode's record and returns the seconds from its observation to its first action."""
 
 
 def steps_of(seconds: float, control_hz: float) -> int:
@@ -156,7 +156,7 @@ def latency_of(settings: RolloutSettings, target: TargetDescription | None, meas
 
 
 def profiled(profile: Profile, scale: float = 1.0) -> Latency:
-    """Return a latency function that applies the cost model and multiplies the result by `scale`."""
+    """Return a latency function: the seconds that a decode's work costs in `profile`, multiplied by `scale`."""
     return lambda decode: scale * float(prices(work_of_record(decode), profile)[0])
 
 

@@ -20,14 +20,14 @@ from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import World
 
 AT_OBJECT = 0.05
-"""Metres. Once the fingertips came closer to the object than this, they count as the cause of its motion."""
+"""Distance in metres. Once the fingertips have been closer to the object, they count as the cause of its motion."""
 
 
 def moved_after_approach(distances: Sequence[float], objects: Sequence[np.ndarray]) -> float:
-    """Return how far the object moved, at most, after the fingertips first came within AT_OBJECT of it, in metres.
+    """Return the object's largest displacement, in metres, since the fingertips first came within AT_OBJECT of it.
 
-    Earlier motion does not count, because some objects fall into place at the start. 0 if the fingertips never came so
-    close. NaN if the task has no object.
+    Earlier motion does not count, because some objects fall into place at the start. The result is 0 if the fingertips
+    never came so close, and NaN if the task has no object.
 
     Args:
         distances: Distance between fingertips and object after each step.
@@ -92,7 +92,8 @@ class _Execution:
             delay: How long the decode takes.
 
         Returns:
-            The delay, with the numbers of steps that executed the previous chunk and that held the last action.
+            The delay, with two numbers of steps filled in: `carried` steps executed the rest of the previous chunk, and
+            `held` steps repeated the last action.
         """
         before, in_chunk = len(self.actions), len(self.chunk)
         while len(self.actions) < before + delay.steps and not self.world.done:
@@ -139,8 +140,9 @@ def episode(
 ) -> Generator[Observation, DecodeRecord, EpisodeRecord]:
     """Run one episode like `run_episode`, but let the caller decode.
 
-    This is a generator. It yields each observation, expects the decode's record from `send`, and returns the episode's
-    record at the end.
+    This generator yields each observation and is sent the record of its decode. At the end it returns the episode's
+    record. `follower` is told about the start, every executed action and the end. It is the decoder itself, or what a
+    batch decoder keeps for this episode. The other arguments are those of `run_episode`.
     """
     began = time.perf_counter()
     world.reset(seed)

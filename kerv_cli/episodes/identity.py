@@ -24,7 +24,7 @@ from kerv_cli.episodes.settings import CONSTANT, PROFILE, WAITS, RolloutSettings
 from kerv_cli.methods.settings import EXPERT
 
 ENGINE = 1
-"""Version of the tokens that the code gives. Increase it with every change that alters tokens or actions.
+"""Version of the decoding. Increase it with every change of the code that alters tokens or actions.
 tests/test_golden.py checks this."""
 
 Plain = Mapping[str, Any]
@@ -36,8 +36,8 @@ Identity = Mapping[str, str]
 OBSERVATION = "observation"
 """Key of the identity's only entry that is not a hash: what the target observes."""
 
-# Fields of RolloutSettings that are no part of a setting's hash: they do not change a result (folders, recording,
-# names), or are stored separately (task and seed; the policy by its hashes). All other fields are part of it.
+# Fields of RolloutSettings that are left out of a setting's hash: they do not change a result (folders, recording,
+# names), or are stored separately (task and seed; the policy by its hashes). All other fields are hashed.
 NOT_DETERMINING = frozenset(
     {"task", "episodes", "seed", "policy", "method", "results", "store", "record", "record_size"}
 )
@@ -64,7 +64,7 @@ def work_of(settings: Plain, identity: Identity, engine: int = ENGINE) -> str:
     Args:
         settings: The rollout's settings as nested plain values.
         identity: Hashes of its weights and data, as `policy.check` returns them.
-        engine: Version of the tokens that the code gives.
+        engine: Version of the decoding, see `ENGINE`.
     """
     determining = without(settings, NOT_DETERMINING - {"policy", "method"})
     policy = settings["policy"]["kind"]

@@ -28,7 +28,7 @@ class Point:
     Attributes:
         name: Name of the grid, which all its points share.
         overrides: This point's overrides, `key=value`.
-        varies: Keys that differ within the grid, and this point's values.
+        varies: Key -> this point's value, for the keys that differ within the grid.
     """
 
     name: str

@@ -27,7 +27,7 @@ def _summed(value: Callable[[DecodeRecord], Any]) -> Callable[[EpisodeRecord], A
 
 
 def _judged(value: Callable[[Round], int]) -> Callable[[EpisodeRecord], int]:
-    """Return a function that sums a value over all rounds of an episode in which the target verified a draft."""
+    """Return a function that sums a value over those rounds of an episode in which a draft was verified."""
     return _summed(lambda decode: sum(value(one) for one in decode.rounds if one.is_verification))
 
 

@@ -255,9 +255,9 @@ def _configure(connection: Any, record: object) -> None:
 
 
 def _begin(connection: sa.Connection) -> None:
-    """Start a transaction.
+    """Start a transaction. If it will write, first wait until no other process writes.
 
-    Only one process writes at a time; others wait. So what a writer has read stays true until it commits.
+    So what a writer has read stays true until it commits.
     """
     if connection.get_execution_options().get("kerv_writes"):
         postgresql = connection.dialect.name == "postgresql"
@@ -287,7 +287,7 @@ def measures_in(connection: sa.Connection) -> list[sa.ColumnElement[Any]]:
 
 
 def _add_measures(connection: sa.Connection) -> None:
-    """Add the columns of MEASURES that an older kerv did not store. It can still read and write the table."""
+    """Add the columns of MEASURES that an older kerv did not store. The older kerv can still use the table."""
     quote = connection.dialect.identifier_preparer.quote
     for column, found in zip(MEASURES, measures_in(connection), strict=True):
         if not isinstance(found, sa.Column):

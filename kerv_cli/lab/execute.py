@@ -48,7 +48,7 @@ RunEpisode = Callable[[int], EpisodeRecord]
 """Function that runs the episode with a given seed."""
 
 Prepare = Callable[[Setting, str], RunEpisode]
-"""Function that builds and warms up a setting's decoder for a task. Picklable. `together` runs batches."""
+"""Function that builds and warms up a setting's decoder for a task. Picklable. Its method `together` runs batches."""
 
 
 @dataclass(frozen=True)
@@ -414,8 +414,8 @@ class _Sweep:
     def _lost(self, attempt: _Attempt) -> list[Episode]:
         """Return the episodes of a lost worker's block that must run again.
 
-        These are the episodes that did not end. If a setting's results depend on the order of episodes, all of its
-        episodes run again.
+        These are the episodes that have neither ended nor failed. If a setting's results depend on the order of its
+        episodes, the ended ones run again, too, and no longer count as done.
         """
         rest = attempt.rest
         whole = {one.setting.work for one in rest if one.setting.depends_on_order}

@@ -154,8 +154,8 @@ def pulse(database: Database) -> tuple[str, bool]:
     """Look whether anything in the results folder has changed, without reading all of it.
 
     Returns:
-        A text that every heartbeat, start and end of a command and every new episode changes. And whether a command is
-        running.
+        A text, which changes with every heartbeat, start or end of a command and with every new episode. And whether a
+        command is running.
     """
     studies = sa.select(sa.func.count()).select_from(STUDIES).scalar_subquery()
     newest = sa.select(sa.func.max(EPISODES.c.id)).scalar_subquery()
@@ -308,7 +308,7 @@ def forget(database: Database, kind: str, name: str) -> None:
 
 
 def interrupted_since(database: Database, kind: str, name: str, command: Sequence[str]) -> str:
-    """Return the first start time of an interrupted command that now runs again (ISO 8601).
+    """Return when a command that was interrupted, perhaps several times, was first started (ISO 8601).
 
     Empty if the newest run of this study or artifact has other arguments or is complete.
 

@@ -68,7 +68,7 @@ class ImportedEpisode:
 
 
 def _same_episode() -> sa.ColumnElement[bool]:
-    """Return the condition that joins SETTINGS and WANTED to every stored run of an episode."""
+    """Return the condition that joins SETTINGS and WANTED to all rows of EPISODES that hold the same episode."""
     return sa.and_(
         EPISODES.c.work == SETTINGS.c.work, *(EPISODES.c[name] == WANTED.c[name] for name in ("task", "seed", "repeat"))
     )
@@ -153,8 +153,8 @@ class StudyStore:
     def save(self, study: Study, existing: Mapping[Episode, StoredEpisode] | None = None) -> None:
         """Write a study's settings and episodes.
 
-        A setting that did not change keeps its episodes of other tasks, so that sweeps of one study over different
-        tasks give one report. Only seeds and repeats in the new study's ranges are kept.
+        A setting that did not change keeps its episodes of other tasks, if their seeds and repeats are in the new
+        study's ranges. So sweeps of one study over different tasks give one report.
 
         Args:
             study: The study.
@@ -238,7 +238,7 @@ class StudyStore:
 
         Args:
             episodes: Only these episodes; None for all.
-            run: Only episodes that the command with this id ran; None for the study's present ones.
+            run: Only episodes that the command with this id ran. None: the episodes that the study uses now.
         """
         import numpy as np
         import pandas as pd

@@ -68,7 +68,7 @@ class EpisodeRunner:
 
 
 def study_of(resolved: ResolvedStudy, kind: str = SWEEP) -> Study:
-    """Check a study's settings, and return the study with all its episodes. Devices are those of this machine.
+    """Check a study's settings, and return the study with all its episodes. `auto` devices are replaced by real ones.
 
     Args:
         resolved: The composed study.

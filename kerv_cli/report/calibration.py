@@ -16,9 +16,8 @@ Table = tuple[tuple[str, ...], list[tuple[object, ...]], str]
 def tables(calibration: Calibration, path: Path) -> Iterator[Table]:
     """Yield two or three tables: motion per task, errors of the motion predictors, and thresholds for verify-skip.
 
-    The first holds K, a measure of how variable a task's motion is, and its reference level K_S (docs/methods.md §3).
-    The third says when a retrieved chunk may be executed without verification (§4). It is left out if that was not
-    calibrated.
+    The first holds each task's K_S, the reference level of its kinematic variability (docs/methods.md §3). The third
+    says when a retrieved chunk may be executed without verification (§4). It is left out if this was not calibrated.
 
     Args:
         calibration: The calibration.

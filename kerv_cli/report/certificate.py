@@ -109,7 +109,7 @@ def planned_certificate(
         settings: Settings of the test.
 
     Raises:
-        UsageError: The policy was tested before, or another study ran episodes with these seeds.
+        UsageError: The policy was tested before and `again` is not set, or its seeds were used before.
         CheckpointError: An artifact of a candidate is missing or damaged.
     """
     baseline, first = _settings(resolved)[:2]
@@ -176,7 +176,7 @@ def _candidate(planned: Candidate, pairs: pd.DataFrame, margin: float, delta: fl
         pairs: Its episodes paired with AR's, from `paired`.
         margin: Largest acceptable loss of success, in points.
         delta: Level of the test.
-        testing: False after an earlier setting has failed: the setting gets no p-value.
+        testing: Whether to compute a p-value. False after an earlier setting has failed, or if AR solves too little.
     """
     ar, own = (pairs[f"success_{side}"].to_numpy(float) for side in ("baseline", "method"))
     # (n,) values in a random order, independent of the tasks

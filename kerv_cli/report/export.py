@@ -44,7 +44,7 @@ def export(run: RunEntry, to: str, folder: Path) -> list[Path]:
 
 
 def _episodes(store: StudyStore) -> pd.DataFrame:
-    """Return the episodes of a study, a row each, as `StudyStore.frame`; raises UsageError if there are none."""
+    """Return the table of a study's episodes that `StudyStore.frame` makes. Raise UsageError if there are none."""
     frame = store.frame()
     if frame.empty:
         raise UsageError(f"study '{store.name}' has no episode yet: {store.how_to_run()}")

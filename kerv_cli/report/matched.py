@@ -1,6 +1,6 @@
 """Matched-success speed: how fast a method is at its fastest setting that keeps success (docs/methods.md §7).
 
-The measure is of WA-SpecDec, arXiv 2608.08725.
+The measure is from WA-SpecDec, arXiv 2608.08725.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ def safety(row: Row) -> tuple[float, float]:
     """Return the key that sorts settings from the safest on. It does not depend on success.
 
     The setting with the smallest unverified share comes first: the share of executed actions that the target has not
-    verified, rounded to whole per cent. Settings that decode nothing come last. Ties go to more target forwards per
-    control step.
+    verified, rounded to whole per cent. Settings that decode nothing come last. Of settings with equal shares, the one
+    with the most target forwards per control step comes first.
     """
     unverified = float(row["unverified_share"])
     return (1.0 if math.isnan(unverified) else round(unverified, 2), -row["forwards_per_step"])

@@ -148,10 +148,14 @@ def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame
         baselines: Label of a setting -> label of its baseline. Other settings are left out.
 
     Returns:
-        One row per pair, sorted by task, seed and repeat. Columns: `label`, `task`, `difficulty`, `seed`, `repeat`,
-        `decodes`, `same_run`, `same_block`; with the endings _baseline and _method: `time` (seconds per control step),
-        `seconds` (of the whole episode), `block`, `success`; and 1 or 0 in the columns of `PairedCounts`. Those are all
-        0 in repeats, which measure the same world again.
+        One row per pair, sorted by task, seed and repeat. It has these columns:
+
+        - `label`, `task`, `difficulty`, `seed`, `repeat`, `decodes` (whether the setting runs a decoder), `same_run`
+          and `same_block`
+        - for each side, with the ending _baseline or _method: `time` (seconds per control step), `seconds` (of the
+          whole episode), `block` and `success`
+        - the four outcomes of `PairedCounts`: 1 for the outcome of this pair, 0 for the others. In repeats, which
+          measure the same world again, all are 0.
     """
     keys = ["task", "seed", "repeat"]
     columns = ["label", *keys, "run", "block", "success", "seconds", "initial_state", *COMPARABLE]

@@ -37,13 +37,16 @@ from kerv_cli.report.viewing.film import animation, film_of
 LOSS = 3.0
 """Default for the largest loss of success that the page's verdict accepts, in points."""
 _FRAMES = 240
-"""A film plays at half speed, or faster if it has more than half as many frames. So it stays short and small."""
+"""A film plays at half speed. If it has more than half as many frames, it plays faster, to stay short and small."""
 
 
 def render(
     store: StudyStore, data: StudyData, loss: float, priced: pd.DataFrame | None = None, tables: Sequence[Path] = ()
 ) -> str:
-    """Return the study's page as one HTML file that needs no other file and no network; arguments as `study_parts`."""
+    """Return the study's page as one HTML file that needs no other file and no network.
+
+    `study_parts` explains the arguments.
+    """
     loader = PackageLoader("kerv_cli.report", "templates")
     template = Environment(loader=loader, autoescape=True, undefined=StrictUndefined).get_template("study.html")
     values = study_parts(store, data, loss, priced, tables) | {"films": _films(store, data)}

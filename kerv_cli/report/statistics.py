@@ -124,7 +124,8 @@ def difference(first: Estimate, second: Estimate) -> Estimate:
     """Estimate the second of two independent success rates minus the first.
 
     With Wilson intervals this is Newcombe's hybrid score interval (Statistics in Medicine 17, 1998, page 873, method
-    10): each end is as far away as the root of the sum of the two rates' squared distances.
+    10). Each rate has a distance to one end of its interval. The root of the sum of the two squared distances is the
+    distance from the difference to one end of its interval.
 
     Args:
         first: A rate with its interval.
@@ -259,8 +260,8 @@ def over_runs(estimates: Sequence[Estimate]) -> Estimate:
     """Combine a speedup that several runs measured with the same pairs.
 
     The value is the geometric mean. The half width of the logarithm's 95 % interval has two independent parts, whose
-    squares are added: that of the pairs, which more runs do not reduce because all runs have the same pairs, and that
-    of the k runs, by Student's t with k − 1 degrees of freedom.
+    squares are added. The first comes from the pairs. More runs do not reduce it, because all runs have the same pairs.
+    The second comes from the k runs, by Student's t with k − 1 degrees of freedom.
 
     Args:
         estimates: The speedup in each run, with the interval over its pairs.

@@ -16,10 +16,9 @@ def is_stressed(table: pd.DataFrame) -> bool:
 
 
 def summed_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Pool a study's episodes over the levels of each kind of stress, the kinds at each level, and all stresses.
+    """Pool a study's stressed episodes: those of each kind of stress, those of each level, and all of them.
 
-    Each pooled row is compared with the baseline's episodes in the same worlds under the same stresses. Unstressed
-    episodes are left out.
+    Each pooled row is compared with the baseline's episodes in the same worlds under the same stresses.
 
     Returns:
         Columns: `study`; `label` (METHOD and SUM); `method` (label without stress); `sum` (such as `push`, `level 2` or

@@ -63,8 +63,8 @@ def intervals(name: str, form: str = ".2f", unit: str = "", scale: float = 1.0, 
 
     Args:
         name: The column.
-        form: Format of the numbers. Numbers without decimals get one in the value if it is not 0, because 99.5 % of
-            success must not read as 100 %.
+        form: Format of the numbers. With `.0f`, the value still has one decimal if this is not 0, because a success of
+            99.5 % must not read as 100 %.
         unit: Text after the value.
         scale: Factor for value and interval; 100 for per cent.
         between: Text between the two ends of the interval.

@@ -88,7 +88,7 @@ class PolicyActs:
 
     @classmethod
     def of(cls, settings: DemosSettings, spec: EnvironmentSpec) -> PolicyActs:
-        """Check that the policy of the settings can act in an environment.
+        """Check that a recording's policy can act in an environment, and return the maker of its actor.
 
         The recording may contain more camera views than the target sees, to train another target on them.
 

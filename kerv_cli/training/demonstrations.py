@@ -73,8 +73,8 @@ def demos_for(settings: S) -> tuple[S, DemoDataset]:
     """Open the demonstrations named in the settings, or by default the ones that the target was trained on.
 
     Returns:
-        settings: The settings with `demos` filled in. An empty `task` is filled in as well, if the demonstrations
-            contain tasks that the target was not trained on: with the tasks that it was trained on.
+        settings: The settings with `demos` filled in. If the demonstrations contain tasks that the target was not
+            trained on, an empty `task` is filled in, too: with the recorded tasks that it was trained on.
         dataset: The demonstrations.
 
     Raises:
@@ -86,7 +86,7 @@ def demos_for(settings: S) -> tuple[S, DemoDataset]:
     name, tasks = settings.demos or target.demos or name_of(()), settings.task
     if settings.demos:
         dataset = open_demos(settings.results, name, tasks or target.tasks)
-    else:  # a missing dataset is recorded with all tasks of the target
+    else:  # if the dataset is missing, the error message says how to record all tasks of the target
         config = target.provenance.get("demos", {}).get("config", {})
         dataset = open_demos(settings.results, name, target.tasks, config.get("episodes", 0))
     check_spaces(dataset, target.actions, target.observation, "the target")
@@ -144,7 +144,7 @@ def check_spaces(dataset: DemoDataset, actions: ActionSpace, observation: Observ
 
 
 def seen_by(dataset: DemoDataset, camera: str, who: str, remedy: str) -> DemoDataset:
-    """Return the dataset with only the views of `camera`. Further recorded views after them are left out.
+    """Return the dataset with only the views of `camera`. Views that were recorded to the right of them are left out.
 
     Args:
         dataset: The demonstrations.

@@ -36,8 +36,8 @@ from kerv_cli.worlds.demos.files import DemoEpisode
 WITHIN = 9
 """Validation reports the share of tokens at most this many bins from the label: Spec-VLA's acceptance radius."""
 WAYPOINTS = (Place("waypoint 1", 0), Place("waypoint 2", 0))
-"""What a policy estimates if its demonstrations hold no object positions: where the hand is when the gripper next
-changes, and at the end. They are never read from a state."""
+"""Positions that a policy estimates if its demonstrations hold no object positions: where the hand will be when the
+gripper next changes, and at the end of the episode. No state contains them, so their index 0 is never used."""
 VALIDATED = 2048
 """Maximum number of samples in a validation."""
 

@@ -97,7 +97,7 @@ class Loop:
             on_step: Called after each step and after each validation, with the number of steps done and the metrics.
 
         Raises:
-            CheckpointError: The resume file is damaged. Or its training ended at the last step without a validation.
+            CheckpointError: The resume file is damaged. Or it has reached `settings.steps` without a validation.
             KervError: The training diverged.
             StorageError: The disk cannot be written.
             Interrupted: The process got Ctrl-C or SIGTERM. The current step was finished and the state is saved.

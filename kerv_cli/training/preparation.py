@@ -29,8 +29,8 @@ class Step:
 
     Attributes:
         kind: Kind of the artifact, such as `drafter` or `datastore`.
-        state: `there`, `missing`, `unfinished`, `of other artifacts` (made from others than the present ones) or,
-            while it trains, `step 300 of 4000`.
+        state: `there`, `missing`, `unfinished`, `of other artifacts` (it was made from artifacts that have been
+            replaced since) or, while it trains, `step 300 of 4000`.
         command: Command-line arguments after `kerv` that make the artifact, without the arguments that all steps share.
         steps: Number of optimisation steps. 0 if it is no training.
     """

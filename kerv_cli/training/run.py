@@ -77,6 +77,7 @@ class TrainingRun(ABC):
             CheckpointError: The resume file is damaged.
             KervError: The training diverged.
             StorageError: The disk cannot be written.
+            Interrupted: The process got Ctrl-C or SIGTERM. The state is saved.
         """
         self.objective.module.train()
         return Loop(self.objective, self.save, self.settings.train, self.folder, self.hash).run(on_step)
@@ -85,7 +86,7 @@ class TrainingRun(ABC):
     def hash(self) -> str:
         """Hash of everything that determines the weights after a given number of steps."""
         train = {key: value for key, value in asdict(self.settings.train).items() if key not in NOT_IDENTITY}
-        train["closed_loop"] = train["closed_loop"] > 0  # scores with and without success do not compare
+        train["closed_loop"] = train["closed_loop"] > 0  # scores with and without success cannot be compared
         return hash_of({"train": train, "demos": self.dataset.sha256, **self.identity()})
 
     def check_folder(self, setting: str) -> None:

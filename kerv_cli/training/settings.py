@@ -165,8 +165,9 @@ class BuildDatastoreSettings(DemonstrationSettings):
 class CalibrateSettings(DemonstrationSettings):
     """Settings of `kerv calibrate`, which measures on demonstrations what KERV and HeiSD need (docs/methods.md §3, §4).
 
-    That is the noise of the kinematic predictors, each task's reference level K_S of motion variability, the ranges
-    that scale the hybrid boundary, and the similarities at which a retrieved draft is executed without verification.
+    It measures the noise of the kinematic predictors, each task's reference level K_S of the kinematic variability, the
+    ranges that scale the boundary between retrieval and drafter, and the similarities from which on a retrieved draft
+    is executed without verification.
     """
 
     episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)

@@ -86,7 +86,7 @@ class TargetRun(TrainingRun):
         Raises:
             UsageError: The policy reads object positions, and the demonstrations hold none. Or `train.places=path` is
                 chosen but a policy acted in some demonstrations. Or a setting needs images and the policy has none.
-            CheckpointError: The demonstrations hold neither object positions nor those of the hand.
+            CheckpointError: The demonstrations hold neither the objects' positions nor the hand's.
         """
         train, manifest = self.settings.train, self.dataset.manifest
         where = f"the demonstrations in {self.dataset.path}"
@@ -176,7 +176,7 @@ class TargetRun(TrainingRun):
 
     @functools.cached_property
     def state_range(self) -> list[list[float]]:
-        """The 0.1th percentiles of the states' s numbers, then their 99.9th percentiles, (s,) each.
+        """Range of each of the s numbers of a state: the 0.1th percentiles (s,), then the 99.9th percentiles (s,).
 
         They are measured on at most STATE_EPISODES episodes.
         """

@@ -247,8 +247,8 @@ class DemoDataset:
         """Join several datasets into one.
 
         Returns:
-            A dataset with all episodes, part by part. Its manifest is the first part's, but with the tasks of all parts.
-            The manifest's hash is over the hashes of the parts.
+            A dataset with all episodes, part by part. Its manifest is the first part's, with the tasks of all parts and
+            a hash over the hashes of the parts.
 
         Raises:
             CheckpointError: The parts have different environments, spaces or cameras.
