@@ -151,7 +151,7 @@ def load_study(name: str, results: str | Path = "results", store: str = "") -> S
         store: URL of the database. Empty: the environment variable KERV_STORE, else SQLite in the folder.
 
     Raises:
-        UsageError: No study, or several, match the name; or the study has no episodes.
+        UsageError: Nothing matches the name, several things match, or it is not a sweep or rollout.
     """
     with chosen_store([f"store={store}"] if store else []):
         return Study(store_of(find_run(results_dir(str(results)), study_name(name))))

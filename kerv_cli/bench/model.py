@@ -1,4 +1,4 @@
-"""Open the model that `kerv bench` measures: a policy's target, or a shape with random weights; and a drafter."""
+"""Open the model that `kerv bench` measures, and its drafter. A model is a policy or a shape with random weights."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measure how long each phase of a decode takes, in whole decodes by the engine with dummy drafts."""
+"""Measure how long each phase of a decode takes. The engine runs complete decodes with dummy drafts."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def costs_of(
     drafter = decoder.parts.proposer
     if isinstance(drafter, DrafterProposer):
         # The first lap computes thresholds. In the second, the drafter reads the prompt's states. After that, drafting
-        # and reading the states of accepted tokens take turns.
+        # and reading the states of the committed tokens take turns.
         _, prompt_states, *turns = (s for name, s in laps if name == "propose")
         yield ("feed", prompt), prompt_states
         for one, drafting in zip(rounds[1:], turns[::2], strict=False):

@@ -1,4 +1,7 @@
-"""Results of a benchmark: phases of a decode, highest speedups, estimates for other devices; files and tables."""
+"""Compute the results of a benchmark, write them to files, and return the rows of its tables.
+
+The results are times of each phase of a decode, the highest speedup of each method, and estimates for other devices.
+"""
 
 from __future__ import annotations
 

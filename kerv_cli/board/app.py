@@ -1,4 +1,4 @@
-"""Assemble the web app from the routes of its modules, and serve it on this machine alone."""
+"""Assemble the web app from the routes of its modules, and serve it. Only this machine can connect."""
 
 from __future__ import annotations
 

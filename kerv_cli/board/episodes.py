@@ -66,7 +66,17 @@ def phase_of(closest: float | None, moved: float | None) -> str:
 
 @dataclass(frozen=True)
 class Cell:
-    """One episode of a study. `episode` is its row number, None if it has not run; `kind` is a key of OUTCOMES."""
+    """One episode of a study.
+
+    Attributes:
+        label: Label of its setting.
+        task: Name of its task.
+        seed: Its seed.
+        episode: Its row number. None if it has not run.
+        kind: Its outcome, a key of OUTCOMES.
+        phase: Phase of the task in which it would count as failed, a key of PHASES.
+        stress: Kind and level of its stress, such as `push 2`. Empty without stress.
+    """
 
     label: str
     task: str

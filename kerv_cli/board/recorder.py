@@ -82,10 +82,10 @@ def record_episode(setting: Setting, task: str, seeds: list[int], results: str, 
     """Run an episode again and write its recording.
 
     Args:
-        setting: Its setting.
-        task: Its task.
-        seeds: Seeds of the episodes that must run before it, then its own.
-        results: The results folder, which has its weights and data.
+        setting: Setting of the episode.
+        task: Task of the episode.
+        seeds: Seeds of the episodes that must run first, then the episode's own.
+        results: The results folder, with the weights and data that the setting needs.
         path: File to write.
 
     Returns:

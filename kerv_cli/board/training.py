@@ -1,4 +1,4 @@
-"""The page of an artifact: what it was made from, what was made of it, and the curves of its training."""
+"""The page of an artifact: what it was made from, what was made from it, and the curves of its training."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Imports studies from other databases and from results folders of version 0.1.0; exports a study to a new kerv.db.
+"""Import studies from other databases and from results folders of version 0.1.0. Export a study to a new kerv.db.
 
 Version 0.1.0 had no database. It had one folder per study, with plan.yaml, run.json and one folder per cell. A cell is
 a setting on one task with a few seeds.

@@ -79,9 +79,9 @@ def check(settings: RolloutSettings, spec: EnvironmentSpec, target: TargetDescri
         target: The policy's description; None for the expert.
 
     Raises:
-        UsageError: An episode ends before its first action, or all actions of a chunk are too old when they arrive; the
-            profile lacks a phase of the method; or the time of autoregressive decoding is needed and the policy cannot
-            decode autoregressively.
+        UsageError: An episode ends before its first action, or all actions of a chunk are too old when they arrive. Or
+            the profile lacks a phase of the method. Or the time of autoregressive decoding is needed, and the policy
+            cannot decode autoregressively.
     """
     timing = settings.rollout
     if timing.clock != REAL:

@@ -1,4 +1,4 @@
-"""What determines an episode's result: settings that have an effect, weights and data, task, seeds and `ENGINE`.
+"""Find what determines an episode's result: settings that have an effect, weights and data, task, seed and `ENGINE`.
 
 Two episodes with the same identity have the same tokens, so studies share them. Code, versions, machine and number of
 workers are not part of the identity. They are stored beside the result.

@@ -52,8 +52,8 @@ def check(settings: RolloutSettings) -> dict[str, str]:
         as `observation` what the target observes.
 
     Raises:
-        UsageError: A number out of range, training seeds, a camera that the policy was not trained on, or parts that do
-            not fit together.
+        UsageError: A number is out of range, a seed is a training seed, the policy was trained on another camera, or
+            parts do not fit together.
         CheckpointError: The policy is missing or damaged, or a file belongs to another target or action space.
     """
     tasks = tasks_of(settings)

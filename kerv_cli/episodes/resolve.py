@@ -87,7 +87,7 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
             others, and `results`, apply to every setting.
 
     Raises:
-        UsageError: An unknown key or name; a key on the command line that the study varies itself; a bad label.
+        UsageError: A key or name is unknown, the study itself sets a key of the command line, or a label is bad.
     """
     of_sweep = [o for o in overrides if _key(o).split(".")[0] in SweepSettings.__dataclass_fields__]
     of_settings = [o for o in overrides if o not in of_sweep or o.startswith("results=")]
@@ -169,7 +169,7 @@ def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
         multirun: Whether -m was given.
 
     Raises:
-        UsageError: An unknown key or name, an impossible value, or several values of `results`.
+        UsageError: A key or name is unknown, a value is impossible, or `results` has several values.
     """
     tasks = [override for override in overrides if override.startswith("task=")]
     others = [override for override in overrides if override not in tasks]

@@ -34,7 +34,11 @@ FULL_BATCHES = 16
 """Largest number of batches in a block."""
 
 NEVER, TIMED, CHANGED, ALL = "never", "timed", "changed", "all"
-"""Values of `rerun=`: run again no episodes, those not timed in turn with others, those that other code ran, or all."""
+"""Values of `rerun=`, which says which existing episodes to run again.
+
+NEVER: none. TIMED: those that did not take turns with all other settings in one block. CHANGED: those that other code
+ran. ALL: all.
+"""
 
 Key = tuple[str, str, int, int]
 """A setting's hash `work`, task, seed and repeat. Equal keys mean the same episode in any study."""
@@ -326,9 +330,9 @@ def _ordered_parts(episodes: Iterable[Episode], block: int) -> list[list[Episode
 
 
 def _keep_whole_orders(usable: dict[Episode, list[StoredEpisode]], block: int) -> None:
-    """Remove stored episodes that a study cannot reuse, because their results depend on the order of episodes.
+    """Remove stored episodes that ran in another order than the study's, if their results depend on the order.
 
-    They can be reused only if a single block ran exactly the wanted seeds.
+    Such episodes can be reused only if a single block ran exactly the wanted seeds.
 
     Args:
         usable: Episode -> its stored rows. It is changed.

@@ -104,9 +104,12 @@ def compare(first: ComparedRun, second: ComparedRun) -> Row:
     """Return the differences between two settings or two trainings, as JSON values.
 
     Returns:
-        `first` and `second`: the two names. `settings`: every key whose values differ, with both values; None if one
-        side does not have the key. `results`: for each measure both values, the change, and the change's 95 % interval
-        if there is one. `note`: why there is no ratio of times, or "".
+        A dictionary with these keys:
+
+        - `first` and `second`: the two names
+        - `settings`: every key whose values differ, with both values. A value is None if that side lacks the key.
+        - `results`: for each measure both values, the change, and its 95 % interval if there is one
+        - `note`: why there is no ratio of times. Empty if there is one.
 
     Raises:
         UsageError: A setting has no episodes.

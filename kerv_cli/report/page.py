@@ -157,7 +157,7 @@ def _settings(data: StudyData) -> list[dict[str, Any]]:
 
 
 def _films(store: StudyStore, data: StudyData) -> list[dict[str, Any]]:
-    """Return a film of one success and one failure per method, as far as they were recorded with a camera."""
+    """Return a film of one success and one failure per method, if such episodes were recorded with a camera."""
     keys = ["label", "task", "seed", "repeat"]
     outcomes = data.episodes.set_index(keys)["success"].to_dict()
     films: dict[tuple[str, bool], dict[str, Any]] = {}

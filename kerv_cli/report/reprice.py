@@ -90,8 +90,8 @@ def repriced_table(data: StudyData, store: StudyStore, profiles: Sequence[NamedP
         times, and the speeds as measured. Settings that run no decoder are left out.
 
     Raises:
-        UsageError: A profile lacks a cost that the study needs, or has costs for shorter chunks only; or a setting has
-            no times because its episodes ran in a batch.
+        UsageError: A profile lacks a cost that the study needs, or has costs for shorter chunks only. Or a setting has
+            no times, because its episodes ran in a batch.
     """
     decoded = data.episodes.groupby("label")[["forwards", "skipped_decodes"]].sum().any(axis=1)
     labels = [label for label in data.labels if decoded[label]]

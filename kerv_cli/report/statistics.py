@@ -278,10 +278,10 @@ def over_runs(estimates: Sequence[Estimate]) -> Estimate:
 def _spread(effects: np.ndarray, strata: np.ndarray, clusters: np.ndarray) -> float:
     """Return half the width of the 95 % interval of a sum over pairs, whose clusters are independent.
 
-    The variance of the sum is estimated as follows: within each stratum, take the variance of the clusters' sums; then
-    add the strata. Strata with only one cluster are merged into one stratum (Cochran, Sampling Techniques, section
-    5A.12). The half width is the standard deviation times the 97.5 % quantile of Student's t. Its degrees of freedom
-    are the number of clusters minus the number of strata.
+    The variance of the sum is estimated within each stratum, from the spread of its clusters' sums. Then the variances
+    of the strata are added. Strata with only one cluster are merged into one stratum (Cochran, Sampling Techniques,
+    section 5A.12). The half width is the standard deviation times the 97.5 % quantile of Student's t. Its degrees of
+    freedom are the number of clusters minus the number of strata.
 
     Args:
         effects: (n,) contribution of each pair to the linearised logarithm of the speedup. They sum to 0.

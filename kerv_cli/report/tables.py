@@ -120,7 +120,7 @@ class StudyData:
 
     @functools.cached_property
     def pairs(self) -> pd.DataFrame:
-        """Pairs of episodes: one of each setting with one of its reference, see `measures.paired`."""
+        """Episodes of each setting, paired with those of the setting that it is compared with (`measures.paired`)."""
         return paired(self.episodes, self.references)
 
     @functools.cached_property

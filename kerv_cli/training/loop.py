@@ -1,8 +1,8 @@
 """The optimisation loop of targets and drafters: schedule, averaged weights, validation, exact resume.
 
 A resumed run writes the same bytes as an uninterrupted run, on the same machine with the same number of threads. For
-this, the batch of step s depends only on the seed and s. One file holds the weights, their average, the optimiser's
-state and the metrics of all validations.
+this, the batch of step s depends only on the seed and s. The resume file holds the weights, their average, the
+optimiser's state and the metrics of all validations.
 """
 
 from __future__ import annotations
