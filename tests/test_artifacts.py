@@ -40,6 +40,7 @@ STUDY = (
     "method=heisd skip.s_min=0.8 boundary=random",
     "method=spec_vla proposer=kalman",
 )
+FILES = {name: f"{name}.json" for name in ("drafter", "early", "calibration")} | {"datastore": "manifest.json"}
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +54,10 @@ def whole(policies, tmp_path_factory):
     words = ["task=reach,drawer-close", "demos=few", "held_out=0.4", "decodes=4", "policy.target=nano-state"]
     run = CalibrationRun(compose("calibrate", [*words, f"results={results}"], CalibrateSettings))
     run.run(lambda text: contextlib.nullcontext(lambda done, total: None))
+    target, described = checkpoint.load_target(results / "artifacts/target/nano-state")
+    drafter = EarlyDrafter().network(EarlySettings(width=16, layers=1), target)
+    own = {"settings": asdict(drafter.settings)}
+    EarlyDrafter().save(results / "artifacts/early/nano-state", drafter, MadeFor.of(described), {}, **own)
     return results
 
 
@@ -101,7 +106,7 @@ def test_a_study_loads_and_hashes_everything_once(results, monkeypatch):
 
 
 def test_only_what_is_needed_is_read(results):
-    for kind in ("drafter", "datastore", "calibration"):
+    for kind in FILES:
         shutil.rmtree(results / "artifacts" / kind)
     check(settings_of(results, "method=ar"))
     check(settings_of(results, "method=jacobi"))
@@ -147,28 +152,14 @@ def test_names_of_artifacts_in_stored_settings_of_0_1_0_are_kept():
     assert with_artifacts({"policy": policy}) == {"policy": policy}
 
 
-@pytest.fixture(scope="module")
-def complete(whole, tmp_path_factory):
-    """As `whole`, with an early drafter."""
-    results = Path(shutil.copytree(whole, tmp_path_factory.mktemp("complete") / "results"))
-    target, described = checkpoint.load_target(results / "artifacts/target/nano-state")
-    drafter = EarlyDrafter().network(EarlySettings(width=16, layers=1), target)
-    made_for, own = MadeFor.of(described), {"settings": asdict(drafter.settings)}
-    EarlyDrafter().save(results / "artifacts/early/nano-state", drafter, made_for, {}, **own)
-    return results
-
-
 # --- one rule for every artifact that names a source
 
 OTHER = "f" * 64
-
-FILES = {name: f"{name}.json" for name in ("drafter", "early", "calibration")} | {"datastore": "manifest.json"}
 MESSAGE = f" {OTHER[:12]}, not for "
 
 
 @pytest.mark.parametrize("kind", FILES)
-def test_what_was_made_for_another_target_is_refused(complete, tmp_path, kind):
-    results = Path(shutil.copytree(complete, tmp_path / "results"))
+def test_what_was_made_for_another_target_is_refused(results, kind):
     files = Artifacts(str(results), PolicySettings(target="nano-state"))
     assert set(files.check(FILES)) == {"target", *FILES}
     path = results / "artifacts" / kind / "nano-state" / FILES[kind]
@@ -179,16 +170,15 @@ def test_what_was_made_for_another_target_is_refused(complete, tmp_path, kind):
         files.check(FILES)
 
 
-def test_an_early_drafter_of_another_chunk_length_is_refused(complete, tmp_path):
-    results = Path(shutil.copytree(complete, tmp_path / "results"))
+def test_an_early_drafter_of_another_chunk_length_is_refused(results):
     path = results / "artifacts/early/nano-state/early.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "chunk": 8}))
     with pytest.raises(CheckpointError, match="for chunks of 8 steps, not of 4"):
         Artifacts(str(results), PolicySettings(target="nano-state")).check(["early"])
 
 
-def test_what_was_made_from_another_artifact_is_refused_beside_this_one(complete, monkeypatch):
-    files = Artifacts(str(complete), PolicySettings(target="nano-state"))
+def test_what_was_made_from_another_artifact_is_refused_beside_this_one(whole, monkeypatch):
+    files = Artifacts(str(whole), PolicySettings(target="nano-state"))
     monkeypatch.setattr(EarlyDrafter, "sources", lambda self, description: {"datastore": OTHER})
     with refused(MESSAGE, error=CheckpointError):
         files.check(FILES)

@@ -4,7 +4,6 @@ import itertools
 import json
 import math
 import re
-import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -345,9 +344,7 @@ def test_decodes_without_host_times_have_no_price(tmp_path):
 # --- the command
 
 
-def test_a_rollout_in_batches_prints_success_and_goes_on_where_it_was(policies, tmp_path, monkeypatch):
-    results = tmp_path / "results"
-    shutil.copytree(policies / "artifacts", results / "artifacts")
+def test_a_rollout_in_batches_prints_success_and_goes_on_where_it_was(results, monkeypatch):
     words = ["policy=state", "policy.target=nano-state", "task=reach-v3,push-v3", "world.horizon=8"]
     command = ["rollout", "method=ar", "episodes=2", "rollout.batch=3", *words, f"results={results}"]
     original = EpisodeRunner.together

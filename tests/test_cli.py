@@ -5,7 +5,6 @@ import json
 import os
 import re
 import shlex
-import shutil
 import signal
 import subprocess
 import sys
@@ -186,9 +185,8 @@ def test_what_has_no_effect_is_said_in_one_line(policies):
 
 
 @pytest.mark.parametrize(("number", "late"), [(signal.SIGINT, False), (signal.SIGTERM, False), (signal.SIGTERM, True)])
-def test_an_interrupted_command_says_so_in_one_line(number, late, policies, tmp_path):
-    words = ["rollout", "task=reach", "episodes=50", "policy.target=nano-vision", f"results={tmp_path}/results"]
-    shutil.copytree(policies, tmp_path / "results")
+def test_an_interrupted_command_says_so_in_one_line(number, late, results):
+    words = ["rollout", "task=reach", "episodes=50", "policy.target=nano-vision", f"results={results}"]
     # as early as there is a process of ours: the line says that it is
     code = "import kerv_cli.__main__ as it; print(flush=True); it.main()"
     begun = subprocess.Popen(

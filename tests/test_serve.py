@@ -1,8 +1,6 @@
 """`kerv serve`: the protocol spoken by a minimal client of our own, bad clients, and the same actions as in process."""
 
-import json
 import os
-import shutil
 import signal
 import socket
 import struct
@@ -13,7 +11,6 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -25,6 +22,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from kerv_cli.base.config import compose as compose_settings
+from kerv_cli.base.files import read_json, write_json
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.methods.artifacts import Artifacts
@@ -293,20 +291,14 @@ def test_a_web_page_may_connect_only_where_it_is_named(policy, origins, accepted
         assert _accepted(port)
 
 
-def ranged(policies: Path, tmp_path: Path, *words: str) -> Policy:
-    """A policy whose target says that its demonstrations' numbers lay between 0 and 1."""
-    shutil.copytree(policies, tmp_path / "results")
-    path = tmp_path / "results" / "artifacts" / "target" / "nano-vision" / "target.json"
-    stored = json.loads(path.read_text()) | {"state_range": [[0.0] * 39, [1.0] * 39]}
-    path.write_text(json.dumps(stored))
-    typed = ["policy.target=nano-vision", f"results={tmp_path / 'results'}", *words]
-    return Policy(compose_settings("serve", typed, ServeSettings))
-
-
 @pytest.mark.parametrize("height", [1e39, -2.5, 3.5])
-def test_a_state_far_from_the_demonstrations_is_refused(policies, tmp_path, height):
+def test_a_state_far_from_the_demonstrations_is_refused(results, height):
+    """The target says that its demonstrations' numbers lay between 0 and 1."""
     state = np.array([0.5, 0.5, height, 0.5])
-    with serving(ranged(policies, tmp_path, "margin=2")) as (port, log):
+    path = results / "artifacts/target/nano-vision/target.json"
+    write_json(path, read_json(path) | {"state_range": [[0.0] * 39, [1.0] * 39]})
+    words = ["policy.target=nano-vision", f"results={results}", "margin=2"]
+    with serving(Policy(compose_settings("serve", words, ServeSettings))) as (port, log):
         client = Client(port)
         with pytest.raises(RuntimeError, match=r"z is .*, the policy was trained on -2 to 3"):
             client.infer(seen(0, **{"observation/state": state}))
