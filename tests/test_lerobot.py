@@ -11,10 +11,13 @@ import pyarrow.parquet as pq
 import pytest
 from command import kerv, refusal, told
 from examples.tiny_openvla import TINY, write_checkpoint
+from loaded import of_target
 from test_openvla import imported
 
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.decoder import Decoder
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
+from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.openvla.config import Bounds, action_space
 from kerv_cli.worlds import instruction_of
@@ -232,3 +235,71 @@ def test_a_dataset_with_videos_is_read(results, tmp_path):
         assert own < shifted
     path.write_bytes(path.read_bytes()[:1000])
     assert path.name in refusal("demos", "import", f"source={source}", "name=cut", f"results={tmp_path}", code=1)
+
+
+# --- demonstrations and files of other actions
+
+
+TARGET = "policy.target=nano-state"
+
+
+@pytest.fixture(scope="module")
+def spaces(policies, tmp_path_factory):
+    """A policy of Meta-World, and demonstrations of another environment."""
+    spaces = tmp_path_factory.mktemp("spaces") / "spaces"
+    shutil.copytree(policies, spaces)
+    record(DemoConfig(("insert-peg",), 4, frame_stride=16, workers=1), spaces / "artifacts/demos/pegs")
+    return spaces
+
+
+def test_a_rollout_refuses_a_target_of_other_actions(spaces):
+    words = ["rollout", "policy=state", TARGET, "episodes=1", "record=0", f"results={spaces}", "task=insert-peg"]
+    said = "target 'nano-state' has an action space with names dx, dy, dz, gripper, environment insertion one with"
+    assert said in refusal(*words)
+
+
+@pytest.mark.parametrize(
+    ("command", "owner"),
+    [
+        (["train", "target", "task=drawer-close", "name=new", "target.observation=state"], "environment metaworld"),
+        (["train", "drafter", TARGET], "the target"),
+        (["train", "drafter", "drafter=early", TARGET], "the target"),
+        (["build", "datastore", "task=drawer-close", TARGET], "the target"),
+        (["calibrate", "task=drawer-close", TARGET], "the target"),
+    ],
+)
+def test_demonstrations_of_another_environment_are_refused_at_once(spaces, command, owner):
+    line = refusal(*command, "demos=pegs", f"results={spaces}", "--plan")
+    assert "artifacts/demos/pegs has an action space with names dx, dy, dz, droll" in line
+    assert f"{owner} one with dx, dy, dz, gripper" in line
+
+
+def test_a_fine_tuned_target_must_be_of_the_demonstrations_environment(spaces):
+    words = ["train", "target", "task=insert-peg", "name=new", "target=nano", "target.observation=state"]
+    words += ["train.init=nano-state", "demos=pegs", "world.camera.name=front", f"results={spaces}"]
+    assert "the target in" in refusal(*words)
+
+
+@pytest.mark.bits
+@pytest.mark.usefixtures("quick_training")
+def test_a_policy_of_seven_dofs_is_trained_and_decodes_with_its_drafters(spaces):
+    common = ["demos=pegs", "train.steps=4", "train.batch=4", "train.validate_every=2", "train.held_out=0.34"]
+    common.append(f"results={spaces}")
+    words = ["task=insert-peg", "name=arm", "target=nano", "target.observation=state", "world.camera.name=front"]
+    kerv("train", "target", *words, *common)
+    for kind in ("drafter", "early"):
+        words = [f"drafter={kind}", "policy.target=arm", "drafter.samples=12"]
+        kerv("train", "drafter", *words, *common)
+    target, description = load_target(spaces / "artifacts/target/arm")
+    loaded = of_target(description, target)
+    drafter = EagleDrafter().load(spaces / "artifacts/drafter/arm", loaded)
+    early = EarlyDrafter().load(spaces / "artifacts/early/arm", loaded)
+    assert early.scale.min() > 0
+    assert early.scale.std() > 0  # it knows the spread of what it was shown
+    assert early.strict.tolist() == [dof == 6 for dof in range(7)] * target.chunk
+    shown = Observation(np.full(7, 0.1), np.full(19, 0.1), "turn the peg and push it into the tilted slot")
+    plain = Decoder(target).decode(shown)
+    assert plain.actions.shape == (target.chunk, 7)
+    tree = Parts(proposer=DrafterProposer(drafter, target, 5, 3, 12))
+    for parts in (tree, Parts(prefill_draft=EarlyProposer(early, target))):
+        assert Decoder(target, parts).decode(shown).tokens == plain.tokens

@@ -6,22 +6,28 @@ import errno
 import json
 import re
 import shutil
+import subprocess
 import sys
+import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
-from command import told
+from command import kerv, told
 from test_calibration import write_dataset
 
 from kerv_cli.base import files
+from kerv_cli.base.config import conf_dir
+from kerv_cli.base.files import read_yaml_lines
 from kerv_cli.episodes.resolve import resolve, resolve_rollout
 from kerv_cli.lab.database import RUNS, Database
 from kerv_cli.lab.runs import run_rows
 from kerv_cli.report.plots import read_log
+from kerv_cli.targets import folders
 from kerv_cli.targets.folders import RESUME
 from kerv_cli.training.preparation import needs
+from kerv_cli.worlds import resolve_tasks
 
 TASK = "reach-v3"
 MINE = "policy.target=mine"
@@ -249,3 +255,60 @@ def test_a_target_whose_training_was_interrupted_is_finished_by_the_command_that
 @pytest.mark.parametrize("command", ["prepare", "build datastore", "calibrate", "train drafter", "rollout", "serve"])
 def test_a_wrong_target_is_noticed_before_anything_else(command):
     assert "no target 'min'" in told(*command.split(), "policy.target=min", code=2)
+
+
+# --- drafts of a part of the tasks
+
+
+@pytest.mark.parametrize(
+    ("words", "command"),
+    [
+        ("policy.artifacts.scout=m method=scout_unverified", "train drafter drafter=scout policy.target=mt10-vision"),
+        ("policy.artifacts.certificate=m method=one_pass_certified", "calibrate success policy.target=mt10-vision"),
+    ],
+)
+def test_a_missing_artifact_with_a_name_is_answered_with_the_command_that_makes_it(words, command, tmp_path):
+    run = kerv("rollout", *words.split(), f"results={tmp_path / 'results'}", code=1)
+    assert f"kerv {command} {words.split()[0]}" in run.stderr
+
+
+@pytest.mark.usefixtures("quick_training")
+def test_drafts_of_seven_tasks_are_made_as_the_note_of_their_study_says(policies, results):
+    shutil.copytree(policies / "artifacts", results / "artifacts", dirs_exist_ok=True)
+    write_dataset(results / "artifacts/demos/mt10", episodes=2, names=resolve_tasks(["MT10"]))
+
+    def run(*words):
+        return told(*words, f"results={results}")
+
+    study, _ = read_yaml_lines(conf_dir() / "study/coverage_unseen.yaml", "the study")
+    making = re.findall(r"kerv (train drafter .*?\])", study["note"])
+    few = ("train.steps=2", "train.batch=8", "train.validate_every=2", "drafter.samples=50")
+    target = "policy.target=nano-state"
+    run(*making[0].split(), target, *few)
+    made = json.loads((results / "artifacts/early/seven/early.json").read_text())
+    seen = set(made["provenance"]["settings"]["task"])
+    assert len(seen) == 7
+    planned = run("sweep", "study=coverage_unseen", target, "--plan")
+    assert not any(task in planned for task in seen)
+
+
+# --- policies of the release
+
+
+def test_the_released_policies_are_those_of_a_checkout():
+    shipped = Path(__file__).resolve().parents[1].glob("results/pretrained/*/target/target.json")
+    assert sorted(path.parts[-3] for path in shipped) == sorted(folders.RELEASED)
+
+
+def test_the_printed_command_installs_a_policy_that_the_wheel_leaves_out(policies, tmp_path, monkeypatch):
+    monkeypatch.setattr(folders, "shipped_dir", lambda: tmp_path / "nothing")
+    for kind in ("target", "drafter"):
+        shutil.copytree(policies / "artifacts" / kind / "nano-vision", tmp_path / "release/mt50-vision" / kind)
+    with tarfile.open(tmp_path / "mt50-vision.tar.gz", "w:gz") as file:
+        file.add(tmp_path / "release/mt50-vision", "mt50-vision")
+    words = ("rollout", "policy=mt50", "task=reach", f"results={tmp_path}/results", "--plan")
+    printed = re.search("'(mkdir .*)'", told(*words, code=2))
+    assert printed
+    subprocess.run(printed[1], shell=True, cwd=tmp_path, check=True)
+    assert "1 task, 3 episodes" in told(*words)
+    assert "mt50-vision" in folders.target_names(f"{tmp_path}/results")

@@ -1,26 +1,39 @@
 """Stress: what each kind changes of a world and what it leaves alone, seeds, levels, refusals, the command line."""
 
 import dataclasses
+import hashlib
 import json
+import math
+import os
+import subprocess
+import sys
+from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from command import kerv
 from examples.insertion import SPEC as INSERTION
+from hypothesis import given
+from hypothesis import strategies as st
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.registry import parts
 from kerv_cli.episodes.identity import stress_of, work_of
 from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.runner import Runner, close_worlds
 from kerv_cli.episodes.settings import RolloutSettings, settings_from
+from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.demos.dataset import register_recorded
+from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD
 from kerv_cli.worlds.mujoco_world import MujocoWorld
 from kerv_cli.worlds.settings import CameraSettings, StressSettings
 from kerv_cli.worlds.stress import base as stressing
 from kerv_cli.worlds.stress.kinds import CameraJitter, Objects, Sensor, objects, scenery_of
+from kerv_cli.worlds.vectors import length
 
 SEED, STEPS, SIZE = 50_006, 24, 48
 KINDS = ("push", "actuation", "sensor", "light", "colour", "camera", "object")
@@ -251,3 +264,63 @@ def test_the_command_line_stresses_and_records_it_in_every_row(tmp_path):
     run = kerv(*words, "world.stress.kind=push", "world.stress.level=0,2", "--json")
     rows = json.loads(run.stdout)["settings"]
     assert [(row["stress"], row["stress_level"]) for row in rows] == [("none", 0), ("push", 2)]
+
+
+# --- the same on every CPU
+
+
+SMALL = CameraSettings(size=24, supersample=1)
+
+
+@pytest.mark.bits
+@given(st.lists(st.floats(1e-100, 1e100).flatmap(lambda x: st.sampled_from([x, -x])), max_size=9))
+def test_a_length_is_rounded_once_per_number_and_for_the_root(numbers):
+    total = 0.0
+    for number in numbers:
+        total = float(Fraction(number) ** 2 + Fraction(total))
+    assert length(np.array(numbers)) == math.sqrt(total)
+
+
+def recorded_hashes(folder: Path) -> list[str]:
+    """Hashes of demonstrations with noise, in two environments."""
+    configs = [
+        DemoConfig((tasks,), episodes=2, camera=SMALL, frame_stride=25, workers=1, tail=5)
+        for tasks in ("INSERTION", "reach")
+    ]
+    return [record(config, folder / config.spec.name).sha256 for config in configs]
+
+
+def stressed() -> list[str]:
+    """One hash per kind of stress, at its strongest: an episode's model, states and pictures."""
+    spec, found = spec_of("insert-peg"), []
+    with spec.open_world("insert-peg", SMALL) as world:
+        expert, camera = spec.expert(world.task), world.camera.name
+        for kind in sorted(parts("stress")):
+            world.stress = stressing.build(StressSettings(kind, 4))
+            observation, model = world.reset(50_000), world._drawable()[0]
+            seen = [model.light_dir, model.light_pos, model.cam_pos, model.cam_quat, model.geom_rgba]
+            for _ in range(12):
+                seen += [observation.state, world.observe([camera]).images[camera]]
+                observation = world.step(expert(observation))
+            found.append(hashlib.sha256(b"".join(array.tobytes() for array in seen)).hexdigest())
+    return found
+
+
+def digests(folder: Path) -> list[str]:
+    return recorded_hashes(folder) + stressed()
+
+
+@pytest.mark.bits
+def test_another_kernel_records_and_draws_the_same(tmp_path):
+    """OpenBLAS's kernels for Prescott run on every x86-64 and round other bits than those of later CPUs; on other
+    machines the variable has no effect. Of Meta-World the float32 state of recordings is compared: in float64 the last
+    bit of its gripper's opening is `np.linalg.norm`'s."""
+    plugins = {"KERV_PLUGINS": "examples.insertion", "PYTHONPATH": os.pathsep.join(sys.path)}
+    environment = os.environ | plugins | {"OPENBLAS_CORETYPE": "Prescott"}
+    command = [sys.executable, __file__, str(tmp_path / "other")]
+    other = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert other.stdout.split() == digests(tmp_path / "own"), other.stderr
+
+
+if __name__ == "__main__":
+    print(*digests(Path(sys.argv[1])))
