@@ -34,7 +34,10 @@ class Machine:
     caches: tuple[tuple[float, float], ...] = ()
 
     def bandwidth_of(self, read: float) -> float:
-        """Return the bandwidth of reading `read` bytes repeatedly: that of the smallest buffer with as many bytes."""
+        """Return the bandwidth of reading `read` bytes again and again.
+
+        It was measured with the smallest buffer that is at least as large.
+        """
         return next((rate for size, rate in self.caches if read <= size), self.bandwidth)
 
     def bounds(self, read: float, flops: float) -> tuple[float, float]:

@@ -112,7 +112,7 @@ def check(settings: RolloutSettings, spec: EnvironmentSpec, target: TargetDescri
 
 
 def calibrates(settings: RolloutSettings) -> bool:
-    """Return whether `rollout.ar_ms` needs the time of autoregressive decoding to be measured on this machine."""
+    """Return whether `rollout.ar_ms` scales by the time of an autoregressive decode, which must be measured here."""
     timing = settings.rollout
     return timing.clock == REAL and timing.latency == MEASURED and timing.ar_ms > 0
 

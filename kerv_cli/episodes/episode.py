@@ -20,7 +20,7 @@ from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import World
 
 AT_OBJECT = 0.05
-"""Distance in metres. Once the fingertips have been closer to the object, they count as the cause of its motion."""
+"""Distance in metres. If the fingertips have been closer than this to the object, its later motion counts as theirs."""
 
 
 def moved_after_approach(distances: Sequence[float], objects: Sequence[np.ndarray]) -> float:

@@ -60,7 +60,7 @@ def _first_word(settings: Plain, typed: str) -> str:
 
 
 def _keys(settings: Plain) -> dict[str, Any]:
-    """Return the settings that determine a result, and the names of the policy's weights, by dotted key."""
+    """Return dotted key -> value of the settings that determine a result, and of the names of the policy's weights."""
     policy: Mapping[str, Any] = settings["policy"]
     return {**flat({"policy": policy}), **flat(effective(settings))}
 

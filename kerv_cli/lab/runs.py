@@ -34,7 +34,7 @@ RUNNING, COMPLETE, FAILED, INTERRUPTED = "running", "complete", "failed", "inter
 BEAT_SECONDS = 5.0
 """Seconds between two heartbeats of a run."""
 LOADING_SECONDS = 5.0
-"""Guess of the part of a command's time that does not grow with its work: loading libraries and the simulator."""
+"""Guess of the seconds that a command takes to load libraries and the simulator. They do not grow with its work."""
 STALE_SECONDS = 900.0
 """A run on another machine counts as dead after this many seconds without a heartbeat."""
 

@@ -453,7 +453,7 @@ def plan_study(
 def stored_episodes(database: Database, study: Study, newer_than: int = 0) -> dict[Key, list[StoredEpisode]]:
     """Return the stored episodes that a study may reuse, by `Episode.key`.
 
-    Only rollouts reuse episodes of rollouts. In a rollout no other setting takes turns, so times cannot be compared.
+    Sweeps do not reuse episodes of rollouts: no other setting took turns with them, so their times cannot be compared.
 
     Args:
         database: The database.

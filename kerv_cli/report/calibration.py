@@ -14,10 +14,10 @@ Table = tuple[tuple[str, ...], list[tuple[object, ...]], str]
 
 
 def tables(calibration: Calibration, path: Path) -> Iterator[Table]:
-    """Yield two or three tables: motion per task, errors of the motion predictors, and thresholds for verify-skip.
+    """Yield two or three tables: K_S and prediction errors per task, errors per predictor, and thresholds per task.
 
-    The first holds each task's K_S, the reference level of its kinematic variability (docs/methods.md §3). The third
-    says when a retrieved chunk may be executed without verification (§4). It is left out if this was not calibrated.
+    K_S is the reference level of a task's kinematic variability (docs/methods.md §3). The thresholds say when a
+    retrieved chunk may be executed without verification (§4). Their table is left out if they were not calibrated.
 
     Args:
         calibration: The calibration.

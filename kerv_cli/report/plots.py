@@ -226,7 +226,7 @@ def png(figure: alt.ConcatChart, title: str, subtitle: str) -> bytes:
 
 
 def library() -> str:
-    """Return Vega-Embed with Vega and Vega-Lite, which draw charts in a page, as JavaScript. It needs no network."""
+    """Return the JavaScript that draws charts in a page (Vega-Embed with Vega and Vega-Lite). It needs no network."""
     return str(vl_convert.javascript_bundle())  # type: ignore[call-arg]  # its stub forgets that it has a default
 
 

@@ -1,1 +1,1 @@
-"""Trainings, datastores and calibrations."""
+"""Train targets and drafters, build datastores, and calibrate methods."""

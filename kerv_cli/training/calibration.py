@@ -50,7 +50,7 @@ from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.files import DemoEpisode
 
 PRESAMPLED = 6
-"""Number of episodes per task over which the decodes that measure K_S are spread."""
+"""The decodes that measure K_S are spread over about this many episodes per task."""
 
 ENTRIES = 4000
 """Maximum number of datastore entries looked up per task, evenly spread.
@@ -60,7 +60,10 @@ On MT10, skip levels from 1000 entries did not hold on other episodes.
 LEAST = 20
 """Minimum number of entries at or above a skip level."""
 LOW, HIGH = 2.0, 1 / 3
-"""Share of wrong chunks that the lower and the upper bound of s_min allow, relative to the share that s_min allows."""
+"""Share of wrong chunks that the lower and the upper bound of s_min allow, relative to the share that s_min allows.
+
+s_min is the smallest similarity at which verification is skipped.
+"""
 
 RATIOS = np.logspace(-3, 3, 49)
 """Grid of the Kalman filter's ratio q / r (process noise to measurement noise), with r = 1."""
@@ -80,7 +83,7 @@ class CalibrationRun:
         tasks: Full names of the tasks.
         path: The JSON to write.
         chosen: Index of each episode that is used -> whether it is held out.
-        notes: After `run`, one line per section that was not measured: why, and whether an earlier one was kept.
+        notes: After `run`, one line per section that was not measured. It says why, and whether an older one was kept.
 
     Raises:
         UsageError: A number is out of range, or a task is unknown.
@@ -177,7 +180,7 @@ class CalibrationRun:
         return earlier
 
     def skip(self, stage: Stage) -> SkipSection | None:
-        """Return per task the lowest similarity at which verification is skipped. None without a datastore of them."""
+        """Return the smallest similarity per task at which verification is skipped. None without a datastore."""
         if "datastore" in self.missing:
             return None
         store = self.artifacts.load("datastore")

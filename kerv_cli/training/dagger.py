@@ -1,4 +1,4 @@
-"""Who acts while `kerv demos` records: the scripted expert, or a policy.
+"""Choose who acts while `kerv demos` records: the scripted expert, or a policy.
 
 If a policy acts, the expert labels the states that it visits (DAgger; Ross, Gordon, Bagnell 2011). The policy may
 decode with any method. For example, `method=scout_unverified` records the states that a drafter's chunks lead

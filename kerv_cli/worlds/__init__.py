@@ -1,7 +1,7 @@
 """Find environments, their tasks and suites (named groups of tasks) by name.
 
-Registers Meta-World and the kinds of stress. Importing this package loads nothing heavy: numpy is imported with an
-environment's specification, and the simulator with its world.
+This package registers Meta-World, LIBERO and the kinds of stress. Importing it loads nothing heavy: numpy is imported
+with an environment's specification, and the simulator with its world.
 """
 
 from __future__ import annotations

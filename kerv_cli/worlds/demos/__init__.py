@@ -1,1 +1,1 @@
-"""Demonstrations: recorded, stored and read back."""
+"""Record demonstrations, store them, and read them back."""

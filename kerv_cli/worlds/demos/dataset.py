@@ -193,7 +193,7 @@ class DemoDataset:
     Attributes:
         path: The dataset's folder.
         manifest: What was recorded.
-        episodes: One entry per episode, in the order of the manifest's tasks. Within a task, seeds ascend.
+        episodes: One entry per episode: dataset by dataset if several were joined, then task by task, then by seed.
         views: Number of views to read from images that show several side by side, from the left. 0: all.
     """
 
