@@ -11,7 +11,6 @@ import secrets
 import shutil
 import socket
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 OTHER_HOSTS_STALE_HOURS = 7 * 24.0
@@ -40,14 +39,6 @@ def is_left_over(path: Path) -> bool:
         return time.time() - path.stat().st_mtime > 3600 * OTHER_HOSTS_STALE_HOURS
     except OSError:  # it was renamed or removed meanwhile
         return False
-
-
-def left_over(root: Path) -> Iterator[Path]:
-    """Yield the temporary files and folders of ended processes, anywhere below `root`. Links are not followed."""
-    for folder, folders, files in os.walk(root):
-        paths = [Path(folder, name) for name in (*folders, *files) if is_left_over(Path(folder, name))]
-        folders[:] = [name for name in folders if Path(folder, name) not in paths]
-        yield from sorted(paths)
 
 
 def clean(folder: Path) -> list[Path]:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, ClassVar
 
 from kerv_cli.base.errors import UnknownName
 from kerv_cli.base.files import visible
-from kerv_cli.base.leftovers import left_over
 from kerv_cli.base.limits import number, setting
 from kerv_cli.base.places import check_writable, results_dir
 from kerv_cli.base.settings import RunSettings
@@ -42,8 +41,6 @@ def check_machine(settings: DoctorSettings) -> list[Finding]:
     from kerv_cli.worlds import specs
 
     display = "a display is there: kerv view opens a window" if has_display() else "none: kerv view prints the command"
-    paths = list(left_over(results_dir(settings.results)))
-    says = f"{len(paths)} files of killed commands, kerv doctor --repair removes them" if paths else "nothing"
     shipped = [path.name for path in visible(shipped_dir()) if path.is_dir()]
     return [
         Finding("versions", True, ", ".join(f"{name} {number}" for name, number in versions().items())),
@@ -52,7 +49,6 @@ def check_machine(settings: DoctorSettings) -> list[Finding]:
         *(find(f"policy {name}", partial(_policy, name, settings)) for name in shipped),
         find("results", partial(_disk, settings)),
         find("database", partial(_database, settings)),
-        Finding("left over", True, says),
         Finding("display", True, display),
     ]
 

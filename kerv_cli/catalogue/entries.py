@@ -117,6 +117,9 @@ def find_runs(results: str | Path) -> list[RunEntry]:
     for row in run_rows(database):
         rows.setdefault((row.kind, row.name), row)
     runs = _studies(database, rows)
+    with contextlib.suppress(OSError):  # remove the rest of studies whose removal was killed
+        for name in ("studies", "rollouts"):
+            clean(database.results / name)
     folder = database.results / "artifacts"
     made = {run.id: run for kind in artifact_kinds() for run in _artifacts(folder / kind, kind)}
     for (kind, name), row in rows.items():

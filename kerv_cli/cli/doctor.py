@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Annotated
 
 import typer
 
-from kerv_cli.base.errors import StorageError
-from kerv_cli.base.leftovers import left_over, remove
-from kerv_cli.base.places import results_dir
 from kerv_cli.bench.doctor import DoctorSettings, check_environment_of, check_machine, check_policy
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, end_with_json, print_table
-
-Repair = Annotated[bool, typer.Option("--repair", help="Remove temporary files that killed commands left behind.")]
 
 
 @command(
@@ -26,14 +20,11 @@ Repair = Annotated[bool, typer.Option("--repair", help="Remove temporary files t
     typed={"target": "policy.target"},
     writes=False,
 )
-def doctor(settings: DoctorSettings, repair: Repair = False, as_json: AsJson = False) -> None:
+def doctor(settings: DoctorSettings, as_json: AsJson = False) -> None:
     """Check rendering, simulator, torch, shipped policies, disk and display; say how to fix each problem.
 
     With target=NAME or environment=NAME check only whether that target or environment behaves as kerv requires.
     """
-    if repair:
-        _repair(settings)
-        return
     if settings.policy.target or settings.environment:
         findings = [*check_policy(settings), *check_environment_of(settings)]
     else:
@@ -43,15 +34,3 @@ def doctor(settings: DoctorSettings, repair: Repair = False, as_json: AsJson = F
         end_with_json([asdict(finding) for finding in findings], code=int(failed))
     print_table(("check", "", "finding"), ((f.what, "ok" if f.ok else "FAILS", f.says) for f in findings))
     raise typer.Exit(int(failed))
-
-
-def _repair(settings: DoctorSettings) -> None:
-    """Remove the temporary files of killed commands from the results folder, and print their names."""
-    paths = list(left_over(results_dir(settings.results)))
-    for path in paths:
-        remove(path)
-        typer.echo(f"removed {path}")
-    remaining = [path for path in paths if path.exists()]
-    if remaining:
-        raise StorageError(f"{remaining[0]} cannot be removed: permission denied?")
-    typer.echo(f"{len(paths)} left over files removed")
