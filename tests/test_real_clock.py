@@ -235,13 +235,6 @@ def test_ar_takes_what_was_asked_for_and_the_others_their_share(results):
     assert steps_of(felt[0], 80.0) == ar.decodes[0].delay_steps
 
 
-def test_measured_latency_is_scaled_by_ars_median_here(policies, monkeypatch):
-    monkeypatch.setattr(policies_of, "ar_seconds", lambda *key: 0.02)
-    record = episode_of(policies, "method=ar", "rollout.clock=real", "rollout.ar_ms=100")
-    for decode in record.decodes:
-        assert decode.delay.seconds == pytest.approx(5 * decode.seconds)
-
-
 def test_a_profile_is_part_of_the_results_identity(results):
     words = [f"results={results}", "policy.target=nano-state", "rollout.clock=real", "rollout.latency=profile"]
     chosen = compose("rollout", [*words, "rollout.profile=there"], RolloutSettings)
@@ -274,7 +267,7 @@ FROM_PROFILE = "rollout.clock=real rollout.latency=profile rollout.profile=there
         (f"{FROM_PROFILE} method=spec_vla", "has no phase 'draft', which this method needs"),
         (f"{CONSTANT} rollout.latency_ms=20 policy=expert rollout.delay_compensation=chunk", "all 1 control steps"),
         (f"{FROM_PROFILE} policy=expert", "it has no forwards"),
-        ("rollout.clock=real rollout.ar_ms=20 policy=expert", "it has no forwards"),
+        ("rollout.clock=real rollout.ar_ms=20", "rollout.ar_ms=20 scales a profile"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(results, words, message):

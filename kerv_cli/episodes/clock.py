@@ -80,20 +80,17 @@ def check(settings: RolloutSettings, spec: EnvironmentSpec, target: TargetDescri
 
     Raises:
         UsageError: An episode ends before its first action, or all actions of a chunk are too old when they arrive. Or
-            the profile lacks a phase of the method. Or the time of autoregressive decoding is needed, and the policy
-            cannot decode autoregressively.
+            the profile lacks a phase of the method. Or the expert is asked for the latencies of a profile.
     """
     timing = settings.rollout
     if timing.clock != REAL:
         return
     if target is not None:
-        latency_of(settings, target, 1.0)
-        if calibrates(settings):
-            what = f"rollout.ar_ms={timing.ar_ms:g} of rollout.latency=measured"
-            target.check_autoregressive(what, "no AR to measure")
-    elif timing.latency == PROFILE or (timing.latency == MEASURED and timing.ar_ms):
-        override = "rollout.latency=profile" if timing.latency == PROFILE else f"rollout.ar_ms={timing.ar_ms:g}"
-        raise UsageError(f"policy=expert with {override}: it has no forwards; use rollout.latency=constant or measured")
+        latency_of(settings, target)
+    elif timing.latency == PROFILE:
+        raise UsageError(
+            "policy=expert with rollout.latency=profile: it has no forwards; use rollout.latency=constant or measured"
+        )
     if timing.latency != CONSTANT:
         return
     late = steps_of(timing.latency_ms / 1000.0, spec.actions.control_hz)
@@ -111,12 +108,6 @@ def check(settings: RolloutSettings, spec: EnvironmentSpec, target: TargetDescri
         )
 
 
-def calibrates(settings: RolloutSettings) -> bool:
-    """Return whether `rollout.ar_ms` scales by the time of an autoregressive decode, which must be measured here."""
-    timing = settings.rollout
-    return timing.clock == REAL and timing.latency == MEASURED and timing.ar_ms > 0
-
-
 def profile_identity(settings: RolloutSettings) -> dict[str, str]:
     """Return the hash of the latency profile that a rollout reads, `{"profile": sha256}`; empty if it reads none.
 
@@ -129,26 +120,23 @@ def profile_identity(settings: RolloutSettings) -> dict[str, str]:
     return {"profile": sha256_of(_profile_path(settings))}
 
 
-def latency_of(settings: RolloutSettings, target: TargetDescription | None, measured: float) -> Latency:
+def latency_of(settings: RolloutSettings, target: TargetDescription | None) -> Latency:
     """Return the function that gives each decode's latency, as `rollout.latency` says.
 
     Args:
         settings: The rollout's settings.
         target: The policy's description; None for the expert.
-        measured: Seconds of an autoregressive decode on this machine. Used only if `calibrates(settings)`.
 
     Raises:
         UsageError: The profile is missing or damaged, or it lacks a phase that the method needs.
     """
     timing = settings.rollout
-    ar_seconds = timing.ar_ms / 1000.0
     if timing.latency == CONSTANT:
         return lambda decode: timing.latency_ms / 1000.0
     if timing.latency == MEASURED:
-        scale = ar_seconds / measured if ar_seconds else 1.0
-        return lambda decode: scale * decode.seconds
+        return lambda decode: decode.seconds
     assert target is not None
-    profile = _open_profile(settings)
+    profile, ar_seconds = _open_profile(settings), timing.ar_ms / 1000.0
     whole = profile.decode((settings.chunk or target.chunk) * target.actions.dofs)
     if ar_seconds and not whole:
         raise UsageError(f"rollout.profile={timing.profile}: its AR decode takes no time; leave out rollout.ar_ms")

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 import torch
@@ -31,8 +29,6 @@ from kerv_cli.worlds.views import frame_shape
 
 PRIVILEGED = "state (privileged)"
 WARM_UP_DECODES = 6
-CALIBRATION_DECODES = 15
-"""Number of autoregressive decodes that are timed. Their median is scaled to `rollout.ar_ms`."""
 
 
 def artifacts_of(settings: MethodSettings) -> Artifacts:
@@ -165,36 +161,9 @@ def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:
     """Return the clock of a world that goes on while the policy decodes. None if the world waits."""
     if settings.rollout.clock == WAITS:
         return None
-    target, measured = None, 0.0
-    if settings.policy.kind != EXPERT:
-        artifacts = artifacts_of(settings)
-        target = artifacts.description
-        if clock.calibrates(settings):
-            loaded: Any = artifacts.target
-            pixels, threads = settings.world.camera.size, settings.runtime.threads
-            measured = ar_seconds(loaded, settings.chunk, task, pixels, threads)
-    latency = clock.latency_of(settings, target, measured)
+    target = None if settings.policy.kind == EXPERT else artifacts_of(settings).description
+    latency = clock.latency_of(settings, target)
     return RealClock(latency, spec_of(task).actions, settings.rollout.delay_compensation)
-
-
-@functools.cache
-def ar_seconds(target: Any, chunk: int, task: str, pixels: int, threads: int) -> float:
-    """Measure how long the target's autoregressive decode takes on this machine. The result is cached in the process.
-
-    Args:
-        target: The loaded target.
-        chunk: Control steps to decode at once; 0 for as many as the target was trained for.
-        task: Name of a task, for its observation space.
-        pixels: Width and height of the images.
-        threads: CPU threads. Not used, but results for different numbers must not share a cache entry.
-
-    Returns:
-        Median seconds of a decode.
-    """
-    decoder, space = Decoder(target, chunk=chunk), spec_of(task).observation
-    warm_up(decoder, task, space, pixels)
-    still = still_observation(decoder, space, pixels)
-    return float(np.median([decoder.decode(still).seconds for _ in range(CALIBRATION_DECODES)]))
 
 
 def still_observation(decoder: ActionDecoder, space: ObservationSpace, pixels: int) -> Observation:
