@@ -8,6 +8,7 @@ import pytest
 from command import kerv
 from conftest import refused
 
+import kerv_cli as library
 from kerv_cli.base.errors import UsageError
 from kerv_cli.cli.common import print_table
 from kerv_cli.worlds import spec as spec_module
@@ -72,6 +73,14 @@ def test_evaluation_has_one_seed_for_each_initial_state_of_the_benchmark():
 @needs_libero
 def test_the_environment_keeps_the_protocol():
     assert {finding.what: finding.says for finding in check_environment(SPEC, FIRST) if not finding.ok} == {}
+
+
+@needs_libero
+def test_the_shipped_policy_solves_a_state_alike_with_strict_drafts(tmp_path):
+    settings = {"policy": "libero", "task": "bowl-on-ramekin", "episodes": 1, "record": 0, "results": tmp_path}
+    episodes = library.rollout(grid=True, method="ar,naive_sd", **settings).episodes()
+    assert [row["success"] for row in episodes] == [True, True]
+    assert len({row["steps"] for row in episodes}) == 1
 
 
 @needs_libero
