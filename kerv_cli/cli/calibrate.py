@@ -25,7 +25,7 @@ from kerv_cli.training.settings import CalibrateSettings, CalibrateSuccessSettin
 @command(
     "calibrate",
     CalibrateSettings,
-    keys="policy.target demos task policy.artifacts episodes decodes proposer window boundary_windows epsilon",
+    keys="policy.target demos task policy.artifacts episodes decodes window boundary_windows epsilon",
     examples=(
         "kerv calibrate demos=mt10 policy.artifacts.calibration=mine",
         "kerv calibrate policy.target=mine demos=mine decodes=20 --plan",

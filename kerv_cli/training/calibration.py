@@ -14,13 +14,13 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 
 from kerv_cli.base.durations import count
-from kerv_cli.base.errors import CheckpointError, KervError
+from kerv_cli.base.errors import KervError
 from kerv_cli.base.files import read_mapping, write_json
+from kerv_cli.base.registry import find
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.episodes.settings import RolloutSettings
@@ -29,7 +29,6 @@ from kerv_cli.methods.calibration import (
     NEVER,
     BoundarySection,
     Calibration,
-    CalibrationArtifact,
     Demonstrations,
     Errors,
     SkipLevel,
@@ -49,6 +48,8 @@ from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.files import DemoEpisode
 
+DRAFTS = {"proposer": "drafter", "acceptance": "relaxed", "threshold": "fixed"}
+"""Parts of the method whose decodes measure K_S."""
 PRESAMPLED = 6
 """The decodes that measure K_S are spread over about this many episodes per task."""
 
@@ -83,7 +84,7 @@ class CalibrationRun:
         tasks: Full names of the tasks.
         path: The JSON to write.
         chosen: Index of each episode that is used -> whether it is held out.
-        notes: After `run`, one line per section that was not measured. It says why, and whether an older one was kept.
+        notes: After `run`, one line per section that was not measured, with the reason.
 
     Raises:
         UsageError: A number is out of range, or a task is unknown.
@@ -100,8 +101,7 @@ class CalibrationRun:
         self.description.check_autoregressive("kerv calibrate", "there is no draft to calibrate")
         self.path = self.artifacts.path("calibration")
         self.chosen = choose_episodes(self.dataset, self.tasks, settings.episodes, settings.held_out)
-        parts = {"proposer": settings.proposer, "acceptance": settings.acceptance, "threshold": settings.threshold}
-        self.method = Method.of(RolloutSettings(**parts))
+        self.method = Method.of(RolloutSettings(**{kind: find(kind, name).default for kind, name in DRAFTS.items()}))
         self.missing = [kind for kind in (*self.method.needs, "datastore") if not self.artifacts.exists(kind)]
         if "datastore" not in self.missing:
             self.artifacts.check(["datastore"])
@@ -117,7 +117,7 @@ class CalibrationRun:
         return (
             f"{self.path}: predictors fitted on {count(len(self.chosen) - held_out, 'demonstration')} of "
             f"{count(len(self.tasks), 'task')}, tested on {held_out}; "
-            f"{settings.decodes} decodes per task with {settings.proposer.kind} drafts; "
+            f"{settings.decodes} decodes per task; "
             f"boundary over {', '.join(map(str, settings.boundary_windows))} positions{without}"
         )
 
@@ -125,7 +125,7 @@ class CalibrationRun:
         """Measure everything and write the calibration.
 
         K_S is not measured if `decodes` is 0 or the drafter is missing. Skip levels are not measured without a
-        datastore. Both are then taken from an earlier calibration of the same target, if there is one.
+        datastore. `notes` says so.
 
         Args:
             stage: Called with the title of each part of the work, to show its progress.
@@ -149,8 +149,9 @@ class CalibrationRun:
             errors = prediction_errors(windows, noise, space)
         if not variability:
             drafter = "".join(f", no {kind}" for kind in self.missing if kind != "datastore")
-            variability = self.kept("variability", f"reference levels K_S: decodes={settings.decodes}{drafter}") or {}
-        skip = skip or self.kept("skip", "skip levels: no datastore of these tasks (kerv build datastore)")
+            self.notes.append(f"no reference levels K_S: decodes={settings.decodes}{drafter}")
+        if skip is None:
+            self.notes.append("no skip levels: no datastore of these tasks (kerv build datastore)")
         calibration = Calibration(
             target=MadeFor.of(self.description),
             demos=Demonstrations(self.dataset.sha256, windows.episodes),
@@ -164,20 +165,6 @@ class CalibrationRun:
         )
         write_json(self.path, asdict(calibration))
         return calibration
-
-    def kept(self, section: str, reason: str) -> Any:
-        """Return a section of an earlier calibration of the same target, if there is one. Note why it was needed.
-
-        Args:
-            section: Field of `Calibration` that was not measured.
-            reason: Why it was not measured, for the note.
-        """
-        try:
-            earlier = getattr(CalibrationArtifact().checked(self.path, self.description), section)
-        except CheckpointError:  # the file is missing, damaged or of another target
-            earlier = None
-        self.notes.append(f"{reason}; {'kept from the earlier run' if earlier else 'left empty'}")
-        return earlier
 
     def skip(self, stage: Stage) -> SkipSection | None:
         """Return the smallest similarity per task at which verification is skipped. None without a datastore."""

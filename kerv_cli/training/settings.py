@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import choice, limits, number, setting
-from kerv_cli.base.settings import RunSettings, TaskSettings, chosen, part
+from kerv_cli.base.settings import RunSettings, TaskSettings, chosen
 from kerv_cli.episodes.settings import DEFAULT_TASKS, SweepSettings
 from kerv_cli.methods.settings import POLICY, MethodSettings, PolicySettings
 from kerv_cli.targets.compact.settings import TargetSettings
@@ -181,23 +181,18 @@ class CalibrateSettings(DemonstrationSettings):
         [5, 15, 30], "window lengths w of the boundary, in positions", **limits(3, 10_000)
     )
     decodes: int = number(60, 0, 100_000, help="decodes per task from which K_S is measured; 0: no K_S")
-    proposer: Any = part("proposer", "drafter", "proposer of the decodes that measure K_S")
-    acceptance: Any = part("acceptance", "relaxed", "acceptance rule of the decodes that measure K_S")
-    threshold: Any = part("threshold", "fixed", "threshold of the decodes that measure K_S")
 
     def check_together(self, prefix: str) -> None:
-        """Refuse an empty `boundary_windows`, and decodes without a proposer.
+        """Refuse an empty `boundary_windows`.
 
         Args:
             prefix: Text before a setting's name in the error message.
 
         Raises:
-            UsageError: `boundary_windows` is empty, or decodes have no proposer.
+            UsageError: `boundary_windows` is empty.
         """
         if not self.boundary_windows:
             raise UsageError(f"{prefix}boundary_windows=[]: name at least one number of positions")
-        if self.decodes and self.proposer.kind == "none":
-            raise UsageError("proposer.kind=none drafts nothing to compare: choose a proposer, or decodes=0")
 
 
 @dataclass
