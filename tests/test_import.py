@@ -134,15 +134,17 @@ def made(tmp_path_factory):
     return folder
 
 
-def test_studies_of_another_database_are_the_same_here(made, tmp_path):
-    told = answer("runs", "import", f"{made}/kerv.db", f"results={tmp_path}/new")
-    assert (set(told["studies"]), told["notes"]) == ({"threshold", "other"}, [])
-    before, after = (load_study(StudyStore(folder, "threshold")) for folder in (made, tmp_path / "new"))
-    pd.testing.assert_frame_equal(before.per_task, after.per_task)
-    newer = shutil.copytree(made, tmp_path / "newer")
-    with sqlite3.connect(newer / "kerv.db") as file:
+def test_an_exported_database_is_the_study_elsewhere(made, tmp_path):
+    answer("runs", "export", "threshold", "--to", "db", "--dir", f"{tmp_path}/out", f"results={made}")
+    (run,) = answer("runs", "list", f"results={tmp_path}/out/threshold")
+    assert (run["id"], run["state"]) == ("threshold", "complete")
+    told = answer("runs", "import", f"{tmp_path}/out/threshold/kerv.db", "name=copy", f"results={tmp_path}/new")
+    assert told == {"studies": ["copy"], "notes": []}
+    before, after = (load_study(StudyStore(*at)) for at in ((made, "threshold"), (tmp_path / "new", "copy")))
+    pd.testing.assert_frame_equal(before.per_task.drop(columns="study"), after.per_task.drop(columns="study"))
+    with sqlite3.connect(tmp_path / "out/threshold/kerv.db") as file:
         file.execute("UPDATE kerv SET value = '99'")
-    said = refusal("runs", "import", str(newer), f"results={tmp_path}/new")
+    said = refusal("runs", "import", f"{tmp_path}/out/threshold", f"results={tmp_path}/new")
     assert "newer kerv" in said
 
 

@@ -1,4 +1,4 @@
-"""Import studies from other databases and from results folders of version 0.1.0.
+"""Import studies from other databases and from results folders of version 0.1.0. Export a study to a new kerv.db.
 
 Version 0.1.0 had no database. It had one folder per study, with plan.yaml, run.json and one folder per cell. A cell is
 a setting on one task with a few seeds.
@@ -18,7 +18,7 @@ import pyarrow as pa
 import sqlalchemy as sa
 
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
-from kerv_cli.base.files import read_mapping, read_yaml_lines, regular, visible
+from kerv_cli.base.files import read_mapping, read_yaml_lines, regular, visible, write_folder
 from kerv_cli.base.limits import check_label
 from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import SETTINGS_GROUPS, part_of
@@ -321,3 +321,25 @@ def _damage(path: Path) -> Iterator[None]:
     except _DAMAGE as error:
         why = " ".join(str(getattr(error, "orig", error)).split())[:160]
         raise CheckpointError(f"{path} is damaged, too large, or not a kerv.db: {why}") from error
+
+
+def export_database(store: StudyStore, folder: Path) -> Path:
+    """Write a kerv.db with a single study into a folder, and return the file. An existing kerv.db is replaced.
+
+    Raises:
+        UsageError: The folder contains other files.
+        StorageError: The disk is full or not writable.
+    """
+
+    def fill(new: Path) -> None:
+        copy = Database(new, f"sqlite:///{new.absolute() / FILE}")
+        with store.database.reading() as connection:
+            row = connection.execute(sa.select(tables.STUDIES).where(tables.STUDIES.c.name == store.name)).one()
+            found = _stored(connection, row)
+            StudyStore(copy, store.name, store.kind).add(found.study, found.episodes, found.command)
+        copy.close()
+
+    if folder.is_dir() and any(path.name != FILE for path in folder.iterdir()):
+        raise UsageError(f"{folder} holds other files: choose another folder with --dir")
+    write_folder(folder, fill)
+    return folder / FILE

@@ -36,7 +36,7 @@ RUNS = "NAME: runs (id, a unique part of it, or last) and results=DIR."
 FILTERS = "NAME: kind=, method=, task=, state=, since= and results=DIR narrow the list."
 
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask; names must be whole.")]
-To = Annotated[str, typer.Option("--to", help="csv or parquet.")]
+To = Annotated[str, typer.Option("--to", help="csv, parquet or db.")]
 Folder = Annotated[Path | None, typer.Option("--dir", help="Folder to write to; default results/exports/FORMAT.")]
 
 
@@ -212,11 +212,11 @@ def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
     typer.echo(f"removed {what}")
 
 
-@_command_on_runs("export", "kerv runs export last", "kerv runs export main --to parquet")
+@_command_on_runs("export", "kerv runs export last", "kerv runs export main --to db")
 def export(
     settings: CommandSettings, names: list[str], to: To = "csv", folder: Folder = None, as_json: AsJson = False
 ) -> None:
-    """Write the episodes of a run as CSV or Parquet."""
+    """Write the episodes of a run as CSV, Parquet or a database that 'kerv runs import' reads."""
     from kerv_cli.catalogue.entries import find_run
     from kerv_cli.report.export import export as hand_over
 

@@ -1,4 +1,4 @@
-"""Export the episodes of a run as CSV or Parquet."""
+"""Export the episodes of a run as CSV, Parquet, or a database of their own."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import pandas as pd
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.files import atomic_path, write_text
 from kerv_cli.catalogue.entries import RunEntry, store_of
+from kerv_cli.catalogue.imports import export_database
 from kerv_cli.episodes.rows import DECODE_SCHEMA
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.tables import csv_text
 
-FORMATS = ("csv", "parquet")
+FORMATS = ("csv", "parquet", "db")
 _AT_ONCE = 100  # episodes in memory at a time
 
 
@@ -33,6 +34,8 @@ def export(run: RunEntry, to: str, folder: Path) -> list[Path]:
     if to not in FORMATS:
         raise UnknownName("format", to, FORMATS)
     store = store_of(run)
+    if to == "db":
+        return [export_database(store, folder / run.id)]
     if to == "parquet":
         return _to_parquet(store, folder / run.id)
     path = folder / f"{run.id}.csv"
