@@ -1,4 +1,8 @@
-"""The command line in this process, which has loaded the libraries already."""
+"""The command line in this process, which has loaded the libraries already, and in one of its own."""
+
+import os
+import subprocess
+import sys
 
 from click.testing import Result
 from typer.testing import CliRunner
@@ -24,3 +28,9 @@ def refusal(*words: str, code: int | None = None) -> str:
     assert run.exit_code in (1, 2), run.output
     (line,) = [line for line in run.stderr.splitlines() if line.startswith("kerv: ")]
     return line
+
+
+def process(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run Python with these arguments in a process of its own."""
+    command = [sys.executable, "-W", "ignore", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, env={**os.environ, **environment})

@@ -2,8 +2,6 @@
 
 import ast
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +36,7 @@ def study(mine):
     return kerv.sweep(path, **mine)
 
 
-def test_the_import_loads_nothing_and_names_what_the_stub_names():
-    code = "import sys, kerv_cli; print(sorted({'torch', 'numpy', 'pandas', 'mujoco', 'typer'} & set(sys.modules)))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
+def test_the_package_names_what_the_stub_names():
     stub = ast.parse((ROOT / "kerv_cli/__init__.pyi").read_text(encoding="utf-8"))
     assert [node.names[0].asname for node in stub.body if isinstance(node, ast.ImportFrom)] == kerv.__all__
     assert all(getattr(kerv, name).__doc__ for name in kerv.__all__)

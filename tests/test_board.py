@@ -113,12 +113,14 @@ def quickest(client, path):
     return min(times)
 
 
-def test_pages_are_quick_with_ten_thousand_episodes(tmp_path):
+def test_pages_are_quick_with_ten_thousand_episodes_and_two_hundred_runs(tmp_path):
     study = threshold_study(["reach-v3", "drawer-open-v3"], 500, tuple(range(1, 9)), name="large")
     rows = [episode_row(episode(study.settings[3], "reach-v3", seed)) for seed in range(20)]
     values = {"started": now(), "block": "b", "decode_seconds": seconds_blob([0.01] * 20)}
     store = StudyStore(tmp_path, "large")
     store.save(study)
+    with Run(store.database, "sweep", "large", ["sweep"]):
+        pass
     names = ("work", "task", "seed", "repeat")
     with store.database.writing() as connection:
         connection.execute(sa.insert(BLOCKS).values(id="b", run="r", seeds="", started=now(), code="", about={}))
@@ -133,28 +135,15 @@ def test_pages_are_quick_with_ten_thousand_episodes(tmp_path):
         found = sa.select(EPISODES.c.id).where(EPISODES.c.work == SETTINGS.c.work, *same)
         found = found.where(SETTINGS.c.id == WANTED.c.setting_id)
         connection.execute(sa.update(WANTED).values(episode_id=found.scalar_subquery()))
+        row, kinds = connection.execute(sa.select(RUNS)).mappings().one(), ("sweep", "target", "drafter", "demos")
+        runs = [{**row, "id": f"r{i}", "kind": kinds[i % 4], "name": f"n{i}", "status": "failed"} for i in range(200)]
+        connection.execute(sa.insert(RUNS), runs)
     client = client_of(tmp_path)
     assert "10000" in client.get("/").text
+    assert client.get("/").text.count("<tr>") > 150
     assert client.get("/studies/large/episodes").text.count('href="/episodes/') == 10_000
     for path in ("/", "/studies/large", "/studies/large/episodes"):
         assert quickest(client, path) < 0.5, path
-
-
-def test_the_first_page_is_quick_with_two_hundred_runs(tmp_path):
-    swept(tmp_path, threshold_study(["reach-v3"], 1, (3,), name="study"))
-    with Database(tmp_path).writing() as connection:
-        row = dict(connection.execute(sa.select(RUNS)).mappings().one())
-        kinds = ("sweep", "target", "drafter", "demos")
-        connection.execute(
-            sa.insert(RUNS),
-            [
-                row | {"id": f"r{i}", "kind": kinds[i % 4], "name": f"n{i}", "status": "failed", "message": "no"}
-                for i in range(200)
-            ],
-        )
-    client = client_of(tmp_path)
-    assert client.get("/").text.count("<tr>") > 150
-    assert quickest(client, "/") < 0.3
 
 
 # --- in a browser ---

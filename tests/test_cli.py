@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import typer
-from command import kerv, refusal
+from command import kerv, process, refusal
 
 from kerv_cli.base import registry
 from kerv_cli.base.config import groups
@@ -24,17 +24,26 @@ from kerv_cli.cli.common import one_line_errors
 FAST = ["episodes=2", "world.horizon=8", "record=0"]
 
 
-def process(*arguments: str, **env: str) -> subprocess.CompletedProcess[str]:
-    """The command as a shell starts it."""
-    command = [sys.executable, "-W", "ignore", "-m", "kerv_cli", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, env={**os.environ, **env})
+@pytest.mark.parametrize(
+    ("code", "heavy"),
+    [
+        ("import kerv_cli", "torch numpy pandas mujoco typer"),
+        ("import kerv_cli.cli.app", "torch mujoco hydra pandas rerun"),
+        ("from kerv_cli.base.registry import parts; parts('proposer')", "torch mujoco numpy pyarrow hydra pydantic"),
+        ("from kerv_cli.worlds import task_names; list(task_names())", "torch mujoco metaworld numpy hydra pydantic"),
+        (
+            "from kerv_cli.worlds.vla_eval import MetaWorld as M; M(tasks=['MT10'], stress='push').get_tasks()",
+            "torch mujoco metaworld",
+        ),
+    ],
+)
+def test_nothing_heavy_is_imported_before_it_is_needed(code, heavy):
+    run = process("-c", f"{code}; import sys; print(*({set(heavy.split())} & set(sys.modules)))", KERV_PLUGINS="")
+    assert run.stdout == "\n", run.stderr
 
 
-def test_help_lists_the_commands_without_importing_anything_heavy():
-    heavy = "{'torch', 'mujoco', 'hydra', 'pandas', 'rerun'}"
-    code = f"import sys, kerv_cli.cli.app; print(sorted({heavy} & set(sys.modules)))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
-    run = process("--help")
+def test_help_lists_the_commands():
+    run = process("-m", "kerv_cli", "--help")
     assert run.returncode == 0
     for command in ("demos", "train", "build", "calibrate", "rollout", "sweep", "report", "view", "doctor"):
         assert f"  {command} " in run.stdout
@@ -64,7 +73,7 @@ def test_damaged_weights_are_refused(results):
 
 def test_no_graphics_gets_the_command_that_brings_them(results):
     words = ("rollout", "task=reach-v3", *FAST, f"results={results}", "policy.target=nano-vision")
-    run = process(*words, MUJOCO_GL="glfw", DISPLAY="")
+    run = process("-m", "kerv_cli", *words, MUJOCO_GL="glfw", DISPLAY="")
     (line,) = [line for line in run.stderr.splitlines() if line.startswith("kerv: ")]
     assert run.returncode == 1
     assert "MUJOCO_GL" in line or "apt-get install" in line
@@ -121,9 +130,8 @@ def test_typer_completes_keys_and_names():
     def completed(*words, shell="zsh"):
         line = " ".join(("kerv", *words))
         asked = {"COMP_WORDS": line, "COMP_CWORD": str(len(words)), "_TYPER_COMPLETE_ARGS": line}
-        environment = {**os.environ, **asked, "_KERV_COMPLETE": f"complete_{shell}"}
         be_kerv = "import sys; sys.argv[0] = 'kerv'; from kerv_cli.__main__ import main; main()"
-        return subprocess.run([sys.executable, "-c", be_kerv], capture_output=True, text=True, env=environment).stdout
+        return process("-c", be_kerv, **asked, _KERV_COMPLETE=f"complete_{shell}").stdout
 
     assert completed("rollout", "me", shell="bash").split() == ["method="]
     assert '"method=spec_vla"' in completed("rollout", "method=spec")
@@ -160,7 +168,7 @@ def test_a_sweep_without_a_study_lists_the_studies_with_their_sizes(tmp_path):
 def test_a_command_from_a_plugin_is_one_like_any_other(tmp_path, monkeypatch):
     """docs/extending.md: tests/examples/own_command.py."""
     path = os.pathsep.join([str(Path(__file__).parent / "examples"), os.environ.get("PYTHONPATH", "")])
-    listed = process("--help", PYTHONPATH=path, KERV_PLUGINS="own_command")
+    listed = process("-m", "kerv_cli", "--help", PYTHONPATH=path, KERV_PLUGINS="own_command")
     assert "  seeds      Print the seeds of a task's episodes\n" in listed.stdout
     monkeypatch.setattr(registry, "_PARTS", {kind: dict(parts(kind)) for kind in registry.kinds()})
     monkeypatch.delitem(sys.modules, "examples.own_command", raising=False)

@@ -1,13 +1,10 @@
 """The registry: names, collisions, plugins, and that everything it names is there."""
 
 import os
-import subprocess
-import sys
 from importlib.metadata import EntryPoint
-from typing import Any
 
 import pytest
-from command import told
+from command import process, told
 from conftest import refused
 
 from kerv_cli.base import registry
@@ -115,13 +112,7 @@ def test_a_plugin_that_does_not_work_gets_one_line(tmp_path, plugins, says):
     (tmp_path / "unfinished.py").write_text("x = 1\ndef f(:\n")
     (tmp_path / "unknown.py").write_text("nothing\n")
     path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
-    done = subprocess.run(
-        [sys.executable, "-c", "from kerv_cli.cli.app import app; app()", "rollout", "--cfg"],
-        env={**os.environ, "PYTHONPATH": path, "KERV_PLUGINS": plugins},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = process("-m", "kerv_cli", "rollout", "--cfg", PYTHONPATH=path, KERV_PLUGINS=plugins)
     assert done.returncode == 2
     assert says in done.stderr
     assert done.stderr.count("\n") == 1
@@ -137,17 +128,3 @@ def test_an_installed_package_registers_by_an_entry_point(tmp_path, monkeypatch,
     monkeypatch.setattr(registry, "entry_points", entry_points)
     registry.load_plugins.__wrapped__()
     assert find("proposer", "installed").built.__self__.build == "installed_parts:build"
-
-
-def test_parts_are_known_without_anything_heavy():
-    heavy = "{'torch', 'mujoco', 'metaworld', 'numpy', 'pyarrow', 'hydra', 'pydantic'}"
-    asked = "import sys; from kerv_cli.base.registry import parts; assert len(parts('proposer')) > 9; "
-    asked += "from kerv_cli.worlds import task_names; assert len(list(task_names())) > 50; "
-    done: Any = subprocess.run(
-        [sys.executable, "-c", f"{asked}print(*({heavy} & set(sys.modules)))"],
-        env={**os.environ, "KERV_PLUGINS": ""},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout == "\n"

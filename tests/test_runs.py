@@ -42,6 +42,12 @@ def results(policies, tmp_path_factory):
     return folder
 
 
+@pytest.fixture
+def copy(results, tmp_path):
+    """One that a test may change."""
+    return Path(shutil.copytree(results, tmp_path / "results"))
+
+
 def listed(results: Path, *words: str) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = json.loads(works("runs", "list", *words, f"results={results}", "--json"))
     return found
@@ -113,9 +119,7 @@ def test_comparison_says_what_differs_in_settings_and_results(results):
 
 
 @pytest.mark.bits
-def test_a_rerun_repeats_the_tokens_in_a_folder_of_its_own(results, tmp_path):
-    copy = tmp_path / "results"
-    shutil.copytree(results, copy)
+def test_a_rerun_repeats_the_tokens_in_a_folder_of_its_own(copy):
     single = next(run["id"] for run in listed(copy, "method=ar"))
     assert ": 2 episodes" in works("runs", "rerun", single, f"results={copy}", "--plan")
     told = json.loads(works("runs", "rerun", single, f"results={copy}", "--json"))
@@ -226,9 +230,7 @@ remove(run, sys.argv[1])
 
 
 @pytest.mark.parametrize("moment", range(4))
-def test_a_removal_that_is_killed_can_be_repeated(results, tmp_path, moment):
-    copy = tmp_path / "results"
-    shutil.copytree(results, copy)
+def test_a_removal_that_is_killed_can_be_repeated(copy, moment):
     name = next(run["id"] for run in listed(copy) if run["kind"] == "rollout")
     (copy / "rollouts" / name / "rollouts").mkdir(parents=True)
     (copy / "rollouts" / name / "rollouts/a.rrd").touch()
@@ -240,9 +242,7 @@ def test_a_removal_that_is_killed_can_be_repeated(results, tmp_path, moment):
     assert not list((copy / "rollouts").iterdir())
 
 
-def test_removal_refuses_links_and_parts_of_names(results, tmp_path):
-    copy = tmp_path / "results"
-    shutil.copytree(results, copy)
+def test_removal_refuses_links_and_parts_of_names(copy, tmp_path):
     name = next(run["id"] for run in listed(copy) if run["kind"] == "rollout")
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()

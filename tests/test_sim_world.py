@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+from command import process
 
 from kerv_cli.base.errors import KervError, RenderingUnavailable, UnknownName, UsageError
 from kerv_cli.episodes.episode import run_episode
@@ -227,12 +228,6 @@ def test_without_a_backend_one_line_names_the_command(choose):
     assert "MUJOCO_GL" not in os.environ
 
 
-def run_python(code, **environment):
-    return subprocess.run(
-        [sys.executable, "-c", code], env={**os.environ, **environment}, capture_output=True, text=True, check=False
-    )
-
-
 def test_physics_works_where_nothing_can_be_drawn():
     code = f"""
 from kerv_cli.base.errors import RenderingUnavailable
@@ -245,7 +240,7 @@ try:
 except RenderingUnavailable as error:
     print(world.steps, error)
 """
-    result = run_python(code, MUJOCO_GL="disable")
+    result = process("-c", code, MUJOCO_GL="disable")
     assert result.stdout == "1 MUJOCO_GL=disable switches drawing off: unset it, or set it to egl\n", result.stderr
 
 
@@ -259,5 +254,5 @@ atexit.register(lambda: print([camera._renderer._gl_context for camera in world.
 world.reset(0)
 print(world.frame().shape)
 """
-    result = run_python(code)
+    result = process("-c", code)
     assert (result.returncode, result.stdout, result.stderr) == (0, "(96, 96, 3)\n[None]\n", "")
