@@ -110,48 +110,38 @@ def store_of(vectors: np.ndarray, shards: dict[str, slice], seeds: np.ndarray | 
     return datastore_of(vectors, np.stack([rows % 251, rows // 251], 1), shards, seeds)  # tokens tell the row
 
 
+def on_a_grid(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Vectors and a key of small whole numbers, so that ties are many."""
+    span, rows = rng.integers([1, 2], [5, 61])
+    vectors = rng.integers(-span, span + 1, (rows + 1, 3)).astype(np.float32)
+    return vectors[1:], vectors[0]
+
+
+def near_a_subspace(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """As an encoder's keys are; with noise they differ in the rest, too."""
+    rows, width = ((500, 64), (9001, 192), (10, 1024))[rng.integers(3)]
+    rank, noise = rng.integers(1, 41), rng.choice([0.0, 1e-7, 1e-3, 0.1])
+    vectors = rng.normal(size=(rows, rank)) @ rng.normal(size=(rank, width)) + noise * rng.normal(size=(rows, width))
+    vectors = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+    vectors[-(rows // 5) :] = vectors[: rows // 5]
+    return vectors, (vectors[3] + rng.choice([0.0, 0.1]) * rng.normal(size=width)).astype(np.float32)
+
+
 @pytest.mark.bits
-@given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(0, 20), st.integers(1, 12), st.integers(1, 4))
-def test_the_search_is_brute_force_with_ties_in_stored_order(seed, n, before, k, span):
-    """Small whole numbers, so that scores are exact and ties are many."""
+@given(st.integers(0, 2**32 - 1), st.sampled_from([on_a_grid, near_a_subspace]), st.integers(1, 12))
+def test_the_search_is_brute_force_with_ties_in_stored_order(seed, made, k):
     rng = np.random.default_rng(seed)
-    vectors = rng.integers(-span, span + 1, (before + n, 3)).astype(np.float32)
-    seeds = rng.integers(0, 3, before + n)
-    store = store_of(vectors, {"a": slice(0, before), "b": slice(before, before + n)}, seeds)
-    key = rng.integers(-span, span + 1, 3).astype(np.float32)
+    vectors, key = made(rng)
+    seeds, before = rng.integers(0, 3, len(vectors)), int(rng.integers(0, len(vectors)))
+    store = store_of(vectors, {"a": slice(0, before), "b": slice(before, len(vectors))}, seeds)
+    exact = (vectors.astype(np.float64) @ key.astype(np.float64)).astype(np.float32)
     for without in (None, 1):
-        ranked = [row for row in range(before, before + n) if without is None or seeds[row] != without]
-        ranked = sorted(ranked, key=lambda row: -sum(int(a) * int(b) for a, b in zip(vectors[row], key, strict=True)))
-        ranked = ranked[:k]
+        ranked = [row for row in np.argsort(-exact, kind="stable") if row >= before and seeds[row] != without][:k]
         neighbours = store.query(key, "b", k, without)
         assert neighbours.steps.tolist() == ranked
         assert neighbours.similarity.dtype == np.float32
-        assert neighbours.similarity.tolist() == [float(vectors[row] @ key) for row in ranked]
+        assert neighbours.similarity.tolist() == exact[ranked].tolist()
         assert neighbours.chunks.tolist() == [[row % 251, row // 251] for row in ranked]
-
-
-@pytest.mark.bits
-@settings(max_examples=30)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    size=st.sampled_from([(500, 64), (9001, 192), (10, 1024)]),
-    rank=st.integers(1, 40),
-    k=st.integers(1, 9),
-    noise=st.sampled_from([0.0, 1e-7, 1e-3, 0.1]),
-)
-def test_the_search_is_exact_near_a_subspace(seed, size, rank, k, noise):
-    """Keys near a subspace, as an encoder's are; with noise rows differ in the rest, too."""
-    rng, (rows, width) = np.random.default_rng(seed), size
-    vectors = rng.normal(size=(rows, rank)) @ rng.normal(size=(rank, width)) + noise * rng.normal(size=size)
-    vectors = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
-    vectors[-(rows // 5) :] = vectors[: rows // 5]
-    seeds = rng.integers(0, 4, rows)
-    store = store_of(vectors, {"a": slice(0, rows)}, seeds)
-    for key in (vectors[1], (vectors[3] + 0.1 * rng.normal(size=width)).astype(np.float32)):
-        exact = (vectors.astype(np.float64) @ key.astype(np.float64)).astype(np.float32)
-        for without in (None, 2):
-            ranked = [row for row in np.argsort(-exact, kind="stable") if without is None or seeds[row] != without]
-            assert store.query(key, "a", k, without).steps.tolist() == ranked[:k]
 
 
 def entries(store: Datastore) -> list[tuple[str, int, int]]:

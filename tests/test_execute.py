@@ -148,27 +148,6 @@ def test_a_study_that_is_deleted_while_it_runs_says_so(tmp_path, workers):
     assert (outcome.failed, store.counts(), claims(store.database)) == ([], (16, 16), 0)
 
 
-def test_over_processes_only_the_guilty_settings_fail(tmp_path):
-    """One setting kills its process, one raises what cannot be pickled; the rest of their blocks still takes turns."""
-    study = threshold_study(["reach-v3", "push-v3"], episodes=2, radii=(1, 3, 5))
-    for setting in study.settings:
-        setting.settings["runtime"]["threads"] = 3  # type: ignore[index]
-    store, outcome = swept(tmp_path, study, misbehave, runtime=RuntimeSettings(workers=2))
-    reasons = {failure.episodes[0].setting.label: failure.reason for failure in outcome.failed}
-    assert len(outcome.failed) == 4
-    assert reasons["spec_vla r=1"] == "its worker process was killed by SIGKILL"
-    assert reasons["spec_vla r=5"].startswith("Odd: 1 and 2")
-    assert len(outcome.done) == 2 * (3 * 2 + 1)
-    table = store.frame()
-    assert set(table["workers"]) == {2}
-    assert table["run"].nunique() == 1
-    assert set(table["wall_seconds"]) == {3.0}  # OMP_NUM_THREADS
-    assert claims(store.database) == 0
-    assert not list(tmp_path.glob(".spool*"))
-    _, again = swept(tmp_path, study)
-    assert len(again.done) == 20 - 14
-
-
 SWEEP = """
 import os
 import sys
@@ -334,20 +313,34 @@ def cluster(monkeypatch):
         gc.collect()
 
 
-def test_a_cluster_loses_only_the_guilty_settings_and_resumes(cluster, tmp_path):
-    study = threshold_study(["reach-v3"], episodes=2, radii=(1, 5))
-    store, outcome = swept(tmp_path, study, misbehave, runtime=cluster)
+@pytest.mark.parametrize(
+    ("executor", "tasks", "killed", "threads"),
+    [
+        ("local", ["reach-v3", "push-v3"], "its worker process was killed by SIGKILL", 3.0),
+        ("slurm", ["reach-v3"], "its job", 1.0),  # Slurm itself would set the variable
+    ],
+)
+def test_only_the_guilty_settings_fail(executor, tasks, killed, threads, request, tmp_path):
+    """One setting kills its process, one raises what cannot be pickled; the rest of their blocks still takes turns."""
+    where = request.getfixturevalue("cluster") if executor == "slurm" else RuntimeSettings(workers=2)
+    study = threshold_study(tasks, episodes=2, radii=(1, 3, 5))
+    for setting in study.settings:
+        setting.settings["runtime"]["threads"] = 3  # type: ignore[index]
+    store, outcome = swept(tmp_path, study, misbehave, runtime=where)
     reasons = {failure.episodes[0].setting.label: failure.reason for failure in outcome.failed}
-    assert set(reasons) == {"spec_vla r=1", "spec_vla r=5"}
-    assert "its job" in reasons["spec_vla r=1"]
+    assert len(outcome.failed) == 2 * len(tasks)
+    assert killed in reasons["spec_vla r=1"]
     assert reasons["spec_vla r=5"].startswith("Odd: 1 and 2")
-    assert len(outcome.done) == 2 * 2 + 1
+    done = len(tasks) * (3 * 2 + 1)
+    assert len(outcome.done) == done
     table = store.frame()
-    assert set(table["executor"]) == {cluster.executor}
-    assert set(table["wall_seconds"]) == {1.0}  # OMP_NUM_THREADS
+    assert (set(table["executor"]), set(table["workers"])) == ({executor}, {2})
+    assert table["run"].nunique() == 1
+    assert set(table["wall_seconds"]) == {threads}  # OMP_NUM_THREADS
     assert claims(store.database) == 0
+    assert not list(tmp_path.glob(".spool*"))
     _, again = swept(tmp_path, study)
-    assert (len(again.reused), len(again.done)) == (5, 3)
+    assert (len(again.reused), len(again.done)) == (done, 10 * len(tasks) - done)
 
 
 def test_an_interrupt_ends_a_clusters_work(cluster, tmp_path):
