@@ -32,7 +32,6 @@ def datastore_of(
     seeds: np.ndarray | None = None,
     left: int = 50,
     space: ActionSpace = SPEC.actions,
-    search: Any = None,
 ) -> Datastore:
     """A datastore in memory; by default row i is of episode i. The steps tell the row."""
     files, rows = {"vectors.npy": "v" * 64, "payload.parquet": "p" * 64}, np.arange(len(vectors))
@@ -40,7 +39,7 @@ def datastore_of(
         2, "datastore", ("scene",), vectors.shape[1], len(rows), 4, space, "t" * 64, "d" * 64, files, {}
     )
     columns = vectors.astype(np.float32), tokens.astype(np.uint8), rows if seeds is None else seeds, rows
-    return Datastore(manifest, *columns, np.full(len(rows), left), shards, search=search)
+    return Datastore(manifest, *columns, np.full(len(rows), left), shards)
 
 
 def of_target(description: TargetDescription, target: object) -> Any:

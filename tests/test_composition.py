@@ -16,14 +16,9 @@ from kerv_cli.episodes.identity import effective, idle_keys, without_effect
 from kerv_cli.episodes.policy import check as check_rollout
 from kerv_cli.episodes.resolve import Point, ResolvedStudy, idle_overrides
 from kerv_cli.episodes.settings import RolloutSettings, SweepSettings, settings_from
+from kerv_cli.methods import heisd
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.eagle import DrafterProposerSettings
-from kerv_cli.methods.heisd import (
-    FusedBoundarySettings,
-    HybridAcceptanceSettings,
-    HybridProposerSettings,
-    SimilaritySkipSettings,
-)
 from kerv_cli.methods.jacobi import JacobiProposerSettings
 from kerv_cli.methods.kerv import CompensateSettings, KinematicThresholdSettings
 from kerv_cli.methods.sp_vla import SpeedSkipSettings
@@ -50,10 +45,10 @@ PRESETS: dict[str, dict[str, Any]] = {
         "rectifier": CompensateSettings(predictor="kalman", use_target_token=False, drop=False, min_verified=0, rest=4),
     },
     "heisd": {
-        "proposer": HybridProposerSettings(shape="tree", depth=5, top_k=8, nodes=50, neighbours=5),
-        "acceptance": HybridAcceptanceSettings(strict_dofs=False, group_limit=30, token_limit=15),
-        "boundary": FusedBoundarySettings(alpha=0.5, window=15, f_star=0.5),
-        "skip": SimilaritySkipSettings(s_min=None, max_skips=2, up=0.0, down=0.0),
+        "proposer": heisd.HybridProposerSettings(shape="tree", depth=5, top_k=8, nodes=50, neighbours=5),
+        "acceptance": heisd.HybridAcceptanceSettings(strict_dofs=False, group_limit=30, token_limit=15),
+        "boundary": heisd.FusedBoundarySettings(alpha=0.5, window=15, f_star=0.5),
+        "skip": heisd.SimilaritySkipSettings(s_min=None, max_skips=2, up=0.0, down=0.0),
     },
     "sp_vla": {"skip": SpeedSkipSettings(v_min=0.3, v_max=1000, buffer=6, share=0.5, penalty=1e-4)},
 }
@@ -122,7 +117,7 @@ def test_only_what_needs_no_states_can_be_chosen_before_the_prefill():
     with pytest.raises(UnknownName, match="unknown prefill_draft 'drafter'"):
         composed("prefill_draft=drafter")
     # a part from elsewhere can still be named in settings that Hydra did not compose
-    method = {**AR, "prefill_draft": HybridProposerSettings()}
+    method = {**AR, "prefill_draft": heisd.HybridProposerSettings()}
     with pytest.raises(UsageError, match="prefill_draft=hybrid: it reads the target's states"):
         Method(method).check(SimpleNamespace(chunk=4))
 
