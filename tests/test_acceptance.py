@@ -104,10 +104,10 @@ def test_segments_cut_a_stretch_of_the_chunk_at_the_groups(space, start, stop):
 
 
 @st.composite
-def trees(draw: st.DrawFn, most: int = 12, vocabulary: int = 12) -> TokenTree:
-    n = draw(st.integers(0, most))
+def trees(draw: st.DrawFn) -> TokenTree:
+    n = draw(st.integers(0, 12))
     parents = [draw(st.integers(-1, i - 1)) for i in range(n)]
-    return TokenTree.build([draw(st.integers(0, vocabulary - 1)) for _ in range(n)], parents)
+    return TokenTree.build([draw(st.integers(0, 11)) for _ in range(n)], parents)
 
 
 def visible(tree: TokenTree, before: int) -> np.ndarray:

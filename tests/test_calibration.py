@@ -71,9 +71,9 @@ BIN = 2 / SPACE.tokens
 STEPS = 24
 
 
-def made_up_episode(task: str, seed: int, tail: int = 8) -> DemoEpisode:
+def made_up_episode(task: str, seed: int) -> DemoEpisode:
     """Ramps of another slope per DoF, saturating now and then; a gripper that closes half way."""
-    time = np.arange(STEPS + tail)
+    time = np.arange(STEPS + 8)
     slopes = 0.05 * (1 + seed % 3) * np.array([1.0, -0.5, 0.25])
     labels = np.clip(np.c_[-0.5 + time[:, None] * slopes, np.where(time < STEPS // 2, -1.0, 1.0)], -1, 1)
     perturbed = seed % 2 == 1

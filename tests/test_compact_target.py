@@ -105,9 +105,9 @@ def test_the_shipped_targets_load_with_metaworlds_spaces(name, cameras, prompt):
         assert EarlyDrafter().load(shipped_dir() / name / "early", request).tokens == target.chunk * 4
 
 
-def nano(space: ObservationSpace = ARM, observation: str = "state") -> CompactTarget:
+def nano(observation: str = "state") -> CompactTarget:
     settings = TargetSettings("nano", observation, 16, 1, 2, 24, chunk=2, keypoints=4, channels=8, scene_tokens=2)
-    return CompactTarget(settings, SEVEN, space, WordTokenizer.build(["insert the peg"]), "front")
+    return CompactTarget(settings, SEVEN, ARM, WordTokenizer.build(["insert the peg"]), "front")
 
 
 def damaged(folder: Path, **changes: object) -> Path:
@@ -151,7 +151,7 @@ def test_weights_that_are_not_finite_are_refused(tmp_path):
 
 
 def test_an_observation_of_another_environment_is_refused():
-    target, seeing = nano(), nano(observation="vision")
+    target, seeing = nano(), nano("vision")
     with pytest.raises(CheckpointError, match="8 numbers of proprioception and 14 of state, the environment gives 4"):
         target.encode(Observation(np.zeros(4), np.zeros(39), "insert"))
     with pytest.raises(CheckpointError, match="camera 'front'"):
@@ -179,10 +179,10 @@ def test_a_padded_bucket_computes_its_tokens(tokens):
 # --- grown
 
 
-def observation(seed: int, size: int = 96) -> Observation:
+def observation(seed: int) -> Observation:
     random = np.random.default_rng(seed)
     return Observation(
-        images={"": random.integers(0, 255, (size, size, 3), dtype=np.uint8)},
+        images={"": random.integers(0, 255, (96, 96, 3), dtype=np.uint8)},
         proprioception=random.normal(0, 0.1, 4).astype(np.float32) + np.float32([0, 0.6, 0.2, 0.5]),
         state=random.normal(0, 0.1, 39).astype(np.float32),
         instruction=SPEC.task("reach-v3").instruction,

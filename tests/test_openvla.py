@@ -67,8 +67,8 @@ def target(results):
     return loaded(results / "artifacts/target/openvla")
 
 
-def shown(seed: int, instruction: str = "pick up the cup", size: tuple[int, int] = (40, 64)) -> Observation:
-    image = np.random.default_rng(seed).integers(0, 256, (*size, 3), dtype=np.uint8)
+def shown(seed: int, instruction: str = "pick up the cup") -> Observation:
+    image = np.random.default_rng(seed).integers(0, 256, (40, 64, 3), dtype=np.uint8)
     return Observation(np.zeros(0), np.zeros(0), instruction, {"primary": image})
 
 
@@ -490,7 +490,7 @@ def written(folder: Path, drafter: PublicDrafter, embedding: Tensor) -> Path:
 
 
 @pytest.mark.bits
-def test_it_computes_what_the_public_layer_does(target):
+def test_it_computes_what_the_public_layer_does():
     """EAGLE's forward, spelt out with transformers' layer: fc over (embedding, state), no norm in front or behind."""
     from transformers import LlamaConfig
     from transformers.models.llama.modeling_llama import LlamaDecoderLayer, LlamaRotaryEmbedding

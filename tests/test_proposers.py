@@ -144,15 +144,13 @@ def test_merging_drops_what_is_named_last_and_cuts_the_last_branch():
 # --- HeiSD: choice and skip
 
 
-def skipping(
-    left: int = 50, s_min: float = 0.5, entries: int = 1, **changes: Any
-) -> tuple[Decoder, torch.Tensor, list[int]]:
+def skipping(left: int = 50, **changes: Any) -> tuple[Decoder, torch.Tensor, list[int]]:
     target = random_target(2, 1, 1, 4)
     prompt = random_prompt(target, 2)
     tokens = list(range(16))
-    store = stored(target, prompt, np.array([tokens] * entries), left)
+    store = stored(target, prompt, np.array([tokens]), left)
     retrieval = RetrievalProposer(store, target, 1, 16)
-    skip = VerifySkip(SimilaritySkipSettings(**changes), retrieval, (0.4, s_min, 0.9))
+    skip = VerifySkip(SimilaritySkipSettings(**changes), retrieval, (0.4, 0.5, 0.9))
     decoder = Decoder(target, Parts(proposer=retrieval, skip=skip))
     decoder.situation = situation(np.random.default_rng(0), 3)
     return decoder, prompt, tokens

@@ -13,7 +13,7 @@ from test_proposers import stored
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.engine.parts import Boundary, Fixed
+from kerv_cli.engine.parts import Boundary
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.methods.heisd import SimilaritySkipSettings
@@ -21,7 +21,6 @@ from kerv_cli.methods.heisd.rules import RetrievalProposer, VerifySkip
 from kerv_cli.methods.kerv.prediction import Hold, PredictionProposer, Ridge
 from kerv_cli.methods.merged import MergedProposer
 from kerv_cli.methods.sp_vla import SpeedSkip, SpeedSkipSettings
-from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.methods.streak import AlwaysSkip, StreakSkip, StreakSkipSettings
 from kerv_cli.worlds.metaworld.spec import SPEC
 
@@ -289,11 +288,9 @@ def test_an_intuitive_decode_runs_nothing_of_the_target():
 # --- streak
 
 
-def decoder_of(source: Any, target: MockTarget, draft: Any = None, radius: int = 0, **settings: Any) -> Decoder:
+def decoder_of(source: Any, target: MockTarget, draft: Any = None, **settings: Any) -> Decoder:
     skip = StreakSkip(StreakSkipSettings(**settings), source)
-    acceptance = RelaxedRule(target.actions) if radius else None
-    parts = Parts(acceptance, Fixed(radius), prefill_draft=draft or source, skip=skip)
-    made = Decoder(target, parts)
+    made = Decoder(target, Parts(prefill_draft=draft or source, skip=skip))
     made.reset("t", 0, np.zeros(3))
     return made
 

@@ -61,9 +61,9 @@ class Sums:
         return {"score": -float(next(module.parameters()).detach().sum())}
 
 
-def quadratic(folder: Path, identity: str = "a") -> Loop:
+def quadratic(folder: Path) -> Loop:
     torch.manual_seed(0)
-    return Loop(Sums(), lambda module, metrics: None, TINY, folder, identity)
+    return Loop(Sums(), lambda module, metrics: None, TINY, folder, "a")
 
 
 @pytest.mark.bits

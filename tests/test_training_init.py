@@ -78,15 +78,11 @@ def init_settings(with_old: Path, *overrides: str) -> TrainTargetSettings:
     return compose("train_target", [*common, *overrides], TrainTargetSettings)
 
 
-def trained(with_old: Path, *overrides: str, stop: int | None = None) -> Path:
+def trained(with_old: Path, *overrides: str) -> Path:
     run = TargetRun(init_settings(with_old, *overrides))
     run.load(lambda done, total: None)
-    run.train(lambda step, metrics: stop_here() if step == stop else None)
+    run.train(lambda step, metrics: None)
     return run.folder
-
-
-def stop_here() -> None:
-    raise KeyboardInterrupt
 
 
 @pytest.mark.bits

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import sys
 import zlib
-from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -40,26 +39,23 @@ ROBOT: dict[str, Any] = {
 }
 
 
-def write_checkpoint(
-    folder: Path, shape: Shape = TINY, seed: int = 0, statistics: Mapping[str, Any] | None = None, shards: int = 2
-) -> Path:
-    """Writes the checkpoint -> `folder`. statistics: data set -> {"q01", "q99", "mask"} of its actions.
+def write_checkpoint(folder: Path, shape: Shape = TINY, seed: int = 0) -> Path:
+    """Write the checkpoint in two files, and return `folder`.
 
     Raises:
-        KervError: the package tokenizers is missing. StorageError: writing failed.
+        StorageError: If writing failed.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / CONFIG, config_of(shape))
-    known = statistics or {"tiny": ROBOT}
-    write_json(folder / STATISTICS, {name: {"action": dict(action)} for name, action in known.items()})
+    write_json(folder / STATISTICS, {"tiny": {"action": ROBOT}})
     normalise = [{"inplace": False, "mean": list(n.mean), "std": list(n.std)} for n in DEFAULTS]
     write_json(folder / PREPROCESSOR, {"image_resize_strategy": "resize-naive", "tvf_normalize_params": normalise})
     (folder / TOKENIZER).write_text(tokenizer_json(shape.vocabulary), encoding="utf-8")
     tensors = random_tensors(shape, seed)
     names = list(tensors)
-    for number in range(shards):
-        file = f"model-{number + 1:05d}-of-{shards:05d}.safetensors"
-        save_tensors(folder / file, {name: tensors[name] for name in names[number::shards]}, {"format": "pt"})
+    for number in range(2):
+        file = f"model-{number + 1:05d}-of-00002.safetensors"
+        save_tensors(folder / file, {name: tensors[name] for name in names[number::2]}, {"format": "pt"})
     return folder
 
 
