@@ -22,7 +22,7 @@ from kerv_cli.base.errors import CheckpointError, StorageError, UsageError
 from kerv_cli.catalogue.imports import import_results
 from kerv_cli.episodes.rows import decodes_table, episode_row
 from kerv_cli.lab import database as module
-from kerv_cli.lab.command import STORE
+from kerv_cli.lab.command import STORE, noted
 from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, FILE, RUNS, STUDIES, Database
 from kerv_cli.lab.runs import Run, making, pulse, run_rows, time_left
 from kerv_cli.lab.store import StudyStore, studies
@@ -313,7 +313,8 @@ def test_a_name_in_use_is_refused_and_a_killed_command_is_listed_with_how_to_go_
         assert listed(tmp_path)[0]["state"] == "running, 3 of 7"
         assert "is running" in told("runs", "rm", "demos/mine", "--yes", f"results={tmp_path}", code=2)
         process.kill()
-    with pytest.raises(UsageError), making(tmp_path, "demos", place, ["demos", "name=mine", "episodes=8"]):
+    words = ["demos", "name=mine", "episodes=8"]
+    with pytest.raises(UsageError), noted(words), making(tmp_path, "demos", place):
         raise UsageError("these are others")
     (row,) = listed(tmp_path)
     assert (row["id"], row["state"], row["command"][:2]) == ("demos/mine", "interrupted, 3 of 7", ["kerv", "demos"])
