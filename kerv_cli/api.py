@@ -208,7 +208,7 @@ class Policy:
             executed: Number of actions of the last answer that were executed. None: all of them.
 
         Returns:
-            (h, D) float64 actions in environment units, to execute one per control step; h ≤ H.
+            (h, D) float64 actions in environment units, to execute one per control step. h is at most H.
 
         Raises:
             UsageError: A value is missing, has a wrong shape or type, or is not finite. The message names it.

@@ -116,7 +116,7 @@ def _film_values(
 
 
 def show_film(request: Request) -> Response:
-    """Show the film of an episode, how far its recording is, or the button that records it."""
+    """Show an episode's film, or the button that records it. During the recording, show the seconds since the click."""
     return render(request, "episode_film.html", **_film_values(request, _found(request)))
 
 

@@ -74,7 +74,7 @@ class Cell:
         seed: Its seed.
         episode: Its row number. None if it has not run.
         kind: Its outcome, a key of OUTCOMES.
-        phase: Phase of the task in which it would count as failed, a key of PHASES.
+        phase: How far the robot got (see `phase_of`), a key of PHASES. The page shows it only for failures.
         stress: Kind and level of its stress, such as `push 2`. Empty without stress.
     """
 
@@ -89,7 +89,15 @@ class Cell:
 
 @dataclass(frozen=True)
 class Grid:
-    """The episodes of one task. `rows` maps labels to seed -> cell. `seeds` begins with those that fail most."""
+    """The episodes of one task, as a table with one row per setting and one column per seed.
+
+    Attributes:
+        task: Name of the task.
+        seeds: All seeds. Those with the most failures come first.
+        rows: Label of a setting -> seed -> the episode.
+        failed: Number of failed episodes.
+        total: Number of all episodes, also those that have not run.
+    """
 
     task: str
     seeds: list[int]
@@ -123,7 +131,12 @@ def cells_of(rows: Sequence[Any], baseline: str, settings: Mapping[str, Setting]
 
 
 def _kind(row: Any, baseline: bool | None) -> str:
-    """Return the kind of an outcome. `baseline` says whether the baseline solved it; None if it did not run."""
+    """Classify an episode's outcome: success, failure, won or lost (against the baseline), error or missing.
+
+    Args:
+        row: The episode, a row of `outcomes`.
+        baseline: Whether the baseline solved the same episode; None if the baseline has no result.
+    """
     if row.episode is None:
         return ERROR if row.failed else MISSING
     if row.success:
@@ -163,7 +176,11 @@ def clusters_of(cells: Sequence[Cell]) -> list[tuple[list[Cell], int]]:
 
 
 def _asked(request: Request) -> tuple[list[Cell], dict[str, Any]]:
-    """Return the episodes that the address asks for, and what every page of episodes shows.
+    """Read a study's episodes for a page.
+
+    Returns:
+        The episodes, only of the setting and task that the address names, if it names any. And values that the
+        templates of both pages show: `study`, `baseline`, `known` (all settings and tasks) and `chosen`.
 
     Raises:
         UnknownName: The study has no such setting or task.

@@ -33,7 +33,7 @@ def _parts(results: Path, name: str, version: str) -> tuple[dict[str, Any], floa
     Args:
         results: The results folder.
         name: Name of the study.
-        version: Its version, so that a study that did not change is not read again.
+        version: `StudyStore.version` of the study. A study is read again only if its version has changed.
     """
     from kerv_cli.report.page import study_parts  # imports Altair, which takes a second
 
@@ -94,9 +94,10 @@ def show_tables(request: Request) -> Response:
 
 
 def _episodes_of(study: str) -> Callable[[str, str, str], str]:
-    """Return a function that links a cell of the table by task to its episodes.
+    """Return a function that returns the address of the episodes behind a cell of the table by task.
 
-    Its arguments are the heading of the table's first column (`task` or `setting`), the row's name, and the column's.
+    The function takes the heading of the table's first column (`task` or `setting`), the name of the cell's row, and
+    the name of its column.
     """
 
     def address(heading: str, row: str, column: str) -> str:

@@ -41,7 +41,7 @@ def show_artifact(request: Request) -> Response:
 
 
 def _curves(run: RunEntry) -> dict[str, object] | None:
-    """Return the chart of a training's validations. None before the second one, or if it is no training."""
+    """Return a training's curves as a Vega-Lite chart. None for other artifacts, and before the second validation."""
     from kerv_cli.report.plots import curves_figure, read_log
 
     try:

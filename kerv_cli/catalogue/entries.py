@@ -68,8 +68,8 @@ class RunEntry:
         figures: Its main numbers by name, such as the success rate.
         command: Command-line arguments (without `kerv`) that made it. Empty if unknown.
         sha256: Hash by which other artifacts refer to it.
-        made_from: Kind -> hash of each artifact that it was made from. If a study uses a second artifact of a kind, the
-            key is `KIND of LABEL`, with the label of its setting.
+        made_from: Kind -> hash of each artifact that it was made from. If settings of a study use different
+            artifacts of a kind, the key of the second and later ones is `KIND of LABEL`, with the label of the setting.
     """
 
     id: str
@@ -347,9 +347,10 @@ def _made_from(value: Mapping[str, Any], provenance: Mapping[str, Any]) -> dict[
 
 
 def parents(run: RunEntry, runs: Sequence[RunEntry]) -> dict[str, str]:
-    """Return what an entry was made from: kind -> id of an entry, or the name of a shipped policy.
+    """Return the artifacts that an entry was made from, as kind -> name.
 
-    If neither is known, the value is the first digits of the hash.
+    The name is the id of another entry, or `shipped` and the name of a policy that kerv ships. For an artifact that is
+    neither, it is the first 12 digits of the hash.
     """
     names = {other.sha256: other.id for other in runs if other.sha256}
     for folder in visible(shipped_dir()):
@@ -441,7 +442,15 @@ def plan_of(run: RunEntry, results: str) -> Plan:
 
 
 def checked(setting: Setting, tasks: list[str], results: str) -> Setting:
-    """Check that a stored setting still has the same weights and data. Return it for this results folder.
+    """Check that the weights and data that a stored setting uses are still the same.
+
+    Args:
+        setting: The stored setting.
+        tasks: Names of the tasks on which it will run.
+        results: The results folder in which it will run.
+
+    Returns:
+        The setting, changed to run in `results`.
 
     Raises:
         CheckpointError: Its weights or data have changed.

@@ -34,7 +34,9 @@ def settings_in(store: StudyStore) -> tuple[str, dict[str, Setting]]:
 
 
 def outcomes(store: StudyStore, task: str = "", seed: int | None = None) -> list[Any]:
-    """Return a row for every episode of a study, in the study's order. Repeats are left out: their outcomes are equal.
+    """Return one row for every label, task and seed of a study, in the study's order.
+
+    Of repeats (further measurements of the same episode) only the first is returned: all have the same outcome.
 
     Args:
         store: The study.
@@ -89,7 +91,7 @@ class FoundEpisode:
         return self.store.rollouts / self.episode.recording
 
     def decodes(self) -> tuple[list[DecodeRecord], list[int]]:
-        """Read its decodes, and the control step at which the actions of each begin."""
+        """Read the episode's decodes. Also return, for each decode, the control step that executes its first action."""
         from kerv_cli.episodes.rows import decode_records
 
         table = self.store.decodes([self.id])

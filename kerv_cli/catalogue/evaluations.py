@@ -78,7 +78,7 @@ class Evaluation:
         config: Settings of the benchmark.
         server: What the model server said about itself.
         episodes: The recorded episodes.
-        planned: Number of episodes that were planned, as far as the recording says.
+        planned: Number of episodes in the recording's work queue. 0 if it has none.
     """
 
     source: Path

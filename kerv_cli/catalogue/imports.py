@@ -54,8 +54,8 @@ class Found:
     """A study that can be imported.
 
     Attributes:
-        study: Its settings and all of its episodes.
-        episodes: Yields the episodes that exist.
+        study: Its settings and the list of all planned episodes.
+        episodes: Yields those that were run, with their results.
         command: Command-line arguments (without `kerv`) that ran it. Empty if unknown.
     """
 

@@ -1,7 +1,7 @@
-"""Declare the commands of `kerv`. A command is a function that is registered as a part of the kind `command`.
+"""Declare the commands of `kerv`: the decorator `command` makes a function the command `kerv NAME`.
 
-Typer's command, its settings, `--cfg`, `--help` and completion are made from the declaration. The function can have
-these parameters:
+The decorator puts the function into kerv's registry. From that entry (a `Part` of kind `command`) this module makes
+typer's command with its options, settings, help and completion. The function can have these parameters:
 
 - `settings`: The command's settings, composed and checked.
 - `overrides`: The `key=value` arguments as typed.
@@ -44,9 +44,10 @@ def command(name: str, settings: type = CommandSettings, keys: str = "", **trait
         **traits: Optional properties:
             examples: Command lines for the help.
             names: Help text for arguments that are not `key=value`. Without it there are none.
-            typed: Key on the command line -> name of the setting, for settings with two names.
-            writes: Whether the command writes to the results folder (default true). Then kerv checks first that it can.
-            each: Name of another command. Overrides that are no settings of this command are settings of that one.
+            typed: Key as typed on the command line -> name of the setting, if the two differ.
+            writes: Whether the command writes to the results folder (default true). If so, kerv first checks that the
+                folder is writable.
+            each: Name of another command, whose settings can be typed, too, such as `rollout` for `sweep`.
     """
 
     def declare(run: F) -> F:
@@ -58,7 +59,7 @@ def command(name: str, settings: type = CommandSettings, keys: str = "", **trait
 
 
 def schemas_of(part: Part) -> list[type]:
-    """Return the dataclass of a command's settings. With the trait `each`, add the settings of that other command."""
+    """Return the dataclass of a command's settings, and that of the other command which its trait `each` names."""
     others = [find("command", part.traits["each"])] if "each" in part.traits else []
     return [one.settings for one in (part, *others)]
 
@@ -124,7 +125,7 @@ def _option(name: str, default: object, annotation: object) -> inspect.Parameter
 
 
 def _typed_argument(part: Part) -> object:
-    """Return the annotation of the argument that takes everything except options. Typer's help does not show it."""
+    """Return the type annotation of the one argument that takes all words except options. The help does not list it."""
     metavar = "NAME" if "names" in part.traits else "KEY=VALUE"
     argument = typer.Argument(metavar=metavar, hidden=True, autocompletion=complete)
     return Annotated[list[str] | None, argument]
@@ -146,7 +147,7 @@ def complete(ctx: typer.Context, incomplete: str) -> list[str]:
 
 
 def _values(part: Part, key: str) -> list[str]:
-    """Return the names that a setting can have. Empty if its value is not one of a list of names."""
+    """Return the names that a setting can have as its value. Empty if its values are not names from a list."""
     if key == "task":
         from kerv_cli.worlds import task_names
 

@@ -1,4 +1,8 @@
-"""The clock of a world that goes on while the policy decodes (docs/methods.md §8)."""
+"""The clock of a world that goes on while the policy decodes (docs/methods.md §8).
+
+The latency of a decode can come from a profile: a file of `kerv bench` with the seconds that each phase of a decode
+(encode, prefill, verify, …) takes on some machine.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +51,7 @@ class RealClock:
     """Tells an episode how long each decode takes, and which of its actions are too old by then.
 
     Attributes:
-        expected: Number of control steps that the next decode will probably take: as many as the one before.
+        expected: Number of control steps that the next decode will probably take: as many as the last decode took.
     """
 
     def __init__(self, latency: Latency, space: ActionSpace, compensation: str = "none") -> None:
@@ -79,8 +83,9 @@ def check(settings: RolloutSettings, spec: EnvironmentSpec, target: TargetDescri
         target: The policy's description; None for the expert.
 
     Raises:
-        UsageError: An episode ends before its first action, or all actions of a chunk are too old when they arrive. Or
-            the profile lacks a phase of the method. Or the expert is asked for the latencies of a profile.
+        UsageError: An episode would end before its first action, or all actions of a chunk are too old when they
+            arrive. Or the profile is missing, damaged, or lacks a phase that the method needs. Or the policy is the
+            expert, for which a profile has no latencies.
     """
     timing = settings.rollout
     if timing.clock != REAL:
@@ -109,7 +114,7 @@ def check(settings: RolloutSettings, spec: EnvironmentSpec, target: TargetDescri
 
 
 def profile_identity(settings: RolloutSettings) -> dict[str, str]:
-    """Return the hash of the latency profile that a rollout reads, `{"profile": sha256}`; empty if it reads none.
+    """Return `{"profile": HASH}` with the SHA-256 of the profile that a rollout reads; empty if it reads none.
 
     Raises:
         UsageError: The profile does not exist.
@@ -121,7 +126,9 @@ def profile_identity(settings: RolloutSettings) -> dict[str, str]:
 
 
 def latency_of(settings: RolloutSettings, target: TargetDescription | None) -> Latency:
-    """Return the function that gives each decode's latency, as `rollout.latency` says.
+    """Return a function that takes the record of a decode and returns its latency in seconds.
+
+    `rollout.latency` chooses the source: a constant, the measured time, or a profile.
 
     Args:
         settings: The rollout's settings.
@@ -144,7 +151,7 @@ def latency_of(settings: RolloutSettings, target: TargetDescription | None) -> L
 
 
 def profiled(profile: Profile, scale: float = 1.0) -> Latency:
-    """Return a latency function: the seconds that a decode's work costs in `profile`, multiplied by `scale`."""
+    """Return a function that takes the record of a decode and returns its seconds by `profile`, times `scale`."""
     return lambda decode: scale * float(prices(work_of_record(decode), profile)[0])
 
 

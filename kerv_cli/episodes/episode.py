@@ -140,9 +140,9 @@ def episode(
 ) -> Generator[Observation, DecodeRecord, EpisodeRecord]:
     """Run one episode like `run_episode`, but let the caller decode.
 
-    This generator yields each observation and is sent the record of its decode. At the end it returns the episode's
-    record. `follower` is told about the start, every executed action and the end. It is the decoder itself, or what a
-    batch decoder keeps for this episode. The other arguments are those of `run_episode`.
+    The generator yields an observation; send it the record of the decode. At the end it returns the episode's record.
+    `follower` is told about the start, every executed action and the end. It is the decoder itself, or the state that
+    a batch decoder keeps for this episode. The other arguments are those of `run_episode`.
     """
     began = time.perf_counter()
     world.reset(seed)

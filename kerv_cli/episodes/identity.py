@@ -79,7 +79,12 @@ def _work(settings: str, identity: str, policy: str, engine: int) -> str:
 
 
 def effective(settings: Plain) -> dict[str, Any]:
-    """Return the settings that determine a result, without those that have no effect in this combination."""
+    """Return only those of a rollout's settings that determine its results, as nested plain values.
+
+    A setting is left out if it never changes a result (such as the number of workers), or if it has no effect beside
+    the other settings (such as the threshold of a method that drafts nothing). Task, seed, policy and the method's name
+    are left out, too.
+    """
     try:
         complete = settings_from(settings)
     except KervError:  # the settings name a part of a plugin that is not installed here
@@ -125,7 +130,7 @@ def stress_text(settings: Plain) -> str:
 
 
 def batch_of(settings: Plain) -> int:
-    """Return how many episodes of a setting run at the same time. Above 1, episodes have no times."""
+    """Return how many episodes of a setting run at the same time. If it is more than 1, they are not timed."""
     return int(settings["rollout"]["batch"])
 
 
@@ -145,8 +150,10 @@ def without(settings: Plain, names: Collection[str]) -> dict[str, Any]:
 def without_effect(settings: RolloutSettings, overrides: Iterable[str], sweep: bool = False) -> dict[str, str]:
     """Return those overrides that have no effect on the rollout, each with the reason.
 
+    The result is empty for the expert: with it, an unused setting is an error.
+
     Args:
-        settings: The rollout's settings. For the expert the result is empty, because it refuses unused settings.
+        settings: The rollout's settings.
         overrides: `key=value`, as typed.
         sweep: Whether the rollout is part of a sweep. Outside a sweep, settings of workers have no effect either.
     """
@@ -230,7 +237,7 @@ def code_hash() -> str:
 
 
 def _meaning(source: bytes) -> bytes:
-    """Return the syntax tree of Python source as text, without docstrings."""
+    """Return the syntax tree of Python source without its docstrings, as the bytes of a text."""
     return ast.dump(_WithoutDocstrings().visit(ast.parse(source))).encode()
 
 

@@ -44,8 +44,8 @@ def check(settings: RolloutSettings) -> dict[str, str]:
     """Refuse settings that cannot run, before anything slow starts.
 
     Returns:
-        Everything besides the settings that determines the results: a hash for each file with weights or data, and
-        as `observation` what the target observes.
+        Everything besides the settings that determines the results. Kind of a file with weights or data -> its hash,
+        and `observation` -> what the policy observes, such as `vision` or the simulator's privileged state.
 
     Raises:
         UsageError: A number is out of range, a seed is a training seed, the policy was trained on another camera, or

@@ -87,7 +87,8 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
             others, and `results`, apply to every setting.
 
     Raises:
-        UsageError: A key or name is unknown, the study itself sets a key of the command line, or a label is bad.
+        UsageError: A key or name is unknown. Or the study has no settings or lacks its baseline. Or one of its settings
+            sets a key that the command line sets, too. Or a label is empty, too long or not one line.
     """
     of_sweep = [o for o in overrides if _key(o).split(".")[0] in SweepSettings.__dataclass_fields__]
     of_settings = [o for o in overrides if o not in of_sweep or o.startswith("results=")]
@@ -146,8 +147,8 @@ def _line_of(path: Path, typed: Collection[str], place: str, others: Mapping[str
     Args:
         path: The study's file.
         typed: Keys on the command line. An error about one of these gets no file and line.
-        place: Key in the file whose value is being read, such as `settings.ar`.
-        others: Maps a setting's key to the key in the file where it is written, if that is not `place`.
+        place: Key in the file to which the error belongs, such as `settings.ar`.
+        others: Exceptions: key of a setting -> the key in the file to which an error about this setting belongs.
     """
     try:
         yield
@@ -214,8 +215,8 @@ def _is_ar(settings: RolloutSettings) -> bool:
 def idle_overrides(resolved: ResolvedStudy, sweep: bool = True) -> dict[str, str]:
     """Return overrides that have no effect, each with the reason.
 
-    An override of one of several settings is listed after the setting's label. An override from the
-    command line is listed only if it has no effect on any setting.
+    If the study has several settings, an override in its file is returned as `LABEL: KEY=VALUE`. An override from the
+    command line is returned only if it has no effect on any setting.
 
     Args:
         resolved: The study or rollout.

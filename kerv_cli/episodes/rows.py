@@ -32,7 +32,7 @@ def _judged(value: Callable[[Round], int]) -> Callable[[EpisodeRecord], int]:
 
 
 def _delay(name: str) -> Callable[[DecodeRecord], Any]:
-    """Return a function that reads this attribute of a decode's delay, and gives None if the world waited."""
+    """Return a function that reads the attribute `name` of a decode's `delay`. It returns None if the world waited."""
     return lambda decode: getattr(decode.delay, name, None)
 
 

@@ -1,7 +1,7 @@
 """Runs episodes in the worlds (open environments) of this process: one after the other, or several at once.
 
 All settings in a process share weights, datastores and worlds. Each setting has its own decoder, because a skip rule
-may depend on the episodes before, and renders its own images, so that no setting finds caches filled by another.
+may depend on earlier episodes. Each setting also renders its own images, so that none profits from another's caches.
 """
 
 from __future__ import annotations
@@ -154,10 +154,11 @@ def _one_after_another(
 ) -> Generator[Observation, DecodeRecord, None]:
     """Run waiting episodes one after another, until none is left.
 
-    A batch runs several of these generators. Each yields an observation and is sent the record of its decode.
+    A batch runs several of these generators at once, one in each of its places. The generator yields an observation;
+    send it the record of the decode.
 
     Args:
-        state: State that the batch decoder keeps for this place. Each episode reuses it.
+        state: The decoder's state for this place of the batch, reused by each episode.
         waiting: Requests that have not begun. If possible, the next one has the same task as the last.
         ended: Each request is appended when it ends, with the record of its episode or its error.
         open_world: Opens a world for a task.
@@ -185,7 +186,7 @@ def _one_after_another(
 
 
 def _take(waiting: list[Request[K]], task: str) -> Request[K]:
-    """Remove and return a waiting request of `task`. If there is none, take one of the task that has the most."""
+    """Remove and return a waiting request of `task`. If it has none, take the task with the most waiting requests."""
     counts = Counter(request.task for request in waiting)
     wanted = task if counts[task] else counts.most_common(1)[0][0]
     return waiting.pop(next(i for i, request in enumerate(waiting) if request.task == wanted))

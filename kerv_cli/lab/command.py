@@ -19,10 +19,10 @@ def current_command() -> list[str]:
 
 @contextlib.contextmanager
 def noted(words: Sequence[str]) -> Iterator[None]:
-    """Remember this process's command-line arguments (without `kerv`) while the block runs.
+    """Remember a command's arguments (without `kerv`) inside this `with` block, to store them with what it makes.
 
-    They are stored with everything that the command makes. The previous ones are restored afterwards, because `kerv
-    prepare` runs other commands inside its own.
+    At the end the arguments from before the block are remembered again, because `kerv prepare` runs other commands
+    inside its own.
     """
     before = current_command()
     _words[:] = words
@@ -37,7 +37,8 @@ def chosen_store(overrides: Iterable[str]) -> Iterator[list[str]]:
     """Use the database named by the override `store=URL`, in this process and its workers, for the `with` block.
 
     Args:
-        overrides: Overrides of a command. Without a `store=` among them, the variable KERV_STORE stays as it is.
+        overrides: Overrides of a command. The environment variable KERV_STORE is set to the value of `store=`. Without
+            it the variable stays as it is.
 
     Yields:
         The same overrides, but without the URL's password, so that it is never stored. The URL is quoted if Hydra needs

@@ -272,7 +272,7 @@ def _version(connection: sa.Connection) -> int | None:
 
 
 def _created(connection: sa.Connection) -> int:
-    """Create the tables, if no other process has done so in the meantime. Return their version."""
+    """Create the tables, if no other process has done so in the meantime. Return the version of their schema."""
     version = _version(connection)
     if version is None:
         _META.create_all(connection)
@@ -281,13 +281,16 @@ def _created(connection: sa.Connection) -> int:
 
 
 def measures_in(connection: sa.Connection) -> list[sa.ColumnElement[Any]]:
-    """Return the columns of MEASURES. Those that an older kerv did not store are null in every row."""
+    """Return the table's columns with results of an episode (MEASURES), to select them.
+
+    A column that the table lacks, because an older kerv made the table, is null in every row.
+    """
     stored = {column["name"] for column in sa.inspect(connection).get_columns(EPISODES.name)}
     return [EPISODES.c[one.name] if one.name in stored else sa.null().label(one.name) for one in MEASURES]
 
 
 def _add_measures(connection: sa.Connection) -> None:
-    """Add the columns of MEASURES that an older kerv did not store. The older kerv can still use the table."""
+    """Add the columns of MEASURES that a table from an older kerv lacks. The older kerv can still use the table."""
     quote = connection.dialect.identifier_preparer.quote
     for column, found in zip(MEASURES, measures_in(connection), strict=True):
         if not isinstance(found, sa.Column):

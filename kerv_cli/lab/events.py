@@ -57,11 +57,11 @@ class EpisodeEnd:
 
 @dataclass(frozen=True)
 class SettingFailed:
-    """One of the compared settings failed in a block of episodes. The other settings of the block go on.
+    """A setting failed in a block (episodes that one process runs). The block's other settings go on.
 
     Attributes:
         reason: The error in one line.
-        trace: Its traceback.
+        trace: The error's traceback.
         error: The error itself if it is a KervError, else None, because other errors may not be picklable.
         episodes: The episode that failed, and then the episodes that will not run because of it.
     """

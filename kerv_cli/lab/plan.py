@@ -259,9 +259,9 @@ def split(
         study: The study.
         stored: Episodes in the database, by `Episode.key`.
         rerun: Which existing episodes to run again: NEVER, TIMED, CHANGED or ALL.
-        since: Only with ALL: episodes of blocks that began at this time (ISO 8601) or later count as existing. The same
-            command ran them before it was interrupted. Empty: none do.
-        earlier: Label -> the newest stored setting with this label and its hash. Used to explain what has changed.
+        since: Used only with ALL, if a command is resumed: the time at which it first began (ISO 8601). Episodes of
+            blocks that began later count as existing, because this command ran them. Empty: all episodes run again.
+        earlier: Label -> the newest stored setting with this label, and its hash. Used to explain what has changed.
 
     Returns:
         Existing episodes with their rows, and missing episodes with the reason for running them.
@@ -318,9 +318,10 @@ def _turns(episodes: Iterable[Episode]) -> dict[tuple[str, int, int], list[Episo
 
 
 def _ordered_parts(episodes: Iterable[Episode], block: int) -> list[list[Episode]]:
-    """Group the episodes whose results depend on their order, by setting, task, repeat and block of seeds.
+    """Return groups of episodes that must run together, in order, because each may change the results of the next.
 
-    Episodes of settings whose results do not depend on order are left out.
+    A group holds one setting, task and repeat, and `block` successive seeds. Episodes of settings whose results do not
+    depend on the order are left out.
     """
 
     def key(one: Episode) -> tuple[str, str, int, int]:
@@ -330,13 +331,14 @@ def _ordered_parts(episodes: Iterable[Episode], block: int) -> list[list[Episode
 
 
 def _keep_whole_orders(usable: dict[Episode, list[StoredEpisode]], block: int) -> None:
-    """Remove stored episodes that ran in another order than the study's, if their results depend on the order.
+    """Remove from `usable` the stored rows that cannot be reused because their episodes ran in another order.
 
-    Such episodes can be reused only if a single block ran exactly the wanted seeds.
+    This concerns only settings whose results depend on the order of their episodes. Their rows are kept if a single
+    block ran exactly the seeds that the study keeps together.
 
     Args:
-        usable: Episode -> its stored rows. It is changed.
-        block: Number of seeds in a block.
+        usable: Episode -> its stored rows. The lists are replaced.
+        block: Number of seeds that the study keeps together.
     """
     sizes = Counter(row.block for rows in usable.values() for row in rows)
     for part in _ordered_parts(usable, block):
@@ -351,13 +353,14 @@ def _keep_whole_orders(usable: dict[Episode, list[StoredEpisode]], block: int) -
 def blocks_of(episodes: Iterable[Episode], block: int, workers: int = 1) -> list[Block]:
     """Group episodes into blocks, each to be run by one process.
 
-    Seeds that the study keeps together share a block if the same settings are missing for them. If a setting depends on
-    the order of episodes, all its seeds stay together. All episodes of a block use the same number of threads. Episodes
-    that run as a batch are grouped by setting, into at least as many blocks as there are workers.
+    A block holds one task, one repeat, one number of threads, and up to `block` successive seeds, for which the same
+    settings must run. If different settings must run for some seeds, those seeds get a block of their own. But the
+    seeds of a setting whose results depend on their order are never split. Episodes that run as a batch are grouped by
+    setting instead, into blocks small enough that every worker gets one.
 
     Args:
         episodes: The episodes to run.
-        block: Number of seeds in a block.
+        block: Number of seeds that the study keeps together.
         workers: Number of processes.
     """
     by_way = _grouped(episodes, lambda one: batch_of(one.setting.settings) > 1)

@@ -151,11 +151,11 @@ def _options(command: Sequence[str]) -> set[str]:
 
 
 def pulse(database: Database) -> tuple[str, bool]:
-    """Look whether anything in the results folder has changed, without reading all of it.
+    """Return a short text that differs from the last one if the results folder has changed since.
 
     Returns:
-        A text, which changes with every heartbeat, start or end of a command and with every new episode. And whether a
-        command is running.
+        text: Changes with every heartbeat (sign of life), start or end of a command, and with every new episode.
+        running: Whether a command is running.
     """
     studies = sa.select(sa.func.count()).select_from(STUDIES).scalar_subquery()
     newest = sa.select(sa.func.max(EPISODES.c.id)).scalar_subquery()

@@ -68,7 +68,10 @@ class ImportedEpisode:
 
 
 def _same_episode() -> sa.ColumnElement[bool]:
-    """Return the condition that joins SETTINGS and WANTED to all rows of EPISODES that hold the same episode."""
+    """Return the SQL condition that joins a study's planned episodes to all stored rows of the same episodes.
+
+    A planned episode is a row of WANTED with its row of SETTINGS. The stored rows are those of EPISODES.
+    """
     return sa.and_(
         EPISODES.c.work == SETTINGS.c.work, *(EPISODES.c[name] == WANTED.c[name] for name in ("task", "seed", "repeat"))
     )
@@ -153,8 +156,9 @@ class StudyStore:
     def save(self, study: Study, existing: Mapping[Episode, StoredEpisode] | None = None) -> None:
         """Write a study's settings and episodes.
 
-        A setting that did not change keeps its episodes of other tasks, if their seeds and repeats are in the new
-        study's ranges. So sweeps of one study over different tasks give one report.
+        If the study is stored already, its unchanged settings keep their episodes of tasks that are not in `study`, as
+        far as their seeds and repeats are in the ranges of `study`. So sweeps of one study over different tasks give
+        one report.
 
         Args:
             study: The study.
@@ -399,9 +403,9 @@ class Plan:
 
     Attributes:
         study: The study.
-        store: Where it is stored.
+        store: The study in the database.
         existing: Episodes that the database has, with their rows.
-        missing: Episodes to run, each with the reason.
+        missing: Episodes to run, each with the reason in a few words, such as `new seeds`.
         newest: Largest row number among the stored episodes. Larger ones were written after the plan, by other sweeps.
         runtime: Executor, workers and device.
         command: Command-line arguments (without `kerv`) that resume the study.
@@ -421,7 +425,7 @@ class Plan:
         return list({one.key: one for one in self.missing}.values())
 
     def blocks(self) -> list[Block]:
-        """Return the episodes to run, grouped into blocks, in the order of their first episodes."""
+        """Group the episodes to run into blocks; one process runs a block. Order blocks by their first episode."""
         return blocks_of(self.to_run, self.study.block, self.runtime.workers)
 
 

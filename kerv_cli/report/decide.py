@@ -61,7 +61,7 @@ def _choice(where: str, rows: Sequence[Row], loss: float) -> Choice:
 
     Args:
         where: The task's name, or `all tasks`.
-        rows: The table's rows there, one per setting, the baseline included.
+        rows: The table's rows for that task or for all tasks, one per setting, the baseline included.
         loss: Largest acceptable loss of success against the baseline, in points.
     """
     success = next((float(row["success"]) for row in rows if is_baseline(row)), math.nan)
@@ -89,7 +89,7 @@ def _choice(where: str, rows: Sequence[Row], loss: float) -> Choice:
 
 
 def safest_first(rows: Sequence[Row]) -> list[Row]:
-    """Return the settings in the order in which `--choose` tests them. The order does not depend on success.
+    """Return the rows of the settings to test, in the order of the tests. The order does not depend on success.
 
     Settings that are equally safe keep the study's order. The baseline, settings without pairs, and settings that were
     timed and were not faster are left out.
@@ -99,7 +99,7 @@ def safest_first(rows: Sequence[Row]) -> list[Row]:
 
 
 def _fastest(rows: Sequence[Row]) -> Row | None:
-    """Return the fastest of the tested settings, or None if there are none.
+    """Return the row of the fastest of the tested settings, or None if there are none.
 
     Settings whose interval shows that they are faster than the baseline come before all others. If no setting has a
     measured speed, return the one that was tested last.

@@ -114,7 +114,7 @@ def figures_of(data: StudyData, loss: float) -> dict[str, alt.ConcatChart]:
 def _suite(table: pd.DataFrame) -> pd.DataFrame:
     """Return the page's table of settings, pooled over tasks.
 
-    If the tasks have several difficulty groups, add columns with the unweighted mean of the groups.
+    If the tasks have several difficulty groups, further columns have the unweighted mean of the groups.
     """
     frame = summary_frame(table)
     if table["difficulty"].str.contains(";").any():
@@ -157,7 +157,11 @@ def _settings(data: StudyData) -> list[dict[str, Any]]:
 
 
 def _films(store: StudyStore, data: StudyData) -> list[dict[str, Any]]:
-    """Return a film of one success and one failure per method, if such episodes were recorded with a camera."""
+    """Return for each method a film of its first recorded success and one of its first recorded failure.
+
+    An outcome without an episode that was recorded with a camera has no film. A film is a dictionary with the setting's
+    label, the task, the seed, the outcome, the number of steps and the GIF in base64.
+    """
     keys = ["label", "task", "seed", "repeat"]
     outcomes = data.episodes.set_index(keys)["success"].to_dict()
     films: dict[tuple[str, bool], dict[str, Any]] = {}

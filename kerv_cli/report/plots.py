@@ -86,9 +86,10 @@ def _pooled(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def with_lines(rows: pd.DataFrame, axis: str) -> pd.DataFrame:
-    """Add `line` and `x`: settings that differ only along the axis are points of one line.
+    """Add the columns `line` (name of the line that joins a setting's point to others) and `x` (its place on the axis).
 
-    A setting that has no number on the axis, or no other such setting, gets a line of its own and no x.
+    Settings that differ only in the value of `axis` are on one line. A setting whose value is no number, or that is
+    alone on its line, gets a line of its own and no x.
     """
     numbers = rows[axis] if axis in rows else pd.Series(None, rows.index, dtype=object)
     x = numbers.map(lambda value: float(value) if is_number(value) else None).astype(float)
@@ -113,12 +114,19 @@ def _tooltip(points: pd.DataFrame) -> list[alt.Tooltip]:
 
 
 def _faded(full: float) -> alt.When:
-    """Return an opacity: `full`, or little if another setting was picked."""
+    """Return the opacity of a point, for Altair to evaluate in the browser.
+
+    It is 0.12 if the reader has clicked on another setting, and `full` otherwise.
+    """
     return alt.when("picked == '' || picked == datum.setting").then(alt.value(full)).otherwise(alt.value(0.12))
 
 
 def _tradeoff(rows: pd.DataFrame, loss: float) -> alt.ConcatChart:
-    """Draw speed and change in success of every setting in two panels, with a line that a setting has to pass."""
+    """Draw speed and change in success of every setting in two panels, one row per setting.
+
+    A dashed line marks the speed of the baseline in one panel, and a loss of `loss` points in the other. A setting
+    whose interval is right of the line is shown to be faster, or to lose less.
+    """
     baselines = rows["baseline"].unique()
     than = f"than {baselines[0]}" if len(baselines) == 1 else "than the baseline"
     panels = {

@@ -1,6 +1,7 @@
 """Estimate what a study's decodes would cost on another machine or with another target (docs/measuring.md).
 
-The estimate assumes that each setting would decode the same tokens in the same control steps there.
+The estimate assumes that each setting would decode the same tokens in the same control steps there. It reads the costs
+from a profile: a file of `kerv bench` with the seconds that each operation of a decode takes on a machine.
 """
 
 from __future__ import annotations
@@ -36,11 +37,11 @@ _TIMES = ("time_per_episode_ms", "time_per_step_ms", "latency_p95_ms")
 
 @dataclass(frozen=True)
 class NamedProfile:
-    """A cost profile of a machine and target, from `kerv bench`.
+    """The costs of one target on one machine, from `kerv bench`, and the name that the user gave.
 
     Attributes:
         name: The name by which the user chose it (`on=NAME`).
-        profile: The costs.
+        profile: Seconds of each operation of a decode.
     """
 
     name: str
@@ -83,11 +84,16 @@ def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfil
 
 
 def repriced_table(data: StudyData, store: StudyStore, profiles: Sequence[NamedProfile]) -> pd.DataFrame:
-    """Estimate the speed of every setting at the costs of each profile.
+    """Estimate how fast every setting would be on the machine of each profile.
+
+    Args:
+        data: The study's episodes.
+        store: The study in the database, to read its decodes.
+        profiles: For each machine, the seconds that each operation of a decode takes there (`kerv bench`).
 
     Returns:
-        One row per profile and setting, pooled over tasks: the estimated speeds with their intervals, the estimated
-        times, and the speeds as measured. Settings that run no decoder are left out.
+        One row per profile and setting, pooled over tasks: the estimated speeds against the baseline with their
+        intervals, the estimated times, and the speeds as measured. Settings that run no decoder are left out.
 
     Raises:
         UsageError: A profile lacks a cost that the study needs, or has costs for shorter chunks only. Or a setting has
@@ -125,7 +131,10 @@ def repriced_table(data: StudyData, store: StudyStore, profiles: Sequence[NamedP
 
 
 def own_prices(data: StudyData, store: StudyStore) -> pd.DataFrame | None:
-    """Estimate the speeds on the machines that the study names. None without names, or if a cost is missing."""
+    """Return `repriced_table` for the profiles that the study's file names (`machines`).
+
+    None if it names none, or if the estimate fails, for example because a profile lacks a cost.
+    """
     if not data.study.machines:
         return None
     try:
@@ -143,8 +152,8 @@ class _LabelWork(NamedTuple):
     """Operations that all decodes of a setting executed.
 
     Attributes:
-        work: The operations of each decode.
-        episode: (decodes,) position of the decode's episode among the setting's episodes.
+        work: The forwards and drafts of each decode, and the recorded seconds of everything else.
+        episode: (decodes,) number of the decode's episode, from 0, in the order of the setting's episodes.
         size: N, number of tokens per chunk.
     """
 
@@ -154,7 +163,11 @@ class _LabelWork(NamedTuple):
 
 
 def _work_of_label(data: StudyData, label: str, store: StudyStore) -> _LabelWork:
-    """Read the decodes of a setting, in the order of its episodes."""
+    """Read which operations the decodes of a setting executed, in the order of its episodes.
+
+    Raises:
+        UsageError: The setting's episodes ran in a batch and have no times.
+    """
     setting = data.settings[label]
     if (batch := batch_of(setting.settings)) > 1:
         raise UsageError(
@@ -191,7 +204,10 @@ def _check(named: NamedProfile, label: str, work: _LabelWork) -> None:
 
 
 def _priced(episodes: pd.DataFrame, work: _LabelWork, profile: Profile) -> pd.DataFrame:
-    """Return the episodes with the seconds that their decodes would take at the profile's costs."""
+    """Return the episodes with other times: those that their decodes would take at the profile's costs.
+
+    The columns `seconds` (of all decodes) and `decode_seconds` (of each decode) are replaced.
+    """
     seconds = prices(work.work, profile)
     total = np.bincount(work.episode, seconds, len(episodes))
     order = np.argsort(work.episode, kind="stable")

@@ -21,10 +21,10 @@ def summed_table(table: pd.DataFrame) -> pd.DataFrame:
     Each pooled row is compared with the baseline's episodes in the same worlds under the same stresses.
 
     Returns:
-        One row per method and sum. `method` is the setting's label without stress. `sum` says what was pooled, such as
-        `push`, `level 2` or `all`. `label` consists of both. The further columns are those of a study's table: `study`,
-        `baseline`, `episodes`, `successes`, `success`, `pairs`, the counts of their outcomes, `mcnemar_p`,
-        `difference`, `margin` and `non_inferior`. Intervals are in columns that end in _low and _high.
+        One row for each method and each way of pooling. `method` is the setting's label without stress. `sum` says what
+        was pooled, such as `push`, `level 2` or `all`. `label` consists of both. The further columns are those of a
+        study's table: `study`, `baseline`, `episodes`, `successes`, `success`, `pairs`, the counts of their outcomes,
+        `mcnemar_p`, `difference`, `margin` and `non_inferior`. Intervals are in columns that end in _low and _high.
     """
     rows = table[(table["averaging"] == MICRO) & (table["stress"] != NONE)]
     reference = next(iter(rows.loc[rows["label"] == rows["baseline"], "unstressed"]), "")

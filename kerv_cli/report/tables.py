@@ -55,8 +55,8 @@ class StudyData:
         study: The settings, and the episodes that the study asks for.
         episodes: One row per stored episode (label, task, seed and repeat). Columns: those of `StudyStore.frame`, and
             difficulty, device, number format and threads.
-        runs: One such table for each run (command) that measured all of the episodes, if all ran the same code on the
-            same machine. Empty if there are fewer than three runs.
+        runs: If at least three runs (commands) each measured all episodes of the study, with the same code on the same
+            machine: one table like `episodes` for each of these runs. Otherwise empty.
     """
 
     study: Study
@@ -85,7 +85,8 @@ class StudyData:
     def references(self) -> dict[str, str]:
         """Label of each setting -> label of the setting that it is compared with.
 
-        That is the baseline under the same stress and clock, if the study has it. Otherwise it is the study's baseline.
+        That is the baseline's method under the same stress and clock, if the study has such a setting. Otherwise it is
+        the study's baseline.
         """
         same: dict[str, str] = {}
         if baseline := self.settings.get(self.study.baseline):
@@ -108,7 +109,8 @@ class StudyData:
     def unstressed(self) -> dict[str, str]:
         """Label of each setting -> label of the same setting without stress.
 
-        If the study has no such setting, it is the first stressed setting of the same method.
+        If the study does not run the setting without stress, the value is the label of the first setting that differs
+        only in stress and `rollout.*`.
         """
         first: dict[str, str] = {}
         for setting in sorted(self.study.settings, key=lambda one: bool(stress_of(one.settings)["level"])):
@@ -125,7 +127,7 @@ class StudyData:
 
     @functools.cached_property
     def run_pairs(self) -> list[pd.DataFrame]:
-        """As `pairs`, but one table for each of `runs`."""
+        """One table like `pairs` for each run in `runs`, with the episodes that this run measured."""
         return [paired(run, self.references) for run in self.runs]
 
     @functools.cached_property
@@ -141,12 +143,12 @@ class StudyData:
 
 
 def _conditions_of(setting: Setting) -> str:
-    """Return the setting's stress and clock as text, to find settings that ran under the same conditions."""
+    """Return a setting's stress and its settings `rollout.*` as JSON, to find settings under the same conditions."""
     return json.dumps([stress_of(setting.settings), setting.settings["rollout"]], sort_keys=True)
 
 
 def _methods_of(setting: Setting) -> str:
-    """Return everything that determines a setting's results, except stress and clock, as text."""
+    """Return everything that determines a setting's results, except stress and the settings `rollout.*`, as JSON."""
     world = without(setting.settings["world"], {"stress"})
     others = without(setting.settings, (NOT_DETERMINING - {"policy"}) | {"world", "rollout"})
     return json.dumps([world, others, dict(setting.identity)], sort_keys=True)
@@ -296,9 +298,14 @@ def further_of(data: StudyData) -> dict[str, Any]:
     """Return everything that a study's CSV files leave out, as JSON values.
 
     Returns:
-        `study` (its name), `axis` (key of the plots' x axis) and `labels`. The last maps each label to `name`, `varies`
-        (values of a grid's keys), `overrides`, `settings`, `identity` (hashes of weights and data), `provenance`, and
-        `measures`: name of an averaging or a task -> measures without a CSV column.
+        A dictionary with the keys `study` (its name), `axis` (key of the plots' x axis) and `labels`. The last maps
+        each setting's label to a dictionary:
+
+        - `name`, `overrides` and `settings` of the setting
+        - `varies`: values of the keys that differ within its grid
+        - `identity`: hashes of weights and data
+        - `provenance`: executor, machine, versions and the like
+        - `measures`: name of an averaging or of a task -> the measures that have no column in the CSV files
     """
     columns = list(data.table.columns)
     left_out = {*CSV_COLUMNS, "series", "unstressed"}

@@ -34,7 +34,8 @@ class Choice:
         candidate: Fastest setting that could be shown with more pairs, if the rates stay the same. Empty if there is
             none, or if a setting is chosen.
         candidate_pairs: About how many pairs in all the candidate needs. NaN without a candidate.
-        tested: Number of settings that qualify for the test: faster than the baseline, or not timed.
+        tested: Number of settings that are tested for their loss of success: those that are faster than the baseline or
+            were not timed.
         episode_speedup: Speed per episode of the chosen setting against the baseline. NaN if it was not timed.
         episode_speedup_low: Lower end of its 95 % interval.
         episode_speedup_high: Upper end of its 95 % interval.
@@ -104,7 +105,12 @@ def sentence(choice: Choice, loss: float, baseline: str) -> str:
 
 
 def unsolved(baseline: str, success: float) -> str:
-    """Return the sentence for a baseline whose success rate, from 0 to 1, is too low for a recommendation."""
+    """Return the sentence that a baseline succeeds too rarely, so that no setting is recommended.
+
+    Args:
+        baseline: Label of the baseline.
+        success: Its success rate, from 0 to 1.
+    """
     return (
         f"{baseline} does not solve these tasks ({100 * success:.0f} % of its episodes succeed), so no setting is "
         "recommended"
@@ -133,7 +139,7 @@ def _speed(choice: Choice) -> str:
 
 
 def _missing(choice: Choice) -> str:
-    """Return the clause that says how many more pairs would be needed, and for which setting."""
+    """Return the clause that says how many more pairs would show that some setting may be taken, and which setting."""
     if not choice.candidate:
         return "at these rates, more pairs would not show one either"
     more = max(1, math.ceil(choice.candidate_pairs - choice.pairs))

@@ -84,7 +84,7 @@ class CalibrationRun:
         tasks: Full names of the tasks.
         path: The JSON to write.
         chosen: Index of each episode that is used -> whether it is held out.
-        notes: After `run`, one line per section that was not measured, with the reason.
+        notes: After `run`, one line per section of the calibration that was not measured, with the reason.
 
     Raises:
         UsageError: A number is out of range, or a task is unknown.
@@ -111,7 +111,7 @@ class CalibrationRun:
         self.notes: list[str] = []
 
     def plan(self) -> str:
-        """Return one line that `--plan` prints: demonstrations, decodes, boundary windows, skip levels and the file."""
+        """Return one line that `--plan` prints: the file, numbers of demonstrations and decodes, what is missing."""
         held_out, settings = sum(self.chosen.values()), self.settings
         without = f"; without {' and '.join(self.missing)}" if self.missing else ""
         return (
@@ -124,8 +124,8 @@ class CalibrationRun:
     def run(self, stage: Stage) -> Calibration:
         """Measure everything and write the calibration.
 
-        K_S is not measured if `decodes` is 0 or the drafter is missing. Skip levels are not measured without a
-        datastore. `notes` says so.
+        K_S is not measured if `decodes` is 0 or the drafter is missing. Skip levels, the smallest similarities at which
+        verification is skipped, are not measured without a datastore. `notes` says so.
 
         Args:
             stage: Called with the title of each part of the work, to show its progress.
@@ -201,10 +201,10 @@ class CalibrationRun:
         return variability
 
     def episode_levels(self, decoder: Decoder, index: int, decodes: int) -> list[float]:
-        """Decode observations that are spread evenly over one demonstration, and return the K of each decode.
+        """Decode observations that are spread evenly over one demonstration, and return each decode's variability K.
 
-        The decoder also gets every executed action in between, because some methods use a history. Decodes without a
-        K, because no draft was compared, are left out.
+        The decoder also gets every executed action in between, because some methods use a history. A decode that
+        compared no draft with the target has no K and is left out.
 
         Args:
             decoder: The decoder.
@@ -376,6 +376,11 @@ def fit_filters(windows: Windows, held: np.ndarray) -> dict[str, Noise]:
 def prediction_errors(windows: Windows, noise: Mapping[str, Noise], space: ActionSpace) -> Errors:
     """Measure the mean absolute error of every predictor on the held-out episodes.
 
+    Args:
+        windows: Actions before each moment, and the actions after it, which are predicted.
+        noise: Name of a Kalman filter -> its noise, from `fit_filters`. Other predictors need none.
+        space: The action space.
+
     Returns:
         Predictor -> task -> DoF -> errors 1 to H control steps ahead, in normalised action units.
     """
@@ -461,10 +466,11 @@ def lowest_level(matches: Matches, confidence: float, least: int = LEAST) -> flo
 def task_levels(matches: Matches, confidence: float) -> SkipLevel:
     """Return a task's s_min, the smallest similarity at which verification is skipped, and its bounds.
 
-    Feedback after each episode may move s_min between `low` and `high`. `low` allows twice the share of wrong chunks
-    that s_min allows, and `high` a third of it. With a confidence of 0.9, that is 0.2 and 0.033. If no similarity is
-    good enough for `high`, `high` is the largest similarity seen. If none is good enough for s_min, all three are
-    NEVER, and the task never skips.
+    In a rollout, feedback after each episode may move s_min between the bounds `low` and `high`. Each of the three is
+    the smallest similarity that keeps the share of wrong chunks within a limit. With a confidence of 0.9 the limits are
+    0.1 for s_min, 0.2 (twice as much) for `low`, and 0.033 (a third) for `high`. If no similarity keeps the limit of
+    `high`, `high` is the largest similarity seen. If none keeps the limit of s_min, all three are NEVER, and the task
+    never skips.
 
     Args:
         matches: The task's matches.

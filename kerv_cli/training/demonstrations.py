@@ -73,8 +73,8 @@ def demos_for(settings: S) -> tuple[S, DemoDataset]:
     """Open the demonstrations named in the settings, or by default the ones that the target was trained on.
 
     Returns:
-        settings: The settings with `demos` filled in. If the demonstrations contain tasks that the target was not
-            trained on, an empty `task` is filled in, too: with the recorded tasks that it was trained on.
+        settings: The settings with `demos` filled in. If `task` is empty and some demonstrated tasks are new to the
+            target, `task` is filled in, too: with the demonstrated tasks that the target was trained on.
         dataset: The demonstrations.
 
     Raises:
@@ -149,8 +149,8 @@ def seen_by(dataset: DemoDataset, camera: str, who: str, remedy: str) -> DemoDat
     Args:
         dataset: The demonstrations.
         camera: Camera name. Several views are joined by `+`.
-        who: Who needs this camera, such as "the target sees", for the error message.
-        remedy: What to do, for the error message.
+        who: Words of the error message before `camera`, such as "the target sees".
+        remedy: End of the error message: what to do.
 
     Raises:
         CheckpointError: The first recorded views are not those of `camera`.

@@ -212,8 +212,9 @@ class Imitation:
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
         """Return the loss of a batch, and the metrics to log.
 
-        The loss is the token loss plus the weighted position loss. In the first `train.scene_steps` steps it is the
-        position loss alone.
+        The loss is the token loss plus `train.scene_weight` times the position loss. The position loss measures how far
+        off the positions are that a target with cameras estimates, such as object and goal. In the first
+        `train.scene_steps` steps it is used alone. A target without cameras has only the token loss.
 
         Args:
             indices: (B,) indices of the samples.

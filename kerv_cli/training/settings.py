@@ -104,8 +104,8 @@ class DemonstrationSettings(TaskSettings):
 class TrainDrafterSettings(DemonstrationSettings):
     """Settings of `kerv train drafter`.
 
-    The drafter learns to imitate `policy.target`. `policy.artifacts.KIND` names the new drafter, for example
-    `policy.artifacts.drafter`.
+    The drafter learns to imitate `policy.target`. The setting `policy.artifacts.KIND` gives the new drafter's name; for
+    kind `drafter` it is `policy.artifacts.drafter`.
     """
 
     # drafter comes after train, because drafter=early overrides some of train's settings
@@ -165,9 +165,9 @@ class BuildDatastoreSettings(DemonstrationSettings):
 class CalibrateSettings(DemonstrationSettings):
     """Settings of `kerv calibrate`, which measures on demonstrations what KERV and HeiSD need (docs/methods.md §3, §4).
 
-    It measures the noise of the kinematic predictors, each task's reference level K_S of the kinematic variability, the
-    ranges that scale the boundary between retrieval and drafter, and the similarities from which on a retrieved draft
-    is executed without verification.
+    It measures four things: the noise of the kinematic predictors; each task's reference level K_S of the kinematic
+    variability; the ranges of curvature and path length, by which HeiSD chooses between retrieval and drafter; and for
+    each task the smallest similarity at which a retrieved draft is executed without verification.
     """
 
     episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)

@@ -81,7 +81,9 @@ class TargetRun(TrainingRun):
         self.check_folder("name")
 
     def check_places(self) -> None:
-        """Choose `train.places=path` if the demonstrations hold no object positions, and refuse what is impossible.
+        """Check that the demonstrations hold the positions that the policy reads or learns to estimate.
+
+        If they hold no object positions, set `train.places=path`: the policy then learns where the hand will be.
 
         Raises:
             UsageError: The policy reads object positions, and the demonstrations hold none. Or `train.places=path` is

@@ -82,7 +82,10 @@ def resolve_tasks(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def stands_for_tasks(name: str) -> bool:
-    """Return whether `name` is a task or suite in small letters. By default, demonstrations have such a name."""
+    """Return whether `name` is the name of a task or suite, written in small letters.
+
+    Demonstrations of one task or suite have such a name by default.
+    """
     return name == name.lower() and any(spec.expand(name) for spec in specs().values())
 
 

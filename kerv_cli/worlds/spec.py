@@ -230,7 +230,7 @@ class EnvironmentSpec:
 
         Args:
             task: Full or short name.
-            camera: Default view of frames. None: the environment's first camera.
+            camera: Default view of `World.frame`. None: the environment's first camera.
             horizon: Control steps of an episode. 0: the environment's default.
 
         Raises:
@@ -271,8 +271,8 @@ class World(ABC):
         success: Success flag of the latest step. A later step may unset it.
         succeeded: Whether `success` was set at any step of this episode.
         stress: Disturbance of the episodes (docs/stress.md). A new value takes effect at the next reset.
-        stressable: What a stress can change in this world (docs/stress.md). Add `range` if `_start` widens the range of
-            initial states by the factor `stress.spread`.
+        stressable: What a stress can change in this world: `actions`, `images`, `model` (the MuJoCo model) and `range`.
+            A subclass adds `range` if its `_start` widens the range of initial states by the factor `stress.spread`.
     """
 
     stressable: ClassVar[frozenset[str]] = frozenset({"actions", "images"})
@@ -398,7 +398,7 @@ class World(ABC):
     def frame(self, camera: CameraSettings | None = None) -> NDArray[np.uint8]:
         """Return the current image (size, size x views, 3) as uint8 RGB, for a recording.
 
-        A stress that disturbs images does not change it.
+        It is sharp and current even if a stress disturbs the policy's images.
 
         Args:
             camera: The view to draw. None: the world's own view.

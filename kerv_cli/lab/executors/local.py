@@ -50,7 +50,15 @@ class Processes:
         return in_thread(lambda: self._result(pool, pool.submit(work)))
 
     def _result(self, pool: Any, future: Future[T]) -> T:
-        """Wait until the worker process of a pool has finished its work, and return the result."""
+        """Wait until a worker process has finished its work, and return the result.
+
+        Args:
+            pool: The loky pool of the worker process.
+            future: The work.
+
+        Raises:
+            WorkerLost: The process died.
+        """
         from joblib.externals.loky.process_executor import BrokenProcessPool
 
         if isinstance(error := future.exception(), BrokenProcessPool):

@@ -19,7 +19,7 @@ class OutcomeStyle(NamedTuple):
     Attributes:
         symbol: One character.
         color: 0xRRGGBBAA.
-        meaning: Explanation for the key.
+        meaning: What the outcome means, for the legend.
     """
 
     symbol: str

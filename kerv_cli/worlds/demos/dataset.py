@@ -84,7 +84,7 @@ class DemoManifest:
         tasks: Task -> its episodes.
         sha256: Hash over the hashes of all episode files.
         versions: Versions of the packages on which physics and images depend.
-        seeds: `first` and `last` seed.
+        seeds: The smallest and the largest seed, with the keys `first` and `last`.
         episodes: Number of recorded episodes.
         missing: Number of requested episodes that could not be recorded because experts failed.
         instructions: Task -> instruction. Only for imported data, whose tasks belong to no registered environment.
@@ -194,7 +194,7 @@ class DemoDataset:
         path: The dataset's folder.
         manifest: What was recorded.
         episodes: One entry per episode: dataset by dataset if several were joined, then task by task, then by seed.
-        views: Number of views to read from images that show several side by side, from the left. 0: all.
+        views: If images show several views side by side, read only this number of them, from the left. 0: all.
     """
 
     path: Path

@@ -53,8 +53,8 @@ class DemoEpisode:
         frames: (n, size, size x views, 3) uint8, the recorded images.
         frame_steps: (n,) int64. Image i was drawn before the action of control step `frame_steps[i]`.
         states: (T, s) float32, privileged state before each action. It begins with the proprioception.
-        labels: (T + tail, D) float32, the expert's actions, clipped and without noise. The last `tail` actions come
-            after the episode's end.
+        labels: (T + tail, D) float32, the expert's actions, clipped and without noise. The last `tail` actions are
+            those with which the expert went on after the episode's end.
         executed: (T, D) float32, the actions that moved the robot.
         initial_state: (k,) float64, the world's `initial_state`, such as the placement of object and goal.
     """
@@ -280,7 +280,7 @@ def foreign_table(source: Path | bytes, where: tuple[str, Any] | None = None) ->
 def _may_hold(group: pq.RowGroupMetaData, column: str, value: Any) -> bool:
     """Return whether a row group (a part of a Parquet file) can contain `value` in `column`.
 
-    The group's statistics decide. Without statistics, it can.
+    The answer comes from the smallest and largest value that the file states. Without them it is True.
     """
     for number in range(group.num_columns):
         chunk = group.column(number)

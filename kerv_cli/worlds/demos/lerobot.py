@@ -1,7 +1,8 @@
 """Import LeRobot datasets of version 3 as demonstrations (docs/data.md).
 
-Images may be in the tables or in video files. `action` holds the actions to imitate, `action.executed` those that moved
-the robot. `observation.state` is the proprioception, `observation.environment_state` the privileged state.
+Images may be in the tables or in video files. `action` holds the actions to imitate. `action.executed` holds the
+actions that moved the robot. `observation.state` is the proprioception, `observation.environment_state` the privileged
+state.
 """
 
 from __future__ import annotations
@@ -263,7 +264,10 @@ def _world_of(source: Source, settings: DemosImportSettings) -> EnvironmentSpec 
 
 
 def _observation(source: Source, state: int, world: EnvironmentSpec) -> ObservationSpace:
-    """Return the observation space of a dataset: that of the environment, or only its proprioception.
+    """Return the observation space of a dataset that was recorded in an environment.
+
+    If the dataset holds the whole state, it is the environment's space. If it holds only the robot's own state, it is
+    the environment's space reduced to the proprioception.
 
     Args:
         source: The dataset.
@@ -271,7 +275,7 @@ def _observation(source: Source, state: int, world: EnvironmentSpec) -> Observat
         world: The environment.
 
     Raises:
-        CheckpointError: `state` fits neither of the two.
+        CheckpointError: `state` is the size of neither the whole state nor the proprioception.
     """
     whole = world.observation
     alone = whole.without_state()
@@ -361,8 +365,8 @@ def _groups(names: Sequence[str], strict: Sequence[str]) -> tuple[Group, ...]:
 def _task_names(tasks: Mapping[int, str], world: EnvironmentSpec | None) -> dict[int, str]:
     """Return the names of a dataset's tasks: task_index -> name.
 
-    In an environment, the name is that of the task with the same instruction. Otherwise it is made from the
-    instruction, with only the characters that folders and settings allow.
+    If the data belong to an environment of kerv, each name is the environment's task with the same instruction.
+    Otherwise it is made from the instruction, in small letters and digits joined by `-`.
 
     Args:
         tasks: task_index -> instruction.

@@ -116,8 +116,9 @@ def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None)
         actor: Moves the robot. None: the expert does.
 
     Returns:
-        The episode. None if the expert did not succeed within `config.horizon` steps, or too late for the simulator to
-        run `config.tail` more. An actor's episode is returned even if it did not succeed.
+        The episode, or None if the expert did not succeed in time. Two limits hold: `config.horizon` steps, and the
+        simulator's own horizon minus the `config.tail` steps that follow the success. An actor's episode is always
+        returned.
     """
     expert = world.spec.expert(world.task)
     observation = world.reset(seed)

@@ -42,7 +42,7 @@ class LiberoExpert:
     """Moves a black bowl onto the plate."""
 
     def __init__(self, spec: EnvironmentSpec, task: str) -> None:
-        """Find the free side of the bowl in a task.
+        """Look up at which side the bowl is gripped in a task, and how high it is carried.
 
         Raises:
             UnknownName: There is no such task.

@@ -36,7 +36,7 @@ _NOISE = 0.02
 
 @contextlib.contextmanager
 def _private_random() -> Iterator[None]:
-    """Restore numpy's global random state afterwards, because LIBERO seeds it and draws from it."""
+    """Restore numpy's global random state at the end of the `with` block, because LIBERO changes it."""
     state = np.random.get_state()  # noqa: NPY002
     try:
         yield

@@ -17,7 +17,7 @@ _FROM_MATERIAL = 0.5, 0.5, 0.5, 1.0  # rgba of a geom that takes its colour from
 
 
 class Light(Stress):
-    """All lights are brighter or darker, and lamps shine from other directions.
+    """All lights are brighter or darker, and lamps (lights with a place in the scene) shine from other directions.
 
     Each level is (gain, degrees):
 
@@ -29,7 +29,7 @@ class Light(Stress):
     levels = ((1.1, 10), (1.2, 15), (1.3, 20), (1.8, 45))
 
     def change(self, model: Model, changes: ModelChanges) -> None:
-        """Scale all lights. Rotate the position and direction of the lamps."""
+        """Scale the strength of all lights. Rotate each lamp's position and direction."""
         gain, degrees = self.amount
         random, head = self.generator(), model.vis.headlight
         lights = (model.light_ambient, model.light_diffuse, model.light_specular)
@@ -47,14 +47,15 @@ class Light(Stress):
 class Colour(Stress):
     """Floor, walls and table get random colours, one per body. Sky, robot and objects keep theirs.
 
-    Each level is the share of the random colour in the mixed colour. The mixed colour multiplies the texture.
+    The new colour is a mixture of the old colour and a random one. Each level is the share of the random one. A texture
+    is multiplied by the new colour.
     """
 
     kind = "colour"
     levels = (0.1, 0.2, 0.3, 0.45)
 
     def change(self, model: Model, changes: ModelChanges) -> None:
-        """Mix the colours of background and table with random colours."""
+        """Mix the colours of floor, walls and table with random colours."""
         share, random = self.amount, self.generator()
         changes.keep(model.geom_rgba)
         scenery = scenery_of(model)
@@ -168,7 +169,7 @@ def _scale(model: Model, body: int, factor: float, moved: bool) -> None:
         model: The model.
         body: Id of the body.
         factor: Factor of the size.
-        moved: Whether the body is a part fixed to an object, whose position is scaled too.
+        moved: Whether to scale the body's position, too. True for a part that is fixed to an object.
     """
     if moved:
         model.body_pos[body] *= factor
@@ -243,7 +244,7 @@ class Push(Stress):
         self._push = self._middle
 
     def act(self, action: Array, step: int) -> Array:
-        """Replace the position part of the action while a burst runs."""
+        """Return the action; while the hand is being pushed, its position part is replaced by the push."""
         runs, begins = self._bursts.next_step(self._random)
         if begins:
             self._push = self._middle + unit_vector(self._random, len(self._half)) * self._half
@@ -262,7 +263,7 @@ class Actuation(Stress):
 
     - noise: standard deviation of Gaussian noise, where 1 is half of a DoF's range
     - gain: largest relative error of a DoF's gain, drawn once per episode
-    - stuck: bursts per second in which one DoF does not move
+    - stuck: mean number of bursts that begin per second while none is running. In a burst one DoF does not move.
     """
 
     kind = "actuation"
