@@ -49,7 +49,7 @@ def conf_dir() -> Path:
 
 
 def groups() -> dict[str, list[str]]:
-    """Return the groups of settings, each with the names that can be chosen: {"method": ["ar", "spec_vla", …], …}."""
+    """Return the names that can be chosen in each group of settings: {"method": ["ar", "spec_vla", …], …}."""
     names = {d.name: {p.stem for p in d.glob("*.yaml")} for d in conf_dir().iterdir() if d.is_dir()}
     for group in SETTINGS_GROUPS:
         names.setdefault(group, set()).update(_parts_of(group))
@@ -156,12 +156,12 @@ def _read_preset(group: str, name: str) -> tuple[dict[str, str], list[tuple[str,
     """Read a method or study file.
 
     Args:
-        group: `method` or `study`. Empty: the command has no such file, and everything returned is empty.
+        group: `method` or `study`. Empty if the command has no such file. Then all three results are empty.
         name: As for `preset_file`.
 
     Returns:
-        Three values: group -> the part that the file chooses; the (key, value) pairs that the file sets; key -> where
-        the file sets it, as `FILE:LINE: ` for error messages.
+        Three values: the part that the file chooses in each group, the (key, value) pairs that the file sets, and where
+        it sets each key, as `FILE:LINE: ` for error messages.
 
     Raises:
         UsageError: The file is missing, is not YAML, or chooses a part in the wrong form.
@@ -221,7 +221,7 @@ def _composed(choices: tuple[tuple[str, str], ...], schema: type, conf: Path, ar
         choices: (group, name) pairs, such as ("method", "kerv"). Later ones override earlier ones.
         schema: Dataclass of the settings.
         conf: Folder of the configuration files.
-        artifacts: Registered kinds of artifacts, which the settings of a policy can name.
+        artifacts: Registered kinds of artifacts. The settings of a policy have a key for each of them.
 
     Raises:
         UnknownName: A group has no such name.
@@ -314,12 +314,12 @@ def split(text: str) -> list[str]:
 
 
 def expand(overrides: Sequence[str]) -> list[list[str]]:
-    """Return all combinations of overrides with several values, each as a list of overrides.
+    """Combine all values of the overrides, and return each combination as a list of overrides with one value.
 
-    Several values are written in Hydra's syntax: `threshold.r=0,3` or `threshold.r=range(0,4)`.
+    For example, `threshold.r=0,3` gives two lists. The values are written in Hydra's syntax, also as `range(0,4)`.
 
     Raises:
-        UsageError: An override cannot be parsed, or there are no or more than MOST_POINTS combinations.
+        UsageError: An override cannot be parsed, there is no combination, or there are more than MOST_POINTS.
     """
     from hydra.errors import HydraException
 

@@ -28,7 +28,7 @@ _OF_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, err
 
 @contextlib.contextmanager
 def storage_errors(path: Path) -> Iterator[None]:
-    """Turn an OSError inside the block into a StorageError, if the disk is full, broken or cannot be written.
+    """Turn an OSError inside the `with` block into a StorageError, if the disk is full, broken or cannot be written.
 
     Args:
         path: The file or folder that is written, for the error message.
@@ -43,10 +43,10 @@ def storage_errors(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Write a file atomically: yield a temporary path, and rename it to `path` at the end of the block.
+    """Write a file atomically: yield a temporary path, and rename it to `path` at the end of the `with` block.
 
     Readers see the old file or the complete new one. The parent folder is created. If the block raises an exception,
-    the temporary file is removed and `path` stays unchanged.
+    the temporary file is removed, and `path` keeps its old content.
 
     Raises:
         StorageError: The disk is full or read-only, or permission is missing.
@@ -72,7 +72,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 def write_folder(folder: Path, fill: Callable[[Path], object]) -> None:
     """Write a folder atomically: fill a temporary folder, then rename it. An existing folder is replaced.
 
-    If `fill` raises an exception, nothing changes.
+    If `fill` raises an exception, `folder` stays as it was.
 
     Args:
         folder: Path of the finished folder.
@@ -201,7 +201,7 @@ def read_json(path: Path) -> Any:
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
-    """Return the object in a JSON file; raises as `read_json`.
+    """Return the JSON object (a mapping) in a file; raises as `read_json`.
 
     Raises:
         CheckpointError: The JSON value is not an object.

@@ -45,7 +45,7 @@ def clean(folder: Path) -> list[Path]:
     """Remove the temporary files and folders of ended processes from `folder`, not from its subfolders.
 
     Returns:
-        The leftover paths that it found and tried to remove.
+        The paths that were to be removed. A path may still exist if removing it failed.
     """
     paths = [path for path in folder.glob(".*.tmp") if is_left_over(path)]
     for path in paths:

@@ -35,7 +35,7 @@ def setting(default: Any, help: str = "", **metadata: Any) -> Any:
 
 
 def limits(least: float = -math.inf, most: float = math.inf, above: float = -math.inf) -> dict[str, Any]:
-    """Return the metadata of a field that limits its number, or every number in its list or mapping.
+    """Return the metadata of a field that limits its value: a number, or every number in a list or mapping.
 
     None is always allowed, NaN never.
 
@@ -131,7 +131,7 @@ def check_settings(settings: Any, what: str = "") -> None:
 
 @functools.cache
 def _declared(kind: type) -> tuple[tuple[Field[Any], type | None], ...]:
-    """Return (field, type of its elements) for each field of a dataclass.
+    """Return each field of a dataclass with the type of its elements, such as `int` for `list[int]`.
 
     The type is None unless the field is a list or a dict of plain values.
     """

@@ -26,7 +26,7 @@ def _adapter(kind: Any) -> Any:
 
 
 def read(kind: type[T], value: Any, what: str, tolerant: bool = False) -> T:
-    """Convert a JSON value to a dataclass, with the dataclasses inside it.
+    """Convert a JSON value to a dataclass, whose fields may be dataclasses, too.
 
     Args:
         kind: The dataclass.
@@ -63,13 +63,13 @@ def read_file(kind: type[T], path: Path) -> T:
 
 
 def content_of(key: Sequence[str], chunk: int, target: str, files: Mapping[str, str]) -> str:
-    """Return the hash that identifies a datastore's content (docs/formats.md).
+    """Return one hash of all that determines what a datastore finds: these four arguments (docs/formats.md).
 
     Args:
         key: Parts of the prompt that form the search keys.
         chunk: H, control steps per stored chunk.
         target: Hash of the target's weights.
-        files: Name -> hash of the datastore's files.
+        files: Hashes of the datastore's files, by name.
     """
     text = json.dumps([key, chunk, target, sorted(files.items())])
     return hashlib.sha256(text.encode()).hexdigest()
@@ -80,8 +80,8 @@ def check_files(folder: Path, files: Mapping[str, str], again: str) -> None:
 
     Args:
         folder: The folder.
-        files: Name of each file -> its SHA-256.
-        again: What the user should do otherwise, text for the error message.
+        files: SHA-256 of each file, by name.
+        again: What the user should do if a file has changed, text for the error message.
 
     Raises:
         CheckpointError: A file is missing or changed.

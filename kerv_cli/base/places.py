@@ -26,7 +26,7 @@ def check_writable(results: str) -> Path:
     """Check that the results folder can be written, before anything is computed. Nothing is created.
 
     Returns:
-        The results folder. If it does not exist, the nearest existing folder above it.
+        The results folder if it exists, else the nearest existing folder above it.
 
     Raises:
         UsageError: The path is a file, or below a file.

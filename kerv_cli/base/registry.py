@@ -108,7 +108,7 @@ class Part:
     def built(self, *arguments: Any, **keywords: Any) -> Any:
         """Import the code that makes the part, call it with these arguments, and return its result.
 
-        Returns None for a part that is absent, such as `proposer=none`.
+        Return None if choosing the part means having none, as in `proposer=none`.
         """
         return load(self.build)(*arguments, **keywords) if self.build else None
 
@@ -216,7 +216,7 @@ def part_of(group: str, name: str) -> Part:
 def parts(kind: str) -> Mapping[str, Part]:
     """Return the parts of a kind as a map from name to part, in the order of registration.
 
-    For the settings group `drafter` these are the artifacts that have settings, because only they are trained.
+    For the settings group `drafter` these are the kinds of artifacts that are trained, which are those with settings.
     """
     load_plugins()
     if kind == "drafter":

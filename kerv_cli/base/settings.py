@@ -17,7 +17,7 @@ S = TypeVar("S")
 
 
 def chosen(kind: str, name: str = "none") -> Callable[[], Any]:
-    """Return a `default_factory` for a dataclass field: it makes the default settings of the part `name`."""
+    """Return a `default_factory` for a dataclass field that makes the default settings of the part `name`."""
     return lambda: find(kind, name).default
 
 

@@ -95,7 +95,7 @@ class ActionSpace:
 
     @cached_property
     def edges(self) -> np.ndarray:
-        """(bins,) edges of the bins on [-1, 1]."""
+        """(bins,) normalised values at which the tokens' intervals begin and end, from -1 to 1."""
         return np.linspace(-1.0, 1.0, self.bins)
 
     @cached_property
@@ -224,7 +224,7 @@ class ActionSpace:
 def action_limits(low: np.ndarray, high: np.ndarray) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return `low` and `high` of an ActionSpace from the lowest and highest actions, (D,) each.
 
-    A DoF that never moves gets the limits value - 1 and value + 1.
+    For a DoF with a constant value, the limits are value - 1 and value + 1.
     """
     still = high - low < 1e-6
     low, high = np.where(still, low - 1.0, low), np.where(still, high + 1.0, high)
@@ -259,7 +259,7 @@ class ObservationSpace:
     Args:
         proprioception: Names of the numbers of proprioception, the robot's own measurements. The first three are the
             end effector's position in metres.
-        state: Length of the privileged state. It begins with the proprioception.
+        state: Number of values in the privileged state. The first ones are the proprioception.
         places: Positions in the state that a policy can estimate from images, such as object and goal.
         centre: Middle of the workspace in metres.
         extra_places: Further positions, read only by a policy that gets the state.
@@ -285,7 +285,8 @@ class ObservationSpace:
         """Return this space as the robot alone sees it: the state is the proprioception, without object positions.
 
         Args:
-            places: Positions that the space names although its state does not contain them. A policy estimates them.
+            places: Positions that the policy estimates. The new space names them, although its state does not contain
+                them.
         """
         return ObservationSpace(self.proprioception, len(self.proprioception), places, self.centre)
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class DoctorSettings(RunSettings):
-    """Settings of `kerv doctor`. If a target or an environment is given, nothing else is checked."""
+    """Settings of `kerv doctor`. If a target or an environment is given, only these are checked."""
 
     groups: ClassVar = {"world": "default", "runtime": "cpu"}
 
@@ -95,10 +95,10 @@ def check_environment_of(settings: DoctorSettings) -> list[Finding]:
 
 
 def _rendering(spec: EnvironmentSpec, settings: DoctorSettings) -> str:
-    """Render frames of an environment and time them. Return the result as text.
+    """Render camera images of an environment and time them. Return the result as text.
 
-    A frame must not be empty: a broken OpenGL backend can load without an error and render nothing. An environment that
-    needs an extra of kerv may be missing, and its frames may take longer.
+    An image must not be empty, because a broken OpenGL backend can load without an error and render nothing. If an
+    environment needs an optional dependency of kerv, it may be missing, and its images may take longer.
     """
     from kerv_cli.worlds.mujoco_world import choose_backend
 

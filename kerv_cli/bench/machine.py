@@ -21,7 +21,7 @@ REPEATS = 7
 
 @dataclass(frozen=True)
 class Machine:
-    """The measured limits of a device, each the best of several repeats.
+    """What a device can do at best: bytes and operations per second, each the best of several measurements.
 
     Attributes:
         bandwidth: Bytes per second when reading a buffer that is larger than all caches.
@@ -34,9 +34,9 @@ class Machine:
     caches: tuple[tuple[float, float], ...] = ()
 
     def bandwidth_of(self, read: float) -> float:
-        """Return the bandwidth of reading `read` bytes again and again.
+        """Return the bytes per second at which the same `read` bytes can be read again and again.
 
-        It was measured with the smallest buffer that is at least as large.
+        This is the bandwidth of the smallest measured buffer that is at least as large.
         """
         return next((rate for size, rate in self.caches if read <= size), self.bandwidth)
 
@@ -45,7 +45,7 @@ class Machine:
         return read / self.bandwidth_of(read), flops / self.flops
 
     def best_of(self, other: Machine) -> Machine:
-        """Return the better value of two measurements in each field. Other programs can only make a value worse."""
+        """Return the higher value of two measurements in each field. Other programs can only make a value lower."""
         caches = [(size, max(a, b)) for (size, a), (_, b) in zip(self.caches, other.caches, strict=True)]
         return Machine(max(self.bandwidth, other.bandwidth), max(self.flops, other.flops), tuple(caches))
 
@@ -72,7 +72,7 @@ def timed(work: Callable[[], object], device: torch.device, repeats: int) -> np.
 
 @torch.inference_mode()
 def measure_machine(device: torch.device, dtype: torch.dtype) -> Machine:
-    """Measure the limits of a device with as many threads as torch has in this process.
+    """Measure a device's bandwidth and operations per second, with as many threads as torch has in this process.
 
     Args:
         device: The device.

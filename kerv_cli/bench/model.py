@@ -76,7 +76,7 @@ class Sizes:
 
         Args:
             kind: Kind of phase, see `phases.Phase`.
-            rows: Number of tokens or levels, see `phases.Phase`.
+            rows: Number of tokens, or for a drafted tree its depth; see `phases.Phase`.
             prompt: P, number of prompt tokens.
         """
         s = self.settings
@@ -109,7 +109,10 @@ class Model:
 
     @property
     def sizes(self) -> Sizes:
-        """Sizes of the target. On a CPU its cache is float32, and compiled weights have their stored format."""
+        """Sizes of the target.
+
+        On a CPU, a number in the cache has 4 bytes. A compiled weight has as many bytes as its stored format.
+        """
         slot, trunk = 4 if self.target.device.type == "cpu" else self.dtype.itemsize, self.target.trunk
         weight: float = self.dtype.itemsize
         if isinstance(getattr(trunk, "packed", None), Program):

@@ -57,13 +57,13 @@ class Phase:
     Attributes:
         kind: encode, prefill, verify, feed (the drafter reads the target's hidden states), draft (the drafter drafts a
             chain), tree (it drafts a tree), or a draft of the shipped policy: early, retrieval, scout.
-        rows: Number of tokens in the forward. For a drafted chain its tokens, for a tree its levels.
+        rows: Number of tokens in the forward. For a drafted chain its number of tokens, for a drafted tree its depth.
         seconds: Median of all repeats.
         p95: 95th percentile of all repeats.
         least: Minimum of all repeats.
-        read: Bytes that must be read.
-        flops: Arithmetic operations that must be done.
-        floor: Shortest possible seconds for these bytes and operations on this device. 0 if they are not known.
+        read: Bytes that the phase must read. 0: unknown.
+        flops: Arithmetic operations that the phase needs. 0: unknown.
+        floor: Shortest possible seconds for these bytes and operations on this device. 0: unknown.
     """
 
     kind: str
@@ -77,7 +77,7 @@ class Phase:
 
     @property
     def share(self) -> float:
-        """Floor ÷ median. It is 1 if the phase is as fast as the device allows."""
+        """Shortest possible time ÷ measured time (median). It is 1 if the phase is as fast as the device allows."""
         return self.floor / self.seconds
 
     @property
@@ -88,7 +88,7 @@ class Phase:
         return f"{self.kind} {self.rows}" if self.kind in FORWARDS[1:] else self.kind
 
     def as_dict(self) -> dict[str, float | str]:
-        """Return the fields for JSON, with name, share and the rates in GB/s and GFLOP/s."""
+        """Return the fields for JSON, and the phase's name, its share, and the GB/s and GFLOP/s that it reached."""
         rates = {"gb_per_s": self.read / self.seconds / 1e9, "gflop_per_s": self.flops / self.seconds / 1e9}
         return {"name": self.name, **asdict(self), **rates, "share": self.share}
 
@@ -101,13 +101,13 @@ class Laps(Stopwatch):
         super().__init__(device)
 
     def lap(self, phase: str) -> None:
-        """End the current lap, and count it for a phase."""
+        """End the current lap, and add its seconds to `phase`."""
         before = self.phases[phase]
         super().lap(phase)
         self.laps.append((phase, self.phases[phase] - before))
 
     def stop(self) -> float:
-        """Stop, and return the sum of all laps in seconds."""
+        """Stop, and return the seconds since the start."""
         seconds = super().stop()
         if self.events is not None:
             pairs = itertools.pairwise(self.events)
@@ -118,7 +118,7 @@ class Laps(Stopwatch):
 class Dummy(Proposer):
     """A proposer that always drafts the same number of nodes, with arbitrary tokens.
 
-    The nodes form a chain. Nodes for which the chunk has no room become children of the root instead.
+    The nodes form a chain. Nodes that do not fit into the chunk become further first tokens of the draft instead.
     """
 
     name = "dummy"
@@ -135,8 +135,8 @@ class Dummy(Proposer):
 def decoders(model: Model) -> list[Decoder]:
     """Return decoders that accept every draft and together run forwards of many sizes.
 
-    One decodes without drafts. Others verify dummy drafts in the prefill or after it. The last three verify chains and
-    a tree of the drafter.
+    The first one decodes without drafts. The next ones verify dummy drafts in the prefill or after it. The last three
+    use the drafter: two verify chains, one verifies trees.
     """
     target, size = model.target, model.size
     rule, everything = RelaxedRule(target.actions, strict_dofs=False), Fixed(target.actions.tokens)
@@ -155,15 +155,15 @@ def decoders(model: Model) -> list[Decoder]:
 def costs_of(
     decoder: Decoder, prompt: int, rounds: Sequence[Round], laps: Sequence[Lap]
 ) -> Iterator[tuple[Key, float]]:
-    """Yield kind, rows and seconds of each phase in a decode.
+    """Yield each phase in a decode: its kind and rows, as in `Phase`, and its seconds.
 
-    The time of a forward ends when its target tokens are on the CPU.
+    A forward's seconds include copying the target's tokens to the CPU.
 
     Args:
         decoder: The decoder.
         prompt: P, number of prompt tokens.
         rounds: The rounds of the decode.
-        laps: As measured by `Laps`, in order.
+        laps: Name and seconds of each lap, as `Laps` measured them.
     """
     seconds = {phase: sum(s for name, s in laps if name == phase) for phase in ("vision", "prefill", "verify")}
     yield ("encode", 1), seconds["vision"]
@@ -186,15 +186,18 @@ def costs_of(
 
 @torch.inference_mode()
 def measure(model: Model, machine: Machine, settings: BenchSettings) -> tuple[Machine, list[Phase]]:
-    """Measure all phases: run all decoders in turn, `settings.repeats` times.
+    """Measure the time of each phase of a decode (prefill, verify, …).
+
+    All decoders run in turn, `settings.repeats` times.
 
     Args:
         model: The model.
-        machine: Limits of the device. They are measured once more at the end, and the better ones count.
+        machine: The device's measured bandwidth and operations per second. Both are measured again after the decodes;
+            the higher values count.
         settings: Settings of the benchmark.
 
     Returns:
-        The limits of the device, and the phases.
+        The values of the device that count, and the measured phases.
     """
     device, evicting = model.target.device, torch.ones(_EVICTING)
     every, seconds = decoders(model), dict[Key, list[float]]()
@@ -226,10 +229,11 @@ def phases_of(
     """Summarise measured times as phases.
 
     Args:
-        seconds: Kind and rows of a phase -> seconds of each repeat.
+        seconds: Seconds of each repeat, by the kind and rows of the phase.
         sizes: Sizes of the target.
-        machine: Limits of the device.
-        drafts: Kind and rows of a draft -> bytes and operations of the network that makes it, zeros if there is none.
+        machine: The device's measured bandwidth and operations per second.
+        drafts: Bytes and operations of the network that makes a draft, by the draft's kind and rows. Zeros if no
+            network makes the draft.
     """
     order = (*FORWARDS, *source_methods(), SCOUT)
     phases, prompt = [], min(rows for kind, rows in seconds if kind == "prefill")
@@ -243,9 +247,9 @@ def phases_of(
 
 @torch.inference_mode()
 def needs_of_draft(decoder: Any) -> tuple[float, float]:
-    """Return the bytes of weights and the operations of the network that makes a decoder's draft before the prefill.
+    """Return the bytes that the network of a decoder's prefill draft reads, and its number of arithmetic operations.
 
-    Both are 0 if no network makes it.
+    Both are 0 if no network makes the draft.
     """
     draft, target = decoder.parts.prefill_draft, decoder.target
     if not isinstance(draft, EarlyProposer):
@@ -260,16 +264,16 @@ def needs_of_draft(decoder: Any) -> tuple[float, float]:
 
 
 def source_methods() -> dict[str, str]:
-    """Return kind of phase -> method to measure it with, for the drafts that have their own phase, such as `early`."""
+    """Return the method with which a kind of draft is measured, by kind, for the drafts that have a phase."""
     measured = [part.traits for part in parts("proposer").values() if "measured_by" in part.traits]
     return {traits["cost"]: traits["measured_by"] for traits in measured}
 
 
 def source_decoders(settings: BenchSettings) -> dict[str, Any]:
-    """Return decoders of the shipped policy that measure early, retrieved and scout drafts, by the kind of the phase.
+    """Return decoders of the shipped policy that measure the drafts `early`, `retrieval` and `scout`, by these names.
 
-    The time of these drafts does not depend on the size of the target. The result is empty if the shipped policy is
-    missing.
+    The time of these drafts does not depend on the size of the target. If the shipped policy is missing, the result is
+    empty.
     """
     words = [f"runtime.{name}={getattr(settings.runtime, name)}" for name in ("device", "threads")]
     try:

@@ -35,10 +35,10 @@ class Bench:
 
     Attributes:
         model: The measured model.
-        machine: Limits of the device.
-        phases: Measured times.
-        ceilings: N (tokens of a chunk) -> highest speedup of each method.
-        profile: Median times by kind and rows, from which the time of a decode can be computed.
+        machine: The device's measured bandwidth and operations per second.
+        phases: Measured times of the phases of a decode.
+        ceilings: Highest speedup of each method, by N, the number of tokens in a chunk.
+        profile: Median seconds by kind and rows of a phase, from which the time of a decode can be computed.
     """
 
     model: Model
@@ -59,7 +59,7 @@ class Bench:
         return f"{self.model.name}, {self.dtype}, {where}, {torch.get_num_threads()} thread, caches cold at first"
 
     def document(self) -> Document:
-        """Return the whole result for JSON (docs/formats.md)."""
+        """Return all results for JSON (docs/formats.md)."""
         device = self.model.target.device
         return {
             "target": self.model.name,
@@ -76,17 +76,19 @@ class Bench:
 
 
 def card_of(model: Model, machine: Machine, tokens: int) -> dict[str, Any]:
-    """Compute the least times that a model's forwards can take on this machine. No forward is executed.
+    """Compute the shortest times that a model's forwards can take on this device. No forward is executed.
 
-    A floor consists of two times in seconds: for reading the weights and for the arithmetic. The larger one counts.
+    Such a shortest time, a floor, is two numbers of seconds: for reading memory, and for the arithmetic. The larger one
+    counts.
 
     Args:
         model: The model.
-        machine: Limits of the device.
+        machine: The device's measured bandwidth and operations per second.
         tokens: N, tokens of a chunk.
 
     Returns:
-        Sizes, rates and floors by name, see `card_rows`.
+        By name: the model's sizes, the device's bandwidth and operations per second, and the floors. `card_rows` prints
+        them.
     """
     prompt, s, sizes = model.target.max_prompt, model.target.settings, model.sizes
     needs = {
@@ -115,7 +117,8 @@ def run(settings: BenchSettings, model: Model, machine: Machine) -> Bench:
     Args:
         settings: Settings of the benchmark.
         model: The model, from `open_model`.
-        machine: Limits of the device. They are measured once more at the end, and the better ones count.
+        machine: The device's measured bandwidth and operations per second. Both are measured again after the decodes;
+            the higher values count.
     """
     machine, phases = measure(model, machine, settings)
     profile = profile_of(phases, model.size)
@@ -124,7 +127,7 @@ def run(settings: BenchSettings, model: Model, machine: Machine) -> Bench:
 
 
 def write(settings: BenchSettings, bench: Bench) -> list[Path]:
-    """Write the result and the projections onto other devices as JSON files. Return their paths."""
+    """Write the results, and the estimates for other devices, as JSON files. Return the paths of the files."""
     folder = results_dir(settings.results) / "bench"
     name = bench.model.name.rstrip("/").rsplit("/", 1)[-1]
     documents = {folder / f"{name}-{bench.dtype}.json": bench.document()}
@@ -139,7 +142,7 @@ def write(settings: BenchSettings, bench: Bench) -> list[Path]:
 
 @dataclass(frozen=True)
 class MethodCeiling:
-    """The highest speedup of a method over AR: every draft is accepted completely.
+    """The highest speedup of a method over autoregressive decoding (AR): every draft is accepted completely.
 
     Attributes:
         method: Name of the method.
@@ -158,7 +161,7 @@ def ceilings(profile: Profile, tokens: int) -> list[MethodCeiling]:
     """Return the highest speedup of each method in conf/method. Methods without verification are left out.
 
     Args:
-        profile: Measured latencies of the forwards.
+        profile: Measured seconds of the forwards and drafts.
         tokens: N, tokens of a chunk.
     """
     names = [name for name in groups()["method"] if name != EXPERT]
@@ -200,7 +203,7 @@ Document = dict[str, Any]
 
 
 def profile_of(phases: Sequence[Phase], tokens: int) -> Profile:
-    """Return a profile, the median seconds of each phase by its number of rows.
+    """Return a latency profile: the median seconds of each kind of phase, by its number of rows.
 
     Args:
         phases: Measured phases.
@@ -219,17 +222,17 @@ def projections(
 ) -> Iterator[tuple[str, Document]]:
     """Estimate the times of another shape in bfloat16 on other devices.
 
-    The shape is `settings.projected`, the devices are those of `settings.projections`. Forwards have as many tokens
-    after the prompt as those that were measured here.
+    The shape is `settings.projected`, the devices are those of `settings.projections`. The forwards are those that were
+    measured here, but with the prompt length of that shape.
 
     Args:
         settings: Settings of the benchmark.
         model: The measured model.
-        machine: Limits of this device.
-        phases: Measured phases.
+        machine: This device's measured bandwidth and operations per second.
+        phases: Phases measured on this device.
 
     Yields:
-        Name of a device, and the result for it.
+        The name of each device, and the estimates for it.
     """
     shape = shape_of(settings.projected, model.size)
     sizes = Sizes(shape, model.target.actions.tokens, _HALF, _HALF)
@@ -255,15 +258,15 @@ def projections(
 
 
 def shares(phases: Sequence[Phase], machine: Machine) -> tuple[float, float]:
-    """Return which share of the device's limits the measured forwards reach: the median of floor ÷ time.
+    """Return how close the measured forwards come to the shortest possible time: the median of shortest ÷ measured.
 
     Args:
         phases: Measured phases.
-        machine: Limits of the device.
+        machine: The device's measured bandwidth and operations per second.
 
     Returns:
-        Two medians: of the forwards that reading memory limits, and of the forwards that arithmetic limits. If there
-        are no forwards of one kind, both numbers are the median of the other kind.
+        Two medians in 0 … 1: one over the forwards that spend more time on reading memory, one over those that spend
+        more on arithmetic. If one kind does not occur, the other kind's median stands for both.
     """
     by_bound: dict[bool, list[float]] = {True: [], False: []}
     for p in phases:
@@ -279,14 +282,14 @@ def projected(
 ) -> list[Phase]:
     """Estimate the times of phases on another device. These are no measurements.
 
-    A forward is assumed to reach the same share of the device's limits as here, and to take at least 15 µs per layer.
+    A forward is assumed to come as close to its shortest possible time as here, and to take at least 15 µs per layer.
     The encoder's time is scaled by the bandwidth. Drafts of the shipped policy keep their time.
 
     Args:
-        phases: Phases with the bytes and operations of the shape on that device.
+        phases: Phases measured on this device, with the bytes and operations of the other shape.
         reached: Result of `shares`.
-        here: Limits of this device.
-        there: Limits of the other device.
+        here: This device's measured bandwidth and operations per second.
+        there: The other device's bandwidth and operations per second.
         layers: Number of decoder layers of the shape.
     """
     projections = []
@@ -311,7 +314,7 @@ PHASE_COLUMNS = ("phase", "median ms", "p95", "least", "GB/s", "GFLOP/s", "floor
 
 
 def card_rows(card: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return (name, value) rows about sizes of the model, limits of the device, and least times of forwards.
+    """Return rows (name, value) for a table: sizes of the model, rates of the device, and shortest times of forwards.
 
     Args:
         card: Result of `card_of`.
@@ -330,7 +333,7 @@ def card_rows(card: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def phase_rows(phases: Sequence[Phase]) -> list[tuple[str, ...]]:
-    """Return a row per phase with the columns PHASE_COLUMNS. A floor is the least time that the device allows."""
+    """Return a row per phase with the columns PHASE_COLUMNS. The floor is the shortest time that the device allows."""
     rows: list[tuple[str, ...]] = []
     for phase in phases:
         limits = ("–", "–", "–", "–")
@@ -346,7 +349,7 @@ def ceiling_rows(by_tokens: Mapping[int, Sequence[MethodCeiling]]) -> list[tuple
     """Return a row per method: its name, then for each N how it verifies and its two speedups.
 
     Args:
-        by_tokens: N (tokens of a chunk) -> highest speedup of each method.
+        by_tokens: Highest speedup of each method, by N, the number of tokens in a chunk.
     """
     by_method: dict[str, list[str]] = {}
     for ceilings in by_tokens.values():

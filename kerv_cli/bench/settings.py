@@ -13,7 +13,7 @@ PROJECTIONS = {"A100 80GB": [2039.0, 312.0], "H100 SXM": [3350.0, 989.0], "RTX 4
 
 @dataclass
 class BenchSettings(RunSettings):
-    """Settings of `kerv bench`, which compares the times of a target with what the device could do at best."""
+    """Settings of `kerv bench`, which compares a target's measured times with the shortest that the device allows."""
 
     model: str = setting("mt10-vision", "a policy, or a shape of conf/target with random weights")
     dtype: str = choice(

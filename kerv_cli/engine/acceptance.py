@@ -1,7 +1,7 @@
 """Acceptance rules: which draft tokens are good enough (docs/methods.md §2.1). This file imports nothing heavy.
 
-The longest accepted path wins. Ties go to the path with the smaller summed distance to the target tokens, then to the
-path that was proposed first.
+A draft is a tree of tokens. A path leads from the last committed token down this tree. The longest accepted path wins.
+Ties go to the path with the smaller summed distance to the target tokens, then to the path that was proposed first.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Bounds = Sequence[tuple[int, int]]
 
 
 class Accepted(NamedTuple):
-    """Result of an acceptance rule.
+    """The draft nodes that an acceptance rule accepts, and the one it rejects.
 
     Attributes:
         path: Indices of the accepted nodes, from depth 0 down. Empty if none was accepted.
@@ -38,8 +38,8 @@ def accept_by_distance(tree: TokenTree, target_tokens: Sequence[int], start: int
 
     Args:
         tree: The draft, n nodes.
-        target_tokens: 1 + n tokens of the target: after the last committed token, then after each node.
-        start: Index in the chunk of the nodes at depth 0.
+        target_tokens: The target's prediction after the last committed token, then after each of the n nodes.
+        start: Number of committed tokens. A node at depth d is token start + d of the chunk.
         limits: Largest accepted distance per DoF, in bins. With all zeros, tokens must be equal.
     """
     alone = [(dof, dof + 1) for dof in range(len(limits))]  # every DoF is a group of its own
@@ -61,13 +61,13 @@ def accept_by_group(
     its DoF's limit of the target token after its parent, and if these distances sum to at most `group_limit`. A path
     ends before a group that is rejected or that is only partly in the tree.
 
-    If `start` is inside a group, the group's first tokens are committed already. They count with distance 0, and only
-    the group's remaining tokens are judged.
+    If `start` is inside a group, the group's first tokens are committed already. Their distance counts as 0. Only the
+    group's other tokens are judged.
 
     Args:
         tree: The draft, n nodes.
-        target_tokens: 1 + n tokens of the target: after the last committed token, then after each node.
-        start: Index in the chunk of the nodes at depth 0.
+        target_tokens: The target's prediction after the last committed token, then after each of the n nodes.
+        start: Number of committed tokens. A node at depth d is token start + d of the chunk.
         limits: Largest accepted distance per DoF, in bins.
         group_limit: Largest accepted sum of a group's distances, in bins.
         bounds: For each DoF, the index of the first DoF of its group and the index after the last one.
@@ -92,12 +92,12 @@ def accept_by_group(
 
 
 def nearest_child(tree: TokenTree, node: int, target_tokens: Sequence[int]) -> int | None:
-    """Return the child of `node` whose token is nearest to the target token; None if there are no children.
+    """Return the child of `node` whose token is nearest to the target's prediction after `node`; None without children.
 
     Args:
         tree: The draft, n nodes.
         node: Index of the parent, or −1 (ROOT) for the last committed token.
-        target_tokens: 1 + n tokens of the target: after the last committed token, then after each node.
+        target_tokens: The target's prediction after the last committed token, then after each of the n nodes.
     """
     children = [i for i, parent in enumerate(tree.parents) if parent == node]
     return min(children, key=lambda i: abs(tree.tokens[i] - target_tokens[node + 1]), default=None)
@@ -113,7 +113,7 @@ class DistanceRule:
     space: ActionSpace
 
     def of_drafts_from(self, proposer: str) -> DistanceRule:
-        """Return the rule that judges the drafts of the proposer with this name. By default this rule judges all."""
+        """Return the rule that judges the drafts of the proposer with this name. By default, always this rule."""
         return self
 
     def limits(self, r: int) -> tuple[int, ...]:
@@ -121,12 +121,12 @@ class DistanceRule:
         raise NotImplementedError
 
     def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
-        """Return the longest accepted path.
+        """Return the longest accepted path, and the node that was rejected after it.
 
         Args:
             tree: The draft, n nodes.
-            target_tokens: 1 + n tokens of the target: after the last committed token, then after each node.
-            start: Index in the chunk of the nodes at depth 0.
+            target_tokens: The target's prediction after the last committed token, then after each of the n nodes.
+            start: Number of committed tokens. A node at depth d is token start + d of the chunk.
             r: Acceptance radius, in bins.
         """
         return accept_by_distance(tree, target_tokens, start, self.limits(r))

@@ -39,7 +39,7 @@ class BatchDecoder:
 
     @torch.inference_mode()
     def decode(self, episodes: Sequence[EpisodeState], observations: Sequence[Observation]) -> list[DecodeRecord]:
-        """Decode one observation per episode. Return one record per episode, which holds its actions."""
+        """Decode one observation per episode. Return one record per episode, with the actions to execute."""
         prompts = functools.cache(lambda: self._encode(observations))  # encoded only if some part reads a prompt
 
         def prompt(i: int) -> Tensor:
@@ -78,7 +78,7 @@ class BatchDecoder:
         return [self.target.encode(observation) for observation in observations]
 
     def _tokens(self, chunks: Sequence[Chunk]) -> list[list[int]]:
-        """Return the N greedy tokens of each chunk. Prompts of equal length are decoded together, without padding."""
+        """Decode N tokens per chunk greedily. Chunks with equally long prompts are decoded together, unpadded."""
         tokens: dict[int, list[int]] = {}
         for length in dict.fromkeys(chunk.prompt_length for chunk in chunks):
             group = [i for i, chunk in enumerate(chunks) if chunk.prompt_length == length]
@@ -94,7 +94,8 @@ class BatchDecoder:
     def _cache(self, rows: int) -> Cache:
         """Return an empty cache for `rows` sequences.
 
-        Only the cache of the latest size stays allocated, because the size changes each time an episode ends.
+        The last cache is used again if it has this number of sequences. Otherwise a new one replaces it. The number
+        changes each time an episode ends, and keeping a cache for each number would fill the memory.
         """
         if rows not in self._caches:
             self._caches = {rows: self.target.new_cache(rows, self.target.max_prompt + self._size)}

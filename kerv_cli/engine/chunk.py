@@ -104,7 +104,7 @@ class EpisodeState:
 
 @dataclass(frozen=True)
 class Rejection:
-    """What a verification computed after a rejected draft token, beyond the accepted path.
+    """The tokens that the draft and the target have after a rejected draft token.
 
     Attributes:
         draft: The draft's tokens after the rejected one.
@@ -128,9 +128,9 @@ class Choice:
 class Chunk:
     """The N tokens of one decode, filled step by step.
 
-    Parts of a method may read this object, and change it only through its methods. The cache holds the prompt and all
-    committed tokens but the newest ones, which the target has not read yet (`uncached`). Usually this is one token.
-    After a rectifier has filled a control step, it may be several.
+    Parts of a method may read this object, and change it only through its methods. The target's cache holds the prompt
+    and the committed tokens, except those that the target has not read yet (`uncached`). Usually only the newest token
+    is uncached. After a rectifier has filled a control step, several may be.
     """
 
     encoding: Tensor | Callable[[], Tensor]  # the prompt, or a function that encodes it
@@ -165,7 +165,10 @@ class Chunk:
 
     @property
     def prompt(self) -> Tensor:
-        """The prompt's embeddings (1, P, E), computed when first read. So skipped chunks need not pay for encoding."""
+        """The prompt's embeddings (1, P, E).
+
+        They are computed when first read. So skipped chunks need not pay for encoding.
+        """
         if not isinstance(self.encoding, Tensor):
             self.encoding = self.encoding()
         return self.encoding
@@ -211,16 +214,15 @@ class Chunk:
         return float(np.abs(self.space.values_of(first) - self.space.values_of(second)).mean())
 
     def targets_along(self, chain: Sequence[int]) -> list[int] | None:
-        """Return the target's tokens along a drafted chain, as computed by the chunk's first verification.
+        """Return the target's tokens for a drafted chain that the chunk's first round verified.
 
-        Call it before the next round, which discards the tokens after the rejection.
+        Call this before the second round, which discards the predictions after a rejected token.
 
         Args:
             chain: A draft of the whole chunk.
 
         Returns:
-            One target token per compared token. None if there was no verification, if it judged another draft, or if it
-            covered fewer than N − 1 tokens.
+            At least N − 1 tokens. None if the first round verified nothing, another draft or fewer tokens.
         """
         if not self.rounds:
             return None
@@ -236,7 +238,7 @@ class Chunk:
         Args:
             record: Record of the forward's round.
             tokens: The tokens to commit.
-            rejection: What the forward computed after a rejected token; None if it rejected none.
+            rejection: The draft's and the target's tokens after a rejected token. None if no token was rejected.
         """
         self.forwards += 1
         self.tokens += tokens
@@ -273,7 +275,7 @@ class Chunk:
         self.rounds.append(Round("skip", proposer, drafted=drafted, accepted=self.size, committed=self.size))
 
     def close(self, values: np.ndarray, with_target_token: bool) -> None:
-        """End the chunk with actions that are partly predicted.
+        """End the chunk with these actions, which are partly predicted. Later control steps are dropped.
 
         Args:
             values: Normalised actions (steps, D): first the values of the committed tokens, then predicted values.
@@ -286,7 +288,7 @@ class Chunk:
     def fill(self, values: np.ndarray, with_target_token: bool) -> None:
         """Commit predicted values up to the end of a control step. Decoding continues with the next step.
 
-        The values are executed as they are. The target reads their nearest tokens.
+        The robot executes the values as they are. The target reads the tokens that are nearest to them.
 
         Args:
             values: Normalised actions (steps, D): first the values of the committed tokens, then predicted values.
@@ -339,7 +341,8 @@ def deviation(space: ActionSpace, actions: np.ndarray, autoregressive: np.ndarra
     Args:
         space: The action space.
         actions: The method's actions (h, D), environment units.
-        autoregressive: The actions of autoregressive decoding (H, D), h ≤ H. Only the first h are compared.
+        autoregressive: The actions of autoregressive decoding (H, D), environment units. Only the first h ≤ H are
+            compared.
     """
     gap = space.normalise(actions) - space.normalise(autoregressive[: len(actions)])
     return float(np.abs(gap).mean())

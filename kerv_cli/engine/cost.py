@@ -1,4 +1,8 @@
-"""The cost model: predicts a decode's seconds from its forwards and a measured latency profile (docs/measuring.md)."""
+"""The cost model: predicts a decode's seconds from its forwards and a measured latency profile (docs/measuring.md).
+
+Every forward and draft has a kind of cost, such as `prefill`, `verify` or `draft`. A profile has the seconds of each
+kind.
+"""
 
 from __future__ import annotations
 
@@ -29,9 +33,9 @@ _LEVELS = 5  # assumed depth of such a tree
 
 
 def source_costs() -> dict[str, list[str]]:
-    """Return, for each kind of cost, the names of the proposers whose drafts have this cost.
+    """Return the names of the proposers whose drafts a profile prices, by their kind of cost.
 
-    A proposer that is not listed costs the seconds that were recorded for its drafts.
+    The drafts of all other proposers cost the seconds that were recorded for them.
     """
     costs: dict[str, list[str]] = {}
     for name, part in parts("proposer").items():
@@ -46,7 +50,7 @@ class Profile:
 
     Attributes:
         prompt: Number of prompt tokens P.
-        phases: For each kind of cost, the measured numbers of rows, increasing, and the seconds for each number.
+        phases: By kind of cost: the numbers of rows that were measured, increasing, and the seconds for each of them.
         tokens: Number of tokens N in a chunk.
         about: What was measured: target, machine, versions.
     """
@@ -65,9 +69,10 @@ class Profile:
         return float(self.times(kind, np.array([rows]))[0])
 
     def times(self, kind: str, rows: np.ndarray) -> np.ndarray:
-        """Return the seconds (n,) for each of several numbers of rows (n,).
+        """Return the seconds (n,) of n forwards or drafts of this kind, over `rows` (n,) rows each.
 
-        Times between measured numbers are interpolated linearly. Beyond the largest one they are extrapolated linearly.
+        Between the measured numbers of rows, the seconds are interpolated linearly. Beyond the largest one they are
+        extrapolated linearly.
         """
         measured, times = self.phases[kind]
         seconds: np.ndarray = np.interp(rows, measured, times)
@@ -115,12 +120,12 @@ def read_profile(path: Path) -> Profile:
 
 
 class Calls(NamedTuple):
-    """The m forwards, or m drafts, of one kind in several decodes.
+    """All forwards, or all drafts, of one kind in several decodes. There are m of them.
 
     Attributes:
-        decode: (m,) index of the decode that made the call.
-        rows: (m,) number of tokens processed, without the prompt's.
-        with_prompt: (m,) bool, whether the prompt's tokens are processed too.
+        decode: (m,) index of the decode that made each call.
+        rows: (m,) number of tokens that each call processed, without the prompt's.
+        with_prompt: (m,) bool, whether the call processed the prompt's tokens, too.
     """
 
     decode: np.ndarray
@@ -133,10 +138,10 @@ class Work:
     """What several decodes computed: forwards, drafts, and recorded seconds of everything else.
 
     Attributes:
-        calls: For each kind of cost that depends on the target's size (`FORWARDS`), its forwards or drafts.
-        sources: For each other kind of cost, (decodes,) bool: whether the decode used a proposer with this cost.
-        host: (decodes,) recorded seconds that do not depend on the target's size, without proposing.
-        propose: (decodes,) recorded seconds of proposing. 0 if the drafter drafted, because its cost is in `calls`.
+        calls: The forwards and drafts whose cost depends on the target's size, by kind (one of `FORWARDS`).
+        sources: For every other kind of cost: (decodes,) bool, whether the decode used a proposer of this kind.
+        host: (decodes,) recorded seconds that neither depend on the target's size nor were spent on drafting.
+        propose: (decodes,) recorded seconds of drafting. 0 if the drafter drafted, because its cost is in `calls`.
     """
 
     calls: Mapping[str, Calls]
@@ -167,8 +172,8 @@ def work_of(
         phases: Recorded seconds of each of `READ_PHASES`, (decodes,).
         looked_up: Whether the decode searched the datastore, (decodes,) bool.
         size: Number of tokens N in a chunk.
-        drafter: The drafter's depth, and whether it drafts a tree. None if unknown: then a draft of many nodes
-            counts as a tree.
+        drafter: The drafter's depth, and whether it drafts a tree. None if unknown: a draft of many nodes then counts
+            as a tree.
     """
     decodes, decode = len(counts), np.repeat(np.arange(len(counts)), counts)
     mode, proposer, start = rounds["mode"], rounds["proposer"], rounds["start"]
@@ -219,10 +224,10 @@ def work_of_record(decode: DecodeRecord) -> Work:
 
 
 def prices(work: Work, profile: Profile) -> np.ndarray:
-    """Return the seconds (decodes,) of each decode by the cost model.
+    """Estimate the seconds of each decode, (decodes,).
 
-    Forwards, and everything that the drafter computes, cost what the profile says. Drafts of other proposers do, too,
-    if the profile has times for them. Everything else costs the seconds that were recorded.
+    The seconds of forwards, and of everything that the drafter computes, are those in the profile. So are the seconds
+    of other proposers' drafts, if the profile has them. Everything else takes the seconds that were recorded.
     """
     total = np.array(work.host, dtype=float)
     for kind, (decode, rows, with_prompt) in work.calls.items():

@@ -43,7 +43,7 @@ class Verified(NamedTuple):
 
     Attributes:
         hidden: The target's hidden states (1, before + n, E). The first `before` belong to tokens that were not in the
-            cache yet: the prompt, or the last committed token. The others belong to the draft's nodes.
+            cache yet: the prompt, or the last committed token. The other n belong to the draft's nodes.
         tree: The draft's n nodes, on the CPU.
         target_tokens: 1 + n tokens, on the CPU: the target's prediction after the last committed token, then its
             prediction after each node.
@@ -89,7 +89,7 @@ class Decoder(ActionDecoder):
 
     @cached_property
     def autoregressive(self) -> Decoder:
-        """An autoregressive decoder of the same target, to measure how far a method's actions deviate."""
+        """An autoregressive decoder of the same target. The method's actions are compared with its actions."""
         return Decoder(self.target, chunk=self.steps)
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
@@ -209,7 +209,10 @@ class Decoder(ActionDecoder):
         stopwatch.lap("propose")
 
     def decode_plainly(self, chunk: Chunk, stopwatch: Stopwatch) -> None:
-        """Decode the remaining tokens without drafts: in one call if the target can, else one forward per token."""
+        """Decode the remaining tokens without drafts.
+
+        This takes one call if the target supports that, else one forward per token.
+        """
         tokens = None
         if isinstance(self.target, ContinuesGreedily):
             tokens = self.target.continue_greedily(chunk.tokens[-1], chunk.remaining, chunk.cache)
@@ -276,7 +279,8 @@ class Decoder(ActionDecoder):
         """Commit the accepted path and, if the chunk has room, the bonus: the target's next token.
 
         Returns:
-            The target's hidden states of the tokens that stay in the cache, (1, before + accepted, E).
+            The target's hidden states from this forward, without those of rejected draft tokens: (1, before + accepted,
+            E). `before` counts the tokens that were forwarded ahead of the draft.
         """
         tree, target_tokens, (path, rejected) = verified.tree, verified.target_tokens, accepted
         if proposer is None or not len(tree):
@@ -305,7 +309,7 @@ class Decoder(ActionDecoder):
         return self._keep(chunk, verified, list(path))
 
     def _keep(self, chunk: Chunk, verified: Verified, rows: list[int]) -> Tensor:
-        """Remove rejected draft tokens from the cache, and return the hidden states of the tokens that stay.
+        """Remove rejected draft tokens from the cache. Return the forward's hidden states without theirs.
 
         Args:
             chunk: The chunk, whose cache is changed.
@@ -324,10 +328,16 @@ class Decoder(ActionDecoder):
     def rectify(self, chunk: Chunk, hidden: Tensor, stopwatch: Stopwatch) -> Tensor:
         """After a rejection, let the rectifier predict the missing values of the control step.
 
-        If several values were filled and the chunk goes on, one forward reads their tokens and gives the next token.
+        If the rectifier filled several values and the chunk is not complete, the target reads their tokens in one more
+        forward, which also gives the next token.
+
+        Args:
+            chunk: The chunk that is decoded.
+            hidden: The target's hidden states of this round, from `commit`.
+            stopwatch: Measures the phases.
 
         Returns:
-            `hidden`, the target's hidden states of this round. The states of the additional forward, if any, follow.
+            `hidden`, followed by the hidden states of the additional forward, if there was one.
         """
         last, rectifier = chunk.rounds[-1], self.parts.rectifier
         if rectifier is None or last.accepted == len(last.drafted):

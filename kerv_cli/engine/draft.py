@@ -71,10 +71,10 @@ class Draft:
         return [x for x in (self.tokens, self.parents) if x is not None and x.device != HOST]
 
     def judged(self, remote: Sequence[np.ndarray]) -> TokenTree:
-        """Return the draft as a tree on the CPU, for the acceptance rule.
+        """Return the draft as a tree on the CPU, which an acceptance rule can judge.
 
         Args:
-            remote: The values of `Draft.remote`, copied to the CPU.
+            remote: Copies of the tensors in `Draft.remote` on the CPU.
         """
         return TokenTree.build(*(vector.astype(np.int64).tolist() for vector in remote)) if remote else self.tree
 
@@ -98,7 +98,7 @@ class Draft:
         return None if parents == list(range(ROOT, len(self) - 1)) else ancestors_of(parents)
 
     def positions(self, start: int, before: int, device: torch.device) -> Tensor:
-        """Return the positions (before + n,) of all tokens of a verification.
+        """Return the positions (before + n,) of all tokens of a verification, for the target's positional encoding.
 
         Args:
             start: Position of the first of these tokens.
@@ -114,7 +114,9 @@ class Draft:
         return torch.cat([torch.arange(start, stop, device=device), stop + depths])
 
     def visible(self, before: int) -> np.ndarray | Tensor | None:
-        """Return the attention mask of a verification, (before + n, before + n) bool; None if it is causal.
+        """Return the attention mask of a verification: which of its tokens each token attends to.
+
+        The mask is (before + n, before + n) bool, or None for a causal mask.
 
         Args:
             before: Number of tokens that are forwarded before the draft. Their attention is causal.

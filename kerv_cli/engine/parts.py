@@ -63,16 +63,16 @@ class Rectifier(Protocol):
         """Start a new episode."""
 
     def next_decode(self) -> None:
-        """Note that a decode has ended."""
+        """Learn that a decode has ended. A rectifier may count decodes in which it predicts nothing."""
 
     def close(self, chunk: Chunk) -> bool:
         """Fill the rejected control step with predicted values, if they can be predicted.
 
-        The rectifier calls `Chunk.close`, which drops the later steps, or `Chunk.fill`, after which the target decodes
-        them.
+        The rectifier calls either `Chunk.close`, which drops the later control steps, or `Chunk.fill`, after which the
+        target decodes the later steps.
 
         Returns:
-            Whether it called one of the two. If not, the target decodes on after its own token.
+            Whether the step was filled. If not, the target decodes on after its own token at the rejected position.
         """
 
 
@@ -84,7 +84,7 @@ class Boundary(ABC):
 
     @abstractmethod
     def choose(self, path: np.ndarray) -> Choice:
-        """Return the decision for the next chunk.
+        """Return whether retrieval or the drafter drafts the next chunk.
 
         Args:
             path: Positions (n, 3) of the end effector measured in this episode so far, metres, oldest first.
@@ -104,7 +104,10 @@ class Skip(ABC):
 
     @abstractmethod
     def take(self, chunk: Chunk) -> bool:
-        """Complete the chunk with an unverified draft, if the rule allows it. Return whether it was completed."""
+        """Complete the chunk with an unverified draft, if the rule allows that. Return whether it did."""
 
     def verified(self, chunk: Chunk) -> None:  # noqa: B027
-        """Learn from a verification. Called after the prefill has verified a draft that was not skipped."""
+        """Learn how the target judged the prefill draft.
+
+        Called after the prefill of each chunk that `take` did not complete.
+        """

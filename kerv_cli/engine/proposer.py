@@ -17,7 +17,7 @@ class Proposer:
 
     Attributes:
         name: Name in the records, e.g. `drafter`.
-        nodes: Maximum number of tokens in a draft, for which the cache reserves room; 0 for as many as a chunk has.
+        nodes: Maximum number of tokens in a draft. The cache reserves room for them. 0 for as many as a chunk has.
     """
 
     name = ""
@@ -38,10 +38,10 @@ class Proposer:
 
         Args:
             chunk: The chunk, which already holds the round's committed tokens.
-            first: Index in the chunk of the last token that was committed before the round.
+            first: Index in the chunk of the token just before this round's tokens. `hidden` starts with this token.
             hidden: The target's hidden states (1, T, E) of the chunk's tokens first … first + T − 1.
-            target_tokens: The round's 1 + n target tokens: after the last committed token, then after each of the
-                draft's n nodes, rejected nodes included.
+            target_tokens: The target's prediction after token `first`, then after each of the draft's n nodes, rejected
+                ones included.
         """
 
 

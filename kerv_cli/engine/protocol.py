@@ -16,9 +16,10 @@ from kerv_cli.base.spaces import ActionSpace, Observation
 
 
 class Cache(Protocol):
-    """Keys and values of the tokens that the target has processed, in buffers of `capacity` slots.
+    """Keys and values of the tokens that the target has processed. A slot holds those of one token.
 
-    Slots 0 … length − 1 are filled. `Target.forward` writes its new tokens after them and increases `length`.
+    Slots 0 … length − 1 of `capacity` are filled. `Target.forward` writes its new tokens after them and increases
+    `length`.
     """
 
     length: int
@@ -27,7 +28,7 @@ class Cache(Protocol):
     def compact(self, start: int, slots: Tensor) -> None:
         """Keep the accepted draft tokens and remove the rejected ones.
 
-        The entries at `slots` move to start, start + 1, …, and `length` becomes start + n.
+        The contents of `slots` move to the slots start, start + 1, …, and `length` becomes start + n.
 
         Args:
             start: First slot after the prompt and the committed tokens, which stay where they are.
@@ -87,9 +88,10 @@ class Target(Protocol):
         Args:
             x: Embeddings of the new tokens (B, T, E).
             positions: Position of each new token in the sequence (T,), for the positional encoding.
-            cache: From `new_cache`. The new tokens attend to all cached tokens and are added. None: no earlier tokens.
-            seen: Attention mask (T, T) bool: whether new token i attends to new token j. None for a causal mask. An
-                array, or on a GPU possibly a tensor.
+            cache: From `new_cache`. The new tokens attend to all cached tokens and are added to them. None: no earlier
+                tokens.
+            seen: Attention mask (T, T) bool: whether new token i attends to new token j. None for a causal mask. It is
+                an array, or possibly a tensor if the target is on a GPU.
         """
 
     def head(self, hidden: Tensor) -> Tensor:
@@ -117,7 +119,7 @@ class ContinuesGreedily(Protocol):
             cache: Holds all tokens before `token`.
 
         Returns:
-            The tokens, or None if the target cannot do this in the way it was loaded.
+            The decoded tokens. None if the target, as it was loaded, cannot decode them in one call.
         """
 
 
@@ -145,7 +147,10 @@ class ReadableTarget(Target, Protocol):
         """Floating-point type of the weights."""
 
     def pooled(self, prompt: Tensor) -> Tensor:
-        """Summarise each prompt (B, P, E) in one vector (B, F), the input of the early drafter."""
+        """Summarise each prompt (B, P, E) in one vector (B, F).
+
+        The early drafter, which drafts before the prefill, reads these vectors.
+        """
 
 
 class ParallelTarget(Target, Protocol):

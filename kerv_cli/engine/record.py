@@ -28,13 +28,13 @@ class Round:
 
     Attributes:
         mode: "prefill" (the prompt alone, which gives token 0), "decode" (one token), "verify" (a draft), "skip" (the
-            target did not run) or PARALLEL.
+            target did not run) or "parallel" (one forward gave all tokens).
         proposer: Name of the proposer that drafted, or "none".
         start: Number of tokens committed before this round.
-        drafted: The draft tokens that were judged: the accepted ones and, after a rejection, the rejected candidate
-            that is nearest to the target token.
-        target_tokens: The target's tokens at the same positions. If the whole draft was accepted and the chunk is not
-            full, the bonus (the target's next token) comes after them.
+        drafted: The draft tokens that decided the round: the accepted ones and, if the draft was rejected after them,
+            the rejected token that is nearest to the target's.
+        target_tokens: The target's tokens at the positions of `drafted`. If the whole draft was accepted and the chunk
+            is not full, the bonus (the target's next token) comes after them.
         accepted: Number of accepted draft tokens.
         committed: Number of committed tokens: the accepted ones and the bonus.
         tree_size: Number of draft tokens in the verified tree.
@@ -93,7 +93,7 @@ class DecodeRecord:
 
     @property
     def delay_steps(self) -> int | None:
-        """Number of control steps that passed during the decode; None if the world waited."""
+        """Number of control steps that passed during the decode; None if the world waited for it."""
         return None if self.delay is None else self.delay.steps
 
     @property
@@ -114,7 +114,7 @@ class DecodeRecord:
     def first_rejected(self) -> int | None:
         """Index in the chunk of the first token that the first verification rejected.
 
-        N if it rejected none. None if the decode had no verification.
+        N if that verification rejected no token. None if the decode had no verification.
         """
         for r in self.rounds:
             if r.is_verification:

@@ -29,8 +29,8 @@ def read(*parts: Tensor) -> list[np.ndarray]:
     """Copy several vectors from one device to the CPU in a single transfer, and wait for it.
 
     Args:
-        parts: Vectors (n,), which may have different lengths. If their types differ, all are returned as float64, which
-            holds the integers used here exactly.
+        parts: Vectors, which may have different lengths. If their types differ, all are returned as float64. This is
+            exact, because all integers here are small enough.
 
     Returns:
         One array per vector.

@@ -52,7 +52,7 @@ class TokenTree:
         return len(self.tokens)
 
     def down_from(self, node: int) -> list[int]:
-        """Follow first children from `node` down to a leaf, and return these nodes, `node` first."""
+        """Return the path from `node` down to a leaf, `node` first. At each node it takes the first child."""
         nodes = [node]
         for i in range(node + 1, len(self)):
             if self.parents[i] == nodes[-1]:

@@ -53,7 +53,7 @@ class Use:
 
 @dataclass(frozen=True)
 class MadeFor:
-    """The target that an artifact was made for.
+    """What identifies the target that an artifact was made for.
 
     Attributes:
         sha256: Hash of the target's weights.
@@ -67,7 +67,7 @@ class MadeFor:
 
     @classmethod
     def of(cls, target: TargetDescription) -> MadeFor:
-        """Return the target with this description."""
+        """Return what identifies the target with this description."""
         return cls(target.origin["sha256"], target.actions, target.chunk)
 
     def check_same(self, target: MadeFor, what: str, made: str, again: str) -> None:
@@ -89,11 +89,11 @@ class MadeFor:
 
 
 def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str, again: str) -> None:
-    """Check that an artifact was made from the same artifacts that the policy uses.
+    """Refuse an artifact that was made from another version of an artifact than the policy uses.
 
     Args:
-        sources: Hashes of the artifacts that the artifact was made from, by kind. Kinds that the policy does not use
-            are ignored.
+        sources: Hashes of the artifacts from which it was made, by kind. Kinds that the policy does not use are
+            ignored.
         used: Hashes of the policy's target and artifacts, by kind.
         what: Beginning of the error message, such as `the early drafter in FOLDER was trained`.
         again: What the user should do, for the error message, such as `run 'kerv calibrate' again`.
@@ -165,7 +165,7 @@ class Artifact(Generic[T]):
         return self.checked(path, artifacts.description)
 
     def made_for(self, description: T) -> MadeFor:
-        """Return the target that the artifact was made for."""
+        """Return what identifies the target that the artifact was made for."""
         fields: Any = description
         return MadeFor(fields.target, fields.actions, fields.chunk)
 
@@ -193,7 +193,10 @@ class Artifact(Generic[T]):
         return True
 
     def digest(self, path: Path, description: T) -> str:
-        """Return the artifact's hash. Stored episodes contain the hashes of the artifacts that they used."""
+        """Return a hash of the artifact, by default that of its description.
+
+        Stored episodes contain the hashes of the artifacts that they used.
+        """
         return sha256_of(self.json(path))
 
     def read(self, path: Path) -> T:
@@ -277,8 +280,8 @@ class Artifacts:
             The hashes, by kind, of the target, the artifacts of `kinds` and the further artifacts that they need.
 
         Raises:
-            CheckpointError: An artifact is missing, damaged, made for another target, or made from another artifact
-                than the policy uses.
+            CheckpointError: An artifact is missing, damaged, made for another target, or made from another version of
+                an artifact than the policy uses.
             UsageError: An artifact was not made for this use.
         """
         hashes, sources, todo = {TARGET: self.description.sha256}, [], list(kinds)

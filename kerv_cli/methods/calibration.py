@@ -29,7 +29,7 @@ class Demonstrations:
 
     Attributes:
         sha256: Hash of the demonstrations.
-        tasks: Task -> {"training": number of episodes, "held_out": number of episodes}.
+        tasks: For each task {"training": number of episodes, "held_out": number of episodes}.
     """
 
     sha256: str
@@ -55,7 +55,7 @@ class BoundarySection:
 
     Attributes:
         episodes: Number of episodes that were measured.
-        windows: Number of positions in the boundary's window, as text such as `15` -> the ranges for this window.
+        windows: The ranges, by the number of positions in the boundary's window, as text such as `15`.
     """
 
     episodes: int
@@ -71,13 +71,13 @@ class SkipLevel:
 
     Attributes:
         s_min: A chunk is executed without verification if its similarity is at least this.
-        low: Lowest value that feedback after an episode may move `s_min` to.
-        high: Highest value that feedback after an episode may move `s_min` to.
+        low: Lowest value that `s_min` may reach if it is changed after each episode (success or failure).
+        high: Highest value that it may reach.
         share: Share of the entries whose best neighbour reaches `s_min`.
         entries: Number of entries that were looked up.
         within: Share of good neighbours among those that reach `s_min`. None: none reaches it.
-        error: Mean absolute error of the chunks of these neighbours, in normalised action units. None: none reaches
-            `s_min`.
+        error: Mean absolute error of the chunks of the neighbours that reach `s_min`, in normalised action units. None:
+            none reaches it.
     """
 
     s_min: float
@@ -115,9 +115,9 @@ class Calibration:
         target: The target that was measured.
         demos: The demonstrations.
         window: Number of control steps of history that a predictor sees.
-        noise: Kalman filter (`kalman`, `damped`) -> its noise per DoF.
+        noise: Noise of each Kalman filter per DoF, by the filter's name (`kalman`, `damped`).
         errors: Errors of all predictors on held-out episodes, as described at `Errors`.
-        variability: Task -> its typical kinematic variability K, with the reference level K_S.
+        variability: Typical kinematic variability K of each task, with its reference level K_S.
         boundary: Ranges by which the hybrid boundary scales a path's radius of curvature and length.
         skip: Thresholds at which verification is skipped.
         provenance: How it was made.
@@ -172,7 +172,7 @@ class Calibration:
     def skip_levels(self, task: str, datastore: str) -> tuple[float, float, float]:
         """Return (low, s_min, high): the similarity s_min at which the task skips verification, and its bounds.
 
-        Feedback after an episode may move s_min between the bounds. All three are NEVER if the task never skips.
+        A skip rule may change s_min after each episode, within the bounds. All three are NEVER if the task never skips.
 
         Args:
             task: Full name of the task.
@@ -233,5 +233,5 @@ class CalibrationArtifact(Artifact[Calibration]):
         return all(section for kind, section in sections.items() if kind in kinds)
 
     def made_for(self, description: Calibration) -> MadeFor:
-        """Return the target that the calibration was made for."""
+        """Return what identifies the target that the calibration was made for."""
         return description.target

@@ -93,7 +93,7 @@ class Method:
             )
 
     def _check_skip(self) -> None:
-        """Check that the prefill draft covers whole chunks, if the skip rule can execute it without verification."""
+        """Check that the prefill draft is a whole chunk, if the skip rule may execute it without verification."""
         skip, draft = self.parts["skip"], self.parts["prefill_draft"]
         joined = skip.traits.get("merges") and draft.traits.get("merged")
         if skip.traits.get("takes_draft") and not draft.traits.get("chains") and not joined:

@@ -47,7 +47,7 @@ class DrafterDescription(checkpoint.Description):
 
 @dataclass(frozen=True)
 class Training:
-    """One training of a drafter, in the form that the optimisation loop takes.
+    """All that the optimisation loop needs to train one drafter.
 
     Attributes:
         drafter: The kind of drafter, which defines the loss and the validation.
@@ -83,8 +83,8 @@ class Training:
 class Decodes(Rows):
     """Training examples of a drafter: the tokens that the target decodes greedily from n observations.
 
-    The observations are in the order of their episodes. Each kind of drafter adds the inputs of its network in a
-    subclass.
+    The observations are in the order of their episodes. Each kind of drafter has a subclass that adds the inputs of its
+    network.
 
     Attributes:
         tokens: (n, N) int64, the target's tokens.
@@ -104,13 +104,14 @@ def evenly(steps: np.ndarray, share: float) -> np.ndarray:
 
 
 class TrainableDrafter(Artifact[DrafterDescription]):
-    """Base of the kinds of drafters with weights. `registry.add_drafter` registers a subclass.
+    """Base class of the drafters that are trained, such as the early drafter. A subclass is one kind of drafter.
 
-    A drafter is a folder with its weights in safetensors and a description `<kind>.json`.
+    The subclass defines the network, its training and its proposer. `registry.add_drafter` registers it. A trained
+    drafter is a folder with the weights in safetensors and a description `<kind>.json`.
 
     Attributes:
-        settings: Dataclass of the settings: shapes of the network, and training.
-        any_chunk: Whether one drafter works for any number of control steps per chunk.
+        settings: Dataclass of the settings, which are shapes of the network and parameters of the training.
+        any_chunk: Whether a trained drafter works for any number of control steps per chunk.
     """
 
     schema = DrafterDescription
@@ -169,7 +170,7 @@ class TrainableDrafter(Artifact[DrafterDescription]):
             episode: The episode.
             steps: (n,) control steps of the observations.
             space: Observation space of the demonstrations.
-            columns: The columns `episodes` and `perturbed` of the result.
+            columns: Values of the result's fields `episodes` and `perturbed`.
         """
         raise NotImplementedError
 
@@ -195,7 +196,7 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         """
 
     def objective(self, target: Any, dataset: DemoDataset, settings: Any, progress: OnProgress) -> Training:
-        """Make the examples and a network with initial weights, for the optimisation loop.
+        """Make the training examples and a network with initial weights, and return them for the optimisation loop.
 
         Args:
             target: The loaded target, on the device to train on.

@@ -62,9 +62,10 @@ class JacobiProposer(ChainProposer):
 
         Args:
             chunk: The chunk that is decoded.
-            first: Index in the chunk of the last token that was committed before the round.
+            first: Index in the chunk of the token just before this round's tokens.
             hidden: Not used.
-            target_tokens: The target's tokens at all positions of this round.
+            target_tokens: The target's prediction after token `first`, then after each token of the guess, rejected
+                ones included.
         """
         accepted = len(chunk.tokens) - first - 2
         self.guess = [*target_tokens[accepted + 1 :], *self.guess[len(target_tokens) - 1 :]]

@@ -101,7 +101,10 @@ class MergedProposer(ChainProposer):
         return Draft.of(tree.tokens, tree.parents)
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Return the drafts of all sources. If no source is sure of its draft, the fallbacks' drafts follow."""
+        """Return the drafts of all sources, and those of the fallbacks if they are needed.
+
+        The fallbacks draft if no source expects its whole chunk to be accepted.
+        """
         sources = list(self.sources)
         if not any(source.is_sure(chunk) for source in sources):
             sources += self.fallback

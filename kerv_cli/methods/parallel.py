@@ -45,7 +45,7 @@ def is_parallel(target: object) -> bool:
 
 
 def check_parallel(parts: Mapping[str, Part], parallel: bool) -> None:
-    """Check that a parallel target has skip=parallel and no drafts, and that no other target has skip=parallel.
+    """Check that a method has skip=parallel and no drafts for a parallel target, and no skip=parallel for any other.
 
     Args:
         parts: All parts of the method, by kind.

@@ -21,7 +21,7 @@ def _unnamed() -> dict[str, str | None]:
 class PolicySettings:
     """The policy that chooses the actions.
 
-    The target and the artifacts are named by folders in results/pretrained or results/artifacts, or by paths.
+    Target and artifacts are chosen by the name of a folder in results/pretrained or results/artifacts, or by a path.
     """
 
     kind: str = choice(MODEL, MODEL, EXPERT, help="expert: the environment's scripted policy, without decoding")

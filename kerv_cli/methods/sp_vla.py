@@ -47,7 +47,7 @@ class SpeedSkip(Skip):
     Attributes:
         decoded: For each of the last `buffer` actions, whether the target decoded it.
         executed: Number of actions executed in this episode.
-        by_target: Whether the target decoded the last chunk.
+        by_target: Whether the target decoded the last chunk. If not, the chunk was predicted.
     """
 
     def __init__(self, settings: SpeedSkipSettings, ridge: Ridge) -> None:

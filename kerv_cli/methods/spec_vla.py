@@ -30,7 +30,7 @@ class RelaxedRule(DistanceRule):
     """Accepts a draft token if it is at most r bins from the target's token.
 
     Attributes:
-        strict_dofs: Whether the tokens of strict DoFs, such as the gripper, must be equal.
+        strict_dofs: Whether tokens of strict DoFs, such as the gripper, must equal the target's.
     """
 
     strict_dofs: bool = True

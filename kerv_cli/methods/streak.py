@@ -23,7 +23,8 @@ decoded the chunk, because no further decode without verification was allowed, o
 class StreakSkipSettings:
     """Execute 1, then 2, 4, … drafts without verification, as long as each verified chunk agrees with its draft (§4.5).
 
-    The draft is the prefill draft. If the prefill draft merges several sources, only the first source's draft counts.
+    The executed draft is the prefill draft. If that merges the drafts of several proposers, only the first proposer's
+    draft is executed and compared.
     """
 
     kind: str = "streak"
@@ -42,8 +43,8 @@ class StreakSkip(Skip):
 
     Attributes:
         source: The proposer of the drafts.
-        allowed: Number of decodes that the last verification allowed without verification.
-        left: How many of these decodes are still to come.
+        allowed: Number of unverified decodes that the last verification allowed.
+        left: How many of the allowed decodes are still to come.
         chain: The draft of the current chunk.
     """
 
@@ -89,8 +90,8 @@ class StreakSkip(Skip):
     def _agrees(self, chunk: Chunk) -> bool:
         """Return whether the draft was accepted whole, or differs from the target's tokens by at most `tolerance`.
 
-        The difference is the mean absolute difference, in normalised action units. Strict DoFs, such as the gripper,
-        must be equal. A draft that was not verified does not agree.
+        The difference is the mean absolute difference, in normalised action units. Tokens of strict DoFs, such as the
+        gripper, must be equal. The result is False if the draft was not verified.
         """
         targets = chunk.targets_along(self.chain)
         if targets is None:

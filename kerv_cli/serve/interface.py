@@ -34,14 +34,16 @@ class Interface:
 
     Attributes:
         actions: Action space of the policy.
-        space: Action space of the environment. If kerv does not know the environment, the policy's.
+        space: Action space of the environment. If kerv does not know the environment, this is the policy's action
+            space.
         observation: Observation space of the policy.
         cameras: Names of the images that the policy reads.
         size: Side of an image in pixels. 0 if the policy reads no images.
         privileged: Whether the policy reads the whole simulator state, not only proprioception.
         images_alone: Whether the policy reads images of any size and no state. A message may then leave out the state.
-        gripper: How the gripper's value (0 closed to 1 open) is sent: `as_is`, or a key of OPEN.
-        grip: Actions of the environment that close and that open the gripper. Empty if unknown.
+        gripper: How the gripper's value (0 closed to 1 open) is sent: `as_is`, `signed` (-1 closed, 1 open) or
+            `signed_inverted` (1 closed, -1 open).
+        grip: The environment's action values that close and that open the gripper. Empty if unknown.
     """
 
     actions: ActionSpace
@@ -108,7 +110,7 @@ class Interface:
         return numbers[:few], np.concatenate([numbers, np.zeros(many - len(numbers))])
 
     def converted(self, actions: np.ndarray) -> np.ndarray:
-        """Convert actions to the client's gripper convention.
+        """Convert the gripper's values in actions to the client's convention, the setting `gripper`.
 
         Args:
             actions: (H, D) in environment units.
@@ -143,7 +145,7 @@ def text_of(value: object, key: str) -> str:
 
 
 def hand_of(observation: Observation) -> np.ndarray:
-    """Return the position (3,) of the end effector in metres. Numbers that the observation lacks are zero."""
+    """Return the position (3,) of the end effector in metres. Coordinates that the observation lacks are zero."""
     hand = np.zeros(3)
     hand[: len(observation.proprioception[:3])] = observation.proprioception[:3]
     return hand
@@ -220,7 +222,7 @@ def _array(name: object, shape: Any, data: Any) -> np.ndarray:
         data: The array's bytes.
 
     Raises:
-        UsageError: The dtype is of another kind, or the bytes do not fit shape and type.
+        UsageError: The dtype is no bool, integer or float type, or the bytes do not fit shape and type.
     """
     dtype = _dtype(name)
     try:

@@ -20,7 +20,7 @@ STATE, IMAGE, PROMPT, RESET, EXECUTED = "observation/state", "observation/image"
 
 
 def metadata(policy: Policy) -> dict[str, object]:
-    """Return the metadata that the server sends to a new client."""
+    """Return what the server tells a new client about the policy: cameras, state, actions, limits and chunk length."""
     interface = policy.interface
     return {
         "server": "kerv",
@@ -90,8 +90,8 @@ class OpenPi(Conversation):
         """Return the values of the answer to a client's message: actions (H, D), times, and number of target forwards.
 
         Args:
-            message: The observation. Optional: `executed`, how many of the last actions were executed, and `reset`,
-                which begins a new episode.
+            message: The observation. It may also have `executed`, how many of the last actions were executed, and
+                `reset`, which begins a new episode.
 
         Raises:
             UsageError: A value is missing or wrong.
@@ -125,7 +125,7 @@ class OpenPi(Conversation):
     def _executed(self, message: Message) -> np.ndarray:
         """Return the actions that the robot has executed since the latest answer.
 
-        They are the first `executed` actions of that answer, or all of them if the message has no such value.
+        These are the first `executed` actions of that answer, or all its actions if the message has no `executed`.
         """
         count = message.get(EXECUTED, len(self.last))
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 0 <= count <= len(self.last):

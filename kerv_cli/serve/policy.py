@@ -43,13 +43,13 @@ class Policy:
 
     Attributes:
         chunk: H, number of control steps in an answer.
-        by_task: Whether a decoder depends on the task, because calibrated values differ between tasks. Clients then
-            name the task.
-        range: The states on which the policy may act.
+        by_task: Whether a decoder depends on the task, because the method's calibrated values or drafts do. Clients
+            then name the task.
+        range: The range of states on which the policy may act.
 
     Raises:
         UnknownName: The policy's environment has no task with that name.
-        UsageError: A number is out of range, or parts of the method do not fit together.
+        UsageError: A setting is out of range, parts of the method do not fit together, or a task must be named.
         CheckpointError: There is no such policy, or an artifact belongs to another policy.
     """
 
@@ -93,9 +93,9 @@ class Policy:
         )
 
     def _range(self) -> StateRange:
-        """Return the states on which the policy may act.
+        """Return the range of states on which the policy may act.
 
-        They are not limited if its checkpoint stores no range, or if the policy reads no state.
+        The range is unlimited if the policy's checkpoint stores none, or if the policy reads no state.
         """
         stored, interface = self.description.state_range, self.interface
         names = interface.observation.proprioception
@@ -105,7 +105,11 @@ class Policy:
         return StateRange(low, high, names, self.settings.margin)
 
     def _artifacts_with(self, trait: str) -> list[str]:
-        """Return the kinds of artifacts (trained or calibrated files) that the method uses and that have the trait."""
+        """Return the kinds of the method's artifacts (trained or calibrated files) that have a registered trait.
+
+        Args:
+            trait: Name of the trait, such as `by_task`.
+        """
         return sorted(kind for kind in self.method.needs if find("artifact", kind).traits.get(trait))
 
     def _any_task(self) -> str:
@@ -152,7 +156,7 @@ class Policy:
         return decoder
 
     def facts(self) -> dict[str, object]:
-        """Return what to store beside the policy's results: settings, hashes of its files, machine and versions."""
+        """Return what is stored with each served episode: settings, hashes of the policy's files, and the machine."""
         shared = {setting.name: getattr(self.settings, setting.name) for setting in fields(MethodSettings)}
         settings = asdict(RolloutSettings(**shared))
         settings["runtime"]["device"] = self.artifacts.device
@@ -180,7 +184,11 @@ class StateRange:
         self.low, self.high, self.names = low - added, high + added, names
 
     def check(self, observation: Observation) -> None:
-        """Refuse a state that is out of range, with a UsageError about the first such number."""
+        """Check that a state is in the range.
+
+        Raises:
+            UsageError: A number of the state is out of range. The message names the first one.
+        """
         numbers = observation.state[: len(self.low)]
         for first in np.flatnonzero((numbers < self.low) | (numbers > self.high)).tolist():
             name = self.names[first] if first < len(self.names) else f"number {first}"
@@ -191,7 +199,7 @@ class StateRange:
 
 
 class Finite:
-    """Wrap a target to find out whether its prompts and logits are finite."""
+    """A wrapper of a target that also checks whether its prompts and logits are finite."""
 
     def __init__(self, target: Target) -> None:
         self._target = target
@@ -209,7 +217,7 @@ class Finite:
         return self._noted(self._target.head(hidden))
 
     def _noted(self, numbers: Tensor) -> Tensor:
-        """Check the numbers without waiting for the device. `check` reads the result later."""
+        """Start to check numbers without waiting for the device, and return them. `check` reads the result."""
         self._fine.append(torch.isfinite(numbers).all())
         return numbers
 

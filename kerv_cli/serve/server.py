@@ -1,7 +1,7 @@
 """Serve clients over websockets, whatever their protocol (docs/serving.md).
 
-This module limits the number of clients, drops silent ones and reports errors. A connection stays open after an error.
-The server keeps running after any client.
+This module limits the number of clients, drops silent ones and reports errors. After an error the connection stays
+open. No client can stop the server.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class PolicyServer:
         Args:
             connection: The connection.
             who: The client's address, for the log.
-            times: The time of every answer in milliseconds is added here.
+            times: List to which the milliseconds of every answer are appended.
 
         Raises:
             ConnectionClosed: The client has left.

@@ -58,7 +58,10 @@ def _gripper_format(interface: Interface) -> str:
 
 
 def observation_params(interface: Interface) -> dict[str, object]:
-    """Return arguments for a benchmark that runs the policy's own environment. Its YAML file overrides them."""
+    """Return the arguments that a benchmark should pass to the policy's own environment.
+
+    The benchmark's YAML file overrides them. Empty if the environment is unknown or needs no arguments.
+    """
     if not interface.grip or interface.images_alone:
         return {}
     if not interface.cameras:
@@ -142,11 +145,14 @@ class VlaEval(Conversation):
         return self._message("hello", about)
 
     def _start(self, payload: Message) -> None:
-        """Note that a new episode begins. The first observation builds its decoder and reports what is wrong."""
+        """Note that a new episode begins.
+
+        The decoder is built at the first observation. Errors in this message are reported only then.
+        """
         self.episode = _Episode(payload)  # errors are reported at the first observation
 
     def _observe(self, payload: Message) -> bytes:
-        """Return the next action. Decode an observation first if the last chunk is used up."""
+        """Return the next action. If the last chunk is used up, decode this observation first."""
         episode = self.episode = self.episode or _Episode({})
         numbers = self.interface.numbers(payload.get("state", payload.get("states")), "state", payload)
         state = Observation(*numbers)
@@ -190,7 +196,7 @@ class VlaEval(Conversation):
         return Observation(*numbers, episode.instruction, frames)
 
     def _end(self, payload: Message) -> None:
-        """End the episode. Store it if the benchmark records it."""
+        """End the episode. Store its record if the benchmark records episodes."""
         episode, self.episode = self.episode, None
         metrics, elapsed = payload.get("metrics"), payload.get("elapsed_sec")
         metrics = metrics if isinstance(metrics, dict) else {}

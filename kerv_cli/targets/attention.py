@@ -27,8 +27,8 @@ class Cache:
         capacity: Maximum number of tokens.
         channels: C, channels of a head.
         like: Tensor whose device and number format the cache gets.
-        fixed: Whether every forward attends to all slots, with a mask that hides the unused ones. Then all shapes are
-            fixed, as CUDA graphs require.
+        fixed: Whether every forward attends to all slots, and a mask hides the unused ones. All shapes are then fixed,
+            as CUDA graphs require.
 
     Attributes:
         buffer: (layers, 2, B, A, slots, C) keys and values. A fixed cache has a spare slot after its capacity.
@@ -49,7 +49,7 @@ class Cache:
     def compact(self, start: int, slots: Tensor) -> None:
         """Keep the tokens of an accepted path, and drop the rest of the draft tree.
 
-        The kept entries move to the slots start, start + 1, …. The cache then ends with the last of them.
+        The kept tokens move to the slots start, start + 1, …. The last of them is then the last token in the cache.
 
         Args:
             start: The first slot to write.
@@ -60,7 +60,10 @@ class Cache:
         self.length = start + n
 
     def next_slots(self, tokens: int) -> Slots:
-        """Return the slots for a number of new tokens, the first ones after the cached tokens."""
+        """Return the slots in which the next `tokens` new tokens go, right after the cached tokens.
+
+        A slice, or for a cache of fixed shapes the indices (tokens,).
+        """
         start, stop = self.length, self.length + tokens
         return torch.arange(start, stop, device=self.buffer.device) if self.fixed else slice(start, stop)
 
@@ -99,9 +102,9 @@ def attention_mask(seen: np.ndarray | Tensor | None, tokens: int, cache: Cache |
     """Return the additive attention mask of new tokens: 0 for tokens that are seen, -inf for hidden ones.
 
     Args:
-        seen: (T, M) bool, which of the last M ≥ T tokens each new token attends to. The new tokens are the last T of
-            these M. All cached tokens before the M are seen. None: attention is causal. A tensor must be on the device
-            of `like`.
+        seen: (T, M) bool, which of the last M tokens each new token attends to. M counts the T new tokens and M − T
+            cached ones before them. Each new token attends to all earlier cached tokens. None: attention is causal. A
+            tensor must be on the device of `like`.
         tokens: T, number of new tokens.
         cache: Cache of earlier tokens. None: there are none.
         like: Tensor whose device and number format the mask gets.
@@ -144,7 +147,10 @@ _WARM_UP = 3  # runs before a capture, in which libraries choose kernels and all
 
 
 def bucket(tokens: int) -> int:
-    """Return the size of the smallest graph for this many tokens: a power of two up to 16, then a multiple of 16."""
+    """Return the number of rows of the smallest graph that holds this many tokens.
+
+    It is a power of two up to 16, then a multiple of 16.
+    """
     if tokens <= 16:
         return 1 << (tokens - 1).bit_length()
     return -(-tokens // 16) * 16
@@ -155,7 +161,7 @@ Compute = Callable[[Tensor, Tensor, Cache, Tensor, Tensor], Tensor]
 
 
 class CapturedCache(Cache):
-    """A key/value cache of fixed shapes, with CUDA graphs that replay a whole forward of one stack as one launch.
+    """A key/value cache of fixed shapes, with CUDA graphs that run a forward through all layers in one launch.
 
     A graph takes a fixed number of tokens, called its bucket (1, 2, 4, 8, 16, 32, 48, …). A forward of T tokens runs in
     the smallest bucket that holds them. The unused rows read zeros and write to the spare slot, which no other row

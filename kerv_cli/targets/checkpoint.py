@@ -81,10 +81,10 @@ class TargetDescription(Description):
 
     @property
     def origin(self) -> Mapping[str, Any]:
-        """Mapping that describes the policy whose tokens the target decodes. `sha256` is the hash of its weights.
+        """The policy whose tokens the target decodes, as a mapping. `sha256` is the hash of that policy's weights.
 
-        Usually this policy is the target itself. A grown target (docs/methods.md §0.2) decodes the tokens of the policy
-        that was enlarged. Then `base` is that policy's folder.
+        Usually this policy is the target itself. A grown target (docs/methods.md §0.2) is an enlarged policy and
+        decodes the tokens of the original one. Then `base` is the folder of the original.
         """
         return self.settings.get("grown") or {"sha256": self.sha256}
 
@@ -143,7 +143,7 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, 
 
     Args:
         path: The file.
-        tensors: Name -> tensor.
+        tensors: The tensors, by name.
         metadata: Texts to store in the file. None: no texts.
 
     Raises:
@@ -186,7 +186,7 @@ def compact(state: Mapping[str, Tensor], stored: str) -> dict[str, Tensor]:
     """Convert tensors to the number format in which they are stored.
 
     Args:
-        state: Name -> tensor.
+        state: The tensors, by name.
         stored: float32 changes nothing. float16 converts all floats. int8 converts matrices to integers from -127 to
             127, with a float16 scale per row in `<name>.scale` (the row's largest absolute value / 127), and all other
             floats to float16.
@@ -329,8 +329,8 @@ def load_state(module: nn.Module, folder: Path, kind: str) -> None:
 def read_target(folder: Path) -> TargetDescription:
     """Return the description of a target and check its weights; errors as `read_description`.
 
-    A family whose weights are not in the target's folder registers its own check as the trait `weights`: a function of
-    the folder and the description.
+    A family of targets whose weights are not in the target's folder registers a check of its own as the trait
+    `weights`. This is a function of the folder and the description.
     """
     description = described(folder, "target", TargetDescription)
     family = parts("target").get(description.family)

@@ -61,14 +61,14 @@ class Trial:
         self.target, self.observation = target, observation
 
     def compare(self, fault: str, check: Callable[[Trial], Pairs]) -> str:
-        """Run a check and compare the logits of its pairs.
+        """Run a check, which yields pairs of hidden states, and compare the logits within each pair.
 
         Args:
-            fault: What is wrong if they differ, text for the error message.
+            fault: What is wrong if the logits differ, text for the error message.
             check: The check.
 
         Returns:
-            The largest difference, as text.
+            The largest difference of two logits, relative to their spread, as text.
         """
         worst = 0.0
         for hidden, expected in check(self):
@@ -144,7 +144,7 @@ class Trial:
         yield self.plain(self.tokens[:4]), self.plain(self.tokens)[:, : self.length + 4]
 
     def pieces(self) -> Pairs:
-        """Check that tokens in several forwards with a cache have the same hidden states as in one forward."""
+        """Check that tokens get the same hidden states in several forwards with a cache as in one forward."""
         for lengths in ([1] * 6, [1, 5, 3]):
             cache, rest = self.new_cache(), iter(self.tokens)
             self.append(self.prompt, cache)
@@ -166,7 +166,7 @@ class Trial:
     def draft_tree(self) -> Pairs:
         """Check that a node of a draft tree has the same hidden state as in a forward of only its own path.
 
-        The tree is forwarded after cached tokens, and together with the prompt, for methods that draft before the
+        The tree is forwarded twice: after cached tokens, and together with the prompt, as with a draft before the
         prefill.
         """
         after = self.forward_tree()[1][:, 1:]

@@ -67,7 +67,7 @@ def check_not_shipped(path: Path, word: str) -> None:
         word: Setting that chooses another folder, such as `policy.artifacts.scout`. Text for the error message.
 
     Raises:
-        UsageError: The folder exists, belongs to a shipped policy, and was not made by a training of the user.
+        UsageError: The folder exists and belongs to a shipped policy, and the user has not trained its artifact.
     """
     made_here = (path / RESUME).is_file()
     if path.exists() and (path.parent / "target" / "target.json").is_file() and not made_here:

@@ -114,9 +114,10 @@ def _grown_layer(old: Layer | None, stack: LayerStack, shape: GrowSettings, gene
 
 
 def _head_rows(heads: int, channels: int, wide: int) -> Tensor:
-    """Return for each channel of the old heads its index among the channels of the new heads, (heads · channels,).
+    """Return the index that each channel of the old heads gets among the channels of the new heads.
 
-    A channel must keep its rotary frequency: pair i of the old head becomes pair i · wide / channels.
+    The result is (heads · channels,). A channel must keep its rotary frequency. So the pair of channels i of an old
+    head becomes pair i · wide / channels.
 
     Args:
         heads: Number of old heads.

@@ -34,7 +34,7 @@ def token_loss(logits: Tensor, tokens: Tensor, labels: Tensor) -> Tensor:
 
 
 def position_loss(estimated: Tensor, places: Tensor) -> Tensor:
-    """Return half the smooth L1 loss of positions (B, K, 3) in metres, computed in units of 2 cm.
+    """Return half the smooth L1 loss of positions (B, K, 3) in metres. Errors are measured in units of 2 cm.
 
     Args:
         estimated: Estimated positions.

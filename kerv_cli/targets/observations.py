@@ -69,7 +69,7 @@ class Observations(Rows):
     steps: Tensor
 
     def inputs(self, indices: Tensor, device: torch.device) -> Inputs:
-        """Return the observations at indices (B,) as a batch on a device. Their images are decoded."""
+        """Return the observations at indices (B,) as a batch on a device, with decoded images."""
         images = None
         if self.frames is not None:
             images = torch.from_numpy(self.frames[indices].pixels()).to(device).permute(0, 3, 1, 2)

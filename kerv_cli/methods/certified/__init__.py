@@ -26,13 +26,13 @@ class CertifiedSkipSettings:
 
 @dataclass
 class ScopedSettings:
-    """On the certificate's tasks, draft with the certified source. On other tasks, draft with `outside`."""
+    """On the certificate's tasks, draft with the certified proposer. On other tasks, draft with `outside`."""
 
     kind: str = "scoped"
     outside: str = "merged"  # prefill draft on other tasks
 
     def check_together(self, prefix: str) -> None:
-        """Refuse a draft `outside` that cannot draft whole chunks before the prefill.
+        """Refuse a proposer `outside` that cannot draft whole chunks before the prefill.
 
         Raises:
             UsageError: `outside` cannot draft whole chunks before the prefill.
@@ -47,9 +47,9 @@ class ScopedSettings:
 
 
 def _needs(settings: ScopedSettings) -> tuple[str, ...]:
-    """Return the kinds of artifacts needed: the certificate, and what the draft `outside` needs.
+    """Return the kinds of artifacts needed: the certificate, and those of the proposer `outside`.
 
-    `CertificateArtifact.needs` adds what the certified draft needs.
+    `CertificateArtifact.needs` adds those of the certified proposer.
     """
     outside = part_of("prefill_draft", settings.outside)
     return "certificate", *outside.needs(outside.default)

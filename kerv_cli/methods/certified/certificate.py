@@ -1,4 +1,4 @@
-"""The certificate of success, and the skip rule and the draft that apply it (docs/methods.md §4.6, ours).
+"""The certificate of success, and the skip rule and the proposer that apply it (docs/methods.md §4.6, ours).
 
 A certificate covers some tasks. A decoder has one task. Whether the certificate covers this task is checked once, when
 the decoder is built.
@@ -41,8 +41,8 @@ class Candidate:
         won: Number of pairs that only the candidate solved.
         p: p-value of the hypothesis that the candidate loses the margin or more. None: not tested, because an earlier
             candidate failed.
-        draft: Settings of the prefill draft, which the rule executes. Old certificates do not store them. Their draft
-            was the scout, a drafter that reads the image itself.
+        draft: Settings of the proposer whose drafts the rule executes. Old certificates do not store them. Their drafts
+            were those of the scout, a drafter that reads the image itself.
     """
 
     label: str
@@ -57,12 +57,12 @@ class Candidate:
 
     @property
     def rule(self) -> Any:
-        """Settings of the skip rule."""
+        """Settings of the skip rule, as the dataclass of this rule."""
         return _part_settings("skip", self.skip)
 
     @property
     def source(self) -> Any:
-        """Settings of the prefill draft."""
+        """Settings of the proposer whose drafts, made before the prefill, the skip rule executes."""
         return _part_settings("prefill_draft", self.draft)
 
 
@@ -75,14 +75,14 @@ class Attempt:
     """Summary of one test of a policy. Each certificate lists the policy's earlier tests.
 
     Attributes:
-        made: When, ISO 8601. Empty: not recorded.
+        made: Time of the test, ISO 8601. Empty: not recorded.
         test: Hash of the test's set-up: `Certificate.test`.
         order: Labels of the candidates in the order of the tests.
         seeds: Seeds of the episodes, as text such as `1000-1049;1100`.
         margin: Percentage points of success that may be lost.
         delta: Level of the test: an upper bound of the probability that it certifies falsely.
         pairs: Number of pairs of episodes.
-        certified: Label of the boldest certified candidate. Empty if there was none.
+        certified: Label of the boldest certified candidate. Empty if none was certified.
     """
 
     made: str
@@ -96,7 +96,7 @@ class Attempt:
 
     @property
     def seeds_served(self) -> set[int]:
-        """Seeds of the episodes, as numbers."""
+        """Seeds of the test's episodes, as numbers."""
         ends = ([int(end) for end in part.split("-")] for part in self.seeds.split(";"))
         return {seed for part in ends for seed in range(part[0], part[-1] + 1)}
 
@@ -111,8 +111,8 @@ class Certificate:
         chunk: Number of control steps per chunk.
         environment: Name of the environment.
         tasks: Full names of the tasks.
-        drafts: Hashes of the artifacts that drafted, by kind.
-        method: Settings of the method's parts except draft and skip rule, by kind.
+        drafts: Hashes of the artifacts that made the drafts, by kind.
+        method: Settings of the method's parts, by kind. Prefill draft and skip rule are in `candidates` instead.
         world: Camera and horizon (maximum episode length).
         dtype: Number format of the models.
         margin: Percentage points of success that may be lost.
@@ -121,7 +121,7 @@ class Certificate:
         candidates: All candidates in the order of the tests, from cautious to bold.
         chosen: Index of the boldest certified candidate. None: no candidate was certified.
         provenance: How it was made.
-        made: When, ISO 8601. Empty in certificates of older versions.
+        made: Time of the test, ISO 8601. Empty in certificates of older versions.
         earlier: All earlier tests of the same policy, the first one first.
     """
 
@@ -145,7 +145,7 @@ class Certificate:
 
     @property
     def risk(self) -> float:
-        """Upper bound of the probability that this test or an earlier one of this policy certified falsely."""
+        """Upper bound of the probability that this test, or any earlier test of this policy, certified falsely."""
         return self.delta + sum(one.delta for one in self.earlier)
 
     @property
@@ -237,7 +237,7 @@ class CertificateArtifact(Artifact[Certificate]):
     schema = Certificate
 
     def made_for(self, description: Certificate) -> MadeFor:
-        """Return the target that was certified. Its chunk length is checked later, when the decoder is built."""
+        """Return what identifies the certified target. Its chunk length is checked later, when the decoder is built."""
         return MadeFor(description.target, description.actions)
 
     def sources(self, description: Certificate) -> Mapping[str, str]:
@@ -245,7 +245,7 @@ class CertificateArtifact(Artifact[Certificate]):
         return description.drafts
 
     def check_use(self, description: Certificate, use: Use) -> None:
-        """Refuse an environment, camera or horizon that was not certified, and on certified tasks another method.
+        """Refuse an environment, camera or horizon that was not certified. On certified tasks, refuse other methods.
 
         A stressed world is allowed, although the certificate says nothing about stress.
 
@@ -278,7 +278,7 @@ def covering(context: Context) -> Certificate | None:
 
 
 def scoped(settings: ScopedSettings, context: Context) -> Proposer:
-    """Build prefill_draft=scoped: the certified draft on the certificate's tasks, else the draft `outside`."""
+    """Build prefill_draft=scoped: on the certificate's tasks the certified proposer, else the proposer `outside`."""
     certificate = covering(context)
     if certificate is not None and certificate.certified is not None:
         source = certificate.certified.source

@@ -65,7 +65,7 @@ class EagleNetwork(LayerStack):
         return self.fuse(torch.cat(inputs, -1))
 
     def draft_position(self, index: int) -> int:
-        """Return the rotary position of a drafted token. `index` is its place in the sequence, prompt included."""
+        """Return the rotary position for position `index` of the sequence (prompt included), where drafting begins."""
         return index
 
     def forward(
@@ -106,7 +106,7 @@ class DrafterProposer(Proposer):
 
     Attributes:
         depth: Maximum number of tokens on a path.
-        top_k: Number of nodes expanded per depth, and of children of each. 1 drafts a chain.
+        top_k: Number of nodes per depth that get children, and number of children of each. 1 drafts a chain.
         nodes: Maximum number of nodes. The most probable nodes are kept.
         cache: Keys and values of the drafter, for all committed positions except the last.
         hidden: (E,) predicted hidden state. The target's head computes the first draft token from it.
@@ -124,7 +124,7 @@ class DrafterProposer(Proposer):
         self.compiled = drafter.compiled_chain(target) if isinstance(drafter, EagleNetwork) else None
 
     def begin(self, chunk: Chunk) -> None:
-        """Run the drafter over the prompt's hidden states and embeddings, after the prefill."""
+        """Let the drafter read the prompt: run it over the prompt's embeddings and the prefill's hidden states."""
         self.observe(torch.cat([chunk.prompt[:, 1:], self.embed(chunk.tokens)], 1), chunk.hidden, 0)
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
@@ -133,11 +133,11 @@ class DrafterProposer(Proposer):
         return Draft(self.chain(min(depth, self.nodes))) if self.top_k == 1 else self.tree(depth)
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
-        """Run the drafter over the hidden states that this round added to the committed tokens.
+        """Let the drafter read the newly committed tokens: run it over their embeddings and the target's hidden states.
 
         Args:
             chunk: The chunk that is decoded.
-            first: Index in the chunk of the last token that was committed before the round.
+            first: Index in the chunk of the token just before this round's tokens. `hidden` starts with this token.
             hidden: (1, T, E) the target's hidden states of the chunk's tokens first … first + T − 1.
             target_tokens: Not used.
         """
@@ -148,14 +148,14 @@ class DrafterProposer(Proposer):
         return self.target.embed(upload([tokens], self.target.device))
 
     def observe(self, following: Tensor, hidden: Tensor, first: int) -> None:
-        """Run the drafter over the target's own hidden states, so that the next draft begins after them.
+        """Run the drafter over hidden states of the target, so that the next draft begins after them.
 
-        In the drafter's cache, their positions replace those of the last draft.
+        The last draft's tokens are removed from the drafter's cache.
 
         Args:
             following: (1, T, E) embedding of the token after each position.
             hidden: (1, T, E) the target's hidden states at the positions first, first + 1, …
-            first: The first position, counted from the prompt's beginning.
+            first: The position of the first hidden state, counted from the prompt's beginning.
         """
         self.cache.length = first
         positions = torch.arange(first, first + hidden.shape[1], device=hidden.device)
@@ -296,7 +296,7 @@ class EagleDrafter(TrainableDrafter):
         return EagleExamples(tokens, **columns, lengths=torch.tensor(lengths), prompt=prompts, hidden=hidden)
 
     def loss(self, training: Training, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Return the mean loss over the `unroll` passes, and the token loss of each pass to log.
+        """Return the mean loss over the drafter's passes (setting `unroll`), and the token loss of each pass to log.
 
         Args:
             training: The training.

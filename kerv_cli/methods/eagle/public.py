@@ -85,7 +85,7 @@ class PublicDrafter(nn.Module):
         return DraftCache(*sizes, weight, weight.is_cuda if fixed is None else fixed)
 
     def draft_position(self, index: int) -> int:
-        """Return the rotary position of a drafted token. `index` is its place in the sequence, prompt included."""
+        """Return the rotary position for position `index` of the sequence (prompt included), where drafting begins."""
         return index - self.shape.skipped * (self.shape.convention.positions == "text")
 
     def forward(
@@ -102,7 +102,7 @@ class PublicDrafter(nn.Module):
             following: (B, T, E) embedding of the token after each position.
             hidden: (B, T, E) hidden state at each position.
             positions: (T,) rotary positions.
-            cache: Keys and values of earlier positions. If the cache is empty, `hidden` must be that of the whole
+            cache: Keys and values of earlier positions. If it is empty, `hidden` must have the states of the whole
                 prompt. None: there are no earlier positions.
             seen: (T, M) bool, which of the last M keys each query sees. None: causal.
         """

@@ -186,7 +186,7 @@ class EarlyProposer(ChainProposer):
         return self._drafted[1:]
 
     def row(self, chunk: Chunk, radius: int) -> Tensor:
-        """Draft a chunk for an acceptance radius in bins.
+        """Draft the tokens of a chunk that are most likely to be accepted with an acceptance radius in bins.
 
         Returns:
             (N + 1,) float64: the N tokens, then the estimated probability that all of them are accepted.
@@ -227,7 +227,7 @@ class EarlyDrafter(TrainableDrafter):
     def decoded(
         self, target: Any, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace, columns: dict[str, Tensor]
     ) -> Decodes:
-        """Decode observations of an episode. Keep only the pooled prompts, because whole ones would fill the memory."""
+        """Decode observations of an episode. Keep only pooled prompts, because whole prompts would fill the memory."""
         prompts = list(prompts_of(target, observations_of(target, episode, steps, space)))
         features = torch.cat([target.pooled(prompt).half().cpu() for prompt in prompts])
         tokens = torch.cat([greedy(target, prompt)[0].cpu() for prompt in prompts])
@@ -272,7 +272,7 @@ class EarlyDrafter(TrainableDrafter):
         return {"score": score, **metrics, **self.further_metrics(training, *rest)}
 
     def further_metrics(self, training: Training, *outputs: Tensor) -> Metrics:
-        """Return metrics of the network's outputs after the logits. The early drafter has no such outputs."""
+        """Return metrics of the network's outputs other than the logits. The early drafter has no such outputs."""
         return {}
 
 
@@ -282,7 +282,7 @@ def _labels(tokens: int, sigma: float, device: torch.device) -> Tensor:
 
 
 def measure(logits: Tensor, examples: Decodes, strict: Tensor) -> Metrics:
-    """Measure how much of the drafts would be accepted, at the radii 0, 3 and 9.
+    """Estimate how many draft tokens would be accepted, at the acceptance radii 0, 3 and 9.
 
     A draft is accepted up to its first token that is not within the radius of the target's greedy token. This
     approximates relaxed acceptance, in which the target's later tokens depend on the accepted draft tokens.
@@ -293,7 +293,8 @@ def measure(logits: Tensor, examples: Decodes, strict: Tensor) -> Metrics:
         strict: (N,) bool, tokens that must equal the target's.
 
     Returns:
-        The mean number of accepted tokens and the share of chunks accepted whole, per radius, and the token accuracy.
+        For each radius the mean number of accepted tokens and the share of drafts that are accepted whole. Also the
+        token accuracy: the share of the drafter's most probable tokens that equal the target's.
     """
     kinds = [mask for mask in (examples.perturbed, ~examples.perturbed) if mask.any()]
 

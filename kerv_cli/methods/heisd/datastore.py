@@ -66,8 +66,8 @@ class Manifest:
         actions: The target's action space.
         target: Hash of the target's weights.
         demos: Hash of the demonstrations.
-        files: Name -> hash of each file beside the manifest.
-        tasks: Full name of the task -> its rows and seeds.
+        files: Hash of each file beside the manifest, by name.
+        tasks: Rows and seeds of each task, by the task's full name.
         provenance: How it was made.
     """
 
@@ -127,7 +127,7 @@ def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
     """Refuse seeds that are not training seeds. Otherwise retrieval would know the evaluation's initial states.
 
     Args:
-        seeds: Full name of the task -> seeds of its episodes.
+        seeds: Seeds of each task's episodes, by the task's full name.
         where: The folder, for the error message.
 
     Raises:
@@ -144,7 +144,7 @@ def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
 
 
 class Index(Protocol):
-    """A search for the rows whose keys are most similar to a key. The function `best` then ranks these rows."""
+    """A search for stored rows with keys most similar to a given key. The function `best` then ranks the rows found."""
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
         """Return the row numbers of the task's k most similar entries, and possibly of more, in ascending order.
@@ -268,7 +268,7 @@ class Datastore:
         return self.shards
 
     def pooled(self, prompt: Tensor, target: ReadableTarget) -> Tensor:
-        """Average the tokens of each segment of the prompt that keys are made from. `key_of` makes the key from this.
+        """Average the prompt's tokens over each segment that keys are made from. `key_of` turns the result into a key.
 
         Args:
             prompt: (1, P, E) encoded prompt.

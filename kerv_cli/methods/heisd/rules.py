@@ -114,11 +114,11 @@ def _weight(members: int) -> float:
 
 
 class _Continuations:
-    """Lists the kinematic groups that may follow the groups chosen so far.
+    """Lists the kinematic groups that may come next on a path of the tree, after the groups chosen so far.
 
-    A neighbour is a stored chunk. Two bit sets of neighbours describe the chosen groups. `last`: the neighbours whose
-    chunk contains the last chosen group. `whole`: the neighbours whose chunk contains every chosen group. If no
-    neighbour contains all of them, `whole` is set to `last`.
+    A neighbour is a stored chunk. Two bit sets of neighbours describe the chosen groups. `last` has the neighbours
+    whose chunk contains the last chosen group. `whole` has those whose chunk contains every chosen group. If there are
+    none, `whole` is set to `last`.
 
     Args:
         rows: Tokens of each neighbour's chunk, most similar neighbour first.
@@ -226,7 +226,7 @@ class HybridProposer(Proposer):
         return cls(EagleDrafter.proposer(settings, context), RetrievalProposer.build(settings, context))
 
     def begin(self, chunk: Chunk) -> None:
-        """Select the proposer that the boundary chose for this chunk, and pass the prefill's results to it."""
+        """Select the proposer that the boundary chose for this chunk, and let it begin the chunk."""
         assert chunk.choice is not None, "a hybrid proposer needs a boundary"
         self.chosen = self.proposers[chunk.choice.mode]
         self.name = self.chosen.name
@@ -237,7 +237,7 @@ class HybridProposer(Proposer):
         return self.chosen.propose(chunk, depth)
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
-        """Pass the newly committed tokens to the selected proposer."""
+        """Let the selected proposer learn from the round; arguments as `Proposer.committed`."""
         self.chosen.committed(chunk, first, hidden, target_tokens)
 
 
@@ -303,9 +303,9 @@ def by_proposer(settings: HybridAcceptanceSettings, context: Context) -> HybridR
 class VerifySkip(Skip):
     """Executes the most similar stored chunk without verification if its similarity is at least s_min.
 
-    At most `max_skips` chunks in a row are executed like this. If the method has a boundary, the boundary must choose
-    retrieval. Once a chunk that reaches the end of its stored episode was executed like this, the other chunks of that
-    stored episode are not, until the next episode begins.
+    At most `max_skips` chunks in a row are executed without verification. If the method has a boundary, the boundary
+    must choose retrieval. Once a stored episode has been executed to its end, none of its chunks is executed without
+    verification again in the same episode of the robot.
 
     With `up` or `down` above 0, s_min changes after each episode. A failure raises it by `up` times the calibrated
     range (high − low), a success lowers it by `down` times the range. Then results depend on the order of the episodes.
@@ -319,7 +319,8 @@ class VerifySkip(Skip):
         Args:
             settings: Settings of skip=similarity.
             retrieval: Finds the most similar stored chunks.
-            levels: The task's (low, s_min, high), as cosines. Feedback moves s_min between low and high.
+            levels: The task's (low, s_min, high), as cosines. s_min may change after each episode, between low and
+                high.
         """
         self.settings, self.retrieval = settings, retrieval
         self.low, self.s_min, self.high = levels
@@ -339,7 +340,7 @@ class VerifySkip(Skip):
         return cls(settings, retrieval, context.calibration.skip_levels(context.task, manifest.content))
 
     def begin(self, task: str, seed: int) -> None:
-        """Begin an episode: count skips from 0, and forget which stored episodes were followed to their end."""
+        """Begin an episode: count skips from 0, and forget which stored episodes were executed to their end."""
         self.in_a_row = 0
         self.ended.clear()
 
@@ -426,7 +427,7 @@ class BoundaryRanges:
 
     @classmethod
     def fit(cls, paths: Iterable[np.ndarray], window: int) -> BoundaryRanges:
-        """Measure the ranges over all windows that a decoder would see, including short ones when an episode begins.
+        """Measure the ranges over all windows that a boundary would see, including short ones when an episode begins.
 
         Args:
             paths: Measured hand positions of each episode, (T, 3) metres.
@@ -472,8 +473,8 @@ class BoundaryRanges:
 class Random(Boundary):
     """Chooses retrieval with probability p, else the drafter: a baseline that does not look at the path.
 
-    With p = 1 retrieval drafts all chunks, with p = 0 the drafter does. An episode's random numbers depend only on the
-    boundary's seed, the task's full name and the episode's seed.
+    With p = 1 retrieval drafts all chunks, with p = 0 the drafter drafts all. An episode's random numbers depend only
+    on the boundary's seed, the task's full name and the episode's seed.
     """
 
     def __init__(self, p: float, seed: int = 0) -> None:

@@ -175,7 +175,11 @@ class Kinematic:
         self.r, self.last = self.falling(self.k_s), self.k_s
 
     def falling(self, x: float) -> float:
-        """Return r_min + (r_max − r_min) · exp(−(x / K_S)^φ), for x in normalised action units."""
+        """Return a radius that falls as x grows: r_min + (r_max − r_min) · exp(−(x / K_S)^φ).
+
+        Args:
+            x: A variability or its change, in normalised action units.
+        """
         s = self.settings
         return falling(s.r_min, s.r_max, x / self.k_s, s.phi)
 

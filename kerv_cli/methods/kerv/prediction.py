@@ -43,10 +43,10 @@ class Noise:
 
 @functools.lru_cache(maxsize=64)
 def filter_state(ratio: float, window: int, damping: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the state of a Kalman filter as a linear function of the last actions.
+    """Return the weights by which a Kalman filter's state depends on the last actions.
 
-    The state is [action, velocity]. The filter begins at the first action with the state [a₀, 0] and the covariance
-    r · I. For each further action it predicts and updates once.
+    The state is [action, velocity]. The filter begins at the first action with the state [a₀, 0] and the covariance r ·
+    I. For each further action it predicts and updates once.
 
     Args:
         ratio: q / r, process noise by measurement noise.
@@ -134,7 +134,7 @@ class Predictor:
         return weights
 
     def _table(self, window: int) -> np.ndarray:
-        """Return the weights (D, horizon, window) for all DoFs."""
+        """Return the weights (D, horizon, window) of all DoFs, for this number of past actions."""
         last = Predictor.weights(self, 0, window)
         return np.stack([last if self.held[dof] else self.weights(dof, window) for dof in range(self.dofs)])
 
@@ -283,7 +283,7 @@ class Compensation:
     - `steps` (the paper's predict length PL) lets the prediction fill further control steps.
     - `predictor=draft` (ours) fills with the rejected draft's remaining tokens first. A draft was made from the
       observation, a prediction only from past actions.
-    - `rest` is the number of decodes without compensation after each compensation.
+    - `rest` is the number of decodes after each compensation in which nothing is compensated.
     """
 
     def __init__(self, settings: CompensateSettings, predictor: Predictor) -> None:
@@ -306,7 +306,7 @@ class Compensation:
         self.resting = 0
 
     def next_decode(self) -> None:
-        """Count a finished decode, for the setting `rest`."""
+        """Count a finished decode. The setting `rest` needs the count."""
         self.resting = max(0, self.resting - 1)
 
     def close(self, chunk: Chunk) -> bool:
@@ -337,12 +337,12 @@ def assemble(
 ) -> np.ndarray | None:
     """Assemble the actions of a compensated chunk: known tokens, then drafted tokens, then predictions.
 
-    `settings.steps` control steps are filled, beginning with the step in which the known tokens end. One step fewer is
-    filled if fewer than `min_verified` DoFs of that step are known (with `drop`, if none is known), unless it is the
-    chunk's first step.
+    `settings.steps` control steps are filled, beginning with the step in which the known tokens end. If too few DoFs of
+    that step are known, one step fewer is filled. Too few means fewer than `min_verified`, or none with `drop`. In the
+    chunk's first step any number is enough.
 
     Args:
-        tokens: Known tokens of the chunk: accepted, or the target's.
+        tokens: Known tokens of the chunk: accepted draft tokens and tokens of the target.
         chunk: The chunk.
         predictor: Predicts the actions that are still missing.
         settings: Settings of the compensation.

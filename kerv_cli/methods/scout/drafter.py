@@ -90,8 +90,8 @@ class ScoutNetwork(Packable):
         """Encode the images and the instructions of observations.
 
         Returns:
-            The proprioception, the mean word embedding of the instruction, and for each camera view the features of its
-            cells and its image points.
+            The proprioception, the mean word embedding of the instruction, and two tensors for each camera view:
+            features of the cells (of the encoder's grid over the view), and image points.
         """
         assert inputs.images is not None
         views = [stem(image) for stem, image in zip(self.stems, inputs.images.split(self.size, -1), strict=True)]
@@ -103,7 +103,7 @@ class ScoutNetwork(Packable):
         Args:
             proprioception: (B, p) proprioception.
             words: (B, word width) mean word embedding of the instruction.
-            views: For each camera view, the features of its cells and its image points, as from `views`.
+            views: For each camera view its features and its image points, as the method `views` returns them.
 
         Returns:
             Features (B, F), and positions (B, K, 3) in metres.
@@ -120,7 +120,7 @@ class ScoutNetwork(Packable):
         return self.drafter.logits(features.to(self.drafter.head.weight.dtype)), places
 
     def pack_weights(self) -> Program | None:
-        """Return the network without its vision encoders as a compiled `Program`. None if it is not float32."""
+        """Return the network without its vision encoders as a compiled `Program`. None if weights are not float32."""
         s = self.settings
         of_view = (1, s.grid**2, s.cell_width), (1, 2 * s.keypoints)
         shapes = [(1, len(self.observation.proprioception)), (1, s.word_width), *of_view * len(self.stems)]

@@ -28,7 +28,10 @@ def mlp(*widths: int) -> nn.Sequential:
 
 
 def relative(vector: Tensor) -> Tensor:
-    """Return the features (…, 6) of vectors (…, 3) in metres: vector / 0.1 m, then tanh(vector / 0.02 m)."""
+    """Return the features (…, 6) of vectors (…, 3) in metres.
+
+    The first three are vector / 0.1 m, the others tanh(vector / 0.02 m).
+    """
     return torch.cat([vector / COARSE, torch.tanh(vector / FINE)], -1)
 
 
@@ -71,7 +74,7 @@ def privileged_features(proprioception: Tensor, states: Tensor, space: Observati
     Args:
         proprioception: (B, p).
         states: (B, s) privileged states.
-        space: Says which numbers of the state these are.
+        space: Says where the state has its extra numbers, velocities and extra places.
     """
     hand, last = proprioception[:, :3], position(states, space.places[-1])
     parts = [states[:, list(space.extra)]]

@@ -290,7 +290,7 @@ def elementwise(code, frame, columns, numbers, indices):
     Args:
         code: The operation, such as ADD.
         frame: (size,) float32.
-        columns: Its line in the table of operations, see `recording.COLUMNS`.
+        columns: The operation's line in the table of operations, see `recording.COLUMNS`.
         numbers: Constants of all operations.
         indices: Places that GATHER operations copy from.
     """
@@ -351,7 +351,7 @@ def run(ops, times, last, indices, numbers, frames, positions, start, cache, mas
     Args:
         ops: (operations, columns) int64, see `recording.COLUMNS`.
         times: Number of executions.
-        last: Number of operations in the last execution. The others only prepare a next execution.
+        last: Number of operations in the last execution. It leaves out those that only prepare a further execution.
         indices: Places (indices in a frame) that GATHER operations copy from.
         numbers: Constants of all operations.
         frames: (B · T, size) float32, one frame (memory) per row. They hold the inputs, and afterwards the outputs.

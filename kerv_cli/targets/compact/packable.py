@@ -57,7 +57,7 @@ class Packable(nn.Module):
 
 
 class PackableLinear(Packable, nn.Linear):
-    """A linear layer that is compiled by itself, not as a part of a larger module. For example an output head."""
+    """A linear layer that is compiled by itself, not as a part of a larger module. An example is an output head."""
 
     def pack_weights(self) -> Any:
         """Return the layer as a compiled `Program`. None if its weights are not float32."""

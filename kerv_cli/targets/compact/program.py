@@ -73,7 +73,8 @@ class Matrix:
     Attributes:
         values: (panels, inputs, PANEL) weights.
         factors: (panels, 2, PANEL) scale and bias of every output.
-        columns: Entries of the table of operations that locate this matrix (see `recording.COLUMNS`).
+        columns: Size, number format and addresses of the matrix, as entries of an operation in the table of operations
+            (see `recording.COLUMNS`).
         nbytes: Bytes of the weights.
     """
 
@@ -188,7 +189,7 @@ class Program:
         Args:
             times: Number of executions.
             inputs: Inputs of the first execution, one token of each of B sequences.
-            cache: Keys and values of earlier tokens. Each execution writes those of one more token after them, but
+            cache: Keys and values of earlier tokens. Each execution appends the keys and values of one more token, but
                 `cache.length` stays as it is.
 
         Returns:

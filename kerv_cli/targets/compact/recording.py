@@ -111,12 +111,12 @@ class Recorded:
         return sum(others, start=first) / self.shape[1]
 
     def argmax(self, dim: int) -> Recorded:
-        """Return the index (1,) of the greatest element among all of them. `dim` must be -1."""
+        """Return the index (1,) of the greatest of all elements. `dim` must be -1."""
         assert dim == -1
         return self.tape.emit(ARGMAX, (1,), [self], self.place.numel())
 
     def attend(self, heads: int, cos: Tensor, sin: Tensor) -> Recorded:
-        """Record the attention of the next layer. This value holds q, k and v (…, 3 E), not yet rotated.
+        """Record the attention of the next layer. This value holds queries, keys and values (…, 3 E), not yet rotated.
 
         Args:
             heads: Number of attention heads.
@@ -139,8 +139,8 @@ class Tape:
         ops: One dictionary per operation, with the names in COLUMNS as keys.
         numbers: Constant arrays, such as norm gains.
         indices: Places that GATHER operations copy from.
-        begins: The first place of every register, then the place where the next register will begin.
-        cache: Number of layers that attend, heads of a layer, channels of a head.
+        begins: The first place of every register. The last entry is where the next register will begin.
+        cache: Three numbers for the cache: layers with attention, heads of a layer, channels of a head.
     """
 
     def __init__(self) -> None:
@@ -187,7 +187,7 @@ class Tape:
         return out
 
     def lined(self, x: Recorded, width: int) -> tuple[Recorded, int, int]:
-        """Make the rows of a value contiguous and equally spaced in the frame, with a copy if necessary.
+        """Return a value whose rows are contiguous and equally spaced in the frame: the value itself, or a copy.
 
         Args:
             x: The value.
@@ -223,7 +223,7 @@ class Tape:
         return self.emit(code, shape, inputs, shape.numel(), numbers) if shape.numel() else inputs[0]
 
     def placed(self, values: Any) -> int:
-        """Store constants, and return the index of the first one among all `numbers`. Equal arrays are stored once."""
+        """Store constants, and return the index of the first one among all constants. Equal arrays are stored once."""
         array, first = torch.as_tensor(values, dtype=torch.float32).detach().flatten().numpy(), 0
         for known in self.numbers:
             if np.array_equal(known, array):
@@ -233,13 +233,15 @@ class Tape:
         return first
 
     def arrange(self, kept: Sequence[Recorded]) -> int:
-        """End a recording: move the registers, so that registers that are never needed at the same time share memory.
+        """End a recording: give every tensor its final place in the frame, the memory of one row of a batch.
+
+        Tensors that are never needed at the same time may share memory.
 
         Args:
-            kept: Inputs and outputs of the recorded function. Nothing else is ever stored in their registers.
+            kept: Inputs and outputs of the recorded function. They share memory with nothing.
 
         Returns:
-            The size of a frame, in numbers.
+            The size of a frame, as a number of float32 values.
         """
         begins, sizes = np.array(self.begins), np.diff(self.begins)
 

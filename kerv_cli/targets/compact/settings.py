@@ -10,7 +10,7 @@ from kerv_cli.base.limits import choice, number, setting
 
 @dataclass
 class TargetSettings:
-    """Shapes of the compact target (docs/methods.md §0.1). The files in `conf/target` are ready-made sizes."""
+    """Shapes of the compact target (docs/methods.md §0.1). Each file in `conf/target` is a ready-made set of shapes."""
 
     size: str = setting("small", "name of these shapes")
     observation: str = choice("vision", "vision", "state", help="read images, or the simulator's state")

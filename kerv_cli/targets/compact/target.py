@@ -64,8 +64,8 @@ class Compiled(NamedTuple):
     """The compiled programs of a target. A copied or pickled target holds None instead of them.
 
     Attributes:
-        prompt: Encodes a prompt.
-        step: Decodes one token after another.
+        prompt: Program that encodes a prompt.
+        step: Program that decodes a token and can be repeated for the next ones.
     """
 
     prompt: Program
@@ -88,13 +88,13 @@ class CompactTarget(Packable):
     Attributes:
         cameras: The camera whose images are read. Empty if the policy reads the state.
         frame_shape: Shape (height, width, 3) of an image.
-        segments: Name of each part of the prompt -> the positions of its tokens, as a slice.
+        segments: Positions of the tokens in each part of the prompt (a slice), by the part's name.
         sha256: Hash of the weights that were loaded. Empty if none were.
         chunk: H, number of control steps that it was trained to decode at once.
         parallel: Whether it decodes all tokens in one forward (`parallel_pass`), and cannot decode them one by one.
         width: E, width of the embeddings and hidden states.
-        heads: Attention heads of a layer. A drafter's layers have as many.
-        feed_forward: Hidden units of a layer. A drafter's layers have as many.
+        heads: Number of attention heads of a layer, also in a drafter's layers.
+        feed_forward: Number of hidden units of a layer, also in a drafter's layers.
         grown_drafter: Shape of the drafter if the target was enlarged together with it (docs/methods.md §0.2), else
             None.
     """
@@ -236,14 +236,15 @@ class CompactTarget(Packable):
         return self.prompt(*given)
 
     def prompt(self, words: Tensor, proprioception: Tensor, *seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the result of `encode_batch` in torch, from the outputs of the vision encoders or from the states.
+        """Compute prompts and positions of the places, as `encode_batch` returns them, in torch.
 
         While a program is recorded, all arguments are `Recorded`, stand-ins for tensors.
 
         Args:
             words: (B, L) ids of words.
             proprioception: (B, p).
-            seen: Vision tokens (B, grid² · views, E) and image points (B, 2 · keypoints · views), or states (B, s).
+            seen: For a vision policy the outputs of its vision encoders: vision tokens (B, grid² · views, E) and image
+                points (B, 2 · keypoints · views). Otherwise the states (B, s).
         """
         embedded, hand = self.word_embedding(words), hand_features(proprioception, self.centre)
         if self.cameras:
@@ -310,7 +311,7 @@ class CompactTarget(Packable):
         Args:
             token: The last token, not yet in the cache.
             count: Number of tokens to decode.
-            cache: Keys and values of everything before `token`. It grows by `count`.
+            cache: Keys and values of all tokens before `token`. It grows by `count` tokens.
 
         Returns:
             The tokens. None if this target is not compiled.
@@ -328,7 +329,7 @@ class CompactTarget(Packable):
 
         Args:
             prompt: (B, P, E).
-            cache: An empty cache. None: no cache is filled.
+            cache: An empty cache, to be filled. None: compute without a cache.
         """
         x = torch.cat([prompt, self.queries.to(prompt.dtype).expand(len(prompt), -1, -1)], 1)
         visible = np.tri(x.shape[1], dtype=bool)

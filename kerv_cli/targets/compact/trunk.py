@@ -97,8 +97,8 @@ class LayerStack(Packable):
         outer: E, width of inputs and outputs. Equals `width` unless the stack was enlarged (`targets/grown.py`).
         heads: Number of attention heads.
         depth: Number of layers.
-        padding: Number of tokens that are appended to a prompt, hidden by the mask, and dropped afterwards. They make a
-            prefill cost as much as that of a longer prompt (`targets/grown.py`).
+        padding: Number of tokens that are appended to a prompt, hidden by the mask, and dropped after the prefill. They
+            make the prefill cost as much as that of a longer prompt (`targets/grown.py`).
     """
 
     inputs = 1
@@ -116,7 +116,7 @@ class LayerStack(Packable):
         return inputs[0]
 
     def begin(self, *inputs: Tensor) -> Tensor:
-        """Return the first layer's input (B, T, width): the combined inputs (B, T, E), padded with zeros."""
+        """Return the first layer's input (B, T, width): the combined inputs (B, T, E), then channels of zeros."""
         x, rest = self.enter(*inputs), self.width - self.outer
         return x if not rest else torch.cat([x, x[..., :1].expand(*x.shape[:-1], rest) * 0.0], -1)
 
@@ -155,13 +155,14 @@ class LayerStack(Packable):
     def run(
         self, inputs: Sequence[Tensor], positions: Tensor, cache: Cache | None, seen: np.ndarray | Tensor | None
     ) -> Tensor:
-        """Return the hidden states (B, T, E) of T new tokens that follow the cached ones. The cache grows by T.
+        """Run all layers over T new tokens, and return their hidden states (B, T, E).
 
         Args:
-            inputs: Tensors (B, T, E).
-            positions: (T,) rotary positions.
-            cache: Keys and values of earlier tokens. None: there are none.
-            seen: Which tokens each new one attends to, as in `attention_mask`. None: attention is causal.
+            inputs: Tensors (B, T, E), as `enter` takes them.
+            positions: (T,) rotary positions of the new tokens.
+            cache: Keys and values of earlier tokens. Those of the new tokens are appended. None: there are no earlier
+                tokens.
+            seen: Which tokens each new token attends to, as in `attention_mask`. None: attention is causal.
         """
         tokens, padding = inputs[0].shape[1], 0 if cache is not None and cache.length else self.padding
         if padding:
@@ -191,7 +192,7 @@ class LayerStack(Packable):
         return x.is_cuda and x.shape[0] == 1 and not wants_gradient(x)
 
     def recorded(self, *inputs: Tensor) -> Tensor:
-        """Compute the hidden states of `Recorded` inputs, stand-ins for tensors (1, 1, E). This records a program."""
+        """Record how hidden states are computed. Inputs and result are `Recorded`, stand-ins for tensors (1, 1, E)."""
         return self.finish(self.run_layers(self.begin(*inputs), slice(None), None, None, None))
 
     def run_layers(
@@ -226,12 +227,13 @@ class Trunk(LayerStack):
     def forward(
         self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
-        """Return the hidden states (B, T, E) of T new tokens that follow the cached ones. The cache grows by T.
+        """Run all layers over T new tokens, and return their hidden states (B, T, E).
 
         Args:
-            x: (B, T, E) embeddings.
-            positions: (T,) rotary positions.
-            cache: Keys and values of earlier tokens. None: there are none.
-            seen: Which tokens each new one attends to, as in `attention_mask`. None: attention is causal.
+            x: (B, T, E) embeddings of the new tokens.
+            positions: (T,) rotary positions of the new tokens.
+            cache: Keys and values of earlier tokens. Those of the new tokens are appended. None: there are no earlier
+                tokens.
+            seen: Which tokens each new token attends to, as in `attention_mask`. None: attention is causal.
         """
         return self.run((x,), positions, cache, seen)

@@ -68,7 +68,7 @@ class VisionEncoder(Packable):
         self.register_buffer("columns", torch.linspace(-1, 1, size // 2), persistent=False)
 
     def pack_weights(self) -> Callable[[Tensor], list[Tensor]] | None:
-        """Return this encoder as a `PackedVision`, which encodes one image. None if the weights are not float32."""
+        """Return this encoder as a `PackedVision`, which encodes single images. None if the weights are not float32."""
         return PackedVision(self, 2 * len(self.columns)) if self.columns.dtype == torch.float32 else None
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:

@@ -37,8 +37,8 @@ class Shards:
 
     Attributes:
         folder: Folder of the checkpoint.
-        tensors: Name of each tensor -> name of its file.
-        shapes: Name of each tensor -> its shape.
+        tensors: Name of the file that holds each tensor, by the tensor's name.
+        shapes: Shape of each tensor, by name.
     """
 
     folder: Path
@@ -102,8 +102,8 @@ def check_layout(shapes: Mapping[str, Sizes], expected: Mapping[str, Sizes], whe
     """Check that a checkpoint has exactly the expected tensors.
 
     Args:
-        shapes: Name -> shape of each tensor in the checkpoint.
-        expected: Name -> shape of each expected tensor.
+        shapes: Shape of each tensor in the checkpoint, by name.
+        expected: Shape of each expected tensor, by name.
         where: Folder of the checkpoint, for the error message.
 
     Raises:
@@ -203,7 +203,7 @@ def digest_of(hashes: Mapping[str, str], settings: Mapping[str, Any]) -> str:
     """Return one SHA-256 that identifies a model whose weights are in several files.
 
     Args:
-        hashes: File -> its SHA-256.
+        hashes: SHA-256 of each file, by name.
         settings: Settings that change what the model computes.
     """
     text = json.dumps({"files": dict(sorted(hashes.items())), "settings": dict(settings)}, sort_keys=True)

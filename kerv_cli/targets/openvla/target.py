@@ -42,7 +42,7 @@ class OpenVLASettings:
     Attributes:
         checkpoint: Folder of the published files.
         statistics: Name of the data set whose action statistics are used.
-        files: Name of each file of weights -> its size in bytes.
+        files: Size of each file of weights in bytes, by name.
         prompt: Version of the prompt, `openvla` or `openvla_v01`.
         crop: Whether images are cropped to the central 90 %, for checkpoints fine-tuned on augmented images.
         libero: Whether images are first compressed as JPEG and resized by Lanczos, as OpenVLA does it for LIBERO.
@@ -87,7 +87,7 @@ class OpenVLATarget:
 
     @property
     def segments(self) -> Mapping[str, slice]:
-        """Name of each part of the prompt -> the positions of its tokens, as a slice.
+        """Positions of the tokens in each part of the prompt (a slice), by the part's name.
 
         The slice of the instruction has no end, because the length of instructions differs.
         """
@@ -144,13 +144,14 @@ class OpenVLATarget:
     def forward(
         self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
-        """Return the hidden states (B, T, E) of T new tokens that follow the cached ones. The cache grows by T.
+        """Run all layers over T new tokens, and return their hidden states (B, T, E).
 
         Args:
-            x: (B, T, E) embeddings.
-            positions: (T,) rotary positions.
-            cache: Keys and values of earlier tokens. None: there are none.
-            seen: Which tokens each new one attends to, as in `attention_mask`. None: attention is causal.
+            x: (B, T, E) embeddings of the new tokens.
+            positions: (T,) rotary positions of the new tokens.
+            cache: Keys and values of earlier tokens. Those of the new tokens are appended. None: there are no earlier
+                tokens.
+            seen: Which tokens each new token attends to, as in `attention_mask`. None: attention is causal.
         """
         return self.model.language_model.model(x, positions, cache, seen)
 

@@ -114,15 +114,16 @@ def run_layers(
     seen: np.ndarray | Tensor | None,
     mask: Tensor | None = None,
 ) -> Tensor:
-    """Return the output (B, T, E) of the last layer for T new tokens. The cache grows by T.
+    """Run all layers over T new tokens, and return the output (B, T, E) of the last layer.
 
     Args:
         layers: Layers of the class `LlamaLayer`.
         language: Shape of the language model.
-        x: (B, T, E) embeddings.
-        positions: (T,) rotary positions.
-        cache: Keys and values of earlier tokens. None: there are none.
-        seen: Which tokens each new one attends to, as in `attention_mask`. None: attention is causal.
+        x: (B, T, E) embeddings of the new tokens.
+        positions: (T,) rotary positions of the new tokens.
+        cache: Keys and values of earlier tokens. Those of the new tokens are appended. None: there are no earlier
+            tokens.
+        seen: Which tokens each new token attends to, as in `attention_mask`. None: attention is causal.
         mask: Additive mask to use instead of `seen`. None: the mask is made from `seen`.
     """
     rotary = rotation(positions, language.channels, language.rope_theta, x.dtype)
