@@ -13,7 +13,7 @@ from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
 @command(
     "train target",
     TrainTargetSettings,
-    keys="name demos task quick target target.observation train.steps train.init log runtime.device",
+    keys="name demos task quick target target.observation train.steps train.init runtime.device",
     examples=(
         "kerv train target name=mine demos=mt10",
         "kerv train target name=first task=reach quick=true --plan",
@@ -33,7 +33,7 @@ def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJso
 @command(
     "train drafter",
     TrainDrafterSettings,
-    keys="policy.target drafter demos task policy.artifacts train.steps log runtime.device",
+    keys="policy.target drafter demos task policy.artifacts train.steps runtime.device",
     examples=(
         "kerv train drafter policy.target=mine demos=mt10",
         "kerv train drafter drafter=early policy.target=mine",

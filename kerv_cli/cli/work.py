@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import typer
@@ -254,7 +252,6 @@ def run_training(run: TrainingRun, plan: bool, as_json: bool, loading: str, trai
 
 def _train(run: TrainingRun, record: Run, loading: str, training: str) -> tuple[dict[str, float], Path]:
     from kerv_cli.training.loop import without_subnormals
-    from kerv_cli.training.tracker import logged
 
     with without_subnormals(), progress_bar(loading, record) as advance:
         run.load(advance)
@@ -266,14 +263,10 @@ def _train(run: TrainingRun, record: Run, loading: str, training: str) -> tuple[
         if not started and step > 1:
             typer.echo(f"resuming at step {step - 1}", err=True)
         started = True
-        log(step, now)
         line = " ".join(f"{name} {value:.4g}" for name, value in list(now.items())[:6] if name != "step")
         advance(step, settings.train.steps, line)
 
-    curves: AbstractContextManager[Callable[[int, dict[str, float]], object]] = nullcontext(lambda step, now: None)
-    if settings.log == "wandb":
-        curves = logged(f"{run.kind}/{run.folder.name}", settings.train.steps, asdict(settings))
-    with without_subnormals(), curves as log, progress_bar(training, record) as advance:
+    with without_subnormals(), progress_bar(training, record) as advance:
         metrics = run.train(on_step)
     from kerv_cli.report.plots import save_curves
 

@@ -15,7 +15,6 @@ from kerv_cli.worlds.settings import WorldSettings
 
 DEMOS = "name of the demonstrations"
 TARGET_DEMOS = f"{DEMOS}; empty: the ones that the target was trained on"
-LOG = "also send the curves to Weights & Biases during training"
 QUICK = "a first policy in minutes: adds the settings in conf/quick.yaml"
 FIRST_EPISODES = "episodes used per task, lowest seeds first; 0: all"
 
@@ -64,7 +63,6 @@ class TrainTargetSettings(TaskSettings):
     task: list[str] = setting([], "tasks and suites; empty: all tasks of the demonstrations")
     demos: str = setting("", f"{DEMOS}; empty: the name that `kerv demos` gives to these tasks")
     quick: bool = setting(False, QUICK)
-    log: str = choice("none", "none", "wandb", help=LOG)
     target: TargetSettings = setting(TargetSettings, "shapes: nano, tiny, slim, small, … (conf/target)")
     train: TrainSettings = setting(TrainSettings, "optimisation")
     world: WorldSettings = setting(WorldSettings, "camera and length of an episode")
@@ -111,7 +109,6 @@ class TrainDrafterSettings(DemonstrationSettings):
     # drafter comes after train, because drafter=early overrides some of train's settings
     groups: ClassVar = {"policy": "vision", "train": "drafter", "drafter": "drafter", "runtime": "auto"}
 
-    log: str = choice("none", "none", "wandb", help=LOG)
     drafter: Any = setting(chosen("drafter", "drafter"), "kind, with shapes and loss: drafter (EAGLE-2), early, scout")
     train: TrainSettings = setting(TrainSettings, "optimisation")
 
