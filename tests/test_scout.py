@@ -234,13 +234,8 @@ def test_a_study_becomes_a_certificate_and_the_certificate_a_method(demonstrated
     serve += ["prefill_draft=scoped", "prefill_draft.outside=hold", "skip=certified"]
     kerv(*serve)
     deploy = ["rollout", "--plan", "method=one_pass_certified", "prefill_draft.outside=hold"]
-    deploy += [
-        "policy.target=nano-vision",
-        f"task={TASK}",
-        "threshold.r=9",
-        "world.horizon=8",
-        f"results={demonstrated}",
-    ]
+    deploy += ["policy.target=nano-vision", f"task={TASK}", "threshold.r=9", "world.horizon=8"]
+    deploy.append(f"results={demonstrated}")
     other = kerv(*deploy, code=2)  # before anything runs
     assert "with proposer.kind=drafter: the certificate is of none" in other.stderr
     kerv(*deploy, "proposer=none")

@@ -86,12 +86,8 @@ def serving(policy: Policy, **chosen: Any) -> Iterator[tuple[int, list[str]]]:
 def seen(seed: int, **changes: Any) -> dict[str, Any]:
     random = np.random.default_rng(seed)
     image = random.integers(0, 256, (96, 96, 3), dtype=np.uint8)
-    return {
-        "observation/image": image,
-        "observation/state": random.normal(size=4),
-        "prompt": "open a drawer",
-        **changes,
-    }
+    state = random.normal(size=4)
+    return {"observation/image": image, "observation/state": state, "prompt": "open a drawer", **changes}
 
 
 @pytest.mark.bits
