@@ -9,7 +9,6 @@ import pytest
 import torch
 from command import kerv
 from examples.insertion import SPEC
-from examples.insertion import SPEC as INSERTION
 from examples.insertion.world import InsertionWorld
 from examples.own_policy import OwnPolicy, Remembered
 from examples.own_target import MockTarget
@@ -148,7 +147,7 @@ def test_doctor_checks_a_policy_on_disk(policies):
 
 
 def test_insertion_keeps_the_protocol():
-    found = check_environment(INSERTION, 100_000)
+    found = check_environment(SPEC, 100_000)
     assert failures(found) == {}
     assert len(found) == 5
 
@@ -180,5 +179,5 @@ class Greedy(InsertionWorld):
 )
 def test_a_broken_environment_is_found(monkeypatch, world, what):
     monkeypatch.setattr(sys.modules[__name__], "Chosen", world, raising=False)
-    spec = replace(INSERTION, world_class=f"{__name__}:Chosen", expert_class="")
+    spec = replace(SPEC, world_class=f"{__name__}:Chosen", expert_class="")
     assert what in failures(check_environment(spec, 100_000))

@@ -110,20 +110,14 @@ def test_demonstrations_without_a_curved_path_have_no_ranges():
         BoundaryRanges(0.1, 0.1, 0.0, 1.0)
 
 
-def test_normalisation_is_linear_and_clipped():
+def test_normalisation_of_bent_straight_and_still_paths():
     assert RANGES.normalise(0.01, STILL) == (0.0, pytest.approx(STILL / 0.15))
     assert RANGES.normalise(0.505, 0.075) == (pytest.approx(0.5), pytest.approx(0.5))
-    assert RANGES.normalise(7.0, 9.0) == (1.0, 1.0)
+    assert RANGES.normalise(7.0, 9.0) == RANGES.normalise(math.inf, 0.15) == (1.0, 1.0)
     assert RANGES.normalise(0.0, 0.15) == (0.0, 1.0)
-    assert RANGES.fused(0.505, 0.15, 0.25) == pytest.approx(0.25 * 0.5 + 0.75)
-
-
-def test_an_infinite_radius_is_a_straight_reach_unless_the_hand_stands_still():
-    assert RANGES.normalise(math.inf, 0.15) == (1.0, 1.0)
     assert RANGES.normalise(math.inf, 0.0) == (0.0, 0.0)
-    boundary = boundary_of("fused")
-    still = boundary.choose(np.full((WINDOW, 3), 0.6))
-    assert still == Choice("drafter", 0.0)
+    assert RANGES.fused(0.505, 0.15, 0.25) == pytest.approx(0.25 * 0.5 + 0.75)
+    assert boundary_of("fused").choose(np.full((WINDOW, 3), 0.6)) == Choice("drafter", 0.0)
 
 
 def test_fused_sends_straight_reaches_to_retrieval_and_bends_to_the_drafter():
@@ -145,18 +139,12 @@ def test_only_the_newest_positions_count():
     assert boundary.choose(path) != boundary.choose(path[-15:-5])
 
 
-@pytest.mark.parametrize("n", [0, 1, 2])
-def test_fewer_than_three_positions_go_to_the_drafter(n):
-    boundary = boundary_of("fused", f_star=0.0)
+@pytest.mark.parametrize("n", [0, 1, 2, 20])
+def test_a_fused_boundary_needs_three_positions_and_the_fixed_kinds_need_none(n):
     path = np.arange(3.0 * n).reshape(n, 3)
-    assert boundary.choose(path) == Choice("drafter", None)
-
-
-@pytest.mark.parametrize("mode", ["retrieval", "drafter"])
-def test_the_fixed_kinds_never_change_their_mind(mode):
-    boundary = boundary_of(f"always_{mode}")
-    for n in (0, 2, 20):
-        assert boundary.choose(np.zeros((n, 3))).mode == mode
+    assert (boundary_of("fused", f_star=0.0).choose(path) == Choice("drafter", None)) == (n < 3)
+    for mode in ("retrieval", "drafter"):
+        assert boundary_of(f"always_{mode}").choose(path).mode == mode
 
 
 def test_random_keeps_its_share_and_repeats_itself():
