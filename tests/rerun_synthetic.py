@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from examples.own_target import MockTarget
+from mock_target import MockTarget
 from studies_synthetic import still_episode
 from test_accepted_loop import Greedy, NearTrees
 

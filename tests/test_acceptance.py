@@ -5,9 +5,9 @@ from itertools import groupby
 import numpy as np
 import pytest
 import torch
-from examples.own_target import SEVEN, MockTarget
 from hypothesis import given
 from hypothesis import strategies as st
+from mock_target import SEVEN, MockTarget
 
 from kerv_cli.base.registry import find
 from kerv_cli.base.spaces import ActionSpace, Group

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 import torch
-from examples.own_target import SEVEN, MockTarget
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mock_target import SEVEN, MockTarget
 from test_acceptance import space_of
 from test_decoding_lossless import assert_adds_up, random_prompt, random_target
 

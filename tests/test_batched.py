@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from command import kerv
-from examples.own_target import MockTarget
+from mock_target import MockTarget
 from studies_synthetic import episode, swept, threshold_study
 from test_compact_target import small, some_observation
 from test_episode import settings

@@ -8,10 +8,10 @@ import pytest
 import torch
 from command import kerv
 from conftest import refused
-from examples.own_target import SEVEN
 from hypothesis import given
 from hypothesis import strategies as st
 from loaded import of_target
+from mock_target import SEVEN
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError

@@ -12,10 +12,10 @@ import pytest
 import torch
 from command import told
 from conftest import refused
-from examples.own_target import SEVEN
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from loaded import datastore_of
+from mock_target import SEVEN
 from test_calibration import write_dataset
 
 from kerv_cli.base.errors import CheckpointError, StorageError, UnknownName, UsageError

@@ -5,9 +5,9 @@ import functools
 import numpy as np
 import pytest
 import torch
-from examples.own_target import SEVEN, MockTarget
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mock_target import SEVEN, MockTarget
 
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.spaces import ActionSpace, Group, Observation
@@ -20,7 +20,6 @@ from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter, EagleNetwork
 from kerv_cli.methods.jacobi import JacobiProposer
-from kerv_cli.targets.checkpoint import load_target, save_module, target_fields
 from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
@@ -245,12 +244,3 @@ def test_the_mock_sees_a_wrong_mask_position_or_cache():
         target.forward(x[:, 3:], positions[3:], cache),
     ):
         assert not torch.allclose(target.head(wrong)[0, -1], right)
-
-
-def test_a_target_of_your_own_is_loaded_by_its_family(tmp_path):
-    fields = target_fields("mock", {"chunk": 3}, "metaworld", SEVEN, OBSERVATION)
-    save_module(tmp_path, "target", torch.nn.Module(), fields)
-    target, described = load_target(tmp_path)
-    assert isinstance(target, MockTarget)
-    assert target.actions == described.actions == SEVEN
-    assert target.chunk == 3

@@ -11,7 +11,7 @@ from command import kerv
 from examples.insertion import SPEC
 from examples.insertion.world import InsertionWorld
 from examples.own_policy import OwnPolicy, Remembered
-from examples.own_target import MockTarget
+from mock_target import MockTarget
 from test_decoding_lossless import RandomTrees, decode, plain_greedy
 
 from kerv_cli.base.spaces import Observation
@@ -85,7 +85,7 @@ def failures(found: list[Finding]) -> dict[str, str]:
     return {finding.what: finding.says for finding in found if not finding.ok}
 
 
-@pytest.mark.parametrize("target", [OwnPolicy(), MockTarget(chunk=1)], ids=["own_policy", "own_target"])
+@pytest.mark.parametrize("target", [OwnPolicy(), MockTarget(chunk=1)], ids=["own_policy", "mock"])
 def test_the_examples_keep_the_protocol(target):
     found = check_target(target, SEEN)
     assert failures(found) == {}

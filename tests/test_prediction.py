@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from examples.own_target import MockTarget
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from mock_target import MockTarget
 from test_decoding_lossless import plain_greedy
 
 from kerv_cli.engine.chunk import WINDOW, ActionHistory, Chunk, Situation

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from examples.own_target import SEVEN, MockTarget
+from mock_target import SEVEN, MockTarget
 from test_decoding_lossless import plain_greedy, random_prompt, random_target
 from test_proposers import stored
 

@@ -1,22 +1,18 @@
-"""Example: a target of your own in one file. It needs no transformer, only `kerv_cli/engine/protocol.py`.
+"""A target that is no transformer: it needs only `kerv_cli/engine/protocol.py`.
 
 Its hidden state is a sum over all that is visible, weighted by position, so a wrong mask, position or cache entry
-changes its tokens: the tests of the decode loop run on it. `KERV_PLUGINS=examples.own_target` registers it, and every
-command then loads targets whose `target.json` says `"family": "mock"`.
+changes its tokens: the tests of the decode loop run on it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.base.registry import add
 from kerv_cli.base.spaces import ActionSpace, Group, Observation
-from kerv_cli.targets.checkpoint import TargetDescription
 
 SEVEN = ActionSpace(
     names=("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper"),
@@ -79,11 +75,3 @@ class MockTarget:
 
     def head(self, hidden: Tensor) -> Tensor:
         return (3 * hidden).sin() @ self.out.T
-
-
-def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> MockTarget:
-    """What `load_target` calls; a target with weights reads them from `folder`."""
-    return MockTarget(description.actions, description.chunk)
-
-
-add("target", "mock", "examples.own_target:build")
