@@ -7,7 +7,6 @@ import os
 import re
 import signal
 import sys
-import threading
 import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
@@ -20,7 +19,6 @@ from conftest import python, raising, refused, until
 from studies_synthetic import (
     count_calls,
     episode,
-    episodes_of,
     misbehave,
     part,
     settings_of,
@@ -38,7 +36,6 @@ from kerv_cli.cli.work import event_printer
 from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, WANTED, Database
 from kerv_cli.lab.events import BlockStarted, BlockWaits, EpisodeEnd, Event, SettingFailed
 from kerv_cli.lab.execute import RunEpisode
-from kerv_cli.lab.executors import check_executor
 from kerv_cli.lab.plan import Setting, Study, blocks_of
 from kerv_cli.lab.store import StudyStore, plan_study
 from kerv_cli.lab.study import estimate
@@ -355,25 +352,6 @@ def test_an_interrupt_ends_a_clusters_work(cluster, tmp_path):
         swept(tmp_path, TWO, slow_elsewhere, runtime=cluster, on_event=interrupt)
     store = StudyStore(tmp_path, "threshold")
     assert (store.counts(), claims(store.database)) == ((16, 32), 0)
-
-
-def test_an_executor_from_outside(tmp_path):
-    """One file, `examples/thread_executor.py`, named in KERV_PLUGINS."""
-    importlib.import_module("examples.thread_executor")
-    threads = set()
-
-    def noting(setting, task):
-        def run(seed):
-            threads.add(threading.current_thread().name)
-            return episodes_of(setting, task)(seed)
-
-        return run
-
-    _, outcome = swept(tmp_path, TWO, noting, runtime=runtime("threads", name="mine"))
-    assert len(outcome.done) == 32
-    assert threads <= {"mine_0", "mine_1"}
-    with pytest.raises(UsageError, match=r"runtime\.executor_options: nam: unexpected"):
-        check_executor(runtime("threads", nam="x"))
 
 
 WRONG = {
