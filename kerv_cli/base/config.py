@@ -198,7 +198,7 @@ def _parsed(override: str) -> Any:
     """Return an override as parsed by Hydra.
 
     Raises:
-        UsageError: It cannot be parsed.
+        UsageError: The override cannot be parsed.
     """
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException

@@ -299,7 +299,7 @@ class Observation:
         proprioception: (p,) float64, the robot's own measurements.
         state: (s,) float64, the simulator's privileged state.
         instruction: The task in words.
-        images: Camera name -> image (h, w, 3) uint8. Only cameras that the policy reads are included.
+        images: Images (h, w, 3) uint8, by camera. Only cameras that the policy reads are included.
     """
 
     proprioception: np.ndarray

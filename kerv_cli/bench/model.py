@@ -134,8 +134,8 @@ class Model:
 def random_target(shape: TargetSettings, device: torch.device, dtype: torch.dtype) -> CompactTarget:
     """Return a compact target with random weights, for inference.
 
-    Its layers are made one after the other, so that memory never holds 7 B weights twice. The weights are
-    rounded to half precision, as the shipped ones are.
+    Its layers are made one after the other, so that memory never holds all weights of a large model twice. The weights
+    are rounded to half precision, as the shipped ones are.
 
     Args:
         shape: Shapes of the target.

@@ -57,9 +57,10 @@ def accept_by_group(
 ) -> Accepted:
     """Return the longest path of whole kinematic groups, such as position or rotation (HeiSD's `sequence` rule).
 
-    The tokens of one group in one control step are accepted together or not at all. They are accepted if each is within
-    its DoF's limit of the target token after its parent, and if these distances sum to at most `group_limit`. A path
-    ends before a group that is rejected or that is only partly in the tree.
+    The tokens of one group in one control step are accepted together or not at all. The distance of a token is that to
+    the target's prediction after its parent. A group is accepted if each distance is within its DoF's limit, and if the
+    distances sum to at most `group_limit`. A path ends before a group that is rejected or that is only partly in the
+    tree.
 
     If `start` is inside a group, the group's first tokens are committed already. Their distance counts as 0. Only the
     group's other tokens are judged.

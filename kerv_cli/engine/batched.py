@@ -71,7 +71,7 @@ class BatchDecoder:
     def _encode(self, observations: Sequence[Observation]) -> list[Tensor]:
         """Return each prompt's embeddings (1, P, E).
 
-        On a CPU the observations are encoded one by one, because this is faster there with kerv's packed weights.
+        On a CPU the observations are encoded one by one, because kerv's compiled encoders are faster that way.
         """
         if isinstance(self.target, EncodesMany) and self.target.device.type != "cpu":
             return list(self.target.encode_many(observations).split(1))

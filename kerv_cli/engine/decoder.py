@@ -225,7 +225,8 @@ class Decoder(ActionDecoder):
     def forward_singly(self, chunk: Chunk, stopwatch: Stopwatch) -> list[int]:
         """Decode the remaining tokens with one forward each, and return them.
 
-        Each token stays on the device as the input of the next forward. The CPU reads all tokens after the last one.
+        Each token stays on the device as the input of the next forward. The CPU reads all tokens after the last
+        forward.
         """
         target, first = self.target, chunk.cache.length
         positions = torch.arange(first, first + chunk.remaining, device=target.device).split(1)
@@ -239,7 +240,7 @@ class Decoder(ActionDecoder):
     def propose(self, chunk: Chunk, proposer: Proposer | None, stopwatch: Stopwatch) -> Draft:
         """Return the proposer's draft. It is empty if there is no proposer or only one token is left to decode.
 
-        A draft is at most `remaining − 1` tokens deep, because the bonus token fills the chunk's last place.
+        A draft is at most `remaining − 1` tokens deep, because the target itself gives the chunk's last token.
 
         Raises:
             KervError: A drafted token is out of range.

@@ -63,7 +63,7 @@ class Rectifier(Protocol):
         """Start a new episode."""
 
     def next_decode(self) -> None:
-        """Learn that a decode has ended. A rectifier may count decodes in which it predicts nothing."""
+        """Count a decode that has ended. A rectifier may pause for some decodes after it has predicted values."""
 
     def close(self, chunk: Chunk) -> bool:
         """Fill the rejected control step with predicted values, if they can be predicted.

@@ -19,7 +19,7 @@ PHASES = ("vision", "prefill", "propose", "verify", "accept", "rectify", "other"
 """Phases of a decode. Their seconds add up to `DecodeRecord.seconds`. `vision` is the time of `Target.encode`."""
 
 UNTIMED = dict.fromkeys(PHASES, math.nan)
-"""Phase seconds of a decode in a batch, which has no time of its own: all NaN."""
+"""Seconds by phase if several episodes were decoded at once: all NaN, because a single decode then has no time."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Round:
 
 @dataclass(frozen=True)
 class Delay:
-    """Latency of a decode, and what the robot did meanwhile, in a world that does not wait (docs/methods.md §8)."""
+    """Latency of a decode in a world that does not wait, and what the robot did meanwhile (docs/methods.md §8)."""
 
     seconds: float  # latency of the decode
     steps: int  # latency in control steps, rounded up
@@ -157,7 +157,7 @@ class EpisodeRecord:
 
     @property
     def timed(self) -> bool:
-        """Whether the decodes have times. Decodes of a batch have none."""
+        """Whether the decodes have times. If several episodes were decoded at once, they have none."""
         return not math.isnan(self.seconds)
 
     @property

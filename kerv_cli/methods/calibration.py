@@ -95,10 +95,10 @@ class SkipSection:
 
     Attributes:
         datastore: Hash of the datastore.
-        epsilon: Largest mean absolute error of a good chunk, in normalised action units. Its strict tokens,
-            such as the gripper's, must be equal.
+        epsilon: Largest mean absolute error of a good chunk, in normalised action units. Its strict tokens, such as the
+            gripper's, must also be equal.
         confidence: Minimum share of good chunks among the chunks that reach the threshold.
-        tasks: Task -> its threshold.
+        tasks: Threshold of each task.
     """
 
     datastore: str
@@ -228,7 +228,10 @@ class CalibrationArtifact(Artifact[Calibration]):
                 description.k_s(task)
 
     def is_complete(self, description: Calibration, kinds: Collection[str]) -> bool:
-        """Return whether K_S was measured if `kinds` has a drafter, and skip levels if `kinds` has a datastore."""
+        """Return whether everything was measured that a policy with artifacts of these `kinds` needs.
+
+        With a drafter this is the reference level K_S, with a datastore the thresholds for skipping verification.
+        """
         sections = {"drafter": description.variability, "datastore": description.skip}
         return all(section for kind, section in sections.items() if kind in kinds)
 

@@ -29,8 +29,8 @@ class JacobiProposer(ChainProposer):
     """Guesses the remaining tokens of a chunk. After each forward, the target's tokens become the next guess.
 
     With strict acceptance this ends with the tokens of autoregressive decoding. If a prefill draft was rejected, the
-    first guess begins with the target's tokens after the rejection. All other tokens of the first guess are zero
-    actions.
+    first guess begins with the target's tokens after the rejection. All other tokens of the first guess stand for
+    normalised actions of 0.
 
     Attributes:
         depth: Number of tokens guessed at once. 0: all remaining tokens.

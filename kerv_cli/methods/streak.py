@@ -67,7 +67,7 @@ class StreakSkip(Skip):
         self.allowed = self.left = self.settings.opening
 
     def take(self, chunk: Chunk) -> bool:
-        """Fill the chunk with the draft, without verification, if that is still allowed and the draft has all N tokens.
+        """Fill the chunk with the draft, unverified, if one more such decode is allowed and the draft has all N tokens.
 
         Returns:
             Whether the chunk was filled.

@@ -2,7 +2,7 @@
 
 An array is a map with the keys __ndarray__ (true), data, dtype and shape. openpi writes them as bytes, vla-eval as
 text. openpi's single numbers have __npgeneric__, data and dtype. vla-eval's images have __image__, data and format.
-Nothing is unpickled, and no array is larger than its own bytes.
+Nothing is unpickled. An array must have exactly the bytes that its shape and type need.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from kerv_cli.worlds.views import frame_shape
 LARGEST = 4096
 """Most pixels of an image's longest side, for policies that resize images themselves."""
 OPEN = {"signed": 1.0, "signed_inverted": -1.0}
-"""Gripper convention of the client -> number that means an open gripper. Its negative means closed.
+"""Number that means an open gripper, by the client's convention. The negative number means closed.
 
 LIBERO's simulator needs the inverted convention.
 """
@@ -65,7 +65,7 @@ class Interface:
             key: Its key in the message, for the error message.
 
         Raises:
-            UsageError: It has another shape or type.
+            UsageError: The image has another shape or type.
         """
         shape = frame_shape(camera, self.size)
         image = image() if callable(image) else image
@@ -83,7 +83,7 @@ class Interface:
     def numbers(self, values: object, key: str, message: Message) -> tuple[np.ndarray, np.ndarray]:
         """Return proprioception (p,) and privileged state (s,) that a client sent.
 
-        Numbers that the policy does not read are set to zero.
+        A message may leave out numbers that the policy does not read. They are then zero.
 
         Args:
             values: What the message holds under `key`. None if it holds nothing.
@@ -236,7 +236,7 @@ def _dtype(name: object) -> np.dtype:
     """Return the dtype with this name.
 
     Raises:
-        UsageError: It is not a bool, integer or float type.
+        UsageError: There is no bool, integer or float type with this name.
     """
     try:
         dtype = np.dtype(name) if isinstance(name, str) else None
@@ -251,7 +251,7 @@ def _image(data: Any) -> np.ndarray:
     """Decode a PNG or JPEG file to an image (height, width, 3).
 
     Raises:
-        UsageError: It is neither PNG nor JPEG, is damaged, or is too large.
+        UsageError: The file is neither PNG nor JPEG, is damaged, or its image is too large.
     """
     from PIL import Image
 

@@ -72,7 +72,7 @@ class OpenPi(Conversation):
         self.decodes = 0
 
     def greeting(self) -> bytes:
-        """Return the metadata as the first message to the client."""
+        """Return the first message to the client: what it must know about the policy, as `metadata` describes it."""
         return packed(metadata(self.policy))
 
     def answer(self, frame: bytes | str) -> bytes:

@@ -25,7 +25,7 @@ from kerv_cli.serve.policy import Conversation, Log, Policy
 
 PROTOCOL_VERSION = 1
 _FORMATS = {("position", 3): "delta_xyz", ("rotation", 3): "axis_angle"}
-"""Name and size of a group of DoFs -> the name that vla-eval gives this format."""
+"""The name that vla-eval gives to a group of DoFs, by the group's name and size."""
 
 
 def dim_specs(interface: Interface) -> dict[str, dict[str, dict[str, object]]]:

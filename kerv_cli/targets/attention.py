@@ -76,9 +76,9 @@ def attend(q: Tensor, k: Tensor, v: Tensor, cache: Tensor | None, slots: Slots |
     """Return the attention's result (B, T, A · C) of new tokens, and write their keys and values to the cache.
 
     Args:
-        q: (B, A, T, C) queries. Several heads may share one head of keys and values.
-        k: (B, K, T, C) keys.
-        v: (B, K, T, C) values.
+        q: (B, A, T, C) queries of A heads.
+        k: (B, K, T, C) keys of K heads. If K < A, several heads of queries share each of them.
+        v: (B, K, T, C) values of K heads.
         cache: (2, B, K, slots, C) keys and values of this layer. None: there are no earlier tokens.
         slots: Slots of the new tokens. None if there is no cache.
         mask: Result of `attention_mask`. None: attention is causal.

@@ -21,7 +21,7 @@ from kerv_cli.engine.protocol import Cache, Target
 from kerv_cli.worlds.findings import Finding, find, need
 
 TOLERANCE = {torch.float64: 1e-6, torch.float32: 2e-4, torch.bfloat16: 0.2, torch.float16: 0.05}
-"""Number format -> largest difference of logits that rounding can cause, in units of their standard deviation."""
+"""Largest difference of logits that rounding can cause, in units of their standard deviation, by number format."""
 MEMBERS = ("actions", "chunk", "cameras", "width", "max_prompt", "device")
 METHODS = ("encode", "embed", "new_cache", "forward", "head")
 TREE = Draft.of([0] * 7, [-1, 0, 0, 1, 1, 2, 4])
@@ -50,7 +50,7 @@ def check_target(target: Target, observation: Observation) -> list[Finding]:
 class Trial:
     """The checks of one target on one observation.
 
-    Most checks compare hidden states with those of `plain`: one causal forward without a cache.
+    Most checks compare hidden states with those from the method `plain`, which runs one causal forward without a cache.
 
     Attributes:
         tokens: Action tokens for the checks. Their values do not matter.
@@ -211,7 +211,7 @@ CHECKS: tuple[tuple[str, str, Callable[[Trial], Pairs]], ...] = (
     ("cache used again", "a reused cache", Trial.reused_cache),
     ("batch", "a batch of two", Trial.batch),
 )
-"""The checks in order: name, what is wrong if it fails, function.
+"""The checks in order. Each has a name, a text that says what is wrong if it fails, and a function.
 
-If the second entry is empty, all later checks need this check, and its failure ends the checks.
+If the text is empty, all later checks need this check, and its failure ends the checks.
 """

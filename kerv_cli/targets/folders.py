@@ -83,7 +83,7 @@ def target_names(results: str) -> list[str]:
 
 
 def beside(target: Path, kind: str) -> Path:
-    """Return the default folder of an artifact that belongs to a target. It need not exist.
+    """Return the default folder of an artifact that belongs to a target. The folder need not exist.
 
     For a shipped target `pretrained/<name>/target` this is `pretrained/<name>/<kind>`, for a trained target
     `artifacts/target/<name>` it is `artifacts/<kind>/<name>`. For any other target it is a subfolder `<kind>`.

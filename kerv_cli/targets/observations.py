@@ -108,7 +108,7 @@ def read_observations(
 
 
 def read_chunks(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarray:
-    """Return the expert's next H actions from each of several control steps on, without added noise.
+    """Return the expert's next H actions at each of several control steps, without added noise.
 
     A chunk that begins near the end includes actions that were recorded after the success.
 
@@ -149,7 +149,8 @@ def observations_of(
         space: Observation space of the demonstrations.
 
     Raises:
-        CheckpointError: The target reads images, but a step has none, or they have a different size than it takes.
+        CheckpointError: The target reads images, but a step has no image, or images have a different size than the
+            target takes.
     """
     pictures: list[dict[str, np.ndarray]] = [{} for _ in steps]
     if target.cameras:

@@ -162,7 +162,7 @@ class DrafterProposer(Proposer):
         self.hidden = self.drafter(following, hidden, positions, self.cache)[0, -1]
 
     def chain(self, depth: int) -> Tensor:
-        """Draft greedily. Return the tokens (depth,)."""
+        """Draft a chain greedily. Return its tokens, (depth,) int64."""
         base = self.cache.length
         if self.compiled is not None:
             return torch.from_numpy(self.compiled.repeat(depth, self.hidden, cache=self.cache)[:, 0]).long()

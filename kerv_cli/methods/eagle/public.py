@@ -113,7 +113,7 @@ class PublicDrafter(nn.Module):
         return run_layers(self.layers, self.shape.language, x, positions, cache, seen, mask)
 
     def prompt_mask(self, x: Tensor, cache: DraftCache | None, seen: np.ndarray | Tensor | None) -> Tensor:
-        """Return the additive attention mask for `mask=prompt`, which hides all keys but the prompt's first P − 1.
+        """Return the additive attention mask for `mask=prompt`. Only the prompt's first P − 1 keys are visible.
 
         Args:
             x: (B, T, E) inputs of the layers.

@@ -82,7 +82,7 @@ class EarlyNetwork(Packable):
         return Program(self.logits, (1, len(self.mean))) if self.mean.dtype == torch.float32 else None
 
     def standardise(self, features: Tensor) -> None:
-        """Set the mean and the scale of the input features, from the training features (n, F)."""
+        """Set the mean and the scale by which inputs are standardised, from the training features (n, F)."""
         self.mean.copy_(features.float().mean(0))
         self.scale.copy_(1.0 / features.float().std(0).clamp_min(1e-3))
 
@@ -155,7 +155,7 @@ def choose(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tensor, Tensor]
 
 
 def _between(below: Tensor, pad: int, radius: int, bins: int) -> Tensor:
-    """Return the probability within ±radius around each bin.
+    """Return, for each bin, the summed probability of the bins within ±radius of it.
 
     Args:
         below: (…, V + 2 pad + 1) cumulative probability over the bins, padded on both sides.
@@ -234,7 +234,7 @@ class EarlyDrafter(TrainableDrafter):
         return EarlyExamples(features=features, tokens=tokens, **columns)
 
     def prepare(self, network: Any, examples: Any) -> None:
-        """Set the mean and the spread by which the network standardises its input features."""
+        """Set the mean and the scale by which the network standardises its inputs, from the training examples."""
         network.standardise(examples.features)
 
     def outputs(self, training: Training, module: Any, examples: Any, indices: Tensor) -> tuple[Tensor, ...]:

@@ -336,5 +336,5 @@ class DatastoreArtifact(Artifact[Manifest]):
         return description.content
 
     def load(self, path: Path, artifacts: Artifacts) -> Datastore:
-        """Open the datastore in `path`, with the search of the policy."""
+        """Open the datastore in `path`, with the search that the policy's settings choose."""
         return Datastore.open(path, artifacts.description, artifacts.search)

@@ -329,7 +329,7 @@ class VerifySkip(Skip):
 
     @classmethod
     def build(cls, settings: SimilaritySkipSettings, context: Context) -> VerifySkip:
-        """Build skip=similarity. If the method's proposer retrieves, both share one search."""
+        """Build skip=similarity. If the method's proposer also retrieves, the search runs only once for both."""
         proposer: Proposer | None = context.built["proposer"]
         retrieval = proposer.proposers["retrieval"] if isinstance(proposer, HybridProposer) else proposer
         if not isinstance(retrieval, RetrievalProposer):
@@ -501,7 +501,7 @@ class Random(Boundary):
 
 @dataclass(frozen=True)
 class Fused(Boundary):
-    """Chooses retrieval if F ≥ F*, where F is the weighted sum of the path's scaled curvature radius and length.
+    """Chooses retrieval if F ≥ F*. F is the weighted sum of the path's radius of curvature and length, both scaled.
 
     With fewer than three positions it chooses the drafter.
 

@@ -28,7 +28,7 @@ class Noise:
     """Parameters of a Kalman filter, one number per DoF.
 
     Only the ratio q / r matters, because the filter's initial covariance is r times the identity. The numbers of strict
-    DoFs (such as the gripper) are not used, because predictions hold these DoFs at their last value.
+    DoFs (such as the gripper) are not used, because a prediction repeats the last value of these DoFs.
 
     Attributes:
         q: Process noise: variance of the random acceleration per control step.

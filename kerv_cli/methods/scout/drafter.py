@@ -147,7 +147,7 @@ class ScoutProposer(EarlyProposer):
 class ScoutExamples(Observations, Decodes):
     """The n training examples of a scout: observations, and the target's tokens and estimated positions for them.
 
-    The simulator's true positions are not used.
+    The positions are those of the places, such as object and goal. The simulator's true positions are not used.
     """
 
     places: Tensor  # (n, K, 3) float32, positions estimated by the target, metres

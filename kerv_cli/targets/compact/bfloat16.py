@@ -2,9 +2,9 @@
 
 Weights are stored in the blocked layout of oneDNN, the library that torch uses for matrix multiplications on a CPU. One
 row and thirty rows then take almost the same time, because most of the time is spent on reading the weights. The
-residual stream, norms, rotations, attention and the cache stay float32. They are cheap, and rounding them would make
-almost equal logits more frequent. oneDNN adds in a different order for one row than for many, so the last bit of a
-result depends on the number of rows (docs/measuring.md).
+residual stream, norms, rotations, attention and the cache stay float32. They are cheap, and rounding them would more
+often make the two best logits almost equal. oneDNN adds in a different order for one row than for many, so the last bit
+of a result depends on the number of rows (docs/measuring.md).
 """
 
 from __future__ import annotations

@@ -207,7 +207,7 @@ def softmax(scores, slots, scale, mask, stop):
         scores: Address of the scores, one per slot of the cache.
         slots: Number of slots.
         scale: Factor of the scores, 1/√C.
-        mask: Address of a number per slot. A slot is hidden if it is not 0. The address 0 hides none.
+        mask: Address of a number per slot. A slot is hidden if its number is not 0. The address 0 hides no slot.
         stop: Slots from this index on are hidden.
     """
     for s in range(stop, slots):

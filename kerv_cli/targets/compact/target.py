@@ -1,4 +1,4 @@
-"""The compact target, the policy that kerv trains: prompt tokens -> Llama-style trunk -> action tokens.
+"""The compact target, the policy that kerv trains: a Llama-style trunk that maps prompt tokens to action tokens.
 
 The prompt is [vision grid] [instruction] [scene] [proprioception]. The last prompt position predicts token 0. An image
 of several camera views gives one vision grid per view.
@@ -6,8 +6,8 @@ of several camera views gives one vision grid per view.
 Scene tokens encode the places: positions that the task is about, such as those of object and goal. They contain where
 each place is, and the vectors from the hand to it. With `observation=vision` these positions are estimated from the
 image. The estimate is trained on the simulator's positions, which are never read afterwards. With `observation=state`
-the simulator gives the positions, together with the rest of its state. This is privileged information. It serves to
-study decoding without perception.
+the simulator gives the positions, together with the rest of its state. Such a policy has privileged information. It
+serves to study decoding without perception.
 """
 
 from __future__ import annotations
@@ -363,7 +363,10 @@ def _segments(settings: TargetSettings, views: int) -> Mapping[str, slice]:
 
 
 def _smooth_table(tokens: int, width: int) -> Tensor:
-    """Return an initial embedding (V, E) in which neighbouring tokens are similar: cosines of the token's value."""
+    """Return an initial embedding (V, E) in which neighbouring tokens are similar.
+
+    Each of the E numbers is a cosine of the token's value, with a random frequency and phase.
+    """
     centres = torch.linspace(-1, 1, tokens)[:, None]
     generator = torch.Generator().manual_seed(0)
     frequency = torch.exp(torch.rand(width, generator=generator) * 4.0)  # up to 55 rad per unit

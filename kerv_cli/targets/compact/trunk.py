@@ -188,7 +188,7 @@ class LayerStack(Packable):
         return hidden[:, :tokens]
 
     def captures(self, x: Tensor) -> bool:
-        """Return whether a forward of x (B, T, E) can run in a captured graph: batch 1 on CUDA, without gradients."""
+        """Return whether a forward of x (B, T, E) can run in a CUDA graph: on a GPU, with B = 1, without gradients."""
         return x.is_cuda and x.shape[0] == 1 and not wants_gradient(x)
 
     def recorded(self, *inputs: Tensor) -> Tensor:

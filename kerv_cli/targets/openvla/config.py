@@ -208,7 +208,8 @@ def action_space(shape: Shape, bounds: Bounds, like: ActionSpace | None, control
 
     Args:
         shape: Shape of the checkpoint.
-        bounds: Action statistics. They become `low` and `high` of the space. A DoF outside their mask gets -1 and 1.
+        bounds: Action statistics, which become `low` and `high` of the space. A DoF that their mask excludes gets -1
+            and 1.
         like: Action space of an environment, from which names, groups, strict DoFs and control rate are copied. None:
             OpenVLA's seven DoFs.
         control_hz: Control steps per second if `like` is None.

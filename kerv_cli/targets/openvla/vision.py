@@ -20,7 +20,7 @@ EPSILON = 1e-6  # of every layer norm
 
 
 def named(**layers: nn.Module) -> nn.Sequential:
-    """Return a sequence of layers. The names of the arguments are the names of their weights."""
+    """Return the layers in sequence. The weights of a layer get the name of its argument."""
     return nn.Sequential(OrderedDict(layers))
 
 
