@@ -110,7 +110,7 @@ def check_settings(settings: Any, what: str = "") -> None:
         what: Name of the dataclass in error messages, such as `runtime`. Empty for the whole settings.
 
     Raises:
-        UsageError: A value is not allowed. The message is about the first one.
+        UsageError: A value is not allowed. The message is about the first such value.
     """
     prefix = f"{what}." if what else ""
     for at, element in _declared(type(settings)):  # type: ignore[arg-type]

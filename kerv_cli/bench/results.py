@@ -346,7 +346,9 @@ def phase_rows(phases: Sequence[Phase]) -> list[tuple[str, ...]]:
 
 
 def ceiling_rows(by_tokens: Mapping[int, Sequence[MethodCeiling]]) -> list[tuple[str, ...]]:
-    """Return a row per method: its name, then for each N how it verifies and its two speedups.
+    """Return a row per method: its name, then for each N how it verifies, and its speedups.
+
+    The first speedup counts no time for drafting, the second one the measured time.
 
     Args:
         by_tokens: Highest speedup of each method, by N, the number of tokens in a chunk.

@@ -34,7 +34,9 @@ _LOADED: dict[tuple[Any, ...], Any] = {}
 
 @dataclass(frozen=True)
 class Use:
-    """What a policy's artifacts will be used for. The artifacts check it before any weights are loaded.
+    """What a policy's artifacts will be used for.
+
+    Each artifact checks that it was made for such a use, before any weights are loaded.
 
     Args:
         method: Settings of the method's parts, by the kind of the part, such as `proposer`.

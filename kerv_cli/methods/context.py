@@ -1,7 +1,7 @@
 """The context in which a method's part is built.
 
-Each part registers a function that takes (settings, context) and returns the part. It returns None if the method then
-works without a part of this kind.
+Each part registers a function that takes (settings, context) and returns the part. The function returns None if the
+method then works without a part of this kind.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ def observation_of(interface: Interface, message: Message) -> Observation:
     """Read the observation from a client's message.
 
     Raises:
-        UsageError: A value is missing, has a wrong size or type, or is not finite. The error names it.
+        UsageError: A value is missing, has a wrong size or type, or is not finite. The message names the value.
     """
     prompt = text_of(message.get(PROMPT, ""), PROMPT)
     images = {}

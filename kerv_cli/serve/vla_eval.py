@@ -89,7 +89,7 @@ class _Episode:
 class VlaEval(Conversation):
     """Serve one worker (shard) of a vla-eval benchmark.
 
-    A worker is silent while it builds a simulator and then does not answer pings. So the server sends it none.
+    While a worker builds a simulator, it is silent and does not answer pings. So the server sends no pings.
     """
 
     seats, ping_s, idle_s = 64, None, 1800.0

@@ -251,7 +251,7 @@ def target_fields(
 
 
 def read_description(folder: Path, kind: str, schema: type[T]) -> T:
-    """Return the description of an artifact. Check its fields, and that the weights have the hash that it names.
+    """Return the description of an artifact. Check its fields, and that the weights have the hash stored in it.
 
     Args:
         folder: Folder of the artifact.

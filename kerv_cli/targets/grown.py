@@ -143,7 +143,7 @@ def recipe_of(description: TargetDescription) -> Recipe:
 
 
 def check_weights(folder: Path, description: TargetDescription) -> None:
-    """Check that the weights of the policy that a grown target enlarges are unchanged.
+    """Check that the policy that a grown target enlarges still has the same weights.
 
     Raises:
         CheckpointError: The policy is missing, or its weights have changed.

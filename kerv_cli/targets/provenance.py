@@ -76,7 +76,7 @@ def git_commit(folder: Path = _HERE) -> str:
     """Return the git commit of kerv, with `+changes` if tracked files of the whole checkout were modified.
 
     Args:
-        folder: A folder of kerv's source code. The result is `none` if it is not part of a checkout.
+        folder: A folder of kerv's source code. If the folder is not part of a checkout, the result is `none`.
     """
     if shutil.which("git") is None or not _git(folder, "ls-files", "--error-unmatch", "__init__.py"):
         return "none"  # an installed copy may be inside another project's repository

@@ -2,15 +2,16 @@
 
 The hypothesis: each value in [0, 1] has an expectation of at least `bound`, given the values before it. A bettor bets
 against the hypothesis. Each bet is made before its value is known. The bettor's wealth starts at 1. If the hypothesis
-is true, the bets do not win on average, and the wealth ever reaches 1/δ with a probability of at most δ (Ville's
+is true, the bets do not win on average, and the probability that the wealth ever reaches 1/δ is at most δ (Ville's
 inequality). So a wealth of 1/δ rejects the hypothesis at level δ, and the wealth may be checked after each value.
 
 Values of different groups, such as tasks, must come in random order. Sorted values would reject the hypothesis only
 because of their order.
 
-For a certificate of success, each value comes from a pair of episodes with the same seed, by AR and by the method:
-(1 + AR − method) / 2, so 0, ½ or 1. The bound is (1 + m) / 2. The hypothesis is that the method loses a share m or more
-of the success.
+For a certificate of success, each value comes from two episodes with the same seed, one by autoregressive decoding and
+one by the method. Let a be 1 if autoregressive decoding succeeds, else 0. Let b be 1 if the method succeeds, else 0.
+The value is (1 + a − b) / 2, so 0, ½ or 1. The bound is (1 + m) / 2, where m is the margin. The hypothesis is that the
+method's rate of success is lower by at least m.
 """
 
 from __future__ import annotations

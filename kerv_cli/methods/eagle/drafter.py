@@ -181,7 +181,8 @@ class DrafterProposer(Proposer):
         """Draft EAGLE-2's dynamic tree of at most `depth` tokens per path.
 
         At each depth, the `top_k` nodes with the highest cumulative log-probability get `top_k` children each. In the
-        end the best `nodes` of all are kept. They form a tree, because a child is never more probable than its parent.
+        end the most probable nodes of all are kept, `nodes` in number. They form a tree, because a child is never more
+        probable than its parent.
         """
         target, top_k, device = self.target, self.top_k, self.hidden.device
         scores = torch.log_softmax(target.head(self.hidden).float(), -1)

@@ -147,7 +147,7 @@ class Index(Protocol):
     """A search for stored rows with keys most similar to a given key. The function `best` then ranks the rows found."""
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return the row numbers of the task's k most similar entries, and possibly of more, in ascending order.
+        """Return the row numbers of the task's k most similar entries, in ascending order. More rows may be among them.
 
         Args:
             key: (d,) float32.

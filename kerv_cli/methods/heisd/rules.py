@@ -186,9 +186,9 @@ class RetrievalProposer(ChainProposer):
         return cls(context.artifact("datastore"), context.target, settings.neighbours, settings.nodes)
 
     def neighbours(self, chunk: Chunk) -> Neighbours:
-        """Return the stored entries most similar to the chunk's observation, and set `chunk.similarity`.
+        """Return the stored entries most similar to the chunk's observation. The search runs once per chunk.
 
-        The search runs once per chunk.
+        Also store the highest similarity in `chunk.similarity`.
         """
         if self._nearest is None or self._nearest[0] is not chunk:
             pooled = read(self.datastore.pooled(chunk.prompt, self.target))[0]
@@ -272,8 +272,8 @@ class GroupRule(DistanceRule):
 
         Args:
             tree: The draft tree.
-            target_tokens: The target's tokens after the last committed token and after each node.
-            start: Number of committed tokens.
+            target_tokens: The target's prediction after the last committed token, then after each node.
+            start: Number of committed tokens. A node at depth d is token start + d of the chunk.
             r: Not used.
         """
         limits, bounds = self.limits(r), self.space.bounds

@@ -220,7 +220,7 @@ class Ridge(Predictor):
         super().__init__(held, None, window, window, horizon)
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return the weights (horizon, window): X' (XᵀX + λI)⁻¹ Xᵀ.
+        """Return the weights (horizon, window): X' (XᵀX + λI)⁻¹ Xᵀ, where λ is the penalty.
 
         X has the row (t, 1) for each past control step t = 0, 1, …, and X' for each future step.
         """

@@ -176,7 +176,7 @@ class Bounds:
 def read_statistics(folder: Path, name: str | None) -> tuple[str, Bounds]:
     """Read the action statistics of a data set from a checkpoint.
 
-    They are in `dataset_statistics.json` of a fine-tuned checkpoint, else in the field `norm_stats` of `config.json`.
+    A fine-tuned checkpoint has them in `dataset_statistics.json`, any other in the field `norm_stats` of `config.json`.
 
     Args:
         folder: Folder of the checkpoint.

@@ -1,8 +1,9 @@
 """Prepare the inputs of OpenVLA: images for its two vision towers, and instructions as token ids.
 
 An image is resized to the size of the towers without keeping its proportions (`resize-naive`, bicubic). Then it is
-scaled to [0, 1] and normalised for each tower. For a checkpoint that was fine-tuned on augmented images it is first
-cropped to the central 90 % of its area (`crop`), with bilinear interpolation. Each side is then √0.9 as long.
+scaled to [0, 1] and normalised for each tower. For a checkpoint that was fine-tuned on augmented images, the image is
+first cropped to the central 90 % of its area (`crop`), with bilinear interpolation. Each side is then √0.9 times as
+long.
 """
 
 from __future__ import annotations
