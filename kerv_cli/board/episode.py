@@ -133,7 +133,7 @@ _FOREVER = {"cache-control": "max-age=86400"}
 
 
 def frame(request: Request) -> Response:
-    """Return the image after a control step."""
+    """Return the image after the control step that the address names. Step 0 is the image at the start."""
     frames, step = _film(request).frames, request.path_params["step"]
     if step >= len(frames):
         raise HTTPException(404, f"the film has {len(frames)} frames, numbered from 0")
@@ -162,7 +162,7 @@ _VIEWER_SECONDS = 20.0
 def viewer_files() -> dict[str, tuple[bytes, str]]:
     """Return the files of Rerun's web viewer: name -> content and media type.
 
-    Rerun's package gives them only through its own server, which runs for a moment, for this machine alone.
+    Rerun's package offers them only through a web server of its own. It is started for a moment, for this machine only.
 
     Raises:
         KervError: The server does not start.
@@ -181,7 +181,11 @@ def viewer_files() -> dict[str, tuple[bytes, str]]:
 
 
 def _fetched(address: str) -> tuple[bytes, str]:
-    """Return content and media type of a file, as soon as its server has started."""
+    """Wait until a server has started. Return content and media type of the file at an address.
+
+    Raises:
+        KervError: The server does not start in time.
+    """
     end = time.monotonic() + _VIEWER_SECONDS
     while True:
         try:

@@ -1,4 +1,4 @@
-"""Helpers of all pages: render a template, answer polls, and find files in the results folder."""
+"""Helpers of all pages: render a template, format values, and find files in the results folder."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ class Job:
 
     Attributes:
         future: Gives the error as text; empty if the recording is written.
-        asked: Time of the click, seconds since 1970.
+        asked: Time at which the user asked for it, seconds since 1970.
     """
 
     future: Future[str]
@@ -32,7 +32,7 @@ class Job:
 
     @property
     def seconds(self) -> int:
-        """Seconds since the click."""
+        """Seconds since the user asked for the recording."""
         return int(time.time() - self.asked)
 
     @property
@@ -53,7 +53,7 @@ class Recorder:
         self._lock = threading.Lock()
 
     def job(self, path: Path) -> Job | None:
-        """Return the last job that was asked to write this file."""
+        """Return the newest job that writes this file. None if nobody asked for one."""
         return self._jobs.get(path)
 
     def record(self, found: FoundEpisode) -> None:

@@ -21,7 +21,7 @@ from kerv_cli.lab.runs import RUNNING, pulse, run_rows
 from kerv_cli.lab.store import StudyStore
 
 _SHARE = 0.01
-"""Largest share of each core's time that goes into refreshing a study while it runs, so that its timings hold."""
+"""Largest share of each core's time for refreshing the page of a running study, so that its times are not disturbed."""
 _SECONDS = 5.0
 """Shortest time between two refreshes."""
 

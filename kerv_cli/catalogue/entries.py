@@ -101,7 +101,7 @@ class RunEntry:
 
     @property
     def is_running(self) -> bool:
-        """Whether a process is making it."""
+        """Whether a process is now making the study or artifact."""
         return self.state.startswith(RUNNING)
 
     @property

@@ -87,7 +87,7 @@ class FoundEpisode:
 
     @property
     def recording(self) -> Path:
-        """Path of its recording, which may not exist."""
+        """Path of the episode's recording, which may not exist."""
         return self.store.rollouts / self.episode.recording
 
     def decodes(self) -> tuple[list[DecodeRecord], list[int]]:

@@ -72,7 +72,7 @@ class Evaluation:
     """One benchmark of a recorded evaluation.
 
     Attributes:
-        source: The file.
+        source: File of the recording.
         id: The evaluation's id in the evaluation program.
         benchmark: Name of the benchmark.
         config: Settings of the benchmark.
@@ -91,7 +91,7 @@ class Evaluation:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Facts about the kerv server (`Policy.facts`). Empty for other servers."""
+        """What a kerv server said about itself: settings, hashes, machine (`Policy.facts`). Empty for other servers."""
         return dict(self.server.get("kerv") or {})
 
     @property
@@ -115,7 +115,7 @@ def import_evaluations(
         words: Command-line arguments (without `kerv`) of the import.
 
     Returns:
-        Name of the study, and one line of text for each group of missing episodes.
+        Name of the study. And lines of text: for each evaluation with errors or missing episodes, how many there are.
 
     Raises:
         UsageError: A path holds no evaluation, the evaluations cannot be compared, another study has the same name, or
@@ -351,14 +351,17 @@ _NAME = re.compile(r"\w[\w.-]{0,199}")
 
 
 def path_of(results: Path, evaluation: str, episode: str) -> Path | None:
-    """Return the file of a served episode. None if a name cannot be used as a file name."""
+    """Return the file in which a kerv server stores an episode that it decoded.
+
+    None if the name of the evaluation or episode cannot be used as a file name.
+    """
     if not _NAME.fullmatch(evaluation) or not _NAME.fullmatch(episode):
         return None
     return results / SERVED / evaluation / f"{episode}.arrow"
 
 
 def write_served(path: Path, record: EpisodeRecord, started: str, by: Mapping[str, Any]) -> None:
-    """Write an episode that a kerv server decoded to a file.
+    """Write to a file an episode that a kerv server decoded.
 
     Args:
         path: The file.

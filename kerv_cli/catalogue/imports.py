@@ -141,7 +141,7 @@ def _study_of(folder: Path, kind: str) -> tuple[Study, dict[Path, list[Episode]]
     """Read the plan.yaml of a study of version 0.1.0.
 
     Returns:
-        The study, and for each of its cells the folder and the episodes.
+        The study; and folder of each of its cells -> the cell's episodes.
     """
     plan, _ = read_yaml_lines(folder / "plan.yaml", str(folder))
     settings = {
@@ -219,8 +219,8 @@ def _in_cell(cell: Path, episodes: list[Episode]) -> Iterator[ImportedEpisode]:
 def connect_foreign(path: Path, **options: Any) -> sqlite3.Connection:
     """Open a SQLite file from somebody else, read-only.
 
-    A small file can contain an endless query. So a connection may take only a limited number of steps, which grows
-    with the file's size. After that, its queries fail.
+    A small file can contain an endless query. So a connection may execute only a limited number of SQLite's
+    instructions, which grows with the file's size. After that, its queries fail.
 
     Args:
         path: The file.
@@ -286,7 +286,7 @@ def _stored_episodes(connection: sa.Connection, settings: dict[int, Setting]) ->
 
     Args:
         connection: The database.
-        settings: The settings by their ids in that database.
+        settings: Id of a setting in this database -> the setting.
 
     Raises:
         ValueError: The decodes of an episode are damaged or too large.

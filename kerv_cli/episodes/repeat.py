@@ -51,7 +51,7 @@ def repeating_words(settings: Plain, identity: Identity, typed: str, task: str, 
 
 
 def _first_word(settings: Plain, typed: str) -> str:
-    """Return the override that chooses the method. For a method from a file, it is the file's path as typed."""
+    """Return the override that chooses the method, such as `method=kerv`, or `method=PATH` for a file of the user."""
     if settings["policy"]["kind"] == EXPERT:
         return "policy=expert"
     path = next((word for word in split(typed) if re.fullmatch(r"method=.+\.ya?ml", word)), "")
@@ -60,7 +60,7 @@ def _first_word(settings: Plain, typed: str) -> str:
 
 
 def _keys(settings: Plain) -> dict[str, Any]:
-    """Return dotted key -> value of the settings that determine a result, and of the names of the policy's weights."""
+    """Return dotted key -> value of all settings `policy.*`, and of the other settings that determine a result."""
     policy: Mapping[str, Any] = settings["policy"]
     return {**flat({"policy": policy}), **flat(effective(settings))}
 

@@ -83,8 +83,8 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     """Compose all settings of the study that the command line chooses.
 
     Args:
-        overrides: The command line's `key=value` arguments. Those of `kerv sweep` and `study` configure the sweep. All
-            others, and `results`, apply to every setting.
+        overrides: The command line's `key=value` arguments. Settings of `kerv sweep`, such as `study` and `results`,
+            configure the sweep. `results` and all others apply to every setting of the study.
 
     Raises:
         UsageError: A key or name is unknown. Or the study has no settings or lacks its baseline. Or one of its settings
@@ -148,7 +148,7 @@ def _line_of(path: Path, typed: Collection[str], place: str, others: Mapping[str
         path: The study's file.
         typed: Keys on the command line. An error about one of these gets no file and line.
         place: Key in the file to which the error belongs, such as `settings.ar`.
-        others: Exceptions: key of a setting -> the key in the file to which an error about this setting belongs.
+        others: Key of a setting -> the key in the file that replaces `place` if the error is about this setting.
     """
     try:
         yield

@@ -82,7 +82,7 @@ _EPISODE: Fields = {
     "initial_state": (pa.list_(FLOAT), lambda episode: np.asarray(episode.initial_state, np.float64).ravel().tolist()),
 }
 EPISODE_SCHEMA = pa.schema((name, kind) for name, (kind, _) in _EPISODE.items())
-"""Columns from an episode's record. The database adds the settings that it belongs to and when it ran."""
+"""Columns that are computed from an episode's record. The database adds others, such as the task and the time."""
 
 _TOKENS = pa.list_(pa.int32())
 _COUNTS = ("start", "accepted", "committed", "tree_size")

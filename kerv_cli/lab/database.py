@@ -290,7 +290,10 @@ def measures_in(connection: sa.Connection) -> list[sa.ColumnElement[Any]]:
 
 
 def _add_measures(connection: sa.Connection) -> None:
-    """Add the columns of MEASURES that a table from an older kerv lacks. The older kerv can still use the table."""
+    """Add the columns with results (MEASURES) that the table of episodes lacks, because an older kerv made it.
+
+    The older kerv can still use the table.
+    """
     quote = connection.dialect.identifier_preparer.quote
     for column, found in zip(MEASURES, measures_in(connection), strict=True):
         if not isinstance(found, sa.Column):

@@ -207,7 +207,7 @@ class StudyStore:
             connection.execute(sa.insert(WANTED), rows)
 
     def counts(self) -> tuple[int, int]:
-        """Return how many of the study's episodes exist, and how many it has in all."""
+        """Return how many of the study's planned episodes have been run, and how many are planned in all."""
         with self.database.reading() as connection:
             row = connection.execute(
                 sa.select(sa.func.count(WANTED.c.episode_id), sa.func.count())
@@ -235,7 +235,7 @@ class StudyStore:
         return sorted(run for run, count in counts.items() if run and count == total)
 
     def frame(self, episodes: Iterable[Episode] | None = None, run: str | None = None) -> pd.DataFrame:
-        """Return the existing episodes as a table, in the study's order: one row per label, task, seed and repeat.
+        """Return the episodes that have been run, in the study's order: one row per label, task, seed and repeat.
 
         It has the columns of the table `episodes`, with `decode_seconds` as an array. Further columns are `run`,
         `code`, and the machine and versions that ran the episode.
@@ -327,7 +327,10 @@ class StudyStore:
                 connection.execute(self.update_of(one.episode).values(episode_id=number))
 
     def update_of(self, one: Episode) -> sa.Update:
-        """Return the SQL UPDATE of an episode's rows in this study: one for each label that shares the episode."""
+        """Return an SQL UPDATE of the rows of WANTED that stand for an episode in this study.
+
+        Settings with different labels but equal meaning share the episode. Each of them has such a row.
+        """
         settings = sa.select(SETTINGS.c.id).join(STUDIES).where(STUDIES.c.name == self.name)
         settings = settings.where(SETTINGS.c.work == one.setting.work)
         same = (WANTED.c.task == one.task, WANTED.c.seed == one.seed, WANTED.c.repeat == one.repeat)

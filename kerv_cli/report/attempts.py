@@ -1,4 +1,7 @@
-"""Keep a certificate to one test per policy, on seeds that no other study ran (docs/methods.md §4.6)."""
+"""See to it that a policy is tested for a certificate only once, on seeds that no other study ran.
+
+A further test must be asked for and gets a smaller error probability (docs/methods.md §4.6).
+"""
 
 from __future__ import annotations
 

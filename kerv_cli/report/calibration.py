@@ -14,10 +14,10 @@ Table = tuple[tuple[str, ...], list[tuple[object, ...]], str]
 
 
 def tables(calibration: Calibration, path: Path) -> Iterator[Table]:
-    """Yield two or three tables: K_S and prediction errors per task, errors per predictor, and thresholds per task.
+    """Yield tables: K_S and prediction errors of each task, errors of each predictor, and thresholds of each task.
 
     K_S is the reference level of a task's kinematic variability (docs/methods.md §3). The thresholds say when a
-    retrieved chunk may be executed without verification (§4). Their table is left out if they were not calibrated.
+    retrieved chunk may be executed without verification (§4). Without thresholds, the last table is left out.
 
     Args:
         calibration: The calibration.

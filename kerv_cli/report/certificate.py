@@ -1,6 +1,7 @@
 """Issue a certificate of success from a study's paired episodes.
 
-The certificate states how much success a setting loses at most against AR (docs/methods.md §4.6, ours).
+The certificate states how much success a setting loses at most against AR (docs/methods.md §4.6, ours). AR is the
+study's baseline. The other settings are the candidates.
 """
 
 from __future__ import annotations
@@ -52,8 +53,8 @@ def folder_of(resolved: ResolvedStudy) -> Path:
     """Check that a study can give a certificate. Return the folder to write the certificate into.
 
     Raises:
-        UsageError: The study has only a baseline, its candidates differ in more than `prefill_draft` and `skip`, its
-            seeds are not selection seeds, or the folder belongs to a policy that kerv ships.
+        UsageError: The study has only a baseline, a condition of `_check_conditions` is not met, its seeds are not
+            selection seeds, or the folder belongs to a policy that kerv ships.
     """
     baseline, *candidates = _settings(resolved)
     if not candidates:
@@ -70,8 +71,8 @@ def folder_of(resolved: ResolvedStudy) -> Path:
 def _check_conditions(resolved: ResolvedStudy) -> None:
     """Refuse studies to which a certificate does not apply.
 
-    All candidates must have the same chunk, method, policy, number format and world. The world must have no stress and
-    wait for the policy. The baseline must be AR.
+    Candidates may differ only in the settings `prefill_draft` and `skip`. The baseline must be AR, with the same
+    tasks, seeds, policy, number format and world. The world must have no stress and wait for the policy.
 
     Raises:
         UsageError: A condition is not met.

@@ -101,7 +101,7 @@ def safest_first(rows: Sequence[Row]) -> list[Row]:
 def _fastest(rows: Sequence[Row]) -> Row | None:
     """Return the row of the fastest of the tested settings, or None if there are none.
 
-    Settings whose interval shows that they are faster than the baseline come before all others. If no setting has a
+    A setting whose interval shows that it is faster than the baseline is preferred to any other. If no setting has a
     measured speed, return the one that was tested last.
     """
     return max(

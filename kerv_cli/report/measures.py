@@ -60,7 +60,7 @@ def measure(
     Args:
         episodes: One row per episode. Columns: those of rows.EPISODE_SCHEMA, `label`, `decode_seconds`, `difficulty`,
             `run`, `block`, and those of `COMPARABLE`.
-        pairs: Their pairs with the baseline, from `paired`.
+        pairs: The episodes' pairs with those of the baseline, from `paired`.
         by: Columns that form the groups: the label, or task and label.
         averaging: MACRO computes a measure for every difficulty group and returns the unweighted mean of the groups.
             Any other value pools all episodes. Paired counts, McNemar's p and `pairs_to_settle` are always pooled.
@@ -105,7 +105,7 @@ def measure(
 
 
 def _averaged(groups: Iterable[Hashable], estimates: Iterable[Estimate]) -> dict[Hashable, Estimate]:
-    """Return the mean of the estimates of each group. Estimates that are NaN are left out."""
+    """Return group -> mean of its estimates. `groups[i]` is the group of `estimates[i]`. NaN estimates are left out."""
     known: dict[Hashable, list[Estimate]] = {}
     for group, estimate in zip(groups, estimates, strict=True):
         known.setdefault(group, []).extend([] if math.isnan(estimate.value) else [estimate])
@@ -187,8 +187,8 @@ def speedups(
 ) -> dict[str, dict[Hashable, Estimate]]:
     """Return `speedup` and `episode_speedup` of each group of pairs.
 
-    A group has none if it has no usable pairs, if an episode was not timed, or if its setting runs no decoder (the
-    scripted expert).
+    A group has no speedup if it has no usable pairs, if an episode was not timed, or if its setting runs no decoder
+    (the scripted expert).
 
     Args:
         pairs: Table made by `paired`.

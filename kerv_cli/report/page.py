@@ -37,7 +37,7 @@ from kerv_cli.report.viewing.film import animation, film_of
 LOSS = 3.0
 """Default for the largest loss of success that the page's verdict accepts, in points."""
 _FRAMES = 240
-"""A film plays at half speed. If it has more than half as many frames, it plays faster, to stay short and small."""
+"""Films play at half speed. One with more than half this number of frames plays faster, to stay short and small."""
 
 
 def render(

@@ -1,4 +1,4 @@
-"""Draw the charts of a study from its tables. The page shows them interactively, a PNG file needs no browser.
+"""Draw the charts of a study from its tables: interactive ones for the page, and PNG files.
 
 A chart has panels side by side. Each of its points is a setting, with these fields: `setting`, `line`, `x`, `value`,
 `low` and `high` (95 % interval), `is_baseline`, and the text that hovering shows. The page sets the parameter `picked`
@@ -220,7 +220,7 @@ def curves_figure(log: pd.DataFrame) -> alt.ConcatChart:
 
 
 def _chart(panels: list[alt.LayerChart], across: int) -> alt.ConcatChart:
-    """Put panels side by side, with the look and the parameter that all charts share."""
+    """Put panels side by side, `across` in a row. Add the look of all charts, and the parameter `picked`."""
     return alt.concat(*panels, columns=across, spacing=28, config=_CONFIG).add_params(alt.param("picked", value=""))
 
 

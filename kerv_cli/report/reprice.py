@@ -144,7 +144,7 @@ def own_prices(data: StudyData, store: StudyStore) -> pd.DataFrame | None:
 
 
 def _speeds(values: Row, prefix: str) -> dict[str, float]:
-    """Return the columns of both speeds and their intervals, with `prefix` before each name."""
+    """Return the speeds per episode and per step and their intervals, with `prefix` before each column's name."""
     return {f"{prefix}{name}{end}": values[f"{name}{end}"] for name in SPEEDS for end in ("", "_low", "_high")}
 
 

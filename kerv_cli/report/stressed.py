@@ -16,7 +16,7 @@ def is_stressed(table: pd.DataFrame) -> bool:
 
 
 def summed_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Pool a study's stressed episodes: those of each kind of stress, those of each level, and all of them.
+    """Pool a study's stressed episodes in three ways: by kind of stress, by level, and all together.
 
     Each pooled row is compared with the baseline's episodes in the same worlds under the same stresses.
 

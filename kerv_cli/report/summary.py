@@ -63,7 +63,7 @@ def intervals(name: str, form: str = ".2f", unit: str = "", scale: float = 1.0, 
 
     Args:
         name: The column.
-        form: Format of the numbers. With `.0f`, the value still has one decimal if this is not 0, because a success of
+        form: Format of the numbers. Even with `.0f` the value gets one decimal unless that is 0, because a success of
             99.5 % must not read as 100 %.
         unit: Text after the value.
         scale: Factor for value and interval; 100 for per cent.
@@ -87,7 +87,7 @@ def _minus(text: str) -> str:
 
 
 def _difference(row: Row) -> str:
-    """Return the change in success. It is empty for the baseline."""
+    """Return the change in success, in points with its interval, as text. Empty for the baseline."""
     return "" if is_baseline(row) else intervals("difference", "+.0f", "", 100.0, " to ")(row)
 
 
@@ -140,7 +140,7 @@ def lost_won(row: Row) -> str:
 
 
 def summary_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame:
-    """Return the rows of a study's table as text. Columns that say nothing are left out, except for the main ones.
+    """Return the rows of a study's table as text, with the main columns and those that are not all empty or zero.
 
     Args:
         table: The study's table.

@@ -65,7 +65,7 @@ class StudyData:
 
     @functools.cached_property
     def settings(self) -> dict[str, Setting]:
-        """Label -> setting."""
+        """Label of each setting -> the setting."""
         return {setting.label: setting for setting in self.study.settings}
 
     @functools.cached_property
@@ -95,7 +95,7 @@ class StudyData:
         return {label: same.get(_conditions_of(one), self.study.baseline) for label, one in self.settings.items()}
 
     def compared_with(self, label: str) -> StudyData:
-        """Return the study under the name NAME_against_LABEL, with another baseline.
+        """Return the study with the setting `label` as its baseline, and with the name NAME_against_LABEL.
 
         Raises:
             UsageError: The study has no such setting.

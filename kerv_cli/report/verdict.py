@@ -31,8 +31,8 @@ class Choice:
         chosen: Fastest setting that is shown to lose less success than the bound. Empty if there is none.
         loss_at_most: Upper bound on the chosen setting's loss of success, in points, at 95 % confidence. NaN if no
             setting is chosen.
-        candidate: Fastest setting that could be shown with more pairs, if the rates stay the same. Empty if there is
-            none, or if a setting is chosen.
+        candidate: Fastest setting that more pairs would show to lose less than the bound, if the rates stay the same.
+            Empty if there is none, or if a setting is chosen.
         candidate_pairs: About how many pairs in all the candidate needs. NaN without a candidate.
         tested: Number of settings that are tested for their loss of success: those that are faster than the baseline or
             were not timed.
@@ -139,7 +139,7 @@ def _speed(choice: Choice) -> str:
 
 
 def _missing(choice: Choice) -> str:
-    """Return the clause that says how many more pairs would show that some setting may be taken, and which setting."""
+    """Return the clause that says how many more pairs a choice would need, and which setting it would then be."""
     if not choice.candidate:
         return "at these rates, more pairs would not show one either"
     more = max(1, math.ceil(choice.candidate_pairs - choice.pairs))

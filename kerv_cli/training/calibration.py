@@ -59,7 +59,7 @@ ENTRIES = 4000
 On MT10, skip levels from 1000 entries did not hold on other episodes.
 """
 LEAST = 20
-"""Minimum number of entries at or above a skip level."""
+"""Minimum number of matches from which a skip level (similarity at which verification is skipped) is derived."""
 LOW, HIGH = 2.0, 1 / 3
 """Share of wrong chunks that the lower and the upper bound of s_min allow, relative to the share that s_min allows.
 
@@ -167,7 +167,7 @@ class CalibrationRun:
         return calibration
 
     def skip(self, stage: Stage) -> SkipSection | None:
-        """Return the smallest similarity per task at which verification is skipped. None without a datastore."""
+        """Return, for each task, the smallest similarity at which verification is skipped. None without a datastore."""
         if "datastore" in self.missing:
             return None
         store = self.artifacts.load("datastore")
@@ -228,10 +228,10 @@ class CalibrationRun:
 
 @dataclass(frozen=True)
 class Windows:
-    """The expert's normalised actions before and after n moments of the demonstrations (D DoFs, H control steps)."""
+    """The expert's normalised actions before and after n moments (control steps) of the demonstrations."""
 
-    past: np.ndarray  # (n, window, D)
-    future: np.ndarray  # (n, H, D)
+    past: np.ndarray  # (n, window, D), D DoFs
+    future: np.ndarray  # (n, H, D), H control steps
     task: np.ndarray  # (n,) index into `tasks`
     held_out: np.ndarray  # (n,) bool, the same for all moments of an episode
     tasks: tuple[str, ...]
@@ -445,7 +445,7 @@ def match(store: Datastore, task: str, epsilon: float) -> Matches:
 
 
 def lowest_level(matches: Matches, confidence: float, least: int = LEAST) -> float | None:
-    """Find the lowest similarity s such that enough of the matches with similarity ≥ s are good.
+    """Find the lowest similarity s for which enough of the matches with a similarity of s or more are good.
 
     Args:
         matches: The task's matches.

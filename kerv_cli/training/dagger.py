@@ -29,7 +29,7 @@ from kerv_cli.worlds.spec import EnvironmentSpec, World
 
 
 class PolicyActor:
-    """Chooses the actions of a recording: whole chunks of a policy, or the expert's actions for some chunks.
+    """Chooses the actions that a recording executes: for each chunk, either the policy's or the expert's.
 
     Task and seed determine which chunks are the expert's. The decoder is never told whether an episode succeeded, so
     no episode depends on earlier episodes.
@@ -88,7 +88,7 @@ class PolicyActs:
 
     @classmethod
     def of(cls, settings: DemosSettings, spec: EnvironmentSpec) -> PolicyActs:
-        """Check that a recording's policy can act in an environment, and return the maker of its actor.
+        """Check that a recording's policy can act in an environment, and return what makes its `PolicyActor`.
 
         The recording may contain more camera views than the target sees, to train another target on them.
 

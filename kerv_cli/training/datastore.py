@@ -133,7 +133,7 @@ class DatastoreBuild:
 
         Args:
             columns: Column -> values, one row per entry of all tasks.
-            shards: Task -> its rows and seeds.
+            shards: Task -> the range of its rows, and the seeds of its episodes.
         """
         keys, tokens, files = columns.pop("keys"), columns.pop("tokens"), {}
         if self.settings.components:

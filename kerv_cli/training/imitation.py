@@ -68,7 +68,7 @@ def load_samples(
         words: Tokenizer of the instructions.
         task_names: Full names of the tasks.
         progress: Called with the numbers of episodes read and of all.
-        waypoints: Number of positions to learn that show where the hand will be later in the episode. 0: the positions
+        waypoints: Number of later positions of the hand that the policy learns to estimate. 0: it learns the positions
             of object and goal instead.
 
     Raises:
@@ -212,8 +212,8 @@ class Imitation:
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
         """Return the loss of a batch, and the metrics to log.
 
-        The loss is the token loss plus `train.scene_weight` times the position loss. The position loss measures how far
-        off the positions are that a target with cameras estimates, such as object and goal. In the first
+        The loss is the token loss plus `train.scene_weight` times the position loss. The position loss measures
+        the errors of the positions, such as object and goal, that a target with cameras estimates. In the first
         `train.scene_steps` steps it is used alone. A target without cameras has only the token loss.
 
         Args:
@@ -281,7 +281,8 @@ class Imitation:
 def check_init(settings: TargetSettings, camera: str, description: TargetDescription, folder: Path) -> None:
     """Refuse initial weights whose shapes differ from the new target's.
 
-    Only `size`, `chunk`, `norm` and `parallel` may differ. The new target may see further views after the old ones.
+    Only the settings `size`, `chunk`, `norm` and `parallel` may differ. The new target may see further views after the
+    old ones.
 
     Args:
         settings: Shapes of the new target.

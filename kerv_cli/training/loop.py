@@ -64,7 +64,7 @@ class Loop:
 
     Args:
         objective: The network, its training samples and its loss.
-        save: Called with the module and its metrics after each validation with the best score so far.
+        save: Called with the module and its metrics after each validation whose score is the best so far.
         settings: Optimisation settings.
         folder: Folder for the resume file and `log.csv`.
         identity: Hash of everything that determines the training. It goes into the resume file.

@@ -147,7 +147,8 @@ class BuildDrafterSettings(RunSettings):
 class BuildDatastoreSettings(DemonstrationSettings):
     """Settings of `kerv build datastore`, which stores demonstrated chunks for retrieval (docs/methods.md §4.1).
 
-    `policy.target` encodes the observations, which become the search keys. Its action tokens are stored.
+    `policy.target` encodes the observations, which become the search keys. The expert's next actions are stored as
+    action tokens.
     """
 
     groups: ClassVar = {"policy": "vision", "runtime": "cpu"}

@@ -42,7 +42,7 @@ class TargetRun(TrainingRun):
     """The training of a compact policy, by `kerv train target`.
 
     Attributes:
-        notes: One line per setting that the demonstrations decided.
+        notes: One line for each setting that was changed to suit the demonstrations.
 
     Raises:
         UsageError: Some settings contradict each other.

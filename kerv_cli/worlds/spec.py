@@ -398,7 +398,7 @@ class World(ABC):
     def frame(self, camera: CameraSettings | None = None) -> NDArray[np.uint8]:
         """Return the current image (size, size x views, 3) as uint8 RGB, for a recording.
 
-        It is sharp and current even if a stress disturbs the policy's images.
+        The image is sharp and current even if a stress disturbs the images that the policy sees.
 
         Args:
             camera: The view to draw. None: the world's own view.

@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 
 def build(options: Any, slots: int, threads: int, folder: Path) -> Executor:
-    """Return an executor: this process itself for one slot, else one process per slot."""
+    """Return an executor with `slots` workers. A single worker is this process itself."""
     return InProcess() if slots == 1 else Processes(slots, threads)
 
 

@@ -272,7 +272,12 @@ def blueprint(record: EpisodeRecord) -> rrb.Blueprint:
 
 
 def _series(name: str, *entities: str) -> rrb.TimeSeriesView:
-    """Return a view that plots some entities over time."""
+    """Return a view that plots data over time.
+
+    Args:
+        name: Title of the view.
+        *entities: Names under which the data were logged.
+    """
     return rrb.TimeSeriesView(
         origin="/",
         contents=[f"/{entity}" for entity in entities],

@@ -41,7 +41,7 @@ from kerv_cli.worlds.vectors import unit_vector
 
 _SEEDS_PER_JOB = 10  # seeds of a job share one simulator
 _EXTRA_SEEDS = 20
-"""Failed seeds are replaced by seeds beyond the requested range: at most this many, plus one per requested episode."""
+"""At most this many failed seeds of a task, plus one per requested episode, are replaced by further seeds."""
 
 
 @dataclass(frozen=True)
@@ -168,8 +168,8 @@ def record(
 ) -> DemoManifest:
     """Record demonstrations into a folder. If the recording was interrupted, continue it.
 
-    If the expert fails for a seed, the next seed after the requested range replaces it, up to a limit. The recorded
-    episodes do not depend on the number of workers.
+    If the expert fails for a seed, the next seed after the requested range replaces it. If more fail than may be
+    replaced, episodes are missing. The recorded episodes do not depend on the number of workers.
 
     Args:
         config: What to record.
@@ -203,7 +203,7 @@ def record(
 def _collect(
     config: DemoConfig, out: Path, on_progress: OnProgress, make_actor: MakeActor | None
 ) -> tuple[dict[str, list[EpisodeEntry]], dict[str, list[int]]]:
-    """Record all episodes.
+    """Record all episodes, and further seeds for those in which the expert fails.
 
     Returns:
         Task -> entries of its episodes for the manifest; and task -> seeds in which the expert failed.
