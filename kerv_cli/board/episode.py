@@ -160,7 +160,7 @@ _VIEWER_SECONDS = 20.0
 
 @functools.cache
 def viewer_files() -> dict[str, tuple[bytes, str]]:
-    """Return the files of Rerun's web viewer: name -> content and media type.
+    """Return content and media type of each file of Rerun's web viewer, by the file's name.
 
     Rerun's package offers them only through a web server of its own. It is started for a moment, for this machine only.
 

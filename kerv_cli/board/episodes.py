@@ -94,7 +94,7 @@ class Grid:
     Attributes:
         task: Name of the task.
         seeds: All seeds. Those with the most failures come first.
-        rows: Label of a setting -> seed -> the episode.
+        rows: For each setting's label, the episodes by seed.
         failed: Number of failed episodes.
         total: Number of all episodes, also those that have not run.
     """
@@ -112,7 +112,7 @@ def cells_of(rows: Sequence[Any], baseline: str, settings: Mapping[str, Setting]
     Args:
         rows: Rows of `outcomes`.
         baseline: Label of the baseline.
-        settings: Label -> setting.
+        settings: The settings by label.
     """
     study = Study("", tuple(settings.values()), (), baseline=baseline)
     references = StudyData(study, pd.DataFrame()).references

@@ -68,7 +68,7 @@ class RunEntry:
         figures: Its main numbers by name, such as the success rate.
         command: Command-line arguments (without `kerv`) that made it. Empty if unknown.
         sha256: Hash by which other artifacts refer to it.
-        made_from: Kind -> hash of each artifact that it was made from. If settings of a study use different
+        made_from: Hashes of the artifacts that it was made from, by kind. If settings of a study use different
             artifacts of a kind, the key of the second and later ones is `KIND of LABEL`, with the label of the setting.
     """
 
@@ -166,8 +166,9 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
 
     Args:
         runs: Entries to choose from.
-        filters: Name of a filter -> its value. `kind` is a whole kind. `method` and `task` are names, or patterns such
-            as `drawer*`. `state` is the beginning of a state, and `since` the earliest start (ISO 8601).
+        filters: The value of each filter, by the filter's name. `kind` is a whole kind. `method` and `task` are names,
+            or patterns such as `drawer*`. `state` is the beginning of a state, and `since` the earliest start
+            (ISO 8601).
 
     Raises:
         UnknownName: A filter, kind or state does not exist.
@@ -347,7 +348,7 @@ def _made_from(value: Mapping[str, Any], provenance: Mapping[str, Any]) -> dict[
 
 
 def parents(run: RunEntry, runs: Sequence[RunEntry]) -> dict[str, str]:
-    """Return the artifacts that an entry was made from, as kind -> name.
+    """Return the names of the artifacts that an entry was made from, by kind.
 
     The name is the id of another entry, or `shipped` and the name of a policy that kerv ships. For an artifact that is
     neither, it is the first 12 digits of the hash.

@@ -141,7 +141,7 @@ def _study_of(folder: Path, kind: str) -> tuple[Study, dict[Path, list[Episode]]
     """Read the plan.yaml of a study of version 0.1.0.
 
     Returns:
-        The study; and folder of each of its cells -> the cell's episodes.
+        The study, and the episodes of each of its cells by the cell's folder.
     """
     plan, _ = read_yaml_lines(folder / "plan.yaml", str(folder))
     settings = {
@@ -286,7 +286,7 @@ def _stored_episodes(connection: sa.Connection, settings: dict[int, Setting]) ->
 
     Args:
         connection: The database.
-        settings: Id of a setting in this database -> the setting.
+        settings: The settings by their id in this database.
 
     Raises:
         ValueError: The decodes of an episode are damaged or too large.

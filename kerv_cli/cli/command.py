@@ -44,7 +44,7 @@ def command(name: str, settings: type = CommandSettings, keys: str = "", **trait
         **traits: Optional properties:
             examples: Command lines for the help.
             names: Help text for arguments that are not `key=value`. Without it there are none.
-            typed: Key as typed on the command line -> name of the setting, if the two differ.
+            typed: Maps a key as typed on the command line to the name of the setting, if the two differ.
             writes: Whether the command writes to the results folder (default true). If so, kerv first checks that the
                 folder is writable.
             each: Name of another command, whose settings can be typed, too, such as `rollout` for `sweep`.
@@ -108,7 +108,7 @@ def _flags(command: TyperCommand, options: Mapping[str, object]) -> list[str]:
 
     Args:
         command: The command.
-        options: Name of the parameter -> value of each option.
+        options: The values of the options, by the name of the parameter.
     """
     names = {param.name: param.opts[0] for param in command.params}
     given = [(names[name], value) for name, value in options.items() if value not in (None, False)]

@@ -230,7 +230,7 @@ def print_figures(what: str, figures: Mapping[str, float], folder: object, as_js
 
     Args:
         what: Header of the table.
-        figures: Name -> number.
+        figures: The numbers by name.
         folder: Folder of the artifact that the numbers describe.
         as_json: Print numbers and folder as JSON.
     """

@@ -44,8 +44,8 @@ def check(settings: RolloutSettings) -> dict[str, str]:
     """Refuse settings that cannot run, before anything slow starts.
 
     Returns:
-        Everything besides the settings that determines the results. Kind of a file with weights or data -> its hash,
-        and `observation` -> what the policy observes, such as `vision` or the simulator's privileged state.
+        Everything besides the settings that determines the results. These are the hashes of files with
+        weights or data, by the kind of file. The key `observation` says what the policy observes, such as `vision`.
 
     Raises:
         UsageError: A number is out of range, a seed is a training seed, the policy was trained on another camera, or

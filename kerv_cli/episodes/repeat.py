@@ -60,7 +60,7 @@ def _first_word(settings: Plain, typed: str) -> str:
 
 
 def _keys(settings: Plain) -> dict[str, Any]:
-    """Return dotted key -> value of all settings `policy.*`, and of the other settings that determine a result."""
+    """Return all settings `policy.*` and the other settings that determine a result, with dotted keys."""
     policy: Mapping[str, Any] = settings["policy"]
     return {**flat({"policy": policy}), **flat(effective(settings))}
 

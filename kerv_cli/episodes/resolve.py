@@ -28,7 +28,7 @@ class Point:
     Attributes:
         name: Name of the grid, which all its points share.
         overrides: This point's overrides, `key=value`.
-        varies: Key -> this point's value, for the keys that differ within the grid.
+        varies: This point's values of the keys that differ within the grid, by key.
     """
 
     name: str
@@ -115,7 +115,7 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
 
 
 def _points(study: StudySettings, path: Path) -> dict[str, Point]:
-    """Expand every entry of the study's `settings` into the points of its grid. Return label -> point."""
+    """Expand every entry of the study's `settings` into the points of its grid. Return the points by label."""
     points: dict[str, Point] = {}
     for name, text in study.settings.items():
         with _line_of(path, (), f"settings.{name}"):
@@ -148,7 +148,7 @@ def _line_of(path: Path, typed: Collection[str], place: str, others: Mapping[str
         path: The study's file.
         typed: Keys on the command line. An error about one of these gets no file and line.
         place: Key in the file to which the error belongs, such as `settings.ar`.
-        others: Key of a setting -> the key in the file that replaces `place` if the error is about this setting.
+        others: Maps a setting to the key in the file that replaces `place` if the error is about this setting.
     """
     try:
         yield

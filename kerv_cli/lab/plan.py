@@ -54,7 +54,7 @@ class Setting:
         overrides: The overrides that make it, as the user wrote them.
         settings: The rollout's settings as nested plain values, without the task.
         identity: Hashes of the weights and data that it reads.
-        varies: Key -> value, for the keys that differ within a grid of settings.
+        varies: This setting's values of the keys that differ within its grid of settings, by key.
         name: Name of that grid, which its settings share. By default the label.
     """
 
@@ -261,7 +261,7 @@ def split(
         rerun: Which existing episodes to run again: NEVER, TIMED, CHANGED or ALL.
         since: Used only with ALL, if a command is resumed: the time at which it first began (ISO 8601). Episodes of
             blocks that began later count as existing, because this command ran them. Empty: all episodes run again.
-        earlier: Label -> the newest stored setting with this label, and its hash. Used to explain what has changed.
+        earlier: The newest stored setting and its hash, by label. Used to explain what has changed.
 
     Returns:
         Existing episodes with their rows, and missing episodes with the reason for running them.
@@ -337,7 +337,7 @@ def _keep_whole_orders(usable: dict[Episode, list[StoredEpisode]], block: int) -
     block ran exactly the seeds that the study keeps together.
 
     Args:
-        usable: Episode -> its stored rows. The lists are replaced.
+        usable: The stored rows of each episode. The lists are replaced.
         block: Number of seeds that the study keeps together.
     """
     sizes = Counter(row.block for rows in usable.values() for row in rows)
@@ -408,7 +408,7 @@ def plain_settings(settings: Plain) -> dict[str, Any]:
 
 
 def seeds_text(seeds: Iterable[int]) -> str:
-    """Write seeds as ranges: (5, 6, 7, 9) -> "5-7;9"."""
+    """Write seeds as ranges: (5, 6, 7, 9) becomes "5-7;9"."""
     runs: list[list[int]] = []
     for seed in sorted(set(seeds)):
         if runs and seed == runs[-1][1] + 1:

@@ -105,7 +105,7 @@ def measure(
 
 
 def _averaged(groups: Iterable[Hashable], estimates: Iterable[Estimate]) -> dict[Hashable, Estimate]:
-    """Return group -> mean of its estimates. `groups[i]` is the group of `estimates[i]`. NaN estimates are left out."""
+    """Return each group's mean estimate. `groups[i]` is the group of `estimates[i]`. NaN estimates are left out."""
     known: dict[Hashable, list[Estimate]] = {}
     for group, estimate in zip(groups, estimates, strict=True):
         known.setdefault(group, []).extend([] if math.isnan(estimate.value) else [estimate])
@@ -145,7 +145,7 @@ def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame
 
     Args:
         episodes: Episodes of all settings and baselines.
-        baselines: Label of a setting -> label of its baseline. Other settings are left out.
+        baselines: Maps a setting's label to the label of its baseline. Other settings are left out.
 
     Returns:
         One row per pair, sorted by task, seed and repeat. It has these columns:

@@ -42,7 +42,7 @@ class Report:
 
     Attributes:
         files: Written files, in the order of writing.
-        tables: Name of each study -> its table.
+        tables: The table of each study, by the study's name.
         priced: The study's speeds on other machines, from `repriced_table`. None if `on` was empty.
     """
 

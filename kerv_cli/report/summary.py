@@ -108,7 +108,7 @@ def _speed(name: str) -> TextOf:
 
 
 def _columns() -> dict[str, TextOf]:
-    """Return heading -> function that formats a cell. The first `MAIN` columns are always shown."""
+    """Return the functions that format a cell, by the column's heading. The first `MAIN` columns are always shown."""
     return {
         "setting": lambda row: str(row["label"]),
         "success": intervals("success", ".0f", " %", 100.0),

@@ -65,7 +65,7 @@ class StudyData:
 
     @functools.cached_property
     def settings(self) -> dict[str, Setting]:
-        """Label of each setting -> the setting."""
+        """The settings by label."""
         return {setting.label: setting for setting in self.study.settings}
 
     @functools.cached_property
@@ -83,7 +83,7 @@ class StudyData:
 
     @functools.cached_property
     def references(self) -> dict[str, str]:
-        """Label of each setting -> label of the setting that it is compared with.
+        """For each setting's label, the label of the setting that it is compared with.
 
         That is the baseline's method under the same stress and clock, if the study has such a setting. Otherwise it is
         the study's baseline.
@@ -107,7 +107,7 @@ class StudyData:
 
     @functools.cached_property
     def unstressed(self) -> dict[str, str]:
-        """Label of each setting -> label of the same setting without stress.
+        """For each setting's label, the label of the same setting without stress.
 
         If the study does not run the setting without stress, the value is the label of the first setting that differs
         only in stress and `rollout.*`.
@@ -305,7 +305,7 @@ def further_of(data: StudyData) -> dict[str, Any]:
         - `varies`: values of the keys that differ within its grid
         - `identity`: hashes of weights and data
         - `provenance`: executor, machine, versions and the like
-        - `measures`: name of an averaging or of a task -> the measures that have no column in the CSV files
+        - `measures`: for each averaging and each task, the measures that have no column in the CSV files
     """
     columns = list(data.table.columns)
     left_out = {*CSV_COLUMNS, "series", "unstressed"}

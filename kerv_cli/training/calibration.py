@@ -83,7 +83,7 @@ class CalibrationRun:
         dataset: The demonstrations.
         tasks: Full names of the tasks.
         path: The JSON to write.
-        chosen: Index of each episode that is used -> whether it is held out.
+        chosen: Maps the index of each episode that is used to whether it is held out.
         notes: After `run`, one line per section of the calibration that was not measured, with the reason.
 
     Raises:
@@ -178,7 +178,7 @@ class CalibrationRun:
         """Measure how far drafts are from the target's tokens, by decoding observations of training episodes.
 
         Returns:
-            Task -> its reference level K_S, the median K. Empty if `decodes` is 0 or the drafter is missing.
+            For each task its reference level K_S, the median K. Empty if `decodes` is 0 or the drafter is missing.
         """
         decodes = self.settings.decodes
         if not decodes or not set(self.missing).isdisjoint(self.method.needs):
@@ -274,7 +274,7 @@ def read_windows(
 
     Args:
         dataset: The demonstrations.
-        chosen: Index of the episode in the dataset -> whether it is held out.
+        chosen: Maps the index of an episode in the dataset to whether it is held out.
         actions: The action space, to normalise actions.
         window: Number of control steps before each moment.
         horizon: Number of control steps after each moment.
@@ -313,7 +313,7 @@ def choose_episodes(dataset: DemoDataset, tasks: Sequence[str], limit: int, shar
         share: Share of the episodes to hold out.
 
     Returns:
-        Index of the episode in the dataset -> whether it is held out.
+        Maps the index of each chosen episode in the dataset to whether it is held out.
 
     Raises:
         CheckpointError: A task has no demonstration.
@@ -359,7 +359,7 @@ def fit_filters(windows: Windows, held: np.ndarray) -> dict[str, Noise]:
         held: (D,) bool. True: predictions hold this DoF at its last value, so it is not fitted.
 
     Returns:
-        Name of the filter -> its noise and damping per DoF.
+        For each filter's name, the noise and damping per DoF.
     """
     past, future = windows.past[~windows.held_out], windows.future[~windows.held_out]
     noise = {}
@@ -378,11 +378,11 @@ def prediction_errors(windows: Windows, noise: Mapping[str, Noise], space: Actio
 
     Args:
         windows: Actions before each moment, and the actions after it, which are predicted.
-        noise: Name of a Kalman filter -> its noise, from `fit_filters`. Other predictors need none.
+        noise: The noise of each Kalman filter by name, from `fit_filters`. Other predictors need none.
         space: The action space.
 
     Returns:
-        Predictor -> task -> DoF -> errors 1 to H control steps ahead, in normalised action units.
+        Nested by predictor, task and DoF: the errors 1 to H control steps ahead, in normalised action units.
     """
     window, horizon = windows.past.shape[1], windows.future.shape[1]
     errors: Errors = {}

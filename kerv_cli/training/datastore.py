@@ -110,8 +110,8 @@ class DatastoreBuild:
         """Make the entries of an episode: one for every observation.
 
         Returns:
-            Column -> values, one row per entry. The column `keys` holds the encoded observations, and `tokens` the
-            expert's next H undisturbed actions.
+            The values of each column, one row per entry. The column `keys` holds the encoded observations, and `tokens`
+            the expert's next H undisturbed actions.
         """
         target: Any = self.artifacts.target
         steps = steps_of(episode, bool(target.cameras))
@@ -129,11 +129,11 @@ class DatastoreBuild:
         }
 
     def _contents(self, columns: dict[str, np.ndarray], shards: Mapping[str, Shard]) -> dict[str, Any]:
-        """Return the files to write: file name -> array or table.
+        """Return the files to write: an array or table by file name.
 
         Args:
-            columns: Column -> values, one row per entry of all tasks.
-            shards: Task -> the range of its rows, and the seeds of its episodes.
+            columns: The values of each column, one row per entry of all tasks.
+            shards: For each task the range of its rows, and the seeds of its episodes.
         """
         keys, tokens, files = columns.pop("keys"), columns.pop("tokens"), {}
         if self.settings.components:

@@ -21,7 +21,7 @@ W = TypeVar("W", bound="WorldSettings")
 
 
 def specs() -> Mapping[str, EnvironmentSpec]:
-    """Return name -> specification of every registered environment."""
+    """Return the specifications of all registered environments, by name."""
     return {name: load(part.build) for name, part in parts("environment").items()}
 
 

@@ -78,8 +78,8 @@ class EnvironmentSpec:
         actions: Action space, with the environment's limits.
         observation: Observation space. The privileged state (all numbers of the simulator) begins with the
             proprioception.
-        tasks: Full name -> task.
-        suites: Name of a suite, in capitals -> full names of its tasks.
+        tasks: The tasks by full name.
+        suites: The full names of each suite's tasks, by the suite's name in capitals.
         horizon: Default number of control steps of an episode, which is also the largest.
         cameras: Names of the cameras. The first is the default.
         world_class: `module:class` of the `World`. Empty for a recorded dataset, in which nothing can be executed.
@@ -91,7 +91,7 @@ class EnvironmentSpec:
         grip: Two values of the gripper's DoF: the one that closes it and the one that opens it. Empty if there is no
             gripper.
         seeds: Ranges of episode seeds.
-        experts: Task -> name of its expert, for tasks in which kerv's expert replaces the simulator's.
+        experts: Names of kerv's experts by task, for tasks in which they replace the simulator's experts.
     """
 
     name: str

@@ -78,7 +78,7 @@ class _Log:
             path: Name of the bar in the viewer.
             steps: (rows,) control step at which each state begins.
             values: (rows,) the states.
-            looks: State -> label and colour (0xRRGGBBAA).
+            looks: Label and colour (0xRRGGBBAA) of each state.
         """
         labels, colors = zip(*looks.values(), strict=True)
         style = rr.StateConfiguration(values=list(looks), labels=list(labels), colors=np.array(colors, dtype=np.uint32))

@@ -81,13 +81,14 @@ class DemoManifest:
         actions: Action space of the environment.
         observation: Observation space of the environment.
         config: Fields of `DemoConfig` without `workers`.
-        tasks: Task -> its episodes.
+        tasks: The episodes of each task.
         sha256: Hash over the hashes of all episode files.
         versions: Versions of the packages on which physics and images depend.
         seeds: The smallest and the largest seed, with the keys `first` and `last`.
         episodes: Number of recorded episodes.
         missing: Number of requested episodes that could not be recorded because experts failed.
-        instructions: Task -> instruction. Only for imported data, whose tasks belong to no registered environment.
+        instructions: The instruction of each task. Only for imported data, whose tasks belong to no registered
+            environment.
     """
 
     format: int
@@ -113,7 +114,7 @@ def register_recorded(
         name: Name of the environment. In capitals, it also names the suite of all tasks.
         actions: Action space.
         observation: Observation space.
-        instructions: Task -> instruction.
+        instructions: The instruction of each task.
         camera: Name of the recorded view.
     """
     tasks = {task: Task(task, instruction, "recorded") for task, instruction in instructions.items()}
@@ -154,8 +155,8 @@ def totals(
     """Return the manifest's fields that summarise its episodes, as JSON values.
 
     Args:
-        entries: Task -> its recorded episodes.
-        failed: Task -> seeds in which the expert failed.
+        entries: The recorded episodes of each task.
+        failed: For each task the seeds in which the expert failed.
         missing: Number of requested episodes that could not be recorded.
     """
     tasks = {}

@@ -54,10 +54,10 @@ class Source:
     """A LeRobot dataset to read.
 
     Attributes:
-        folder: Its folder.
+        folder: Folder of the dataset.
         info: Contents of meta/info.json.
         episodes: Rows of the tables in meta/episodes.
-        tasks: task_index -> instruction.
+        tasks: The instructions by `task_index`, the number of a task.
         camera: Name of the camera to read.
         key: Name of the feature with the camera's images.
     """
@@ -294,7 +294,7 @@ def _episode(source: Source, row: Row, names: Mapping[int, str], tail: int) -> D
     Args:
         source: The LeRobot dataset.
         row: The episode's row in meta/episodes.
-        names: task_index -> name of the task.
+        names: The names of the tasks by `task_index`.
         tail: Number of copies of the last action to append to the labels.
 
     Raises:
@@ -363,13 +363,13 @@ def _groups(names: Sequence[str], strict: Sequence[str]) -> tuple[Group, ...]:
 
 
 def _task_names(tasks: Mapping[int, str], world: EnvironmentSpec | None) -> dict[int, str]:
-    """Return the names of a dataset's tasks: task_index -> name.
+    """Return the names of a dataset's tasks by `task_index`.
 
     If the data belong to an environment of kerv, each name is the environment's task with the same instruction.
     Otherwise it is made from the instruction, in small letters and digits joined by `-`.
 
     Args:
-        tasks: task_index -> instruction.
+        tasks: The instructions by `task_index`.
         world: The environment. None: the tasks belong to no environment of kerv.
 
     Raises:

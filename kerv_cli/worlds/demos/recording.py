@@ -206,7 +206,8 @@ def _collect(
     """Record all episodes, and further seeds for those in which the expert fails.
 
     Returns:
-        Task -> entries of its episodes for the manifest; and task -> seeds in which the expert failed.
+        Two dictionaries by task: the entries of its episodes for the manifest, and the seeds in which the expert
+        failed.
     """
     entries: dict[str, list[EpisodeEntry]] = {task: [] for task in config.tasks}
     failed: dict[str, list[int]] = {task: [] for task in config.tasks}
@@ -304,7 +305,7 @@ def _record_seeds(
     """Record each seed of a task that has no file yet. Runs in a worker process.
 
     Returns:
-        The task; and seed -> entry for the manifest, None if the expert failed.
+        The task, and for each seed its entry for the manifest, or None if the expert failed.
     """
     actor = make_actor(config) if make_actor else None
     with config.spec.open_world(task, config.camera) as world:
