@@ -51,7 +51,7 @@ def whole(policies, tmp_path_factory):
     write_dataset(results / "artifacts/demos/few")
     policy = PolicySettings(target="nano-state")
     DatastoreBuild(BuildDatastoreSettings(policy=policy, demos="few", task=list(TASKS), results=str(results))).build()
-    words = ["task=reach,drawer-close", "demos=few", "held_out=0.4", "decodes=4", "policy.target=nano-state"]
+    words = ["task=reach,drawer-close", "demos=few", "decodes=4", "policy.target=nano-state"]
     run = CalibrationRun(compose("calibrate", [*words, f"results={results}"], CalibrateSettings))
     run.run(lambda text: contextlib.nullcontext(lambda done, total: None))
     target, described = checkpoint.load_target(results / "artifacts/target/nano-state")

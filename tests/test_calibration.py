@@ -48,14 +48,11 @@ from kerv_cli.training.calibration import (
     LEAST,
     CalibrationRun,
     Matches,
-    Windows,
     choose_episodes,
     episode_windows,
     fit_noise,
     lowest_level,
     match,
-    moving_errors,
-    prediction_errors,
     skip_section,
     task_levels,
 )
@@ -149,7 +146,7 @@ def quiet(title: str) -> AbstractContextManager[Callable[[int, int], object]]:
 
 
 def words(results: Path, *overrides: str) -> list[str]:
-    usual = {"task": "reach,drawer-close", "demos": "few", "held_out": "0.4", "decodes": "0"}
+    usual = {"task": "reach,drawer-close", "demos": "few", "decodes": "0"}
     usual |= {"policy.target": "nano-state", "results": str(results)}
     given = dict(override.split("=", 1) for override in overrides if "=" in override)
     return [f"{key}={value}" for key, value in {**usual, **given}.items()]
@@ -196,34 +193,12 @@ def test_the_fit_finds_the_noise_that_made_the_data(ratio):
     assert ratio / 4 < q < 4 * ratio
 
 
-def line_windows(slope: float) -> Windows:
-    """One task of lines and one of constants; the gripper ramps in both."""
-    time = np.arange(14)
-    lines = np.stack([np.full((14, 4), 0.3), np.c_[np.repeat(slope * time[:, None], 3, 1), 0.01 * time]])
-    both = np.concatenate([lines, lines])
-    held = np.array([False, False, True, True])
-    return Windows(both[:, :10], both[:, 10:], np.array([0, 1, 0, 1]), held, TASKS, {}, [])
-
-
-def test_errors_of_hold_and_linear_have_closed_forms():
-    noise = {kind: Noise(*3 * [(1.0,) * 4]) for kind in PREDICTORS}
-    errors = prediction_errors(line_windows(0.02), noise, SPACE)
-    assert set(errors) == set(PREDICTORS)
-    np.testing.assert_allclose(moving_errors(errors, "hold", SPACE), [[0] * 4, 0.02 * np.arange(1, 5)], atol=1e-12)
-    np.testing.assert_allclose(moving_errors(errors, "linear", SPACE), np.zeros((2, 4)), atol=1e-12)
-    for kind in PREDICTORS:  # the gripper is held by all of them
-        np.testing.assert_allclose(errors[kind][TASKS[1]]["gripper"], 0.01 * np.arange(1, 5), atol=1e-12)
-
-
-def test_both_kinds_of_episodes_are_held_out(results):
+def test_the_first_episodes_of_each_task_are_chosen(results):
     dataset = DemoDataset.open(results / "artifacts/demos/few")
-    chosen = choose_episodes(dataset, TASKS, 0, 0.3)
-    assert len(chosen) == 12
-    held = [dataset.episodes[i] for i, out in chosen.items() if out]
-    assert {(e.task, e.perturbed) for e in held} == {(t, p) for t in TASKS for p in (False, True)}
-    assert len(choose_episodes(dataset, TASKS[:1], 4, 0.3)) == 4
+    assert len(choose_episodes(dataset, TASKS, 0)) == 12
+    assert len(choose_episodes(dataset, TASKS[:1], 4)) == 4
     with pytest.raises(CheckpointError, match="no episode of push-v3"):
-        choose_episodes(dataset, ("push-v3",), 0, 0.3)
+        choose_episodes(dataset, ("push-v3",), 0)
 
 
 def test_variability_is_the_mean_difference_of_the_judged_tokens():
@@ -244,7 +219,7 @@ def test_variability_is_the_mean_difference_of_the_judged_tokens():
 @pytest.mark.parametrize("target", ["nano-state", "nano-vision"])
 def test_a_run_writes_what_the_next_session_reads(results, target):
     run = run_of(results, "decodes=4", f"policy.target={target}")
-    assert "8 demonstrations of 2 tasks, tested on 4; 4 decodes per task" in run.plan()
+    assert "12 demonstrations of 2 tasks; 4 decodes per task" in run.plan()
     made = run.run(quiet)
     assert {row.decodes for row in made.variability.values()} == {4}
     run.episode_levels = lambda decoder, index, decodes: [0.1, 5.0, 0.3]  # type: ignore[method-assign]
@@ -256,7 +231,7 @@ def test_a_run_writes_what_the_next_session_reads(results, target):
     loaded = CalibrationArtifact().checked(run.path, read_target(folder))
     assert loaded == made
     assert loaded.demos.sha256 == run.dataset.sha256
-    assert loaded.boundary.episodes == 8
+    assert loaded.boundary.episodes == 12
     assert loaded.skip is None
     assert [line.split(":")[0] for line in run.notes] == ["no skip levels"]
     for kind, predictor_class in PREDICTORS.items():
@@ -270,7 +245,6 @@ def calibration(levels: dict[str, float]) -> Calibration:
         demos=Demonstrations("b" * 64, {}),
         window=10,
         noise={kind: Noise(*3 * [(1.0,) * 4]) for kind in ("kalman", "damped")},
-        errors={},
         variability={task: Variability(level, 5) for task, level in levels.items()},
         boundary=BoundarySection(8, {"15": BoundaryRanges(0.01, 2.0, 0.0, 0.2)}),
         skip=SkipSection("d" * 64, 0.1, 0.9, {task: SkipLevel(0.9, 0.8, 0.99, 0.5, 40, 0.9, 0.1) for task in levels}),
@@ -415,13 +389,11 @@ def test_tasks_that_the_datastore_does_not_hold_are_left_out():
     assert skip_section(store, ["b"], 0.1, 0.9, lambda done, total: None) is None
 
 
-def test_the_ranges_are_those_of_the_training_episodes(own):
+def test_the_ranges_are_those_of_the_chosen_episodes(own):
     run, made = calibrated(own, "boundary_windows=[7,15]")
-    training = [run.dataset.load(i).end_effector for i, held_out in run.chosen.items() if not held_out]
-    everything = [run.dataset.load(i).end_effector for i in run.chosen]
-    assert made.ranges(7) == BoundaryRanges.fit(training, 7)
-    assert made.ranges(15) == BoundaryRanges.fit(training, 15)
-    assert made.ranges(7) != BoundaryRanges.fit(everything, 7)
+    paths = [run.dataset.load(i).end_effector for i in run.chosen]
+    assert made.ranges(7) == BoundaryRanges.fit(paths, 7)
+    assert made.ranges(15) == BoundaryRanges.fit(paths, 15)
     with pytest.raises(CheckpointError, match="over 7, 15 positions, the boundary looks at 9: run 'kerv calibrate"):
         made.ranges(9)
     with pytest.raises(CheckpointError):
@@ -447,7 +419,7 @@ def test_the_skip_levels_belong_to_one_datastore(own):
 
 def test_the_command_prints_what_it_found(own):
     shown = told("calibrate", *words(own, "epsilon=1.9", "confidence=0.5"))
-    for said in ("held-out error", "damped", "h=4", "s_min", "would be skipped", "error ≤ 1.9", "144"):
+    for said in ("K_S", "s_min", "would be skipped", "error ≤ 1.9", "144"):
         assert said in shown
     assert "without datastore" not in told("calibrate", *words(own), "--plan")
     shutil.rmtree(own / "artifacts/datastore")

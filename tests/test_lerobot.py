@@ -108,7 +108,7 @@ def test_everything_trains_on_recorded_observations_of_an_openvla(results):
     kerv("train", "drafter", *common, *short, "train.held_out=0.5")
     kerv("train", "drafter", "drafter=early", *common, *short, "train.held_out=0.5")
     kerv("build", "datastore", *common, "task=BACK", "key=[vision]")
-    calibrate = ["calibrate", *common, "task=BACK", "decodes=2", "held_out=0.5", "window=5", "boundary_windows=[5]"]
+    calibrate = ["calibrate", *common, "task=BACK", "decodes=2", "window=5", "boundary_windows=[5]"]
     kerv(*calibrate)
     made = json.loads((results / "artifacts/calibration/rec/calibration.json").read_text())
     assert set(made["variability"]) == set(both(results)[1].manifest.instructions)

@@ -51,7 +51,7 @@ def results(policies, tmp_path, monkeypatch):
 @pytest.mark.parametrize("command", ["build datastore", "calibrate"])
 def test_tasks_and_demonstrations_are_those_of_the_target(command):
     plan = " ".join(told(*command.split(), MINE, "--plan").split())
-    assert "of 1 task, " in plan
+    assert "of 1 task" in plan
     assert "2 tasks" in " ".join(told(*command.split(), MINE, "task=[reach,push]", "--plan").split())
 
 
@@ -184,7 +184,7 @@ def test_an_artifact_has_a_row_and_is_shown_with_the_settings_that_it_was_made_w
         "target/new": ["train", "target", "target=nano", "name=new", "target.observation=state", *quick],
         "early/one": ["train", "drafter", "drafter=early", "policy.target=new", "policy.artifacts.early=one", *quick],
         "datastore/new": ["build", "datastore", "policy.target=new", *quick[:2]],
-        "calibration/new": ["calibrate", "policy.target=new", *quick[:2], "decodes=0", "held_out=0.5"],
+        "calibration/new": ["calibrate", "policy.target=new", *quick[:2], "decodes=0"],
     }
     for name, words in made.items():
         told(*words)

@@ -19,8 +19,6 @@ from kerv_cli.methods.kerv.prediction import Noise
 FILE = "calibration.json"
 NEVER = 1.01  # s_min of a task that never skips: cosines do not exceed 1
 AGAIN = "run 'kerv calibrate' again"
-Errors = dict[str, dict[str, dict[str, list[float]]]]
-"""`errors[predictor][task][dof]`: the mean absolute errors 1 to H control steps ahead, in normalised action units."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +27,7 @@ class Demonstrations:
 
     Attributes:
         sha256: Hash of the demonstrations.
-        tasks: For each task {"training": number of episodes, "held_out": number of episodes}.
+        tasks: For each task {"training": number of episodes}.
     """
 
     sha256: str
@@ -116,7 +114,6 @@ class Calibration:
         demos: The demonstrations.
         window: Number of control steps of history that a predictor sees.
         noise: Noise of each Kalman filter per DoF, by the filter's name (`kalman`, `damped`).
-        errors: Errors of all predictors on held-out episodes, as described at `Errors`.
         variability: Typical kinematic variability K of each task, with its reference level K_S.
         boundary: Ranges by which the hybrid boundary scales a path's radius of curvature and length.
         skip: Thresholds at which verification is skipped.
@@ -127,7 +124,6 @@ class Calibration:
     demos: Demonstrations
     window: int
     noise: dict[str, Noise]
-    errors: Errors
     variability: dict[str, Variability]
     boundary: BoundarySection | None = None
     skip: SkipSection | None = None

@@ -2,7 +2,7 @@
 
 The JSON holds:
 
-- the noise of the kinematic predictors, and their errors on held-out episodes,
+- the noise of the kinematic predictors,
 - each task's K_S, the reference level of the kinematic variability K (how far drafts are from the target's tokens),
 - the ranges by which the boundary between retrieval and drafter scales curvature and path length,
 - for each task the smallest similarity at which a retrieved chunk is executed without verification.
@@ -11,7 +11,7 @@ The JSON holds:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 
@@ -30,7 +30,6 @@ from kerv_cli.methods.calibration import (
     BoundarySection,
     Calibration,
     Demonstrations,
-    Errors,
     SkipLevel,
     SkipSection,
     Variability,
@@ -38,9 +37,9 @@ from kerv_cli.methods.calibration import (
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.heisd.datastore import Datastore
 from kerv_cli.methods.heisd.rules import BoundaryRanges
-from kerv_cli.methods.kerv.prediction import FILTERS, PREDICTORS, Noise, kalman_weights
+from kerv_cli.methods.kerv.prediction import FILTERS, Noise, kalman_weights
 from kerv_cli.targets.folders import check_not_shipped
-from kerv_cli.targets.observations import check_tail, held_out_every, observations_of
+from kerv_cli.targets.observations import check_tail, observations_of
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_tasks, demos_for
 from kerv_cli.training.settings import CalibrateSettings
@@ -83,7 +82,7 @@ class CalibrationRun:
         dataset: The demonstrations.
         tasks: Full names of the tasks.
         path: The JSON to write.
-        chosen: Maps the index of each episode that is used to whether it is held out.
+        chosen: Indices of the episodes that are used.
         notes: After `run`, one line per section of the calibration that was not measured, with the reason.
 
     Raises:
@@ -100,7 +99,7 @@ class CalibrationRun:
         self.description = self.artifacts.description
         self.description.check_autoregressive("kerv calibrate", "there is no draft to calibrate")
         self.path = self.artifacts.path("calibration")
-        self.chosen = choose_episodes(self.dataset, self.tasks, settings.episodes, settings.held_out)
+        self.chosen = choose_episodes(self.dataset, self.tasks, settings.episodes)
         self.method = Method.of(RolloutSettings(**{kind: find(kind, name).default for kind, name in DRAFTS.items()}))
         self.missing = [kind for kind in (*self.method.needs, "datastore") if not self.artifacts.exists(kind)]
         if "datastore" not in self.missing:
@@ -112,11 +111,11 @@ class CalibrationRun:
 
     def plan(self) -> str:
         """Return one line that `--plan` prints: the file, numbers of demonstrations and decodes, what is missing."""
-        held_out, settings = sum(self.chosen.values()), self.settings
+        settings = self.settings
         without = f"; without {' and '.join(self.missing)}" if self.missing else ""
         return (
-            f"{self.path}: predictors fitted on {count(len(self.chosen) - held_out, 'demonstration')} of "
-            f"{count(len(self.tasks), 'task')}, tested on {held_out}; "
+            f"{self.path}: predictors fitted on {count(len(self.chosen), 'demonstration')} of "
+            f"{count(len(self.tasks), 'task')}; "
             f"{settings.decodes} decodes per task; "
             f"boundary over {', '.join(map(str, settings.boundary_windows))} positions{without}"
         )
@@ -146,7 +145,6 @@ class CalibrationRun:
                 progress(number, len(settings.boundary_windows))
         with stage("fitting the predictors"):
             noise = fit_filters(windows, space.is_strict)
-            errors = prediction_errors(windows, noise, space)
         if not variability:
             drafter = "".join(f", no {kind}" for kind in self.missing if kind != "datastore")
             self.notes.append(f"no reference levels K_S: decodes={settings.decodes}{drafter}")
@@ -154,10 +152,9 @@ class CalibrationRun:
             self.notes.append("no skip levels: no datastore of these tasks (kerv build datastore)")
         calibration = Calibration(
             target=MadeFor.of(self.description),
-            demos=Demonstrations(self.dataset.sha256, windows.episodes),
+            demos=Demonstrations(self.dataset.sha256, {k: {"training": n} for k, n in windows.episodes.items()}),
             window=settings.window,
             noise=noise,
-            errors=errors,
             variability=variability,
             boundary=BoundarySection(len(windows.paths), ranges),
             skip=skip,
@@ -190,8 +187,8 @@ class CalibrationRun:
         with stage("pre-sampling") as progress:
             for number, name in enumerate(self.tasks, 1):
                 levels: list[float] = []
-                for index, held_out in self.chosen.items():
-                    if not held_out and self.dataset.episodes[index].task == name and len(levels) < decodes:
+                for index in self.chosen:
+                    if self.dataset.episodes[index].task == name and len(levels) < decodes:
                         budget = min(math.ceil(decodes / PRESAMPLED), decodes - len(levels))
                         levels += self.episode_levels(decoder, index, budget)
                 if not levels:
@@ -232,11 +229,8 @@ class Windows:
 
     past: np.ndarray  # (n, window, D), D DoFs
     future: np.ndarray  # (n, H, D), H control steps
-    task: np.ndarray  # (n,) index into `tasks`
-    held_out: np.ndarray  # (n,) bool, the same for all moments of an episode
-    tasks: tuple[str, ...]
-    episodes: dict[str, dict[str, int]]  # task -> {"training": number of episodes, "held_out": number}
-    paths: list[np.ndarray]  # end effector in each training episode, (T, 3) metres
+    episodes: dict[str, int]  # task -> number of episodes
+    paths: list[np.ndarray]  # end effector in each episode, (T, 3) metres
 
 
 def episode_windows(episode: DemoEpisode, actions: ActionSpace, window: int, horizon: int) -> np.ndarray:
@@ -264,7 +258,7 @@ def episode_windows(episode: DemoEpisode, actions: ActionSpace, window: int, hor
 
 def read_windows(
     dataset: DemoDataset,
-    chosen: Mapping[int, bool],
+    chosen: Sequence[int],
     actions: ActionSpace,
     window: int,
     horizon: int,
@@ -274,59 +268,43 @@ def read_windows(
 
     Args:
         dataset: The demonstrations.
-        chosen: Maps the index of an episode in the dataset to whether it is held out.
+        chosen: Indices of the episodes in the dataset.
         actions: The action space, to normalise actions.
         window: Number of control steps before each moment.
         horizon: Number of control steps after each moment.
         progress: Called with the numbers of episodes read and of all.
 
     Raises:
-        KervError: A task has no training episode, or no held-out episode, that is longer than the window.
+        KervError: A task has no episode that is longer than the window.
     """
-    tasks = tuple(dict.fromkeys(dataset.episodes[i].task for i in chosen))
-    counts = {task: {"training": 0, "held_out": 0} for task in tasks}
-    columns, paths = [], []
-    for done, (index, held_out) in enumerate(chosen.items(), 1):
+    counts = dict.fromkeys((dataset.episodes[index].task for index in chosen), 0)
+    parts, paths = [], []
+    for done, index in enumerate(chosen, 1):
         episode = dataset.load(index)
-        cut = episode_windows(episode, actions, window, horizon)
-        columns.append((cut, np.full(len(cut), tasks.index(episode.task)), np.full(len(cut), held_out)))
-        if not held_out:
-            paths.append(episode.end_effector.copy())
-        counts[episode.task]["held_out" if held_out else "training"] += bool(len(cut))
+        parts.append(episode_windows(episode, actions, window, horizon))
+        paths.append(episode.end_effector.copy())
+        counts[episode.task] += bool(len(parts[-1]))
         progress(done, len(chosen))
-    short = [task for task, count in counts.items() if not all(count.values())]
-    if short:
-        raise KervError(f"{', '.join(short)}: no training or no held-out episode is longer than a window of {window}")
-    around, task, held = map(np.concatenate, zip(*columns, strict=True))
-    return Windows(around[:, :window], around[:, window:], task, held, tasks, counts, paths)
+    if short := [task for task, count in counts.items() if not count]:
+        raise KervError(f"{', '.join(short)}: no episode is longer than a window of {window}")
+    around = np.concatenate(parts)
+    return Windows(around[:, :window], around[:, window:], counts, paths)
 
 
-def choose_episodes(dataset: DemoDataset, tasks: Sequence[str], limit: int, share: float) -> dict[int, bool]:
-    """Choose the first episodes of each task, and hold some of them out.
-
-    The share is held out evenly from a task's plain episodes and from its perturbed episodes.
+def choose_episodes(dataset: DemoDataset, tasks: Sequence[str], limit: int) -> list[int]:
+    """Return the indices of the first episodes of each task.
 
     Args:
         dataset: The demonstrations.
         tasks: Full names of the tasks.
         limit: Maximum number of episodes per task; 0: all.
-        share: Share of the episodes to hold out.
-
-    Returns:
-        Maps the index of each chosen episode in the dataset to whether it is held out.
 
     Raises:
         CheckpointError: A task has no demonstration.
     """
     check_tasks(dataset, tasks)
-    chosen: dict[int, bool] = {}
-    for task in tasks:
-        of_task = [index for index, entry in enumerate(dataset.episodes) if entry.task == task][: limit or None]
-        for perturbed in (False, True):
-            kind = [i for i in of_task if dataset.episodes[i].perturbed == perturbed]
-            every = held_out_every(max(2, len(kind)), share)
-            chosen |= {index: number % every == every - 1 for number, index in enumerate(kind)}
-    return chosen
+    by_task = [[i for i, entry in enumerate(dataset.episodes) if entry.task == task] for task in tasks]
+    return [index for indices in by_task for index in indices[: limit or None]]
 
 
 def fit_noise(past: np.ndarray, future: np.ndarray, dampings: Sequence[float]) -> tuple[float, float]:
@@ -352,7 +330,7 @@ def fit_noise(past: np.ndarray, future: np.ndarray, dampings: Sequence[float]) -
 
 
 def fit_filters(windows: Windows, held: np.ndarray) -> dict[str, Noise]:
-    """Fit the Kalman filters `kalman` and `damped` on the training episodes.
+    """Fit the Kalman filters `kalman` and `damped`.
 
     Args:
         windows: Actions before each moment, and after it, which the filters should predict.
@@ -361,8 +339,7 @@ def fit_filters(windows: Windows, held: np.ndarray) -> dict[str, Noise]:
     Returns:
         For each filter's name, the noise and damping per DoF.
     """
-    past, future = windows.past[~windows.held_out], windows.future[~windows.held_out]
-    noise = {}
+    past, future, noise = windows.past, windows.future, {}
     for kind in FILTERS:
         dampings = DAMPINGS if kind == "damped" else (1.0,)
         fits = [
@@ -371,39 +348,6 @@ def fit_filters(windows: Windows, held: np.ndarray) -> dict[str, Noise]:
         ]
         noise[kind] = Noise(tuple(q for q, _ in fits), (1.0,) * len(fits), tuple(d for _, d in fits))
     return noise
-
-
-def prediction_errors(windows: Windows, noise: Mapping[str, Noise], space: ActionSpace) -> Errors:
-    """Measure the mean absolute error of every predictor on the held-out episodes.
-
-    Args:
-        windows: Actions before each moment, and the actions after it, which are predicted.
-        noise: The noise of each Kalman filter by name, from `fit_filters`. Other predictors need none.
-        space: The action space.
-
-    Returns:
-        Nested by predictor, task and DoF: the errors 1 to H control steps ahead, in normalised action units.
-    """
-    window, horizon = windows.past.shape[1], windows.future.shape[1]
-    errors: Errors = {}
-    for kind, predictor_class in PREDICTORS.items():
-        predictor = predictor_class(space.is_strict, noise.get(kind), window, window, horizon)
-        errors[kind] = {}
-        for number, task in enumerate(windows.tasks):
-            chosen = windows.held_out & (windows.task == number)
-            mean = np.abs(predictor.predict_many(windows.past[chosen], horizon) - windows.future[chosen]).mean(0)
-            errors[kind][task] = {name: mean[:, dof].tolist() for dof, name in enumerate(space.names)}
-    return errors
-
-
-def moving_errors(errors: Errors, kind: str, space: ActionSpace) -> np.ndarray:
-    """Average a predictor's errors over the DoFs that are not strict (a strict DoF, such as a gripper, is held).
-
-    Returns:
-        (tasks, H) mean absolute errors, in normalised action units.
-    """
-    moving = [name for name in space.names if name not in space.strict]
-    return np.array([[rows[name] for name in moving] for rows in errors[kind].values()]).mean(1)
 
 
 @dataclass(frozen=True)

@@ -169,7 +169,6 @@ class CalibrateSettings(DemonstrationSettings):
     """
 
     episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)
-    held_out: float = number(0.1, above=0, most=0.5, help="share of episodes kept for measuring the predictors' errors")
     window: int = number(10, 4, 10_000, help="control steps of history that the predictors see")
     epsilon: float = number(
         0.1, above=0, most=1e6, help="verify-skip: largest mean absolute error of a good chunk, normalised units"
