@@ -156,12 +156,10 @@ def run_of(results: Path, *overrides: str) -> CalibrationRun:
     return CalibrationRun(compose("calibrate", words(results, *overrides), CalibrateSettings))
 
 
-def calibrated(
-    results: Path, *overrides: str, levels: dict[str, Variability] | None = None
-) -> tuple[CalibrationRun, Calibration]:
-    """A whole run; `levels` in the place of the pre-sampled variability."""
+def calibrated(results: Path, *overrides: str) -> tuple[CalibrationRun, Calibration]:
+    """A whole run, without the pre-sampled variability."""
     run = run_of(results, *overrides)
-    run.presample = lambda stage: levels or {}  # type: ignore[method-assign]
+    run.presample = lambda stage: {}  # type: ignore[method-assign]
     return run, run.run(quiet)
 
 
@@ -239,23 +237,22 @@ def test_a_run_writes_what_the_next_session_reads(results, target):
         np.testing.assert_allclose(predictor.predict(np.full((10, 4), 0.25), 4), 0.25)
 
 
-def calibration(levels: dict[str, float]) -> Calibration:
+def calibration() -> Calibration:
     return Calibration(
         target=MadeFor("a" * 64, SPACE, 4),
         demos=Demonstrations("b" * 64, {}),
         window=10,
         noise={kind: Noise(*3 * [(1.0,) * 4]) for kind in ("kalman", "damped")},
-        variability={task: Variability(level, 5) for task, level in levels.items()},
+        variability={"reach-v3": Variability(0.7, 5)},
         boundary=BoundarySection(8, {"15": BoundaryRanges(0.01, 2.0, 0.0, 0.2)}),
-        skip=SkipSection("d" * 64, 0.1, 0.9, {task: SkipLevel(0.9, 0.8, 0.99, 0.5, 40, 0.9, 0.1) for task in levels}),
+        skip=SkipSection("d" * 64, 0.1, 0.9, {"reach-v3": SkipLevel(0.9, 0.8, 0.99, 0.5, 40, 0.9, 0.1)}),
     )
 
 
-def description(**changes: Any) -> TargetDescription:
-    settings = {"chunk": changes.pop("chunk", 4)}
-    whole = {"sha256": "a" * 64, "family": "compact", "environment": SPEC.name, "settings": settings}
+def description() -> TargetDescription:
+    own = {"sha256": "a" * 64, "family": "compact", "environment": SPEC.name, "settings": {"chunk": 4}}
     spaces = {"actions": SPACE, "observation": SPEC.observation, "cameras": (), "words": (), "provenance": {}}
-    return TargetDescription(1, "target", **{**whole, **spaces, **changes})
+    return TargetDescription(1, "target", **own, **spaces)
 
 
 @pytest.mark.parametrize(
@@ -272,8 +269,8 @@ def description(**changes: Any) -> TargetDescription:
 )
 def test_what_does_not_fit_is_refused_in_one_line(change, says, tmp_path):
     path = tmp_path / "calibration.json"
-    write_json(path, dataclasses.asdict(calibration({"reach-v3": 0.7})))
-    assert CalibrationArtifact().checked(path, description()) == calibration({"reach-v3": 0.7})
+    write_json(path, dataclasses.asdict(calibration()))
+    assert CalibrationArtifact().checked(path, description()) == calibration()
     value = copy.deepcopy(read_json(path))
     change(value)
     path.write_text(json.dumps(value))
@@ -298,7 +295,7 @@ def test_wrong_requests_get_one_line(results, override, kind, says):
 
 def test_a_task_without_a_reference_level_is_named():
     with pytest.raises(CheckpointError, match="no reference level K_S for push-v3, only for reach-v3"):
-        calibration({"reach-v3": 0.7}).k_s("push-v3")
+        calibration().k_s("push-v3")
 
 
 # --- calibration skip
