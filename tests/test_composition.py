@@ -58,11 +58,6 @@ def composed(*overrides: str) -> RolloutSettings:
     return compose("rollout", overrides, RolloutSettings)
 
 
-def checked(overrides: str) -> None:
-    asked = composed(*overrides.split())
-    Method.of(asked).check(SimpleNamespace(chunk=4))
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_a_preset_is_the_parts_that_its_name_promises(method):
     asked = composed(f"method={method}")
@@ -107,7 +102,7 @@ def test_settings_survive_a_file(method):
 )
 def test_what_does_not_belong_together_is_refused(overrides, says):
     with refused(says):
-        checked(overrides)
+        Method.of(composed(*overrides.split())).check(SimpleNamespace(chunk=4))
 
 
 def test_only_what_needs_no_states_can_be_chosen_before_the_prefill():

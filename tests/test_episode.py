@@ -37,9 +37,11 @@ def test_strict_speculation_is_ar_in_closed_loop(policies, policy):
 
 
 def test_the_record_of_an_episode_adds_up(policies):
-    wanted = settings(policies, "method=spec_vla", "threshold.r=200", "acceptance.strict_dofs=false")
+    wanted = settings(
+        policies, "method=spec_vla", "threshold.r=200", "acceptance.strict_dofs=false", "policy.target=nano-vision"
+    )
     wanted.record = 1
-    record = episodes(compose_with(wanted, "nano-vision"), 1)[0]
+    record = episodes(wanted, 1)[0]
     assert record.steps == 10 == len(record.actions) == len(record.path) - 1 == len(record.gripper) - 1
     assert record.decode_steps == (0, 4, 8)
     assert sorted(record.frames) == list(range(11))
@@ -55,11 +57,6 @@ def test_the_record_of_an_episode_adds_up(policies):
     first.reset(EVALUATION_SEED)
     assert (record.initial_state == first.initial_state).all()
     first.close()
-
-
-def compose_with(chosen: RolloutSettings, target: str) -> RolloutSettings:
-    chosen.policy.target = target
-    return chosen
 
 
 def test_a_state_policy_never_draws(policies, monkeypatch):

@@ -132,13 +132,9 @@ def test_a_file_appears_complete_and_nothing_else_stays(tmp_path):
     write_json(path, {"a": [1, 2.5, "ü"]})
     assert read_json(path) == {"a": [1, 2.5, "ü"]}
     assert [entry.name for entry in path.parent.iterdir()] == ["value.json"]
-    assert path.stat().st_mode & 0o777 == 0o666 & ~_umask()
-
-
-def _umask():
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+    umask = os.umask(0)
+    os.umask(umask)
+    assert path.stat().st_mode & 0o777 == 0o666 & ~umask
 
 
 def write_half(path):

@@ -36,10 +36,6 @@ TARGET = MockTarget(SPACE, chunk=N // D)
 HOLD = Hold(SPACE.is_strict, minimum=1)
 
 
-def prompt_of(seed: int) -> torch.Tensor:
-    return torch.randn(1, 5, TARGET.width, generator=torch.Generator().manual_seed(seed)).double()
-
-
 def compensation(**values: Any) -> Compensation:
     return Compensation(CompensateSettings(**values), HOLD)
 
@@ -127,7 +123,7 @@ class Known(Proposer):
         return Draft.of(self.drafted)
 
 
-PROMPT = prompt_of(3)
+PROMPT = torch.randn(1, 5, TARGET.width, generator=torch.Generator().manual_seed(3)).double()
 TRUTH = plain_greedy(TARGET, PROMPT)
 
 
