@@ -276,7 +276,6 @@ ANSWERS = [
     ("rollout device=cuda", "unknown key 'device': did you mean runtime.device?"),
     ("rollout task=reach-v2", "unknown task or suite 'reach-v2': did you mean reach-v3"),
     ("rollout method=AR", "unknown method 'AR': did you mean ar?"),
-    ("prepare for=kervv", "unknown method 'kervv': did you mean kerv"),
     ("rollout rollout.clock=reel", "unknown rollout.clock 'reel': did you mean real?"),
     ("runs list state=finished", "unknown state 'finished': known: complete, begun, damaged, step"),
     # values
@@ -296,7 +295,7 @@ ANSWERS = [
     ("rollout method=type.yaml", "type.yaml:2: threshold.r: Value 'wide' of type 'str'"),
     ("rollout method=nothing.yaml", "method=nothing.yaml cannot be read: No such file"),
     # what is not there
-    ("rollout policy.target=mine", "no target 'mine' in results/artifacts/target/mine"),
+    ("rollout policy.target=mine", "train it with 'kerv train target name=mine'"),
     ("demos import source=file", "file is a file: name the folder of a LeRobot dataset"),
     ("rollout results=file", "results=file is a file: name a folder"),
     ("view nothing.rrd", "nothing.rrd does not exist or is no recording"),
@@ -334,7 +333,6 @@ ANSWERS = [
     ("bench projections.mine=[1]", "GB/s and TFLOP/s"),
     ("serve gripper=loose", "unknown gripper 'loose'"),
     ("serve port=70000", "port=70000"),
-    ("demos policy=vision policy.target=nope task=reach", "train it with 'kerv train target name=nope'"),
 ]
 """A line as typed -> what its answer says."""
 

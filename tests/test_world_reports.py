@@ -13,7 +13,6 @@ from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings, SweepSettings, TimingSettings
 from kerv_cli.lab.execute import RunEpisode
 from kerv_cli.lab.plan import Setting
-from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.decide import verdict_of
 from kerv_cli.report.plots import latency_figure, study_figures
 from kerv_cli.report.report import report
@@ -47,24 +46,20 @@ def run_stressed(setting: Setting, task: str) -> RunEpisode:
 
 @pytest.fixture(scope="module")
 def stressed(tmp_path_factory):
+    """The results folder of a study of stressed worlds, and its data."""
     folder = tmp_path_factory.mktemp("stress")
-    swept(folder, study_of(stressed_settings(), TASKS, "stress", title="", axis=""), run_stressed)
-    return folder
+    store, _ = swept(folder, study_of(stressed_settings(), TASKS, "stress", title="", axis=""), run_stressed)
+    return folder, load_study(store)
 
 
 @pytest.fixture(scope="module")
-def stressed_data(stressed):
-    return load_study(StudyStore(stressed, "stress"))
+def stressed_table(stressed):
+    return stressed[1].table
 
 
-@pytest.fixture(scope="module")
-def stressed_table(stressed_data):
-    return stressed_data.table
-
-
-def test_a_stressed_setting_is_compared_with_the_baseline_under_the_same_stress(stressed_data, stressed_table):
+def test_a_stressed_setting_is_compared_with_the_baseline_under_the_same_stress(stressed, stressed_table):
     rows = {row["label"]: row for row in rows_of(stressed_table, "micro over tasks")}
-    assert stressed_data.references["bold"] == "ar"
+    assert stressed[1].references["bold"] == "ar"
     assert rows["bold, kind=push level=4"]["baseline"] == "ar, kind=push level=4"
     assert rows["bold, kind=push level=4"]["difference"] == 0.0
     assert rows["bold, kind=light level=4"]["difference"] == -0.5
@@ -101,7 +96,7 @@ def test_sums_count_every_stressed_world_once(stressed_table):
 
 
 def test_the_report_writes_the_sums(stressed):
-    written = {path.name for path in report(stressed, "stress").files}
+    written = {path.name for path in report(stressed[0], "stress").files}
     assert {"stress_summed.csv", "stress.png"} <= written
 
 
@@ -168,12 +163,12 @@ def delayed(tmp_path_factory):
                 )
     about = {"title": "Latency", "baseline": "ar waits", "axis": "rollout.ar_ms"}
     folder = tmp_path_factory.mktemp("latency")
-    swept(folder, study_of(settings, ["reach-v3", "push-v3"], "latency", **about), run_delayed)
-    return folder
+    store, _ = swept(folder, study_of(settings, TASKS, "latency", **about), run_delayed)
+    return folder, load_study(store).table
 
 
 def test_every_setting_is_compared_with_ar_at_its_latency(delayed):
-    whole = load_study(StudyStore(delayed, "latency")).table
+    _, whole = delayed
     rows = latency_table(whole).set_index("label")
     assert len(rows) == 12  # not the world that waits
     fast = rows.loc["spec_vla ar_ms=100 none"]
@@ -194,7 +189,7 @@ def test_every_setting_is_compared_with_ar_at_its_latency(delayed):
 
 
 def test_the_figure_has_a_panel_per_compensation_and_a_line_per_method(delayed):
-    figure = latency_figure(load_study(StudyStore(delayed, "latency")).table)
+    figure = latency_figure(delayed[1])
     assert [panel.title for panel in figure.concat] == ["delay compensation: none", "delay compensation: chunk"]
     points = points_of(figure)[0]
     assert list(points["line"].unique()) == ["ar", "spec_vla"]
@@ -204,5 +199,5 @@ def test_the_figure_has_a_panel_per_compensation_and_a_line_per_method(delayed):
 
 
 def test_a_report_has_the_table_and_the_figure(delayed):
-    names = {path.name for path in report(delayed, "latency").files}
+    names = {path.name for path in report(delayed[0], "latency").files}
     assert {"latency.csv", "latency_latency.csv", "latency_latency.png", "report.html"} <= names
