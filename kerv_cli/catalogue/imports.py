@@ -40,7 +40,7 @@ _RENAMED = {name: f"{name}_tuned" for name in ("spec_vla", "kerv", "heisd")} | {
 }
 _NOT_OF_BLOCK = {"state", "episodes", "successes", "seconds", "wall_seconds", "timed", "started", "files", "sha256",
                  "run", "pid", "code"}  # fmt: skip
-_FURTHER = ("order", "started", "worker_pid")
+_FURTHER = ("order", "started")
 _ROW = (*(column.name for column in MEASURES), *_FURTHER)
 
 MOST_STEPS = 20_000_000

@@ -97,7 +97,6 @@ EPISODES = _table(
     *_required(sa.BigInteger, "seed"),
     *_required(sa.Integer, "repeat", "order"),  # order: number of episodes that the block ran before it
     sa.Column("block", sa.ForeignKey("blocks.id"), nullable=False),
-    sa.Column("worker_pid", sa.Integer),
     *MEASURES,
     *_required(sa.LargeBinary, "decode_seconds"),  # (decodes,) little-endian float64
     # the same episode may run again in another block, with other settings or other code

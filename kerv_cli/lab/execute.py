@@ -165,7 +165,6 @@ class BlockRun:
         row = episode_row(record) | {
             "order": order,
             "started": started.isoformat(timespec="milliseconds"),
-            "worker_pid": os.getpid(),
             "decode_seconds": seconds_blob(decode.seconds for decode in record.decodes),
         }
         about = stamp(str(one.setting.settings["runtime"]["device"]))
