@@ -1,5 +1,6 @@
 """The property that guards the engine: strict speculative decoding yields AR's tokens, token for token, in float32."""
 
+import dataclasses
 import functools
 
 import numpy as np
@@ -8,9 +9,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mock_target import SEVEN, MockTarget
+from test_acceptance import space_of
 
 from kerv_cli.base.errors import KervError
-from kerv_cli.base.spaces import ActionSpace, Group, Observation
+from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
@@ -200,10 +202,7 @@ def spaces(draw: st.DrawFn) -> ActionSpace:
     if draw(st.booleans()):
         return SEVEN
     sizes = draw(st.lists(st.integers(1, 3), min_size=1, max_size=4))
-    names = tuple(f"d{i}" for i in range(sum(sizes)))
-    groups = tuple(Group(f"g{i}", size) for i, size in enumerate(sizes))
-    unit = (1.0,) * len(names)
-    return ActionSpace(names, groups, names[-1:], 20.0, tuple(-x for x in unit), unit, bins=draw(st.integers(3, 40)))
+    return dataclasses.replace(space_of(*sizes), bins=draw(st.integers(3, 40)))
 
 
 @settings(max_examples=80)

@@ -1,4 +1,4 @@
-"""LeRobot datasets of version 3 are read, with images and with videos; what was read can be trained on."""
+"""LeRobot datasets of version 3 are read and trained on; what was made for other actions is refused."""
 
 import json
 import shutil

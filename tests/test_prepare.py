@@ -1,4 +1,4 @@
-"""A policy of one's own: tasks and demonstrations are those that it was trained on, `kerv prepare` makes the rest."""
+"""A policy of one's own: it keeps its tasks and demonstrations, `kerv prepare` makes the rest; released policies."""
 
 from __future__ import annotations
 

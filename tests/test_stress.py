@@ -1,4 +1,4 @@
-"""Stress: what each kind changes of a world and what it leaves alone, seeds, levels, refusals, the command line."""
+"""Stress: what each kind changes of a world, seeds, levels, refusals, the command line; the same on every CPU."""
 
 import dataclasses
 import hashlib
