@@ -1,14 +1,29 @@
-"""Real episodes on real Meta-World: closed loop, pairing, what is timed and what is drawn."""
+"""Real episodes on Meta-World: closed loop, pairing, what is timed and drawn; and a world that does not wait."""
 
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from command import refusal
+from examples.insertion import SPEC as INSERTION
+from examples.point_mass import SPEC, PointWorld
 
 from kerv_cli.base.config import compose
-from kerv_cli.engine.record import PHASES, EpisodeRecord
+from kerv_cli.base.errors import KervError
+from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.cost import Profile
+from kerv_cli.engine.record import PHASES, DecodeRecord, Delay, EpisodeRecord, Round
+from kerv_cli.episodes import policy as policies_of
 from kerv_cli.episodes import runner as run
+from kerv_cli.episodes.clock import RealClock, profiled, steps_of
+from kerv_cli.episodes.episode import run_episode
+from kerv_cli.episodes.rows import decodes_table, episode_row
 from kerv_cli.episodes.settings import RolloutSettings
-from kerv_cli.worlds.metaworld.spec import SPEC
+from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD
 from kerv_cli.worlds.metaworld.world import MetaWorld
 from kerv_cli.worlds.settings import EVALUATION_SEED
 
@@ -52,8 +67,8 @@ def test_the_record_of_an_episode_adds_up(policies):
         assert decode.forwards == len(decode.rounds)
         assert sum(r.committed for r in decode.rounds) == len(decode.tokens) == 16
         assert decode.variability > 0
-    assert (record.environment, record.space) == ("metaworld", SPEC.actions)
-    first = SPEC.open_world("drawer-open-v3")
+    assert (record.environment, record.space) == ("metaworld", METAWORLD.actions)
+    first = METAWORLD.open_world("drawer-open-v3")
     first.reset(EVALUATION_SEED)
     assert (record.initial_state == first.initial_state).all()
     first.close()
@@ -74,3 +89,276 @@ def test_deviation_is_sampled_and_zero_for_ar_itself(policies):
     assert [d.deviation for d in ar.decodes] == [None, 0.0, None]
     loose = settings(policies, "policy.target=nano-state", "deviation_every=1", "method=spec_vla", "threshold.r=120")
     assert any(d.deviation for d in episodes(loose, 1)[0].decodes)
+
+
+# --- a world that goes on while the policy decodes
+
+
+HZ = SPEC.actions.control_hz
+TASK = "drawer-open-v3"
+
+
+class Numbered:
+    """Its chunks are numbered: action `i` of decode `n` is (n, i) in hundredths of the limits. It remembers what it was
+    shown and told."""
+
+    cameras = ()
+
+    def __init__(self, chunk: int = 4, seconds: Callable[[int], float] = lambda n: 0.0) -> None:
+        self.chunk, self.seconds = chunk, seconds
+        self.shown: list[Observation] = []
+        self.told: list[np.ndarray] = []
+
+    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
+        """Begins an episode."""
+        self.shown, self.told = [], []
+
+    def decode(self, observation: Observation) -> DecodeRecord:
+        """The next numbered chunk."""
+        self.shown.append(observation)
+        number = len(self.shown)
+        actions = np.array([(number, i) for i in range(self.chunk)], np.float32) / 2000
+        seconds = self.seconds(number)
+        return DecodeRecord((), actions, 0, (), "ar", seconds, {})
+
+    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
+        """Remembers it."""
+        self.told.append(action)
+
+    def finish(self, success: bool) -> None:
+        """Nothing to learn."""
+
+
+def played(record: EpisodeRecord) -> list[tuple[int, int]]:
+    """The executed actions by their numbers; (0, 0) is standing still."""
+    return [(round(2000 * a), round(2000 * b)) for a, b in record.actions.tolist()]
+
+
+def point_episode(clock: RealClock | None, decoder: Any = None, horizon: int = 0) -> EpisodeRecord:
+    """In a world in which the numbers lead nowhere near the goal."""
+    with PointWorld(SPEC, "push-point", horizon=horizon) as world:
+        return run_episode(world, decoder or Numbered(), EVALUATION_SEED + 1, clock=clock)
+
+
+def constant(steps: float, compensation: str = "none") -> RealClock:
+    return RealClock(lambda decode: steps / HZ, SPEC.actions, compensation)
+
+
+@pytest.mark.bits
+@pytest.mark.parametrize("compensation", ["none", "chunk"])
+def test_without_latency_an_episode_is_bit_for_bit_the_one_in_a_waiting_world(policies, compensation):
+    real = ["rollout.clock=real", "rollout.latency=constant", f"rollout.delay_compensation={compensation}"]
+    a, b = (episode_of(policies, "method=spec_vla", *words) for words in ([], real))
+    assert (a.actions == b.actions).all()
+    assert (a.path == b.path).all()
+    assert [d.tokens for d in a.decodes] == [d.tokens for d in b.decodes]
+    assert a.decode_steps == b.decode_steps
+    assert [d.delay for d in a.decodes] == [None] * len(a.decodes)
+    assert [d.delay for d in b.decodes] == [Delay(0.0, 0, step) for step in b.decode_steps]
+
+
+def episode_of(results: Path, *overrides: str) -> EpisodeRecord:
+    chosen = settings(results, "policy.target=nano-state", *overrides)
+    policies_of.check(chosen)
+    return episodes(chosen, 1)[0]
+
+
+@pytest.mark.parametrize(
+    ("steps", "chunk"), [(1, (0, 1, 2, 3)), (3, (0, 1, 2, 3)), (4, (0, 1, 2, 3)), (6, (0, 1, 2, 3, 3, 3))]
+)
+def test_the_chunk_before_is_executed_on_and_then_its_last_action_is_held(steps, chunk):
+    """k <= H: k old actions after an observation, and no pause after the first chunk."""
+    record, pause = point_episode(constant(steps)), max(0, steps - 4)
+    assert played(record)[: steps + 2 * len(chunk)] == [(0, 0)] * steps + [(n, i) for n in (1, 2) for i in chunk]
+    assert record.decodes[0].delay == Delay(steps / HZ, steps, 0, carried=0, held=steps)
+    assert record.decodes[1].delay == Delay(steps / HZ, steps, max(4, steps), steps - pause, pause)
+    assert record.decode_steps[:2] == (steps, steps + len(chunk))
+
+
+def test_a_fake_clock_says_how_long_each_decode_took():
+    """Measured seconds, rounded up; a decode begins as early as the one before took long."""
+    seconds = {1: 0.11, 2: 0.31, 3: 0.05}
+    decoder = Numbered(4, lambda n: seconds.get(n, 0.2))
+    record = point_episode(RealClock(lambda decode: decode.seconds, SPEC.actions), decoder)
+    delays = [d.delay for d in record.decodes[:4] if d.delay is not None]
+    assert [d.steps for d in delays] == [2, 4, 1, 2]
+    assert [d.seconds for d in delays] == [0.11, 0.31, 0.05, 0.2]
+    assert [(d.observed, d.carried, d.held) for d in delays] == [(0, 0, 2), (4, 2, 2), (8, 1, 0), (12, 1, 1)]
+    assert len(decoder.told) == record.steps  # held actions are part of the history
+
+
+def test_an_episode_can_end_while_the_policy_decodes():
+    record = point_episode(constant(6), horizon=9)
+    assert record.steps == 9
+    assert record.decodes[-1].delay == Delay(0.6, 6, 6, carried=3, held=0)
+    assert record.decode_steps[-1] == 9
+    row = episode_row(record)
+    assert (row["delay_decodes"], row["delay_steps"], row["carried_steps"], row["held_steps"]) == (2, 12, 3, 6)
+    assert row["delay_seconds"] == pytest.approx(1.2)
+    assert [(r["observed"], r["delay_steps"], r["held"]) for r in decodes_table(record).to_pylist()] == [
+        (0, 6, 6),
+        (6, 6, 0),
+    ]
+    waiting = point_episode(None)
+    waited, sums = decodes_table(waiting).to_pylist()[0], episode_row(waiting)
+    assert waited["delay_steps"] is waited["observed"] is waited["delay_seconds"] is None
+    assert {sums[f"{name}_steps"] for name in ("delay", "carried", "held", "dropped")} == {0}
+    assert (sums["delay_decodes"], sums["delay_seconds"]) == (0, 0.0)
+
+
+def test_rounding_up_ignores_float_noise_and_refuses_nonsense():
+    assert [steps_of(s, 80.0) for s in (0.0, 0.0001, 0.0125, 0.0126, 5 * 0.0125, 0.2)] == [0, 1, 1, 2, 5, 16]
+    for wrong in (-0.001, float("nan"), float("inf")):
+        with pytest.raises(KervError):
+            steps_of(wrong, 80.0)
+
+
+def test_chunk_drops_what_is_stale():
+    record = point_episode(constant(2, "chunk"))
+    assert played(record)[:8] == [(0, 0), (0, 0), (1, 2), (1, 3), (2, 2), (2, 3), (3, 2), (3, 3)]
+    assert {d.delay.dropped for d in record.decodes if d.delay} == {2}
+    slow = point_episode(RealClock(lambda decode: decode.seconds, SPEC.actions, "chunk"), Numbered(4, lambda n: 0.6))
+    assert played(slow)[6:12] == [(1, 3)] * 6  # the last action of a chunk is always left
+    assert slow.decodes[0].delay == Delay(0.6, 6, 0, carried=0, held=6, dropped=3)
+
+
+def test_before_its_first_action_a_robot_stands_still():
+    assert METAWORLD.standstill(1.0).tolist() == [0.0, 0.0, 0.0, -1.0]
+    assert METAWORLD.standstill(0.0).tolist() == [0.0, 0.0, 0.0, 1.0]
+    assert INSERTION.standstill(0.0).tolist() == [0.0] * 7  # a held peg stays held
+    assert INSERTION.standstill(1.0).tolist() == [0.0] * 6 + [1.0]
+    with METAWORLD.open_world("pick-place-v3") as world:
+        before = world.reset(EVALUATION_SEED).proprioception
+        for _ in range(20):
+            world.step(world.spec.standstill(1.0))
+        assert world.observation.proprioception == pytest.approx(before, abs=1e-2)
+
+
+# --- sources of latency
+
+PROFILE = Profile(
+    31,
+    {
+        "encode": ((1,), (0.005,)),
+        "prefill": ((31, 46), (0.008, 0.0095)),
+        "verify": ((1, 16), (0.002, 0.005)),
+        "draft": ((2, 6), (0.001, 0.005)),
+        "feed": ((1, 31), (0.0005, 0.002)),
+    },
+)
+
+
+def decode_of(rounds: Sequence[Round], propose: float = 0.0) -> DecodeRecord:
+    phases = {"propose": propose, "accept": 0.0005, "other": 0.0005, "verify": 9.0}
+    return DecodeRecord((0,) * 16, np.zeros((4, 4), np.float32), len(rounds), tuple(rounds), "ar", 9.5, phases, size=16)
+
+
+AR = decode_of([Round("decode" if i else "prefill", "none", i, (), (i,), 0, 1, 0, ()) for i in range(16)])
+
+
+def test_a_profile_prices_the_records_forwards():
+    """All on another device but acceptance and the like, whose seconds are the record's own."""
+    assert profiled(PROFILE)(AR) == pytest.approx(0.005 + 0.008 + 15 * 0.002 + 0.001)
+    skipped = decode_of([Round("skip", "early", 0, (0,) * 16, (), 16, 16, 0, ())], propose=0.002)
+    assert profiled(PROFILE)(skipped) == pytest.approx(0.005 + 0.002 + 0.001)
+    one = decode_of([Round("verify", "merged", 0, (0,) * 15, (0,) * 16, 15, 16, 15, (9,))], propose=0.003)
+    assert profiled(PROFILE)(one) == pytest.approx(0.005 + 0.0095 + 0.003 + 0.001)
+    drafted = decode_of(
+        [
+            Round("prefill", "none", 0, (), (0,), 0, 1, 0, ()),
+            Round("verify", "drafter", 1, (0,) * 14, (0,) * 15, 14, 15, 14, (9,)),
+        ],
+        propose=5.0,  # the drafter's, which the profile has its own times for
+    )
+    wanted = 0.005 + 0.008 + 0.002 + (0.002 + 14 * 0.0002) + 13 * 0.001 + 0.001
+    assert profiled(PROFILE)(drafted) == pytest.approx(wanted)
+
+
+def profile_file(folder: Path, **phases: Any) -> Path:
+    document = {"profile": PROFILE.as_dict()}
+    document["profile"]["phases"] |= phases
+    path = folder / "bench" / "there.json"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(json.dumps(document))
+    return path
+
+
+@pytest.fixture
+def results(policies, tmp_path):
+    """The policies, in a folder to which a bench can be added."""
+    (tmp_path / "artifacts").symlink_to(policies / "artifacts")
+    return tmp_path
+
+
+def test_ar_takes_what_was_asked_for_and_the_others_their_share(results):
+    profile_file(results)
+    words = ("rollout.clock=real", "rollout.latency=profile", "rollout.profile=there", "rollout.ar_ms=43")
+    ar = episode_of(results, "method=ar", *words)
+    host = [sum(d.phases[name] for name in ("propose", "accept", "rectify", "other")) for d in ar.decodes]
+    felt = [d.delay.seconds for d in ar.decodes if d.delay is not None]
+    assert felt == pytest.approx([0.043 * (1 + h / 0.043) for h in host])  # the profile's AR takes 43 ms
+    double = episode_of(results, "method=ar", *words[:3], "rollout.ar_ms=86").decodes[0]
+    assert double.delay.seconds >= 2 * 0.043
+    assert steps_of(felt[0], 80.0) == ar.decodes[0].delay_steps
+
+
+def test_a_profile_is_part_of_the_results_identity(results):
+    words = [f"results={results}", "policy.target=nano-state", "rollout.clock=real", "rollout.latency=profile"]
+    chosen = compose("rollout", [*words, "rollout.profile=there"], RolloutSettings)
+    found = []
+    for seconds in (0.005, 0.006):
+        profile_file(results, encode={"rows": [1], "seconds": [seconds]})
+        found.append(policies_of.check(chosen)["profile"])
+    assert found[0] != found[1]
+    assert "profile" not in policies_of.check(dataclasses.replace(chosen, rollout=RolloutSettings().rollout))
+
+
+# --- what is refused: one line, exit code 2
+
+CONSTANT = "rollout.clock=real rollout.latency=constant"
+FROM_PROFILE = "rollout.clock=real rollout.latency=profile rollout.profile=there"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (f"{CONSTANT} rollout.latency_ms=nan", "rollout.latency_ms=nan: from 0"),
+        (f"{CONSTANT} rollout.latency_ms=6250", "500 control steps, but an episode of metaworld has 500"),
+        (
+            f"{CONSTANT} rollout.latency_ms=50 rollout.delay_compensation=chunk",
+            "all 4 control steps of a chunk are stale",
+        ),
+        (f"{CONSTANT} rollout.latency_ms=13 rollout.delay_compensation=chunk chunk=2", "all 2 control steps"),
+        ("rollout.clock=real rollout.latency=profile", "name a document of 'kerv bench"),
+        (FROM_PROFILE.replace("there", "nowhere"), "rollout.profile=nowhere: no such document"),
+        (f"{FROM_PROFILE} method=spec_vla", "has no phase 'draft', which this method needs"),
+        (f"{CONSTANT} rollout.latency_ms=20 policy=expert rollout.delay_compensation=chunk", "all 1 control steps"),
+        (f"{FROM_PROFILE} policy=expert", "it has no forwards"),
+        ("rollout.clock=real rollout.ar_ms=20", "rollout.ar_ms=20 scales a profile"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(results, words, message):
+    profile_file(results, draft={"rows": [], "seconds": []})
+    assert_refused(results, words, message)
+
+
+def assert_refused(results: Path, words: str, message: str) -> None:
+    target = [] if "expert" in words else ["policy.target=nano-state"]
+    assert message in refusal("rollout", f"task={TASK}", f"results={results}", *target, *words.split(), code=2)
+
+
+@pytest.mark.parametrize(
+    ("phases", "message"),
+    [
+        ({"encode": {"rows": [1], "seconds": [-0.1]}}, "impossible times of the phase 'encode'"),
+        ({"verify": {"rows": [1], "seconds": [float("nan")]}}, "impossible times of the phase 'verify'"),
+        ({"verify": {"rows": [2, 1], "seconds": [1, 1]}}, "impossible times of the phase 'verify'"),
+        ({"prefill": {"rows": [1, 2], "seconds": [1]}}, "impossible times of the phase 'prefill'"),
+        ({"prefill": {"rows": [], "seconds": []}}, "has no phase 'prefill'"),
+        ({"prefill": {"rows": [1], "seconds": ["x"]}}, "holds no latency profile"),
+        ({"prefill": 3}, "holds no latency profile"),
+    ],
+)
+def test_an_impossible_profile_is_refused(results, phases, message):
+    profile_file(results, **phases)
+    assert_refused(results, FROM_PROFILE, message)
