@@ -418,7 +418,6 @@ def test_the_command_prints_what_it_found(own):
     shown = told("calibrate", *words(own, "epsilon=1.9", "confidence=0.5"))
     for said in ("K_S", "s_min", "would be skipped", "error ≤ 1.9", "144"):
         assert said in shown
-    assert "without datastore" not in told("calibrate", *words(own), "--plan")
     shutil.rmtree(own / "artifacts/datastore")
     shown = told("calibrate", *words(own, "policy.artifacts.calibration=without"))
     for said in ("no reference levels K_S: decodes=0\n", "no skip levels: no datastore"):
