@@ -151,7 +151,7 @@ def load_study(name: str, results: str | Path = "results", store: str = "") -> S
         store: URL of the database. Empty: the environment variable KERV_STORE, else SQLite in the folder.
 
     Raises:
-        UsageError: Nothing matches the name, several things match, or it is not a sweep or rollout.
+        UsageError: Nothing matches the name, several things match, or the match is no sweep or rollout.
     """
     with chosen_store([f"store={store}"] if store else []):
         return Study(store_of(find_run(results_dir(str(results)), study_name(name))))
@@ -181,7 +181,7 @@ class Policy:
 
     Attributes:
         info: Description of inputs and outputs: cameras, image_size (pixels), names of the numbers in the state, names
-            and limits of the D actions, control_hz, chunk (H control steps).
+            and limits of the D numbers of an action, control_hz, chunk (H, the most actions in an answer).
         last: The last answer with all details, such as `policy_timing` (milliseconds) and `decode` (forwards, tokens,
             mode). Empty before the first.
     """

@@ -97,8 +97,8 @@ def check_environment_of(settings: DoctorSettings) -> list[Finding]:
 def _rendering(spec: EnvironmentSpec, settings: DoctorSettings) -> str:
     """Render camera images of an environment and time them. Return the result as text.
 
-    An image must not be empty, because a broken OpenGL backend can load without an error and render nothing. If an
-    environment needs an optional dependency of kerv, it may be missing, and its images may take longer.
+    An image must not be empty, because a broken OpenGL backend can load without an error and render nothing. A
+    simulator that is an optional dependency of kerv may be missing, and may need more than 50 ms for an image.
     """
     from kerv_cli.worlds.mujoco_world import choose_backend
 

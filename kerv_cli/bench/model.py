@@ -91,14 +91,14 @@ class Sizes:
 
 @dataclass(frozen=True)
 class Model:
-    """The model that is measured.
+    """The model that `kerv bench` measures: a policy, or a shape of conf/target with random weights.
 
     Attributes:
         name: Name of the policy or of the shape.
         target: The target, a ReadableTarget.
-        drafter: The policy's drafter, or one with random weights.
-        observation: The observation that is decoded, black images and zeros.
-        is_shape: Whether the target has random weights.
+        drafter: The policy's drafter. A shape, or a policy without a drafter, gets one with random weights.
+        observation: The observation to decode: all images are black, and all numbers 0.
+        is_shape: Whether the model is a shape.
     """
 
     name: str
@@ -163,7 +163,7 @@ def layer_weights(settings: TargetSettings) -> int:
 
 
 def open_model(settings: BenchSettings) -> Model:
-    """Open the policy or shape `settings.model` for inference, with its drafter.
+    """Open `settings.model` for inference: a policy, or a shape of conf/target, which gets random weights.
 
     A shape, or a policy without a drafter, gets a drafter with random weights.
 

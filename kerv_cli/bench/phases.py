@@ -56,8 +56,9 @@ class Phase:
 
     Attributes:
         kind: encode, prefill, verify, feed (the drafter reads the target's hidden states), draft (the drafter drafts a
-            chain), tree (it drafts a tree), or a draft of the shipped policy: early, retrieval, scout.
-        rows: Number of tokens in the forward. For a drafted chain its number of tokens, for a drafted tree its depth.
+            chain), tree (the drafter drafts a tree), or early, retrieval, scout (drafting with that source). The last
+            three are measured with the shipped policy, because their time does not depend on the target's size.
+        rows: Number of tokens in a forward or in a drafted chain. Depth of a drafted tree. 1 for the other kinds.
         seconds: Median of all repeats.
         p95: 95th percentile of all repeats.
         least: Minimum of all repeats.
@@ -162,8 +163,8 @@ def costs_of(
     Args:
         decoder: The decoder.
         prompt: P, number of prompt tokens.
-        rounds: The rounds of the decode.
-        laps: Name and seconds of each lap, as `Laps` measured them.
+        rounds: Records of the decode's rounds. A round is one forward and the draft that it verified.
+        laps: Name and seconds of each lap (interval of the stopwatch `Laps`), in order.
     """
     seconds = {phase: sum(s for name, s in laps if name == phase) for phase in ("vision", "prefill", "verify")}
     yield ("encode", 1), seconds["vision"]
@@ -197,7 +198,7 @@ def measure(model: Model, machine: Machine, settings: BenchSettings) -> tuple[Ma
         settings: Settings of the benchmark.
 
     Returns:
-        The values of the device that count, and the measured phases.
+        The device with the values that count, and the measured phases.
     """
     device, evicting = model.target.device, torch.ones(_EVICTING)
     every, seconds = decoders(model), dict[Key, list[float]]()

@@ -220,7 +220,7 @@ def profile_of(phases: Sequence[Phase], tokens: int) -> Profile:
 def projections(
     settings: BenchSettings, model: Model, machine: Machine, phases: Sequence[Phase]
 ) -> Iterator[tuple[str, Document]]:
-    """Estimate the times of another shape in bfloat16 on other devices.
+    """Estimate how long a decode of a target with another shape takes in bfloat16 on other devices.
 
     The shape is `settings.projected`, the devices are those of `settings.projections`. The forwards are those that were
     measured here, but with the prompt length of that shape.
@@ -232,7 +232,7 @@ def projections(
         phases: Phases measured on this device.
 
     Yields:
-        The name of each device, and the estimates for it.
+        For each device its name, and the estimates as a JSON document.
     """
     shape = shape_of(settings.projected, model.size)
     sizes = Sizes(shape, model.target.actions.tokens, _HALF, _HALF)
@@ -280,7 +280,7 @@ def shares(phases: Sequence[Phase], machine: Machine) -> tuple[float, float]:
 def projected(
     phases: Sequence[Phase], reached: tuple[float, float], here: Machine, there: Machine, layers: int
 ) -> list[Phase]:
-    """Estimate the times of phases on another device. These are no measurements.
+    """Return the phases of another shape with times that are estimated for another device, not measured.
 
     A forward is assumed to come as close to its shortest possible time as here, and to take at least 15 µs per layer.
     The encoder's time is scaled by the bandwidth. Drafts of the shipped policy keep their time.
@@ -290,7 +290,7 @@ def projected(
         reached: Result of `shares`.
         here: This device's measured bandwidth and operations per second.
         there: The other device's bandwidth and operations per second.
-        layers: Number of decoder layers of the shape.
+        layers: Number of decoder layers of the other shape.
     """
     projections = []
     for p in phases:

@@ -60,9 +60,9 @@ class RunEntry:
         state: For example `complete`, `2 of 6 episodes`, `step 300 of 600`, `begun` or `damaged`.
         methods: Decoding methods of its settings. For an artifact, its kind.
         tasks: Names of its tasks.
-        episodes: Number of its episodes.
-        total: Number of episodes or steps in all. 0 if unknown.
-        done: How many of them are finished.
+        episodes: Number of its stored episodes.
+        total: Number of episodes or training steps that were planned. 0 if unknown.
+        done: How many of the planned ones are finished.
         left: While it runs, the estimated remaining time, such as `about 3 min left`.
         message: Why the newest command that makes it failed.
         figures: Its main numbers by name, such as the success rate.
@@ -145,8 +145,8 @@ def find_run(results: str | Path, name: str, exact: bool = False) -> RunEntry:
         exact: Whether to accept only a whole id.
 
     Raises:
-        UsageError: Several entries match, or there are none at all.
-        UnknownName: No entry matches.
+        UsageError: Several entries match, or the folder has no entries.
+        UnknownName: The folder has entries, but none matches.
     """
     runs = find_runs(results)
     if not runs:

@@ -204,7 +204,7 @@ def _evaluation(file: sqlite3.Connection, path: Path, name: str, metadata: str) 
 
 
 def labelled(recordings: Sequence[list[Evaluation]], labels: Sequence[str] = ()) -> dict[str, list[Evaluation]]:
-    """Give each path's evaluations a label. The evaluations of one label become one setting.
+    """Return the evaluations of each path by a label. The evaluations of one label become one setting.
 
     Args:
         recordings: The evaluations of each path.

@@ -55,7 +55,7 @@ class Found:
 
     Attributes:
         study: Its settings and the list of all planned episodes.
-        episodes: Yields those that were run, with their results.
+        episodes: Yields the episodes that were run, with their results.
         command: Command-line arguments (without `kerv`) that ran it. Empty if unknown.
     """
 
@@ -167,8 +167,8 @@ def completed(stored: Mapping[str, Any]) -> dict[str, Any]:
     """Convert the settings of a rollout of version 0.1.0 to the current format, without the task.
 
     Missing settings get their defaults. Settings that no longer exist are removed. Settings of a part that is not
-    installed stay as they are. Renamed presets get their new names. A draft is a tree if its `top_k` is above 1,
-    because 0.1.0 had no setting `shape`.
+    installed stay as they are. Renamed presets get their new names. Drafts with a `top_k` above 1 get `shape=tree`, a
+    setting that 0.1.0 did not have.
     """
     stored = {**stored, "method": _RENAMED.get(str(stored.get("method")), stored.get("method"))}
     plain = dataclasses.asdict(read(RolloutSettings, with_artifacts(stored), "a stored setting", tolerant=True))

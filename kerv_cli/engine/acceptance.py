@@ -114,7 +114,7 @@ class DistanceRule:
     space: ActionSpace
 
     def of_drafts_from(self, proposer: str) -> DistanceRule:
-        """Return the rule that judges the drafts of the proposer with this name. By default, always this rule."""
+        """Return the rule that judges the drafts of the proposer with this name. This base class returns itself."""
         return self
 
     def limits(self, r: int) -> tuple[int, ...]:

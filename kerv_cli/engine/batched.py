@@ -109,7 +109,7 @@ def greedy(target: Target, prompt: Tensor, cache: Cache | None = None, size: int
 
     Args:
         target: The policy.
-        prompt: The prompts' embeddings (B, P, E).
+        prompt: Embeddings (B, P, E) of B prompts with P tokens of width E.
         cache: An empty cache with room for P + N tokens; None for a new one.
         size: Number of tokens N; 0 for as many as the target's chunk has.
 

@@ -236,7 +236,7 @@ class Chunk:
         """Commit the tokens that one forward decided.
 
         Args:
-            record: Record of the forward's round.
+            record: What the forward verified, accepted and committed.
             tokens: The tokens to commit.
             rejection: The draft's and the target's tokens after a rejected token. None if no token was rejected.
         """

@@ -139,7 +139,8 @@ class Work:
 
     Attributes:
         calls: The forwards and drafts whose cost depends on the target's size, by kind (one of `FORWARDS`).
-        sources: For every other kind of cost: (decodes,) bool, whether the decode used a proposer of this kind.
+        sources: For each kind of draft whose cost does not depend on the target's size, such as `retrieval`: (decodes,)
+            bool, whether the decode used a proposer of this kind.
         host: (decodes,) recorded seconds that neither depend on the target's size nor were spent on drafting.
         propose: (decodes,) recorded seconds of drafting. 0 if the drafter drafted, because its cost is in `calls`.
     """

@@ -64,5 +64,5 @@ class ChainProposer(Proposer):
         raise NotImplementedError
 
     def is_sure(self, chunk: Chunk) -> bool:
-        """Return whether the proposer expects its best chain to be accepted whole. By default, never."""
+        """Return whether the proposer expects its best chain to be accepted whole. False for this base class."""
         return False

@@ -149,12 +149,12 @@ def without(settings: Plain, names: Collection[str]) -> dict[str, Any]:
 def without_effect(settings: RolloutSettings, overrides: Iterable[str], sweep: bool = False) -> dict[str, str]:
     """Return those overrides that have no effect on the rollout, each with the reason.
 
-    The result is empty for the expert: with it, an unused setting is an error.
+    For the scripted expert the result is always empty, because unused settings are refused elsewhere with an error.
 
     Args:
         settings: The rollout's settings.
         overrides: `key=value`, as typed.
-        sweep: Whether the rollout is part of a sweep. Outside a sweep, settings of workers have no effect either.
+        sweep: Whether the rollout is part of a sweep. If not, settings of worker processes also have no effect.
     """
     if settings.policy.kind == EXPERT:
         return {}

@@ -23,10 +23,10 @@ MOST_SEEDS = 10_000
 
 @dataclass(frozen=True)
 class Point:
-    """One setting of a study as it is written: its overrides. A comma list expands into a grid of several points.
+    """One setting of a study, given by its overrides. Overrides with several values give a grid of several points.
 
     Attributes:
-        name: Name of the grid, which all its points share.
+        name: Name of the grid. All points of a grid have the same name.
         overrides: This point's overrides, `key=value`.
         varies: This point's values of the keys that differ within the grid, by key.
     """

@@ -54,8 +54,9 @@ class Setting:
         overrides: The overrides that make it, as the user wrote them.
         settings: The rollout's settings as nested plain values, without the task.
         identity: Hashes of the weights and data that it reads.
-        varies: This setting's values of the keys that differ within its grid of settings, by key.
-        name: Name of that grid, which its settings share. By default the label.
+        varies: This setting's values of the keys that differ within its grid, by key. A grid is the settings that one
+            entry of the study expands into, because an override has several values.
+        name: Name of the grid. Empty: the label.
     """
 
     label: str
@@ -117,7 +118,7 @@ class Study:
         baseline: Label of the setting that the others are compared with.
         axis: Configuration key on the x axis of plots. Empty: no plot.
         note: A sentence printed in the report.
-        block: Number of seeds for which the settings take turns in one process.
+        block: Number of seeds in a block, which one process runs. For each of these seeds it runs all settings.
         machines: Names of cost profiles of other machines, on which the report estimates the speeds.
     """
 
@@ -151,7 +152,7 @@ def all_episodes(
     Args:
         settings: The settings to compare.
         tasks: Names of the tasks.
-        block: Number of seeds for which the settings take turns.
+        block: Number of seeds in a block. All settings run these seeds before the next block begins.
         repeats: How often every episode is measured.
 
     Raises:
@@ -258,7 +259,8 @@ def split(
     Args:
         study: The study.
         stored: Episodes in the database, by `Episode.key`.
-        rerun: Which existing episodes to run again: NEVER, TIMED, CHANGED or ALL.
+        rerun: Which existing episodes to run again: none (NEVER), those that did not take turns in one block (TIMED),
+            those that other code ran (CHANGED), or all (ALL).
         since: Used only with ALL, if a command is resumed: the time at which it first began (ISO 8601). Episodes of
             blocks that began later count as existing, because this command ran them. Empty: all episodes run again.
         earlier: The newest stored setting and its hash, by label. Used to explain what has changed.

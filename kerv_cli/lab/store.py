@@ -301,7 +301,7 @@ class StudyStore:
 
         Args:
             study: The settings and all episodes.
-            episodes: The episodes that exist.
+            episodes: The episodes that were run, with their results.
             command: Command-line arguments (without `kerv`) of the import.
         """
         from kerv_cli.episodes.rows import seconds_blob, table_blob

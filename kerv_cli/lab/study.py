@@ -71,7 +71,7 @@ def study_of(resolved: ResolvedStudy, kind: str = SWEEP) -> Study:
     """Check a study's settings, and return the study with all its episodes. `auto` devices are replaced by real ones.
 
     Args:
-        resolved: The composed study.
+        resolved: The study with all its settings.
         kind: SWEEP or ROLLOUT.
 
     Raises:
@@ -100,10 +100,10 @@ def study_of(resolved: ResolvedStudy, kind: str = SWEEP) -> Study:
 
 
 def plan(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
-    """Plan a sweep: find the episodes of a study that are missing from the database.
+    """Plan a sweep: return which episodes of a study are in the database, and which must run.
 
     Args:
-        resolved: The composed study.
+        resolved: The study with all its settings.
         command: Command-line arguments (without `kerv`) that resume this sweep.
 
     Raises:
@@ -123,7 +123,7 @@ def plan_rollout(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
     """Plan a rollout. If the same command was interrupted before, plan the rest of its newest rollout instead.
 
     Args:
-        resolved: The composed settings.
+        resolved: The rollout with all its settings.
         command: Command-line arguments (without `kerv`) of the rollout.
     """
     check_writable(resolved.first.results)
@@ -149,7 +149,7 @@ def run(planned: Plan, on_event: OnEvent = lambda event: None, *, save: Save = l
     Args:
         planned: The plan.
         on_event: Called with each event, to show progress.
-        save: Writes recordings. By default nothing is recorded.
+        save: Writes a recording. The default writes nothing.
 
     Raises:
         Interrupted: Ctrl-C was pressed.

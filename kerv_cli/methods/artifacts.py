@@ -159,7 +159,9 @@ class Artifact(Generic[T]):
         return path / f"{self.kind}.json"
 
     def load(self, path: Path, artifacts: Artifacts) -> Any:
-        """Load the artifact in `path`, for the target of `artifacts`. By default, only read and check its description.
+        """Load the artifact in `path`, and check that it was made for the target of `artifacts`.
+
+        This base class returns only the checked description. A subclass returns what a method uses, such as a network.
 
         Raises:
             CheckpointError: The artifact is missing, damaged or made for another target.
@@ -180,7 +182,7 @@ class Artifact(Generic[T]):
         return ()
 
     def check_use(self, description: T, use: Use) -> None:
-        """Refuse a use that the artifact was not made for. By default every use is allowed.
+        """Refuse a use that the artifact was not made for. This base class allows every use.
 
         Raises:
             UsageError: The artifact was made for another method, environment, camera or horizon.
@@ -195,7 +197,7 @@ class Artifact(Generic[T]):
         return True
 
     def digest(self, path: Path, description: T) -> str:
-        """Return a hash of the artifact, by default that of its description.
+        """Return a hash that identifies the artifact. This base class returns the hash of the description.
 
         Stored episodes contain the hashes of the artifacts that they used.
         """

@@ -27,7 +27,7 @@ class Demonstrations:
 
     Attributes:
         sha256: Hash of the demonstrations.
-        tasks: For each task {"training": number of episodes}.
+        tasks: For each task the number of episodes, as {"training": 50}.
     """
 
     sha256: str

@@ -77,8 +77,8 @@ class Method:
     def _check_drafts(self) -> None:
         """Check the proposer, the boundary and the prefill draft.
 
-        A boundary that chooses between retrieval and the drafter needs a proposer that has both, and the other way
-        round. A prefill draft must not need the target's hidden states, which exist only after the prefill.
+        A boundary that chooses between retrieval and the drafter needs a proposer that has both. Such a proposer needs
+        such a boundary. A prefill draft must not need the target's hidden states, which exist only after the prefill.
         """
         proposer, boundary, draft = (self.parts[kind] for kind in ("proposer", "boundary", "prefill_draft"))
         if bool(proposer.traits.get("has_boundary")) != bool(boundary.traits.get("chooses")):

@@ -45,7 +45,9 @@ def is_parallel(target: object) -> bool:
 
 
 def check_parallel(parts: Mapping[str, Part], parallel: bool) -> None:
-    """Check that a method has skip=parallel and no drafts for a parallel target, and no skip=parallel for any other.
+    """Refuse skip=parallel for a target that decodes token by token, and every other method for a parallel target.
+
+    A method with skip=parallel is also refused if it drafts.
 
     Args:
         parts: All parts of the method, by kind.

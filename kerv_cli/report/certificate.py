@@ -144,10 +144,10 @@ def planned_certificate(
 
 
 def certify(certificate: Certificate, store: StudyStore, wanted: Sequence[Episode], baseline: str) -> Certificate:
-    """Test the candidates in their order, each at level delta, up to the first that fails.
+    """Test the candidates in their order, each at level delta, until one fails.
 
-    By fixed-sequence testing, the probability that any certified setting loses more than `margin` points is at most
-    delta. Nothing is tested if AR solves less than half of its episodes.
+    Return the certificate with the results. By fixed-sequence testing, the probability that any certified setting
+    loses more than `margin` points is at most delta. Nothing is tested if AR solves less than half of its episodes.
 
     Args:
         certificate: The planned certificate.
@@ -170,7 +170,7 @@ def certify(certificate: Certificate, store: StudyStore, wanted: Sequence[Episod
 
 
 def _candidate(planned: Candidate, pairs: pd.DataFrame, margin: float, delta: float, testing: bool) -> Candidate:
-    """Test one setting against AR.
+    """Return a candidate with the results of its episodes and of its test against AR.
 
     Args:
         planned: The candidate without results.

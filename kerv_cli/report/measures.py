@@ -67,7 +67,7 @@ def measure(
         all_pairs: Whether speedups also use pairs that were not measured in one block.
 
     Returns:
-        For each group, column name to value. A measure without data is NaN.
+        For each group, its measures by column name. A measure without data is NaN.
     """
     if averaging != MACRO:
         episodes, pairs = episodes.assign(difficulty=""), pairs.assign(difficulty="")
@@ -120,7 +120,7 @@ def paired_columns(counts: stats.PairedCounts, difference: Estimate) -> Row:
         difference: Success rate of the setting minus the baseline's, with its interval.
 
     Returns:
-        Column name to value. `mcnemar_p` is NaN if there are no pairs.
+        The values by column name. `mcnemar_p` is NaN if there are no pairs.
     """
     return {
         "pairs": sum(counts),
@@ -185,16 +185,19 @@ def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame
 def speedups(
     pairs: pd.DataFrame, by: list[str], averaging: str, all_pairs: bool = False
 ) -> dict[str, dict[Hashable, Estimate]]:
-    """Return `speedup` and `episode_speedup` of each group of pairs.
+    """Return two speedups of each group of pairs: mean time of the baseline ÷ mean time of the method.
 
-    A group has no speedup if it has no usable pairs, if an episode was not timed, or if its setting runs no decoder
-    (the scripted expert).
+    `speedup` compares seconds per control step, `episode_speedup` seconds per episode. A group has no speedup if it has
+    no usable pairs, if an episode was not timed, or if its setting runs no decoder (the scripted expert).
 
     Args:
         pairs: Table made by `paired`.
         by: Columns that form the groups.
-        averaging: MACRO averages times over difficulty groups.
-        all_pairs: Whether to use pairs that were not measured in one block, too.
+        averaging: MACRO: a mean time is the mean of the difficulty groups' means. Otherwise: the mean of all pairs.
+        all_pairs: Whether to use pairs that were not measured in one block (side by side in one process), too.
+
+    Returns:
+        For each of the two names, the speedups by group.
     """
     timed = pairs if all_pairs else pairs[pairs["same_block"]]
     blocks = timed["block_method"].astype(str) + "|" + timed["block_baseline"].astype(str)

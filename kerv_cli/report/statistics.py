@@ -124,8 +124,8 @@ def difference(first: Estimate, second: Estimate) -> Estimate:
     """Estimate the second of two independent success rates minus the first.
 
     With Wilson intervals this is Newcombe's hybrid score interval (Statistics in Medicine 17, 1998, page 873, method
-    10). Each rate has a distance to one end of its interval. The root of the sum of the two squared distances is the
-    distance from the difference to one end of its interval.
+    10). The distance from the difference to its lower end is the root of the sum of two squared distances: from the
+    second rate to its lower end, and from the first rate to its upper end. For the upper end it is the other way round.
 
     Args:
         first: A rate with its interval.
@@ -139,7 +139,7 @@ def difference(first: Estimate, second: Estimate) -> Estimate:
 def pairs_for_power(lost: float, won: float, power: float = 0.8) -> float:
     """Return about how many pairs McNemar's exact test needs to show a difference at the 5 % level.
 
-    A pair is discordant if exactly one of the two succeeds. The number of such pairs is taken as random, too.
+    A pair is discordant if exactly one of the two succeeds. The number of discordant pairs is treated as random.
 
     Args:
         lost: Expected share of pairs in which only the baseline succeeds.
@@ -220,7 +220,7 @@ def speedup(
 
     The 95 % interval is computed for the ratio's logarithm, linearised, in a stratified cluster sample (Cochran,
     Sampling Techniques, 1977). The strata are the tasks. The clusters are blocks: episodes that ran together in one
-    process and so share the state of the machine. Two cases differ:
+    process and so share the state of the machine. In two cases the clusters are not the blocks:
 
     - If every task has only one block, the tasks are the clusters.
     - If there is only one block in all, its pairs are the clusters. The interval then holds only for the state that the
@@ -276,15 +276,16 @@ def over_runs(estimates: Sequence[Estimate]) -> Estimate:
 
 
 def _spread(effects: np.ndarray, strata: np.ndarray, clusters: np.ndarray) -> float:
-    """Return half the width of the 95 % interval of a sum over pairs, whose clusters are independent.
+    """Return half the width of the 95 % interval of the logarithm of a speedup.
 
-    The variance of the sum is estimated within each stratum, from the spread of its clusters' sums. Then the variances
-    of the strata are added. Strata with only one cluster are merged into one stratum (Cochran, Sampling Techniques,
-    section 5A.12). The half width is the standard deviation times the 97.5 % quantile of Student's t. Its degrees of
-    freedom are the number of clusters minus the number of strata.
+    A pair is a baseline episode and a method episode from the same initial state. Pairs in different clusters are
+    independent. The variance is estimated within each stratum, from the spread of its clusters' sums of `effects`. Then
+    the variances of the strata are added. Strata with only one cluster are merged into one stratum (Cochran, Sampling
+    Techniques, section 5A.12). The half width is the standard deviation times the 97.5 % quantile of Student's t, with
+    as many degrees of freedom as there are more clusters than strata.
 
     Args:
-        effects: (n,) contribution of each pair to the linearised logarithm of the speedup. They sum to 0.
+        effects: (n,) how far each pair moves that logarithm, to first order; 0 in total.
         strata: (n,) number of each pair's stratum (task), from 0.
         clusters: (n,) number of each pair's cluster (block), from 0. A cluster is in one stratum.
 

@@ -1,8 +1,9 @@
 """Describe what a served policy reads and sends, and check and encode the messages (msgpack with numpy arrays).
 
-An array is a map with the keys __ndarray__ (true), data, dtype and shape. openpi writes them as bytes, vla-eval as
-text. openpi's single numbers have __npgeneric__, data and dtype. vla-eval's images have __image__, data and format.
-Nothing is unpickled. An array must have exactly the bytes that its shape and type need.
+An array is a map with the keys __ndarray__ (true), data, dtype and shape. These keys are bytes in openpi and text in
+vla-eval. A single number in openpi is a map with the keys __npgeneric__, data and dtype. An image in vla-eval is a map
+with the keys __image__, data and format. Nothing is unpickled. An array must have exactly the bytes that its shape and
+type need.
 """
 
 from __future__ import annotations

@@ -209,11 +209,11 @@ class Finite:
         return getattr(self._target, name)
 
     def encode(self, observation: Observation) -> Tensor:
-        """Encode the observation and check the prompt."""
+        """Return the prompt. `check` will raise an error if a number in it is not finite."""
         return self._noted(self._target.encode(observation))
 
     def head(self, hidden: Tensor) -> Tensor:
-        """Compute the logits and check them."""
+        """Return the logits. `check` will raise an error if one of them is not finite."""
         return self._noted(self._target.head(hidden))
 
     def _noted(self, numbers: Tensor) -> Tensor:

@@ -246,7 +246,7 @@ def episode_windows(episode: DemoEpisode, actions: ActionSpace, window: int, hor
         The expert's undisturbed actions around each moment (n, window + horizon, D), oldest first.
 
     Raises:
-        CheckpointError: The recording holds too few labels after the episode's end.
+        CheckpointError: The recording holds too few actions of the expert after the episode's end.
     """
     steps, length = len(episode.executed), window + horizon
     check_tail(episode, horizon, f"predictions of {horizon} steps")
@@ -315,7 +315,7 @@ def fit_noise(past: np.ndarray, future: np.ndarray, dampings: Sequence[float]) -
     Args:
         past: (n, window) normalised actions before each moment.
         future: (n, H) normalised actions after each moment.
-        dampings: Dampings to try. (1,) is the filter with constant velocity.
+        dampings: Factors of the velocity per control step to try. 1: the velocity stays constant.
 
     Returns:
         The process noise q, for a measurement noise r = 1, and the damping.

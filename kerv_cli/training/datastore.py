@@ -87,7 +87,8 @@ class DatastoreBuild:
             progress: Called with the numbers of episodes done and of all.
 
         Raises:
-            CheckpointError: An episode has too few labels, or images of another size than the target takes.
+            CheckpointError: An episode has too few actions of the expert, or images of another size than the target
+                takes.
             UnknownName: `key` names an unknown part of the prompt.
             StorageError: The disk cannot be written.
         """

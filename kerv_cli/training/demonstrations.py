@@ -73,8 +73,8 @@ def demos_for(settings: S) -> tuple[S, DemoDataset]:
     """Open the demonstrations named in the settings, or by default the ones that the target was trained on.
 
     Returns:
-        settings: The settings with `demos` filled in. If `task` is empty and some demonstrated tasks are new to the
-            target, `task` is filled in, too: with the demonstrated tasks that the target was trained on.
+        settings: The settings with `demos` filled in. If `task` is empty, and the demonstrations have tasks that the
+            target was not trained on, `task` names all their other tasks.
         dataset: The demonstrations.
 
     Raises:
@@ -103,7 +103,7 @@ def demos_for(settings: S) -> tuple[S, DemoDataset]:
 
 
 def check_tasks(dataset: DemoDataset, names: Sequence[str]) -> None:
-    """Refuse demonstrations that have no episode of one of these tasks.
+    """Refuse demonstrations unless every task in `names` has an episode.
 
     Args:
         dataset: The demonstrations.

@@ -72,7 +72,7 @@ def load_samples(
             of object and goal instead.
 
     Raises:
-        CheckpointError: An episode has too few labels, or images of another size.
+        CheckpointError: An episode has too few actions of the expert, or images of another size.
     """
     chosen = [i for i, entry in enumerate(dataset.episodes) if entry.task in task_names]
     parts = []

@@ -83,7 +83,8 @@ class TargetRun(TrainingRun):
     def check_places(self) -> None:
         """Check that the demonstrations hold the positions that the policy reads or learns to estimate.
 
-        If they hold no object positions, set `train.places=path`: the policy then learns where the hand will be.
+        Without object positions, change `train.places` from `state` to `path`, and add a note. The policy then learns
+        where the hand will be.
 
         Raises:
             UsageError: The policy reads object positions, and the demonstrations hold none. Or `train.places=path` is

@@ -47,9 +47,9 @@ class ScopedSettings:
 
 
 def _needs(settings: ScopedSettings) -> tuple[str, ...]:
-    """Return the kinds of artifacts needed: the certificate, and those of the proposer `outside`.
+    """Return the kinds of artifacts needed: the certificate, and what the proposer for other tasks (`outside`) needs.
 
-    `CertificateArtifact.needs` adds those of the certified proposer.
+    The certificate itself lists what the certified proposer needs (`CertificateArtifact.needs`).
     """
     outside = part_of("prefill_draft", settings.outside)
     return "certificate", *outside.needs(outside.default)

@@ -102,7 +102,7 @@ class EarlyNetwork(Packable):
         """Draft chunks. The result stays on the device, so the CPU need not wait for a GPU.
 
         Args:
-            features: (B, F) pooled prompts.
+            features: (B, F) pooled prompts, F features each.
             radius: Acceptance radius, in bins.
 
         Returns:
@@ -114,7 +114,7 @@ class EarlyNetwork(Packable):
         """Choose the tokens of chunks from logits.
 
         Args:
-            logits: (B, N, V).
+            logits: (B, N, V) for N tokens with V possible values each.
             radius: Acceptance radius, in bins.
 
         Returns:
@@ -160,11 +160,11 @@ def _between(below: Tensor, pad: int, radius: int, bins: int) -> Tensor:
     Args:
         below: (…, V + 2 pad + 1) cumulative probability over the bins, padded on both sides.
         pad: Padding of `below`, at least `radius`.
-        radius: In bins.
+        radius: Acceptance radius, in bins.
         bins: Number V of bins.
 
     Returns:
-        (…, V).
+        (…, V) summed probabilities.
     """
     return below[..., pad + radius + 1 :][..., :bins] - below[..., pad - radius :][..., :bins]
 

@@ -147,10 +147,10 @@ class Index(Protocol):
     """A search for stored rows with keys most similar to a given key. The function `best` then ranks the rows found."""
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return the row numbers of the task's k most similar entries, in ascending order. More rows may be among them.
+        """Return the row numbers of the task's k most similar entries, and perhaps of more, in ascending order.
 
         Args:
-            key: (d,) float32.
+            key: (d,) float32, the key to compare with.
             task: Full name of the task.
             k: Number of rows wanted.
             without: Seed of an episode to leave out. None: use all episodes.
@@ -275,19 +275,19 @@ class Datastore:
             target: The target that encoded it.
 
         Returns:
-            (p,) float32 with the norm 1, on the target's device.
+            (S · E,) float32 for S segments and width E, with the norm 1, on the target's device.
         """
         return prompt_key(prompt, target, self.manifest.key)[0]
 
     def key_of(self, pooled: np.ndarray) -> np.ndarray:
-        """Return the search key (d,) float32 of a pooled prompt (p,), projected if the datastore has a projection."""
+        """Return the search key (d,) float32: the result of `pooled`, projected if the datastore has a projection."""
         return pooled if self.projection is None else projected(pooled[None], self.projection)[0]
 
     def query(self, key: np.ndarray, task: str, k: int, without: int | None = None) -> Neighbours:
         """Return the k entries of a task that are most similar to a key, or all entries if there are fewer.
 
         Args:
-            key: (d,).
+            key: (d,) search key.
             task: Full name of the task.
             k: Number of entries.
             without: Seed of an episode to leave out, for leave-one-episode-out measurements. None: use all episodes.

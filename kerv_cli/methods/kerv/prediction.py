@@ -123,7 +123,7 @@ class Predictor:
         self.tables = {m: self._table(m) for m in range(minimum, window + 1)}
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return the weights (horizon, window) for one DoF. By default, all weight is on the newest action.
+        """Return the weights (horizon, window) for one DoF. This base class puts all weight on the newest action.
 
         Args:
             dof: Index of the DoF.
@@ -276,14 +276,14 @@ class PredictionProposer(ChainProposer):
 class Compensation:
     """KERV: after a rejection, keeps the accepted tokens and predicts the rest of that control step.
 
-    The settings change this:
+    These settings change it:
 
-    - `use_target_token` (ours) also keeps the target's token at the rejected position, which is already computed.
-    - `drop` (ours) ends the chunk after the predicted steps. Without it, the target decodes the later steps.
-    - `steps` (the paper's predict length PL) lets the prediction fill further control steps.
-    - `predictor=draft` (ours) fills with the rejected draft's remaining tokens first. A draft was made from the
+    - `use_target_token` (ours): also keep the target's token at the rejected position, which is already computed.
+    - `drop` (ours): end the chunk after the predicted steps. Otherwise the target decodes the later steps.
+    - `steps` (the paper's predict length PL): how many control steps to fill.
+    - `predictor=draft` (ours): fill with the rejected draft's remaining tokens first. A draft was made from the
       observation, a prediction only from past actions.
-    - `rest` is the number of decodes after each compensation in which nothing is compensated.
+    - `rest`: in how many decodes after each compensation nothing is compensated.
     """
 
     def __init__(self, settings: CompensateSettings, predictor: Predictor) -> None:
@@ -313,7 +313,7 @@ class Compensation:
         """Fill the rejected control step, if its missing values can be predicted.
 
         Returns:
-            Whether it was filled. If not, the target decodes on after its own token.
+            Whether the step was filled. If not, the target decodes on after its own token at the rejected position.
         """
         if self.resting:
             return False

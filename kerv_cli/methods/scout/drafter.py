@@ -106,7 +106,7 @@ class ScoutNetwork(Packable):
             views: For each camera view its features and its image points, as the method `views` returns them.
 
         Returns:
-            Features (B, F), and positions (B, K, 3) in metres.
+            Features (B, F), and the positions (B, K, 3) in metres of K places, such as object and goal.
         """
         cells = [part for grid in views[::2] for part in (grid.mean(1), self.cells(grid).flatten(1))]
         located = self.locate(torch.cat([*views[1::2], hand_features(proprioception, self.centre), words], -1))

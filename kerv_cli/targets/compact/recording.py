@@ -50,8 +50,8 @@ class Recorded:
 
     Attributes:
         tape: The tape that records its operations.
-        place: Integer tensor of the same shape. It holds the place of each element, its index in a frame.
-        shape: The shape of the tensor.
+        place: Integer tensor: for each element, its index in the float32 memory (frame) of one batch row.
+        shape: The shape of the tensor, which `place` has, too.
     """
 
     requires_grad = is_cuda = False
@@ -116,10 +116,10 @@ class Recorded:
         return self.tape.emit(ARGMAX, (1,), [self], self.place.numel())
 
     def attend(self, heads: int, cos: Tensor, sin: Tensor) -> Recorded:
-        """Record the attention of the next layer. This value holds queries, keys and values (…, 3 E), not yet rotated.
+        """Record the attention of the next layer. Of this value's 3 E columns, E are queries, E keys and E values.
 
         Args:
-            heads: Number of attention heads.
+            heads: Number of attention heads, with C channels each. Together they have E channels.
             cos: (positions, 1, C) rotary cosines, for every position that can occur.
             sin: (positions, 1, C) rotary sines.
 

@@ -86,7 +86,7 @@ class CompactTarget(Packable):
         camera: Name of the camera. A name that joins several views with `+` means one image of all views.
 
     Attributes:
-        cameras: The camera whose images are read. Empty if the policy reads the state.
+        cameras: One name: the camera whose images are read. Empty if the policy reads the state.
         frame_shape: Shape (height, width, 3) of an image.
         segments: Positions of the tokens in each part of the prompt (a slice), by the part's name.
         sha256: Hash of the weights that were loaded. Empty if none were.

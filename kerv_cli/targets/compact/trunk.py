@@ -1,6 +1,7 @@
 """The Llama-style trunk: RMSNorm, RoPE, SwiGLU, tree attention over a key/value cache.
 
-Shapes: B batch, T new tokens, S cached tokens, E width, A heads, C = E / A.
+Shapes: B batch, T new tokens, S cached tokens, E width of inputs and outputs, A heads, C = width / A channels of a
+head. The width inside the layers is larger than E only in an enlarged target (`targets/grown.py`).
 
 There are three implementations, whose results are equal up to rounding:
 
@@ -68,12 +69,12 @@ class Layer(nn.Module):
         slots: Slots | None = None,
         mask: Tensor | None = None,
     ) -> Tensor:
-        """Compute the output (B, T, E) of the layer.
+        """Compute the output (B, T, width) of the layer.
 
         Args:
-            x: (B, T, E) input. Also a stand-in for a tensor while a program is recorded.
+            x: (B, T, width) input: a tensor, or its stand-in `Recorded` while a program is recorded.
             rotary: Cosines and sines, (T, 1, C) each.
-            cache: (2, B, A, capacity, C) keys and values of this layer. None: there are no earlier tokens.
+            cache: (2, B, A, capacity, C) keys and values of this layer's A heads. None: there are no earlier tokens.
             slots: Slots of the cache that the new keys and values are written to.
             mask: Result of `attention_mask`. None: attention is causal.
         """
@@ -94,7 +95,7 @@ class LayerStack(Packable):
     Attributes:
         inputs: Number of input tensors (B, T, E).
         width: Width inside the layers.
-        outer: E, width of inputs and outputs. Equals `width` unless the stack was enlarged (`targets/grown.py`).
+        outer: E, width of inputs and outputs.
         heads: Number of attention heads.
         depth: Number of layers.
         padding: Number of tokens that are appended to a prompt, hidden by the mask, and dropped after the prefill. They
@@ -121,7 +122,7 @@ class LayerStack(Packable):
         return x if not rest else torch.cat([x, x[..., :1].expand(*x.shape[:-1], rest) * 0.0], -1)
 
     def finish(self, x: Tensor) -> Tensor:
-        """Turn the last layer's output (B, T, width) into hidden states (B, T, E)."""
+        """Cut the last layer's output (B, T, width) to its first E channels and normalise it: the hidden states."""
         return self.norm(x if self.width == self.outer else x[..., : self.outer])
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:

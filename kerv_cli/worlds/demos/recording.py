@@ -302,10 +302,10 @@ def _run_jobs(
 def _record_seeds(
     config: DemoConfig, out: Path, task: str, seeds: Sequence[int], make_actor: MakeActor | None
 ) -> tuple[str, _Outcomes]:
-    """Record each seed of a task that has no file yet. Runs in a worker process.
+    """Record a task's episodes of `seeds`, except those with a file. Runs in a worker process.
 
     Returns:
-        The task, and for each seed its entry for the manifest, or None if the expert failed.
+        The task's name; and for each seed the manifest's entry of its episode, or None if the expert failed.
     """
     actor = make_actor(config) if make_actor else None
     with config.spec.open_world(task, config.camera) as world:
