@@ -374,7 +374,7 @@ def write_served(path: Path, record: EpisodeRecord, started: str, by: Mapping[st
     """
     row = episode_row(record) | {"task": record.task, "seed": record.seed, "started": started}
     if not len(record.path):
-        row |= {"path_length": None}
+        row |= {"path_length": None, "jerk": None}
     facts = json.dumps({"episode": row, "by": by})
     table = decodes_table(record).replace_schema_metadata({_KEY: facts})
     options = pa.ipc.IpcWriteOptions(compression="zstd")

@@ -169,3 +169,9 @@ class EpisodeRecord:
     def path_length(self) -> float:
         """Length of the end effector's path, metres."""
         return path_length(self.path)
+
+    @property
+    def jerk(self) -> float:
+        """Root mean square of the end effector's jerk, m/s³; NaN if the episode has fewer than 3 steps."""
+        third = np.diff(self.path.astype(np.float64), n=3, axis=0) * self.space.control_hz**3
+        return float(np.sqrt((third**2).sum(axis=1).mean())) if len(third) else math.nan

@@ -75,7 +75,7 @@ _EPISODE: Fields = {
     "delay_steps": (INT, _summed(_delay("steps"))),  # the sum in control steps
     # of these: steps on the previous chunk, steps on the last action, and actions that were too old to execute
     **{f"{name}_steps": (INT, _summed(_delay(name))) for name in ("carried", "held", "dropped")},
-    **_attributes("path_length", kind=FLOAT),  # of the end effector, metres
+    **_attributes("path_length", "jerk", kind=FLOAT),  # of the end effector: metres; m/s³
     **_attributes("closest_approach", kind=FLOAT),  # least distance of fingertips to object, metres
     **_attributes("object_moved", kind=FLOAT),  # how far the object moved after they came within 5 cm, metres
     **_attributes("wall_seconds", kind=FLOAT),

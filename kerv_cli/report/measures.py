@@ -229,6 +229,7 @@ def _means(episodes: pd.DataFrame, by: list[str]) -> pd.DataFrame:
         **{f"ms.{phase}": episodes[f"seconds.{phase}"] * per_step for phase in PHASES},
         "steps_to_success": episodes["steps"].where(solved),
         "path_m": episodes["path_length"].astype(float).where(solved),
+        "jerk": episodes["jerk"].astype(float),
         "near_contact_failure": (distances < NEAR).astype(float).where(~solved & distances.notna()),
     }
     quantiles = {"latency_p50_ms": 0.5, "latency_p95_ms": 0.95, "latency_worst_ms": 1.0}
