@@ -119,7 +119,7 @@ class Laps(Stopwatch):
 class Dummy(Proposer):
     """A proposer that always drafts the same number of nodes, with arbitrary tokens.
 
-    The nodes form a chain. Nodes that do not fit into the chunk become further first tokens of the draft instead.
+    The nodes form a chain. Nodes that do not fit into the chunk become alternatives to the chain's first token.
     """
 
     name = "dummy"
@@ -265,7 +265,7 @@ def needs_of_draft(decoder: Any) -> tuple[float, float]:
 
 
 def source_methods() -> dict[str, str]:
-    """Return the method with which a kind of draft is measured, by kind, for the drafts that have a phase."""
+    """Return by kind of draft, except SCOUT, the method that measures it: {"early": "early_unverified", …}."""
     measured = [part.traits for part in parts("proposer").values() if "measured_by" in part.traits]
     return {traits["cost"]: traits["measured_by"] for traits in measured}
 

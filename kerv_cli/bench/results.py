@@ -142,7 +142,7 @@ def write(settings: BenchSettings, bench: Bench) -> list[Path]:
 
 @dataclass(frozen=True)
 class MethodCeiling:
-    """The highest speedup of a method over autoregressive decoding (AR): every draft is accepted completely.
+    """The speedup of a method over autoregressive decoding (AR) if every draft were accepted completely.
 
     Attributes:
         method: Name of the method.

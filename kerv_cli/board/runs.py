@@ -34,7 +34,7 @@ ORDERS: dict[str, Callable[[RunEntry], object]] = {
 
 
 def show_runs(request: Request) -> Response:
-    """Show studies, artifacts and unfinished commands. By default, running ones come first, then the newest."""
+    """Show studies, artifacts and unfinished commands. Unless the user sorts them, running ones come first."""
     version, is_live = pulse(database_of(request))
     if request.query_params.get("known") == version:
         return Response(status_code=204)  # htmx leaves the page as it is

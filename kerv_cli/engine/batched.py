@@ -1,6 +1,8 @@
 """Decodes the observations of several episodes at once, for runs that measure success but no times.
 
 Only methods that never verify a draft can be batched (docs/measuring.md).
+
+Shapes: B prompts, P prompt tokens, N tokens of a chunk, E width of the target's embeddings and hidden states.
 """
 
 from __future__ import annotations
@@ -109,7 +111,7 @@ def greedy(target: Target, prompt: Tensor, cache: Cache | None = None, size: int
 
     Args:
         target: The policy.
-        prompt: Embeddings (B, P, E) of B prompts with P tokens of width E.
+        prompt: The prompts' embeddings (B, P, E).
         cache: An empty cache with room for P + N tokens; None for a new one.
         size: Number of tokens N; 0 for as many as the target's chunk has.
 

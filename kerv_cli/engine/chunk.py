@@ -1,4 +1,7 @@
-"""The chunk of actions that a decode fills, and what a decoder remembers of the running episode."""
+"""The chunk of actions that a decode fills, and what a decoder remembers of the running episode.
+
+Shapes: D degrees of freedom of an action, N tokens of a chunk, P prompt tokens, E width of the target.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +48,7 @@ class ActionHistory:
         self._actions = np.concatenate([self._actions, action[None]])[-self.window :]
 
     def values(self, pending: np.ndarray | None = None) -> np.ndarray:
-        """Return the latest actions (m, D), m ≤ window, oldest first.
+        """Return the latest m actions (m, D), oldest first. m is at most `window`.
 
         Args:
             pending: Actions (k, D) of the current chunk that are decided but not executed yet. They count as executed,

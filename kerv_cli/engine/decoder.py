@@ -1,4 +1,7 @@
-"""The decode loop of all methods: propose, verify, accept, commit, rectify (docs/methods.md §2)."""
+"""The decode loop of all methods: propose, verify, accept, commit, rectify (docs/methods.md §2).
+
+Shapes: P prompt tokens, E width of the target's embeddings and hidden states.
+"""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ class Proposer:
         Args:
             chunk: The chunk, which already holds the round's committed tokens.
             first: Index in the chunk of the token just before this round's tokens. `hidden` starts with this token.
-            hidden: The target's hidden states (1, T, E) of the chunk's tokens first … first + T − 1.
+            hidden: The target's hidden states (1, T, E), each E wide, of the chunk's tokens first … first + T − 1.
             target_tokens: The target's prediction after token `first`, then after each of the draft's n nodes, rejected
                 ones included.
         """

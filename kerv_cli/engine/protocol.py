@@ -147,7 +147,7 @@ class ReadableTarget(Target, Protocol):
         """Floating-point type of the weights."""
 
     def pooled(self, prompt: Tensor) -> Tensor:
-        """Summarise each prompt (B, P, E) in one vector (B, F).
+        """Summarise each prompt (B, P, E) in one vector of F numbers, (B, F).
 
         The early drafter, which drafts before the prefill, reads these vectors.
         """

@@ -156,9 +156,9 @@ class StudyStore:
     def save(self, study: Study, existing: Mapping[Episode, StoredEpisode] | None = None) -> None:
         """Write a study's settings and episodes.
 
-        If the study is stored already, its unchanged settings keep their episodes of tasks that are not in `study`, as
-        far as their seeds and repeats are in the ranges of `study`. So sweeps of one study over different tasks give
-        one report.
+        If the study is stored already, its unchanged settings keep their episodes of tasks that are not in `study`.
+        Episodes with a seed or repeat outside the ranges of `study` are removed from the study. So sweeps of one study
+        over different tasks give one report.
 
         Args:
             study: The study.
@@ -327,9 +327,9 @@ class StudyStore:
                 connection.execute(self.update_of(one.episode).values(episode_id=number))
 
     def update_of(self, one: Episode) -> sa.Update:
-        """Return an SQL UPDATE of the rows of WANTED that stand for an episode in this study.
+        """Return an SQL UPDATE of the rows of WANTED (planned episodes) that stand for an episode in this study.
 
-        Settings with different labels but equal meaning share the episode. Each of them has such a row.
+        There are several rows if settings with different labels have equal meaning, and so share the episode.
         """
         settings = sa.select(SETTINGS.c.id).join(STUDIES).where(STUDIES.c.name == self.name)
         settings = settings.where(SETTINGS.c.work == one.setting.work)

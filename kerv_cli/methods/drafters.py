@@ -87,7 +87,7 @@ class Decodes(Rows):
     network.
 
     Attributes:
-        tokens: (n, N) int64, the target's tokens.
+        tokens: (n, N) int64, the N tokens of each chunk.
         episodes: (n,) int64, index of the observation's episode.
         perturbed: (n,) bool, whether the observation's episode was executed with noise.
     """

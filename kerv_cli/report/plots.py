@@ -46,7 +46,7 @@ def study_figures(table: pd.DataFrame, axis: str, loss: float = 3.0) -> dict[str
 
     - A study of stress: success against the level of stress.
     - A study whose settings differ along `axis`: speed and success against it.
-    - Any other study that compares or was timed: speed and change in success of every setting.
+    - Any other study that compares settings or was timed: speed and change in success of every setting.
 
     Args:
         table: The study's table.

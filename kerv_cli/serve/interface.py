@@ -114,7 +114,7 @@ class Interface:
         """Convert the gripper's values in actions to the client's convention, the setting `gripper`.
 
         Args:
-            actions: (H, D) in environment units.
+            actions: (H, D), H actions of D DoFs in environment units.
 
         Returns:
             (H, D) float64.

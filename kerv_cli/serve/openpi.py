@@ -59,7 +59,7 @@ class OpenPi(Conversation):
     """Serve one robot at a time. A robot that sends nothing for two minutes is disconnected.
 
     Attributes:
-        last: (H, D) actions of the latest answer, in environment units.
+        last: (H, D) the H actions of the latest answer, for D DoFs, in environment units.
         last_hand: (3,) position of the end effector when that answer was computed, in metres.
         decodes: Number of answers so far.
     """
@@ -87,7 +87,7 @@ class OpenPi(Conversation):
         return packed(self.act(unpacked(frame)))
 
     def act(self, message: Message) -> dict[str, Any]:
-        """Return the values of the answer to a client's message: actions (H, D), times, and number of target forwards.
+        """Return the values of the answer to a client's message: actions, times, and number of target forwards.
 
         Args:
             message: The observation. It may also have `executed`, how many of the last actions were executed, and

@@ -105,10 +105,10 @@ class Policy:
         return StateRange(low, high, names, self.settings.margin)
 
     def _artifacts_with(self, trait: str) -> list[str]:
-        """Return the kinds of the method's artifacts (trained or calibrated files) that have a registered trait.
+        """Return the kinds of the method's artifacts (trained or calibrated files) that have a trait in the registry.
 
         Args:
-            trait: Name of the trait, such as `by_task`.
+            trait: Name of the trait, a further property such as `by_task`.
         """
         return sorted(kind for kind in self.method.needs if find("artifact", kind).traits.get(trait))
 

@@ -147,7 +147,7 @@ class VlaEval(Conversation):
     def _start(self, payload: Message) -> None:
         """Note that a new episode begins.
 
-        The decoder is built at the first observation. Errors in this message are reported only then.
+        The decoder is built at the first observation. Errors in `payload` are reported only then.
         """
         self.episode = _Episode(payload)  # errors are reported at the first observation
 

@@ -62,7 +62,7 @@ class Cache:
     def next_slots(self, tokens: int) -> Slots:
         """Return the slots in which the next `tokens` new tokens go, right after the cached tokens.
 
-        A slice, or for a cache of fixed shapes the indices (tokens,).
+        The result is a slice. For a cache of fixed shapes it is a tensor of indices (tokens,).
         """
         start, stop = self.length, self.length + tokens
         return torch.arange(start, stop, device=self.buffer.device) if self.fixed else slice(start, stop)

@@ -57,7 +57,8 @@ class TargetDescription(Description):
         cameras: Names of the camera images that it reads.
         words: Vocabulary of instructions.
         provenance: How it was made.
-        state_range: The 0.1th and the 99.9th percentile of the demonstrations' states, (s,) each. None: not recorded.
+        state_range: Two lists, with the 0.1th and the 99.9th percentile of each number of the demonstrations' states.
+            None: not recorded.
     """
 
     family: str

@@ -3,7 +3,7 @@
 Speculative decoding relies on this: a token's hidden state depends only on the tokens that it attends to, however the
 tokens are divided into forwards. `kerv doctor target=NAME` checks a stored target, `check_target` any object.
 
-Shapes: P prompt tokens, T tokens, E width, V action tokens.
+Shapes: B prompts, P prompt tokens, T tokens, E width, V action tokens.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Training losses of targets and drafters."""
+"""Training losses of targets and drafters.
+
+Shapes: B samples, N tokens of a chunk, V possible tokens, K places.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Read observations from demonstrations: in batches to train a compact target, or one by one for any target."""
+"""Read observations from demonstrations: in batches to train a compact target, or one by one for any target.
+
+Shapes: n observations, p and s numbers of proprioception and state, L words, P prompt tokens, E width, H control steps
+of a chunk, D degrees of freedom of an action.
+"""
 
 from __future__ import annotations
 

@@ -243,7 +243,7 @@ def episode_windows(episode: DemoEpisode, actions: ActionSpace, window: int, hor
         horizon: Number of control steps after the moment.
 
     Returns:
-        The expert's undisturbed actions around each moment (n, window + horizon, D), oldest first.
+        The expert's undisturbed actions of D DoFs around each moment (n, window + horizon, D), oldest first.
 
     Raises:
         CheckpointError: The recording holds too few actions of the expert after the episode's end.
@@ -310,7 +310,8 @@ def choose_episodes(dataset: DemoDataset, tasks: Sequence[str], limit: int) -> l
 def fit_noise(past: np.ndarray, future: np.ndarray, dampings: Sequence[float]) -> tuple[float, float]:
     """Find the noise and damping of one DoF's Kalman filter.
 
-    Try every pair of a noise in `RATIOS` and a damping. Return the pair with the smallest mean absolute error.
+    Try every pair of a noise in `RATIOS` and a damping. Return the pair whose predictions have the smallest mean
+    absolute error.
 
     Args:
         past: (n, window) normalised actions before each moment.

@@ -3,6 +3,8 @@
 One sample is one recorded control step: the observation, and the expert's next H undisturbed actions. Validation uses
 held-out episodes. Two policies with the same token accuracy may differ widely in success. So with `train.closed_loop`,
 the success in simulated episodes decides which weights are best.
+
+Shapes: B samples of a batch, N tokens of a chunk, H control steps of a chunk, D degrees of freedom of an action.
 """
 
 from __future__ import annotations
@@ -105,7 +107,7 @@ def waypoints_of(episode: DemoEpisode, steps: np.ndarray, count: int, actions: A
     Args:
         episode: A demonstration.
         steps: (n,) control steps.
-        count: Number K of positions per step: the next K − 1 gripper changes after it, and the end. If fewer changes
+        count: Number K of positions per step: those at the next K − 1 gripper changes and at the end. If fewer changes
             follow, the end takes their place.
         actions: The action space.
 
@@ -214,7 +216,7 @@ class Imitation:
 
         The loss is the token loss plus `train.scene_weight` times the position loss. The position loss measures
         the errors of the positions, such as object and goal, that a target with cameras estimates. In the first
-        `train.scene_steps` steps it is used alone. A target without cameras has only the token loss.
+        `train.scene_steps` steps the loss is the position loss alone. A target without cameras has only the token loss.
 
         Args:
             indices: (B,) indices of the samples.

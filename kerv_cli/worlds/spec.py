@@ -1,4 +1,7 @@
-"""Describe an environment: its constants as data (`EnvironmentSpec`) and the base class of its simulators (`World`)."""
+"""Describe an environment: its constants as data (`EnvironmentSpec`) and the base class of its simulators (`World`).
+
+Shapes: D degrees of freedom of an action, s numbers of the privileged state.
+"""
 
 from __future__ import annotations
 

@@ -4,6 +4,8 @@ The input at position i is the embedding of token i + 1, concatenated with the t
 layer maps it to the target's width. The drafter predicts the hidden state at i + 1. From this state the target's frozen
 head computes the logits of token i + 2. The drafter's cache holds the whole prompt, and rotary positions count from the
 prompt's beginning.
+
+Shapes: B sequences, T new tokens, P prompt tokens, N tokens of a chunk, E width of the target.
 """
 
 from __future__ import annotations
@@ -297,7 +299,7 @@ class EagleDrafter(TrainableDrafter):
         return EagleExamples(tokens, **columns, lengths=torch.tensor(lengths), prompt=prompts, hidden=hidden)
 
     def loss(self, training: Training, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Return the mean loss over the drafter's passes (setting `unroll`), and the token loss of each pass to log.
+        """Return the mean loss over the drafter's passes (see `unrolled`), and the token loss of each pass to log.
 
         Args:
             training: The training.

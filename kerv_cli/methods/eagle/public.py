@@ -2,6 +2,8 @@
 
 Such a drafter is a linear layer `fc` and one Llama layer, without a norm before or after it. It uses the target's
 embeddings and head, and has the same inputs as our own drafter. `Convention` describes two further differences.
+
+Shapes: B sequences, T new tokens, S cached tokens, P prompt tokens, E width of the target.
 """
 
 from __future__ import annotations

@@ -3,6 +3,8 @@
 It drafts a whole chunk from the encoded prompt, before the target's trunk runs. A residual network turns the pooled
 prompt into a few features per token, and one head turns the features into logits over the bins. So a chunk costs one
 small forward pass.
+
+Shapes: B prompts, F features of a pooled prompt, N tokens of a chunk, V bins, which are the possible tokens.
 """
 
 from __future__ import annotations
@@ -102,7 +104,7 @@ class EarlyNetwork(Packable):
         """Draft chunks. The result stays on the device, so the CPU need not wait for a GPU.
 
         Args:
-            features: (B, F) pooled prompts, F features each.
+            features: (B, F) pooled prompts.
             radius: Acceptance radius, in bins.
 
         Returns:
@@ -114,7 +116,7 @@ class EarlyNetwork(Packable):
         """Choose the tokens of chunks from logits.
 
         Args:
-            logits: (B, N, V) for N tokens with V possible values each.
+            logits: (B, N, V).
             radius: Acceptance radius, in bins.
 
         Returns:
@@ -186,7 +188,7 @@ class EarlyProposer(ChainProposer):
         return self._drafted[1:]
 
     def row(self, chunk: Chunk, radius: int) -> Tensor:
-        """Draft the tokens of a chunk that are most likely to be accepted with an acceptance radius in bins.
+        """Draft the tokens of a chunk that are most likely to be accepted with this acceptance `radius`, in bins.
 
         Returns:
             (N + 1,) float64: the N tokens, then the estimated probability that all of them are accepted.

@@ -8,6 +8,8 @@ less similar ones. The chunk is the expert's next H actions, as tokens.
 
 A datastore is a folder with `vectors.npy` (rows, d) float32 or float16, `payload.parquet`, `manifest.json` and, if keys
 are projected, `projection.npy`. Rows are sorted by task, seed and step.
+
+Shapes: B observations, P prompt tokens, E width of the target, d numbers of a key.
 """
 
 from __future__ import annotations
@@ -275,7 +277,7 @@ class Datastore:
             target: The target that encoded it.
 
         Returns:
-            (S · E,) float32 for S segments and width E, with the norm 1, on the target's device.
+            (S · E,) float32 for S segments, with the norm 1, on the target's device.
         """
         return prompt_key(prompt, target, self.manifest.key)[0]
 

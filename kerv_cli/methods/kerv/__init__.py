@@ -151,7 +151,7 @@ class Kinematic:
     """KERV: the acceptance radius r follows the variability K, the mean distance of draft tokens to target tokens.
 
     r = r_min + (r_max − r_min) · exp(−(K / K_S)^φ). K was measured in the last decode that compared drafts. K_S is the
-    task's reference level. An episode begins as if K were K_S.
+    task's reference level. r_min, r_max and φ are settings. An episode begins as if K were K_S.
 
     Attributes:
         r: The radius of the next decode, in bins, not rounded.

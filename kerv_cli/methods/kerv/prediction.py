@@ -3,6 +3,8 @@
 For a given noise and window length, every prediction is a fixed linear function of the last actions. Its weights are
 computed once, so a prediction is one small matrix multiplication. Actions are normalised to [-1, 1]. The unit of time
 is a control step.
+
+Shapes: D degrees of freedom of an action, m past actions, B histories of actions.
 """
 
 from __future__ import annotations

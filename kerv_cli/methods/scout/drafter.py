@@ -4,6 +4,8 @@ A scout is a drafter that reads the image itself, beside the hand and the instru
 computes. So chunks without verification never pay for the target's encoder, and a scout need not repeat an error of
 the target's encoder. Its own vision encoder (stem) and its estimate of the positions of object and goal feed the
 network of the early drafter.
+
+Shapes: B observations, p numbers of proprioception, F features, K places, N tokens of a chunk, V bins.
 """
 
 from __future__ import annotations

@@ -8,6 +8,9 @@ each place is, and the vectors from the hand to it. With `observation=vision` th
 image. The estimate is trained on the simulator's positions, which are never read afterwards. With `observation=state`
 the simulator gives the positions, together with the rest of its state. Such a policy has privileged information. It
 serves to study decoding without perception.
+
+Shapes: B observations, p and s numbers of proprioception and state, L words, K places, P prompt tokens, T new tokens, N
+tokens of a chunk, V action tokens, E width.
 """
 
 from __future__ import annotations
@@ -79,7 +82,7 @@ class CompactTarget(Packable):
     """The compact policy: encoders, trunk and head. Implements the protocol `ReadableTarget`.
 
     Args:
-        settings: Shapes.
+        settings: Shapes of the networks, such as width and number of layers.
         actions: Action space.
         observation: Observation space.
         words: Vocabulary of instructions.

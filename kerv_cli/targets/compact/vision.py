@@ -2,6 +2,8 @@
 
 The vision tokens are a coarse grid for the trunk. The K image points are found by spatial soft-argmax (Finn et al.
 2016) on the finest feature map, because success depends on the exact position of markers that are 4 pixels wide.
+
+Shapes: B images, h × w pixels or cells, C channels, E width of the trunk.
 """
 
 from __future__ import annotations

@@ -4,6 +4,9 @@ The prompt is [begin] [vision patches] [text], as in OpenVLA's own code. Action 
 The head gives logits for the ids of action tokens only. The published code takes the argmax over all ids, and executes
 an id that is no action token as the last bin. As long as the published code decodes action tokens, greedy decoding here
 gives the same tokens.
+
+Shapes: B prompts, P prompt tokens, T new tokens, n vision tokens, F pooled features, V action tokens, E width, s pixels
+per side of an image.
 """
 
 from __future__ import annotations

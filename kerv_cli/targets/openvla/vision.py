@@ -3,7 +3,7 @@
 Modules have the names that published checkpoints use. Weights without effect are left out: the last block of each tower
 (OpenVLA takes the output of the last but one), the norm after it and SigLIP's pooling head.
 
-Shapes: B batch, n patches, W width of a tower, E width of the language model.
+Shapes: B images of h × w pixels, n patches, W width of a tower, E width of the language model.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class VisionBackbone(nn.Module):
         self.featurizer, self.fused_featurizer = (VisionTower(tower) for tower in shape.towers)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """Map images (B, 6, h, w), three channels for each tower, to patch tokens (B, n, W + W')."""
+        """Map images (B, 6, h, w), three channels for each tower, to patch tokens (B, n, sum of both widths)."""
         return torch.cat([self.featurizer(pixels[:, :3]), self.fused_featurizer(pixels[:, 3:])], -1)
 
 

@@ -53,8 +53,8 @@ class DemoEpisode:
         frames: (n, size, size x views, 3) uint8, the recorded images.
         frame_steps: (n,) int64. Image i was drawn before the action of control step `frame_steps[i]`.
         states: (T, s) float32, privileged state before each action. It begins with the proprioception.
-        labels: (T + tail, D) float32, the expert's actions, clipped and without noise. The last `tail` actions are
-            those with which the expert went on after the episode's end.
+        labels: (T + tail, D) float32, the expert's actions for D DoFs, clipped and without noise. The last `tail` ones
+            are those with which the expert went on after the episode's end.
         executed: (T, D) float32, the actions that moved the robot.
         initial_state: (k,) float64, the world's `initial_state`, such as the placement of object and goal.
     """
@@ -146,7 +146,7 @@ class EncodedFrames:
     """Images (n, size, width, 3) uint8 that are decoded when they are used.
 
     Attributes:
-        files: Files that contain the PNG files.
+        files: Episode files, which contain the images as PNG files.
         spans: (n, 3) int64. For each image: index into `files`, position of the PNG's first byte, position after its
             last.
         size: Height in pixels.
