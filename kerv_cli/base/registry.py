@@ -216,7 +216,7 @@ def part_of(group: str, name: str) -> Part:
 def parts(kind: str) -> Mapping[str, Part]:
     """Return the parts of a kind as a map from name to part, in the order of registration.
 
-    For the settings group `drafter` these are the kinds of artifacts that are trained, which are those with settings.
+    `drafter` is a special case. It gives the parts of the kind `artifact` that have settings: only those are trained.
     """
     load_plugins()
     if kind == "drafter":

@@ -183,7 +183,10 @@ def completed(stored: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _in_cells(cells: Mapping[Path, list[Episode]], notes: list[str]) -> Iterator[ImportedEpisode]:
-    """Yield the episodes of every complete cell, and note the damaged cells."""
+    """Yield the episodes of a study of 0.1.0. Skip cells that have not run, and describe unreadable ones in `notes`.
+
+    A cell is a folder with the episodes of one setting on one task, for a few seeds.
+    """
     for cell, episodes in cells.items():
         # a cell that ran again has newer folders NAME-2, NAME-3, …
         again = [path for path in visible(cell.parent) if path.name.startswith(f"{cell.name}-")]

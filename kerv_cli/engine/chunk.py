@@ -107,12 +107,12 @@ class EpisodeState:
 
 @dataclass(frozen=True)
 class Rejection:
-    """The tokens that the draft and the target have after a rejected draft token.
+    """What follows a rejected draft token.
 
     Attributes:
-        draft: The draft's tokens after the rejected one.
-        target: The target's tokens after the rejected one and after each token of `draft`. The target predicted them as
-            if the rejected token had been committed.
+        draft: The draft tokens after the rejected one.
+        target: What the target predicts after the rejected token, then after each token of `draft`, as if those tokens
+            had been committed. So there is one more than in `draft`.
     """
 
     draft: tuple[int, ...] = ()

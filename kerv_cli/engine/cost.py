@@ -65,7 +65,7 @@ class Profile:
         return [kind for kind in kinds if not self.phases.get(kind, ((), ()))[0]]
 
     def seconds(self, kind: str, rows: int) -> float:
-        """Return the seconds of one forward or draft of this kind, over `rows` rows."""
+        """Return the seconds of one forward or draft of this kind over `rows` tokens."""
         return float(self.times(kind, np.array([rows]))[0])
 
     def times(self, kind: str, rows: np.ndarray) -> np.ndarray:

@@ -256,7 +256,7 @@ class Decoder(ActionDecoder):
         return draft
 
     def verify(self, chunk: Chunk, draft: Draft) -> Verified:
-        """Run the target over the tokens that are not in its cache yet, and then over the draft.
+        """Run the target once, over the tokens that are not in its cache yet, followed by the draft.
 
         In the first round, the tokens that are not in the cache are the prompt. Later they are the last committed
         token, or the tokens that a rectifier has filled.

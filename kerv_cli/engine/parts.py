@@ -57,7 +57,7 @@ class Rectifier(Protocol):
 
     @property
     def uses_target_token(self) -> bool:
-        """Whether the target's own token at the rejected position is executed. If not, it is predicted too."""
+        """Whether the target's own token at the rejected position is executed. Else the rectifier predicts it, too."""
 
     def reset(self) -> None:
         """Start a new episode."""

@@ -101,9 +101,9 @@ class MergedProposer(ChainProposer):
         return Draft.of(tree.tokens, tree.parents)
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Return the drafts of all sources, and those of the fallbacks if they are needed.
+        """Return the drafts of all sources, of at most `depth` tokens each.
 
-        The fallbacks draft if no source expects its whole chunk to be accepted.
+        The fallbacks draft, too, if no source expects its whole chunk to be accepted.
         """
         sources = list(self.sources)
         if not any(source.is_sure(chunk) for source in sources):

@@ -23,8 +23,9 @@ def summed_table(table: pd.DataFrame) -> pd.DataFrame:
     Returns:
         One row for each method and each way of pooling. `method` is the setting's label without stress. `sum` says what
         was pooled, such as `push`, `level 2` or `all`. `label` consists of both. The further columns are those of a
-        study's table: `study`, `baseline`, `episodes`, `successes`, `success`, `pairs`, the counts of their outcomes,
-        `mcnemar_p`, `difference`, `margin` and `non_inferior`. Intervals are in columns that end in _low and _high.
+        study's table: `study`, `baseline`, `episodes`, `successes`, `success`, `pairs`, the counts of the pairs'
+        outcomes, `mcnemar_p`, `difference`, `margin` and `non_inferior`. Intervals are in
+        columns that end in _low and _high.
     """
     rows = table[(table["averaging"] == MICRO) & (table["stress"] != NONE)]
     reference = next(iter(rows.loc[rows["label"] == rows["baseline"], "unstressed"]), "")

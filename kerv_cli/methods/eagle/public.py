@@ -115,12 +115,12 @@ class PublicDrafter(nn.Module):
         return run_layers(self.layers, self.shape.language, x, positions, cache, seen, mask)
 
     def prompt_mask(self, x: Tensor, cache: DraftCache | None, seen: np.ndarray | Tensor | None) -> Tensor:
-        """Return the additive attention mask for `mask=prompt`. Only the prompt's first P − 1 keys are visible.
+        """Return the additive attention mask for `mask=prompt`: it hides every key after the prompt's first P − 1, too.
 
         Args:
             x: (B, T, E) inputs of the layers.
             cache: Keys and values of S earlier tokens. None: there are none, and x is the prompt.
-            seen: (T, M) bool, which of the last M keys each query may see without this restriction. None: causal.
+            seen: (T, M) bool, which of the last M keys each query may see apart from that. None: causal.
 
         Returns:
             (T, S + T): 0 for visible keys, −∞ for hidden keys.

@@ -114,11 +114,12 @@ def _weight(members: int) -> float:
 
 
 class _Continuations:
-    """Lists the kinematic groups that may come next on a path of the tree, after the groups chosen so far.
+    """Lists the kinematic groups of tokens that may come next on a path of the tree, with their probabilities.
 
-    A neighbour is a stored chunk. Two bit sets of neighbours describe the chosen groups. `last` has the neighbours
-    whose chunk contains the last chosen group. `whole` has those whose chunk contains every chosen group. If there are
-    none, `whole` is set to `last`.
+    Retrieval returns stored chunks, the neighbours. Their tokens are cut into kinematic groups. A caller describes the
+    groups chosen so far by two sets of neighbours, `last` and `whole`, whose bits stand for neighbours. `last` has the
+    neighbours whose chunk contains the last chosen group. `whole` has those whose chunk contains every chosen group. If
+    there are none, `whole` is set to `last`.
 
     Args:
         rows: Tokens of each neighbour's chunk, most similar neighbour first.

@@ -244,10 +244,11 @@ def attention(frames, out, qkv, tables, cache, start, filled, mask, keys, values
         start: Number of valid slots in the cache. The new tokens get the next T slots.
         filled: Number of slots that `keys` and `values` hold already.
         mask: (T, start + T), 0 for slots that a token sees. Shape (0, 1) means that attention is causal.
-        keys: (B · A, panels, C, PANEL) copy of the cached keys, stored like the weights of a linear layer whose inputs
-            are the channels and whose outputs are the slots. This layer turns a query into its scores.
-        values: (B · A, panels, slots, PANEL) copy of the cached values, stored like the weights of a linear layer whose
-            inputs are the slots and whose outputs are the channels. This layer turns attention weights into a result.
+        keys: (B · A, panels, C, PANEL) copy of the cached keys. It is stored like the weights of a linear layer with
+            the channels as inputs and the slots as outputs, in panels of PANEL outputs. So one matrix product gives the
+            scores of a query.
+        values: (B · A, panels, slots, PANEL) copy of the cached values, stored likewise with the slots as inputs and
+            the channels as outputs. So one matrix product applies the attention weights.
     """
     tokens, heads, channels = tables.shape[0], cache.shape[2], tables.shape[2]
     stop, size, panels, parts = start + tokens, 4 * frames.shape[1], keys.shape[1], values.shape[1]

@@ -164,7 +164,7 @@ class Program:
     def __call__(
         self, *inputs: Tensor, positions: Tensor | None = None, cache: Cache | None = None, mask: Tensor | None = None
     ) -> list[Tensor]:
-        """Compute the outputs. Each has one row per row of the inputs.
+        """Compute the outputs. Each has as many rows as the inputs.
 
         Args:
             inputs: (rows, …). With attention (B, T, …), which are B · T rows: B sequences of T tokens.

@@ -223,7 +223,7 @@ class Tape:
         return self.emit(code, shape, inputs, shape.numel(), numbers) if shape.numel() else inputs[0]
 
     def placed(self, values: Any) -> int:
-        """Store constants, and return the index of the first one among all constants. Equal arrays are stored once."""
+        """Store an array of constants, and return the index of its first number. Equal arrays are stored once."""
         array, first = torch.as_tensor(values, dtype=torch.float32).detach().flatten().numpy(), 0
         for known in self.numbers:
             if np.array_equal(known, array):

@@ -113,8 +113,9 @@ class Objects(Stress):
     move freely and have no mesh. The friction of all geoms changes, not only that of objects, because a contact uses
     the larger of its two frictions. The damping of the objects' joints changes, too.
 
-    Each level is (size, mass, friction, spread). The first three are factors by which a value is multiplied or divided,
-    drawn per episode. `spread` widens the range of initial states around its centre.
+    Each level is (size, mass, friction, spread). The first three are factors. In each episode a value is
+    multiplied by its factor, or divided by it, at random. `spread` widens the range of initial states around its
+    centre.
     """
 
     kind = "object"
