@@ -22,7 +22,7 @@ def main() -> None:
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    """End the process at once, while modules are loading: an exception inside an import could do harm anywhere."""
+    """Handle a signal while modules are loading: end at once, because an exception inside an import could do harm."""
     os.write(2, b"kerv: interrupted\n")
     os._exit(130)
 

@@ -78,8 +78,7 @@ class Bench:
 def card_of(model: Model, machine: Machine, tokens: int) -> dict[str, Any]:
     """Compute the shortest times that a model's forwards can take on this device. No forward is executed.
 
-    Such a shortest time, a floor, is two numbers of seconds: for reading memory, and for the arithmetic. The larger one
-    counts.
+    A shortest time (floor) has two parts in seconds: one for reading memory, one for arithmetic. The larger one counts.
 
     Args:
         model: The model.

@@ -33,9 +33,9 @@ _LEVELS = 5  # assumed depth of such a tree
 
 
 def source_costs() -> dict[str, list[str]]:
-    """Return the names of the proposers whose drafts a profile prices, by their kind of cost.
+    """Return, for each kind of cost, the names of the proposers whose drafts get their time from a profile.
 
-    The drafts of all other proposers cost the seconds that were recorded for them.
+    The drafts of all other proposers keep the time that was recorded for them.
     """
     costs: dict[str, list[str]] = {}
     for name, part in parts("proposer").items():

@@ -213,7 +213,7 @@ class CalibrationArtifact(Artifact[Calibration]):
         return path
 
     def check_use(self, description: Calibration, use: Use) -> None:
-        """Refuse a task without the reference level K_S, if the method's threshold needs it.
+        """Refuse a task for which K_S, KERV's reference level of motion, was not measured, if the threshold needs it.
 
         Raises:
             CheckpointError: K_S was not measured for a task.

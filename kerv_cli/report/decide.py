@@ -89,10 +89,11 @@ def _choice(where: str, rows: Sequence[Row], loss: float) -> Choice:
 
 
 def safest_first(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows of the settings to test, in the order of the tests. The order does not depend on success.
+    """Return the rows of the settings to test, the safest first. Success does not influence the order.
 
-    Settings that are equally safe keep the study's order. The baseline, settings without pairs, and settings that were
-    timed and were not faster are left out.
+    Safe means: few unverified tokens, then many forwards per control step (`safety`). Settings that are equally safe
+    keep the study's order. The baseline, settings without pairs, and settings that were timed and were not faster are
+    left out.
     """
     compared = [row for row in rows if not is_baseline(row) and row["pairs"]]
     return sorted((row for row in compared if not is_number(row[SPEED]) or row[SPEED] > 1), key=safety)

@@ -27,7 +27,7 @@ def safety(row: Row) -> tuple[float, float]:
 
 
 def passing(rows: Iterable[Row], loss: float) -> list[Row]:
-    """Return the rows of settings that are shown to lose less than `loss`, up to the first that is not.
+    """Return the rows of settings that are shown to lose less than `loss`: those before the first that is not.
 
     By fixed-sequence testing, all tests together have the error rate of one test.
 

@@ -106,7 +106,10 @@ def study_parts(
 
 
 def figures_of(data: StudyData, loss: float) -> dict[str, alt.ConcatChart]:
-    """Return the study's charts by the ending of their file names."""
+    """Return the study's charts. A key is what the chart adds to the study's name in its file's name: `_latency`.
+
+    `loss` is the largest acceptable loss of success, in points.
+    """
     figures = study_figures(data.table, data.study.axis, loss)
     return figures | ({"_latency": latency_figure(data.table)} if len(latency_table(data.table)) else {})
 
@@ -159,7 +162,7 @@ def _settings(data: StudyData) -> list[dict[str, Any]]:
 def _films(store: StudyStore, data: StudyData) -> list[dict[str, Any]]:
     """Return for each method a film of its first recorded success and one of its first recorded failure.
 
-    An outcome without an episode that was recorded with a camera has no film. A film is a dictionary with the setting's
+    If no episode with an outcome was filmed, there is no film of it. A film is a dictionary with the setting's
     label, the task, the seed, the outcome, the number of steps and the GIF in base64.
     """
     keys = ["label", "task", "seed", "repeat"]

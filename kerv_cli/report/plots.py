@@ -54,7 +54,8 @@ def study_figures(table: pd.DataFrame, axis: str, loss: float = 3.0) -> dict[str
         loss: Largest acceptable loss of success, in points.
 
     Returns:
-        The charts by the ending of their file's name, such as `_tradeoff`. Empty if there is nothing to draw.
+        The charts. A key is what the chart adds to the study's name in its file's name, such as `_tradeoff`. Empty if
+        there is nothing to draw.
     """
     rows = _pooled(table)
     if is_stressed(table):

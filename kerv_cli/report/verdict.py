@@ -139,7 +139,10 @@ def _speed(choice: Choice) -> str:
 
 
 def _missing(choice: Choice) -> str:
-    """Return the clause that says how many more pairs a choice would need, and which setting it would then be."""
+    """Return the clause that says about how many more pairs would show that a setting is good enough to be chosen.
+
+    It names that setting. If more pairs would not help, it says so.
+    """
     if not choice.candidate:
         return "at these rates, more pairs would not show one either"
     more = max(1, math.ceil(choice.candidate_pairs - choice.pairs))

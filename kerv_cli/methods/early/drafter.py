@@ -244,10 +244,10 @@ class EarlyDrafter(TrainableDrafter):
         return (module(examples.features[indices].to(training.target.device).float()),)
 
     def token_loss(self, training: Training, logits: Tensor, indices: Tensor) -> Tensor:
-        """Return the cross-entropy of logits with the target's tokens, spread over neighbouring bins as soft labels.
+        """Return the cross-entropy of logits with soft labels: the target's tokens and, less, their neighbouring bins.
 
         Args:
-            training: The training.
+            training: The running training, with its examples and settings.
             logits: (B, N, V).
             indices: (B,) indices of the training examples.
         """

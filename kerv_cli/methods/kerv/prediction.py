@@ -196,7 +196,7 @@ class Kalman(Predictor):
     name = "kalman"
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return the weights (horizon, window) of the filter with this DoF's noise."""
+        """Return the filter's prediction as weights on the last `window` actions, (horizon, window)."""
         assert self.noise is not None
         q, r, damping = self.noise.q[dof], self.noise.r[dof], self.noise.damping[dof]
         return kalman_weights(q, r, window, self.horizon, damping)

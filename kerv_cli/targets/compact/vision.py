@@ -116,7 +116,7 @@ class PackedVision:
     """
 
     def __init__(self, encoder: nn.Module, size: int) -> None:
-        """Export an encoder.
+        """Export an encoder to ONNX, and open a session that runs it.
 
         Args:
             encoder: Maps images (1, 3, size, size) uint8 to tokens and points.
