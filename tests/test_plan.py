@@ -106,6 +106,7 @@ def test_the_code_below_the_commands_counts_and_nothing_else(tmp_path, monkeypat
 
     before = code_hash.__wrapped__()
     assert hash_after("report/tables.py", "x = 1") == hash_after("cli/sweep.py", "x = 1") == before
+    assert hash_after("base/settings.py", '# a comment\n"""and a string that stands alone"""\n') == before
     computing = [hash_after(file, "x = 1") for file in ("engine/decoder.py", "base/settings.py", "episodes/runner.py")]
     assert len({before, *computing}) == 4
 

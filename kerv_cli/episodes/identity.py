@@ -6,6 +6,7 @@ workers are not part of the identity. They are stored beside the result.
 
 from __future__ import annotations
 
+import ast
 import functools
 import hashlib
 import importlib.util
@@ -224,14 +225,26 @@ _COMPUTING = ("base", "engine", "methods", "targets", "worlds", "episodes")
 def code_hash() -> str:
     """Return a hash of the code that computes episodes, as hexadecimal SHA-256.
 
-    Episodes are stored with this hash, so that those computed by other code can be found. It covers kerv's own
-    files and those of registered plugins.
+    Episodes are stored with this hash, so that those computed by other code can be found. It covers the syntax trees of
+    kerv's own files and of registered plugins. Comments, docstrings and formatting do not change it.
     """
     root, digest = Path(kerv_cli.__file__).parent, hashlib.sha256()
     own = sorted(path for room in _COMPUTING for path in (root / room).rglob("*.py"))
     for name, path in [*((path.relative_to(root).as_posix(), path) for path in own), *_of_plugins()]:
-        digest.update(f"{name}\0".encode() + hashlib.sha256(path.read_bytes()).digest())
+        content = _meaning(path.read_bytes()) if path.suffix == ".py" else path.read_bytes()
+        digest.update(f"{name}\0".encode() + hashlib.sha256(content).digest())
     return digest.hexdigest()
+
+
+def _meaning(source: bytes) -> bytes:
+    """Return the syntax tree of Python source without its docstrings, as the bytes of a text."""
+    return ast.dump(_WithoutDocstrings().visit(ast.parse(source))).encode()
+
+
+class _WithoutDocstrings(ast.NodeTransformer):
+    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
+        alone = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        return None if alone else node
 
 
 def _of_plugins() -> Iterator[tuple[str, Path]]:
