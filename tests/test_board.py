@@ -142,8 +142,8 @@ def test_pages_are_quick_with_ten_thousand_episodes_and_two_hundred_runs(tmp_pat
     assert "10000" in client.get("/").text
     assert client.get("/").text.count("<tr>") > 150
     assert client.get("/studies/large/episodes").text.count('href="/episodes/') == 10_000
-    for path in ("/", "/studies/large", "/studies/large/episodes"):
-        assert quickest(client, path) < 0.5, path
+    for path, seconds in (("/", 0.3), ("/studies/large", 0.5), ("/studies/large/episodes", 0.5)):
+        assert quickest(client, path) < seconds, path
 
 
 # --- in a browser ---

@@ -118,6 +118,7 @@ def test_the_names_and_difficulties_are_those_of_metaworld():
 
     assert set(TASKS) == set(ENV_POLICY_MAP)
     assert Counter(task.difficulty for task in TASKS.values()) == {"easy": 28, "medium": 11, "hard": 6, "very_hard": 5}
+    assert len({task.instruction for task in TASKS.values()}) == 50
     assert all(re.fullmatch(r"[a-z]+( [a-z]+){0,9}", task.instruction) for task in TASKS.values())
 
 

@@ -117,11 +117,11 @@ def find_runs(results: str | Path) -> list[RunEntry]:
     for row in run_rows(database):
         rows.setdefault((row.kind, row.name), row)
     runs = _studies(database, rows)
-    with contextlib.suppress(OSError):  # remove the rest of studies whose removal was killed
-        for name in ("studies", "rollouts"):
-            clean(database.results / name)
-    folder = database.results / "artifacts"
-    made = {run.id: run for kind in artifact_kinds() for run in _artifacts(folder / kind, kind)}
+    folder, kinds = database.results / "artifacts", artifact_kinds()
+    for place in (database.results / "studies", database.results / "rollouts", *(folder / kind for kind in kinds)):
+        with contextlib.suppress(OSError):
+            clean(place)  # what killed commands left there
+    made = {run.id: run for kind in kinds for run in _artifacts(folder / kind, kind)}
     for (kind, name), row in rows.items():
         if kind in _STUDIES:
             continue
@@ -281,8 +281,6 @@ def _description(folder: Path, kind: str) -> Path:
 
 
 def _artifacts(folder: Path, kind: str) -> Iterator[RunEntry]:
-    with contextlib.suppress(OSError):
-        clean(folder)
     for path in visible(folder):
         # an unfinished recording and a training before its first validation have no description yet
         if any(file.is_file() for file in (_description(path, kind), path / "recording.json", path / LOG)):
