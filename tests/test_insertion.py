@@ -12,6 +12,7 @@ from examples.insertion import SPEC
 from examples.insertion.world import InsertionWorld
 from examples.own_policy import OwnPolicy, Remembered
 from mock_target import MockTarget
+from test_decoding_lossless import RandomTrees, decode, plain_greedy
 
 from kerv_cli.base.spaces import Observation
 from kerv_cli.targets.conformance import check_target
@@ -89,6 +90,15 @@ def test_the_examples_keep_the_protocol(target):
     found = check_target(target, SEEN)
     assert failures(found) == {}
     assert len(found) == 9
+
+
+@pytest.mark.bits
+def test_the_example_without_a_cache_is_decoded_losslessly():
+    target = OwnPolicy()
+    prompt = target.encode(SEEN)
+    truth = plain_greedy(target, prompt)
+    for seed in range(5):
+        assert decode(target, RandomTrees(truth, seed, 12, 255), prompt).tokens == truth
 
 
 class Forgetful(Remembered):

@@ -2,22 +2,30 @@
 
 import dataclasses
 import json
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from command import told
-from examples.own_proposer_table import FollowTable
+from examples.own_proposer_table import FollowProposer, FollowTable
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mock_target import MockTarget
 from test_calibration import write_dataset
+from test_decoding_lossless import assert_adds_up, plain_greedy, random_prompt, random_target
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.spaces import Observation
 from kerv_cli.catalogue.entries import find_runs, matching
-from kerv_cli.engine.decoder import Decoder
+from kerv_cli.engine.chunk import ActionHistory, Situation
+from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.settings import RolloutSettings, settings_from
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.compose import Method
+from kerv_cli.methods.kerv.prediction import Hold, PredictionProposer
+from kerv_cli.methods.merged import MergedProposer
 
 POLICY = ("policy.target=nano-state", "policy.artifacts.follow=learnt")
 PLACES = {
@@ -26,6 +34,39 @@ PLACES = {
     "prefill_draft=merged prefill_draft.sources=[follow] prefill_draft.fallback=[hold]": {"follow"},
 }
 """Overrides that put the proposer in every place -> the artifacts that the method then needs."""
+
+
+@pytest.mark.bits
+@settings(max_examples=25)
+@given(seed=st.integers(0, 10_000), chunk=st.sampled_from([1, 2, 4]), depth=st.integers(0, 20), data=st.data())
+@pytest.mark.parametrize("place", ["proposer", "prefill_draft", "merged"])
+@pytest.mark.parametrize("mock", [True, False])
+def test_it_is_lossless_wherever_it_drafts(place, mock, seed, chunk, depth, data):
+    if mock:
+        target: Any = MockTarget(chunk=chunk, seed=seed)
+        prompt = torch.randn(1, 5, target.width, generator=torch.Generator().manual_seed(seed)).double()
+    else:
+        target = random_target(seed, 2, 2, chunk)
+        prompt = random_prompt(target, seed)
+    space, random = target.actions, np.random.default_rng(seed)
+    truth = plain_greedy(target, prompt)
+    before = random.integers(0, space.tokens, (1, space.dofs))
+    steps = np.concatenate([before, np.reshape(truth, (chunk, space.dofs))])
+    own = FollowProposer(FollowTable.fit([steps[: data.draw(st.integers(1, len(steps)))]], space), depth)
+    hold = PredictionProposer(Hold(space.is_strict, minimum=1, horizon=chunk))
+    parts = {
+        "proposer": Parts(proposer=own),
+        "prefill_draft": Parts(prefill_draft=own, proposer=own),
+        "merged": Parts(prefill_draft=MergedProposer([own], 40, [hold])),
+    }[place]
+    decoder, history = Decoder(target, parts), ActionHistory(space.dofs)
+    if data.draw(st.booleans(), "executed"):
+        history.append(space.values_of(before[0]))
+    decoder.situation = Situation("t", history)
+    for _ in range(2):
+        result = decoder.decode_prompt(prompt)
+        assert result.tokens == truth
+        assert_adds_up(result)
 
 
 @pytest.mark.bits
@@ -53,6 +94,7 @@ def test_it_is_trained_from_the_command_line_and_drafts_in_every_place(results):
         assert set(identity) - {"observation"} == {"target", *wanted}
         assert identity["follow"] == described["sha256"]
         assert settings_from(dataclasses.asdict(asked)) == asked
+        assert files.load("follow") is Artifacts(asked.results, asked.policy).load("follow")
         assert not torch.equal(files.load("follow").logits, FollowTable(4, 255).logits)
         plain, drafting = Decoder(files.target), method.decoder(files.target, files.load)
         state = np.random.default_rng(1).uniform(0, 0.5, 39)
