@@ -239,7 +239,7 @@ def _text(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Place:
-    """A position that the task is about, such as that of the object: `state[first : first + 3]` of the simulator.
+    """Where something that the task is about stands, such as the object: `state[first : first + 3]` of the simulator.
 
     Args:
         name: Name of the place.

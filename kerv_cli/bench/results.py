@@ -221,8 +221,8 @@ def projections(
 ) -> Iterator[tuple[str, Document]]:
     """Estimate how long a decode of a target with another shape takes in bfloat16 on other devices.
 
-    The shape is `settings.projected`, the devices are those of `settings.projections`. The forwards are those that were
-    measured here, but with the prompt length of that shape.
+    `settings.projected` names the shape, `settings.projections` the devices. The forwards are the same as here, with
+    the prompt length of that shape.
 
     Args:
         settings: Settings of the benchmark.

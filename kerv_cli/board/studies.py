@@ -94,7 +94,7 @@ def show_tables(request: Request) -> Response:
 
 
 def _episodes_of(study: str) -> Callable[[str, str, str], str]:
-    """Return a function that returns the address of the episodes behind a cell of the table by task.
+    """Return a function that links a cell of the table by task to its episodes.
 
     The function takes the heading of the table's first column (`task` or `setting`), the name of the cell's row, and
     the name of its column.

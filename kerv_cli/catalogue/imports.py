@@ -115,7 +115,7 @@ def is_results(path: Path) -> bool:
 
 
 def _database_of(path: Path) -> Path | None:
-    """Return the database file: `path` itself, or kerv.db in the folder `path`. None if there is none."""
+    """Return the database file: `path` itself, or kerv.db in it if it is a folder. None if that is no database."""
     file = path / FILE if path.is_dir() else path
     return file if file.is_file() and file.suffix == Path(FILE).suffix else None
 

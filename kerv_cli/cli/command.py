@@ -59,7 +59,7 @@ def command(name: str, settings: type = CommandSettings, keys: str = "", **trait
 
 
 def schemas_of(part: Part) -> list[type]:
-    """Return the dataclass of a command's settings, and that of the other command which its trait `each` names."""
+    """Return the dataclass of a command's settings. If its trait `each` names another command, add that one's."""
     others = [find("command", part.traits["each"])] if "each" in part.traits else []
     return [one.settings for one in (part, *others)]
 

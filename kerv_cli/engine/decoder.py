@@ -283,8 +283,8 @@ class Decoder(ActionDecoder):
         """Commit the accepted path and, if the chunk has room, the bonus: the target's next token.
 
         Returns:
-            The target's hidden states from this forward, without those of rejected draft tokens: (1, before + accepted,
-            E). `before` counts the tokens that were forwarded ahead of the draft.
+            The target's hidden states from this forward, (1, before + accepted, E): of the tokens ahead of the draft,
+            whose number is `before`, and of the accepted draft tokens.
         """
         tree, target_tokens, (path, rejected) = verified.tree, verified.target_tokens, accepted
         if proposer is None or not len(tree):

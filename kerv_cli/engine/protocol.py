@@ -16,7 +16,7 @@ from kerv_cli.base.spaces import ActionSpace, Observation
 
 
 class Cache(Protocol):
-    """Keys and values of the tokens that the target has processed. A slot holds those of one token.
+    """Keys and values of the tokens that the target has processed, one token per slot.
 
     Slots 0 … length − 1 of `capacity` are filled. `Target.forward` writes its new tokens after them and increases
     `length`.

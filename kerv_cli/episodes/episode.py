@@ -141,8 +141,8 @@ def episode(
     """Run one episode like `run_episode`, but let the caller decode.
 
     The generator yields an observation; send it the record of the decode. At the end it returns the episode's record.
-    `follower` is told about the start, every executed action and the end. It is the decoder itself, or the state that
-    a batch decoder keeps for this episode. The other arguments are those of `run_episode`.
+    `follower` is told about the start, every executed action and the end. It is the decoder itself, or the
+    state that a batch decoder keeps for this episode. `run_episode` describes the other arguments.
     """
     began = time.perf_counter()
     world.reset(seed)

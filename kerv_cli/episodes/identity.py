@@ -79,7 +79,7 @@ def _work(settings: str, identity: str, policy: str, engine: int) -> str:
 
 
 def effective(settings: Plain) -> dict[str, Any]:
-    """Return only those of a rollout's settings that determine its results, as nested plain values.
+    """Return the settings that determine a rollout's results, as nested plain values.
 
     A setting is left out if it never changes a result (such as the number of workers), or if it has no effect beside
     the other settings (such as the threshold of a method that drafts nothing). Task, seed, policy and the method's name

@@ -186,7 +186,7 @@ def _one_after_another(
 
 
 def _take(waiting: list[Request[K]], task: str) -> Request[K]:
-    """Remove and return a waiting request of `task`, or if there is none, of the task with the most requests."""
+    """Remove and return a waiting request: one of `task`, else one of the task with the most requests."""
     counts = Counter(request.task for request in waiting)
     wanted = task if counts[task] else counts.most_common(1)[0][0]
     return waiting.pop(next(i for i, request in enumerate(waiting) if request.task == wanted))

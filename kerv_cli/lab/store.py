@@ -70,7 +70,7 @@ class ImportedEpisode:
 def _same_episode() -> sa.ColumnElement[bool]:
     """Return the SQL condition that joins a study's planned episodes to all stored rows of the same episodes.
 
-    A planned episode is a row of WANTED with its row of SETTINGS. The stored rows are those of EPISODES.
+    WANTED joined to SETTINGS has the planned episodes, EPISODES the stored ones.
     """
     return sa.and_(
         EPISODES.c.work == SETTINGS.c.work, *(EPISODES.c[name] == WANTED.c[name] for name in ("task", "seed", "repeat"))
