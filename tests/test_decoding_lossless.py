@@ -135,7 +135,8 @@ def test_strict_decoding_equals_ar(name, seed, layers, heads, chunk, nodes, insi
     truth = plain_greedy(target, prompt)
     made = {"none": None, "trees": RandomTrees(truth, seed, nodes), "jacobi": JacobiProposer()}
     if name == "drafter":
-        settings = DrafterSettings(layers=data.draw(st.integers(1, 2), "layers of the drafter"))
+        drawn = st.fixed_dictionaries({"layers": st.integers(1, 2), "final_norm": st.booleans()})
+        settings = DrafterSettings(**data.draw(drawn, "the drafter"))
         drafter = EagleDrafter().network(settings, target).eval().requires_grad_(False)
         if fixed:
             drafter.new_cache = functools.partial(drafter.new_cache, fixed=True)  # type: ignore[method-assign]

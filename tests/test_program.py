@@ -170,9 +170,11 @@ def test_batches_and_teacher_forcing_agree(observation):
         assert close(plain.teacher_forced(inputs, tokens)[0], packed.teacher_forced(inputs, tokens)[0])
 
 
-def test_the_drafter_is_packed_too():
+@pytest.mark.parametrize("final_norm", [True, False])
+def test_the_drafter_is_packed_too(final_norm):
     target, _ = both_targets("state", 1)
-    plain = shaken(EagleDrafter().network(DrafterSettings(), target), 1)
+    plain = shaken(EagleDrafter().network(DrafterSettings(final_norm=final_norm), target), 1)
+    assert any(name.startswith("norm.") for name in plain.state_dict()) == final_norm
     packed = copy.deepcopy(plain)
     pack(packed)
     assert packed.packed is not None
@@ -184,6 +186,10 @@ def test_the_drafter_is_packed_too():
             first = drafter(following[:, :8], hidden[:, :8], torch.arange(8), cache)
             outputs.append(torch.cat([first, drafter(following[:, 8:], hidden[:, 8:], torch.tensor([8]), cache)], 1))
     assert close(*outputs)
+    states = plain.run_layers(plain.enter(following, hidden), torch.arange(9), None, None, None)
+    if final_norm:
+        states = states / (states.square().mean(-1, keepdim=True) + 1e-5).sqrt() * plain.norm.weight
+    assert close(outputs[0], states)
 
 
 def test_packed_weights_never_outlive_their_weights():

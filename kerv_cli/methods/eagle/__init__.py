@@ -14,7 +14,8 @@ class DrafterSettings:
 
     kind: str = "drafter"
     layers: int = number(1, 0, 1024)  # decoder layers of the target's width
-    unroll: int = number(3, 1, 64)  # passes per training step; each later one reads the drafter's own states; paper: 1
+    final_norm: bool = True  # an RMSNorm after the last layer (ours); EAGLE-2's and Spec-VLA's public drafters: false
+    unroll: int = number(3, 1, 64)  # passes per training step; later ones read the drafter's own states; public code: 1
     samples: int = number(12_000, 1, 10**8)  # maximum number of observations whose greedy decodes it is trained on
     state_weight: float = number(1.0, 0, 1e6)  # weight of the smooth L1 loss on the hidden state
     token_weight: float = number(0.1, 0, 1e6)  # weight of the cross-entropy with the target's token distribution

@@ -58,7 +58,7 @@ class EagleNetwork(LayerStack):
     inputs = 2
 
     def __init__(self, settings: DrafterSettings, width: int, heads: int, feed_forward: int) -> None:
-        super().__init__(width, settings.layers, heads, feed_forward)
+        super().__init__(width, settings.layers, heads, feed_forward, settings.final_norm)
         self.settings = settings
         self.fuse = nn.Linear(2 * width, width)
 

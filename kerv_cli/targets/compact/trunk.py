@@ -90,7 +90,7 @@ class Layer(nn.Module):
 
 
 class LayerStack(Packable):
-    """Base class of the trunk and the drafter: an input step, decoder layers and a final norm.
+    """Base class of the trunk and the drafter: an input step, decoder layers and, usually, a final norm.
 
     Attributes:
         inputs: Number of input tensors (B, T, E).
@@ -105,12 +105,17 @@ class LayerStack(Packable):
     inputs = 1
     padding = 0
 
-    def __init__(self, width: int, layers: int, heads: int, feed_forward: int) -> None:
+    def __init__(self, width: int, layers: int, heads: int, feed_forward: int, final_norm: bool = True) -> None:
         super().__init__()
         self.width, self.outer, self.heads, self.depth = width, width, heads, layers
         self.rotary = Rotary(width // heads)
         self.layers = nn.ModuleList(Layer(width, heads, feed_forward) for _ in range(layers))
-        self.norm = nn.RMSNorm(width, eps=1e-5)
+        self.norm = nn.RMSNorm(width, eps=1e-5) if final_norm else nn.Identity()
+
+    @property
+    def weight(self) -> Tensor:
+        """Any one weight: it has the device and the number format of all."""
+        return next(self.parameters())
 
     def enter(self, *inputs: Tensor) -> Tensor:
         """Combine the inputs, (B, T, E) each, into one tensor (B, T, E)."""
@@ -122,7 +127,7 @@ class LayerStack(Packable):
         return x if not rest else torch.cat([x, x[..., :1].expand(*x.shape[:-1], rest) * 0.0], -1)
 
     def finish(self, x: Tensor) -> Tensor:
-        """Cut the last layer's output (B, T, width) to its first E channels and normalise it: the hidden states."""
+        """Cut the last layer's output (B, T, width) to its first E channels and apply the final norm: hidden states."""
         return self.norm(x if self.width == self.outer else x[..., : self.outer])
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
@@ -133,7 +138,7 @@ class LayerStack(Packable):
             capacity: Maximum number of tokens.
             fixed: Whether every forward attends to all slots, so that its shapes are fixed. None: only on CUDA.
         """
-        like: Tensor = self.norm.weight
+        like = self.weight
         if isinstance(self.packed, Bfloat16Layers):
             like = like.float()
         sizes = self.depth, batch, self.heads, capacity + self.padding, self.width // self.heads
@@ -147,9 +152,9 @@ class LayerStack(Packable):
             For float32 weights a `Program`. For bfloat16 weights `Bfloat16Layers`, if the CPU can multiply bfloat16.
             Otherwise None.
         """
-        if self.norm.weight.dtype == torch.float32:
+        if self.weight.dtype == torch.float32:
             return Program(self.recorded, *[(1, 1, self.outer)] * self.inputs)
-        if self.norm.weight.dtype == torch.bfloat16 and multiplies_bfloat16():
+        if self.weight.dtype == torch.bfloat16 and multiplies_bfloat16():
             return Bfloat16Layers(self.rotary(slice(None)), self.layers)
         return None
 
