@@ -1,20 +1,22 @@
 """`kerv bench`: what is counted, what is measured, what is refused."""
 
 import dataclasses
+import importlib
 import json
 
 import numpy as np
 import pytest
 import torch
 from command import kerv, refusal
+from examples.tiny_openvla import TINY, write_checkpoint
 from flips import flipped
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.bench import phases as measuring
-from kerv_cli.bench.machine import Machine
-from kerv_cli.bench.model import layer_weights, open_model
-from kerv_cli.bench.phases import Laps, Phase, costs_of, decoders
-from kerv_cli.bench.results import ceilings, profile_of, projected, shares
+from kerv_cli.bench.machine import Machine, measure_machine
+from kerv_cli.bench.model import Sizes, layer_weights, open_model
+from kerv_cli.bench.phases import Laps, Phase, costs_of, decoders, measure
+from kerv_cli.bench.results import card_of, ceilings, profile_of, projected, shares
 from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.engine.cost import READ_PHASES, Profile, Work, prices, read_profile, work_of
 
@@ -79,6 +81,54 @@ def test_bytes_and_operations_of_a_forward():
     assert sizes.needs("verify", 3, 10) == (read, flops)
     assert sizes.needs("encode", 1, 10) == (0, 0)
     assert sizes.needs("tree", 5, 10)[1] == 8 * sizes.needs("draft", 5, 10)[1]
+
+
+def test_the_sizes_of_a_grown_target_are_those_of_its_new_layers(policies, tmp_path):
+    shape = ["grow.width=128", "grow.heads=2", "grow.feed_forward=160", "grow.layers=3", "grow.prompt=70"]
+    large = f"{tmp_path}/large"
+    shape += ["grow.drafter=true", "policy.target=nano-vision", f"name={large}"]
+    kerv("build", "target", *shape, f"results={policies}")
+    model, base = (open_model(BenchSettings(model=name, results=str(policies))) for name in (large, "nano-vision"))
+    sizes, s = model.sizes, base.target.settings
+    tokens = base.target.actions.tokens
+    assert sizes.trunk_weights == 3 * (4 * 128**2 + 3 * 128 * 160) + s.width * tokens
+    assert sizes.drafter == 4 * 128**2 + 3 * 128 * 160 + 2 * s.width**2 + s.width * tokens
+    assert (sizes.cached, sizes.channels) == (2 * 3 * 128, 3 * 128)
+    prompt = model.target.max_prompt
+    assert sizes.forward(prompt, 0)[1] == 2 * sizes.trunk_weights * 70 + 4 * 3 * 128 * 70 * 71 / 2
+    assert base.sizes == Sizes.of_shape(s, tokens, 4.0, 4)
+
+
+@pytest.mark.usefixtures("quick")
+def test_the_sizes_of_an_openvla_policy_are_counted_and_its_decodes_measured(tmp_path):
+    write_checkpoint(tmp_path / "tiny")
+    kerv("build", "target", "target=openvla", f"checkpoint={tmp_path}/tiny", f"results={tmp_path}")
+    settings = BenchSettings(model="openvla", repeats=3, results=str(tmp_path))
+    model = open_model(settings)
+    machine = measure_machine(model.target.device, model.dtype)
+    width, layers = TINY.language.hidden_size, TINY.language.num_hidden_layers
+    weights = layers * (4 * width**2 + 3 * width * TINY.language.intermediate_size) + width * 256
+    card = card_of(model, machine, 7)
+    assert (card["weights"], card["weight_bytes"]) == (weights, 4 * weights)
+    phases = measure(model, machine, settings)[1]
+    assert {phase.kind for phase in phases} == {"encode", "prefill", "verify", "feed", "draft", "tree"}
+
+
+def test_a_policy_that_does_not_show_its_layers_is_refused(tmp_path):
+    importlib.import_module("examples.own_policy")
+    kerv("build", "target", "target=own", "name=own", f"results={tmp_path}")
+    assert "has no attribute `layers`" in refusal("bench", "target=own", f"results={tmp_path}", code=2)
+
+
+def test_a_draft_that_cannot_be_measured_is_named_and_the_others_are_measured(monkeypatch, caplog):
+    def without_early(settings, task):
+        if settings.method == "early_unverified":
+            raise CheckpointError("no early drafter")
+        return settings.method
+
+    monkeypatch.setattr(measuring, "decoder_for", without_early)
+    assert set(measuring.source_decoders(NANO)) == {"retrieval", "scout"}
+    assert "'early': no early drafter" in caplog.text
 
 
 @pytest.mark.bits

@@ -20,7 +20,7 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import EagleDrafter, EagleNetwork
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.compact.packable import pack
-from kerv_cli.targets.compact.program import Program, stored_bytes
+from kerv_cli.targets.compact.program import stored_bytes
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import Layer
@@ -38,21 +38,44 @@ class Sizes:
     """The sizes of a target, from which the bytes and operations of its forwards are computed.
 
     Attributes:
-        settings: Shapes of the target.
-        vocabulary: V, number of action tokens.
+        layers: Number of weights in the matrices of all layers.
+        head: Number of weights in the head.
+        drafter: Number of weights that a pass of the drafter reads, with the head's.
+        channels: Channels of all layers' attention: four operations each, per key that a token attends to.
+        cached: Numbers in the key/value cache per token.
         weight: Bytes of a weight, on average.
         slot: Bytes of a number in the key/value cache.
+        padding: Tokens that a prefill computes beyond the prompt. Only grown targets have them.
+        drafter_padding: The same of the drafter, when it reads the prompt's states.
     """
 
-    settings: TargetSettings
-    vocabulary: int
+    layers: int
+    head: int
+    drafter: int
+    channels: int
+    cached: int
     weight: float
     slot: int
+    padding: int = 0
+    drafter_padding: int = 0
+
+    @classmethod
+    def of_shape(cls, shape: TargetSettings, vocabulary: int, weight: float, slot: int) -> Sizes:
+        """Return the sizes of a compact target of a shape, and of its one-layer drafter.
+
+        Args:
+            shape: Shapes of the target.
+            vocabulary: V, number of action tokens.
+            weight: Bytes of a weight.
+            slot: Bytes of a number in the key/value cache.
+        """
+        layer, head, channels = layer_weights(shape), shape.width * vocabulary, shape.layers * shape.width
+        return cls(layer * shape.layers, head, layer + 2 * shape.width**2 + head, channels, 2 * channels, weight, slot)
 
     @property
     def trunk_weights(self) -> int:
         """Number of weights that every forward reads: the layers' matrices and the head."""
-        return layer_weights(self.settings) * self.settings.layers + self.settings.width * self.vocabulary
+        return self.layers + self.head
 
     def forward(self, rows: int, cached: int) -> tuple[float, float]:
         """Return the bytes that a forward reads, and its number of arithmetic operations.
@@ -61,13 +84,13 @@ class Sizes:
         channel of each key that a token attends to.
 
         Args:
-            rows: Number of tokens in the forward.
-            cached: Number of earlier tokens in the cache.
+            rows: Number of tokens in the forward. A grown target adds its padding to a prefill.
+            cached: Number of earlier tokens in the cache. 0: a prefill.
         """
-        s, weights = self.settings, self.trunk_weights
-        read = weights * self.weight + 2.0 * s.layers * (cached + rows) * s.width * self.slot
+        rows += 0 if cached else self.padding
+        read = self.trunk_weights * self.weight + float(self.cached) * (cached + rows) * self.slot
         attended = rows * cached + rows * (rows + 1) / 2
-        return read, 2.0 * weights * rows + 4.0 * s.layers * s.width * attended
+        return read, 2.0 * self.trunk_weights * rows + 4.0 * self.channels * attended
 
     def needs(self, kind: str, rows: int, prompt: int) -> tuple[float, float]:
         """Return the bytes that a phase of a decode reads, and its number of arithmetic operations.
@@ -79,14 +102,13 @@ class Sizes:
             rows: Number of tokens, or for a drafted tree its depth; see `phases.Phase`.
             prompt: P, number of prompt tokens.
         """
-        s = self.settings
-        drafter = float(layer_weights(s) + 2 * s.width**2 + s.width * self.vocabulary)
-        # number of passes over the drafter's weights, and of rows in all passes; its tree has eight nodes per level
-        passes = {"feed": (1, rows), "draft": (rows - 1, rows - 1), "tree": (rows - 1, 8 * (rows - 1))}
         if kind in ("prefill", "verify"):
             return self.forward(rows, prompt if kind == "verify" else 0)
+        # number of passes over the drafter's weights, and of rows in all passes; its tree has eight nodes per level
+        fed = rows + (self.drafter_padding if rows >= prompt else 0)
+        passes = {"feed": (1, fed), "draft": (rows - 1, rows - 1), "tree": (rows - 1, 8 * (rows - 1))}
         times, tokens = passes.get(kind, (0, 0))
-        return times * drafter * self.weight, 2.0 * tokens * drafter
+        return times * self.drafter * self.weight, 2.0 * tokens * self.drafter
 
 
 @dataclass(frozen=True)
@@ -109,15 +131,21 @@ class Model:
 
     @property
     def sizes(self) -> Sizes:
-        """Sizes of the target.
-
-        On a CPU, a number in the cache has 4 bytes. A compiled weight has as many bytes as its stored format.
-        """
-        slot, trunk = 4 if self.target.device.type == "cpu" else self.dtype.itemsize, self.target.trunk
-        weight: float = self.dtype.itemsize
-        if isinstance(getattr(trunk, "packed", None), Program):
-            weight = stored_bytes(trunk) / sum(p.numel() for p in trunk.parameters())
-        return Sizes(self.target.settings, self.target.actions.tokens, weight, slot)
+        """Sizes of the target, counted in its own layers and its cache. A grown target's are those of its new trunk."""
+        target, drafter, cache = self.target, self.drafter, self.target.new_cache(1, 1)
+        matrices = [x for x in (*target.layers.parameters(), *target.layers.buffers()) if x.dim() == 2]
+        weights, head = sum(x.numel() for x in matrices), target.width * target.actions.tokens
+        return Sizes(
+            layers=weights,
+            head=head,
+            drafter=sum(p.numel() for p in drafter.parameters() if p.dim() == 2) + head,
+            channels=len(target.layers) * matrices[0].shape[1],
+            cached=cache.buffer[..., 0, :].numel(),
+            weight=stored_bytes(matrices) / weights,
+            slot=cache.buffer.element_size(),
+            padding=cache.capacity - 1,
+            drafter_padding=drafter.new_cache(1, 1).capacity - 1,
+        )
 
     @property
     def size(self) -> int:
@@ -127,7 +155,7 @@ class Model:
     @property
     def dtype(self) -> torch.dtype:
         """Number format of the trunk's weights."""
-        dtype: torch.dtype = self.target.head.weight.dtype
+        dtype: torch.dtype = self.target.dtype
         return dtype
 
 
@@ -182,6 +210,12 @@ def open_model(settings: BenchSettings) -> Model:
     device, _ = set_up(settings.runtime)
     artifacts = Artifacts(settings.results, PolicySettings(target=settings.model), None, device, settings.runtime.dtype)
     target: Any = artifacts.target
+    if not hasattr(target, "layers"):
+        family = artifacts.description.family
+        raise UsageError(
+            f"target={settings.model}: the family '{family}' has no attribute `layers`, which kerv bench counts; "
+            "add it (kerv_cli/engine/protocol.py)"
+        )
     drafter = artifacts.load("drafter") if artifacts.path("drafter").exists() else _drafter(target)
     return Model(settings.model, target, drafter, blank(target), False)
 

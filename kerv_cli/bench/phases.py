@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -34,6 +35,8 @@ from kerv_cli.methods.early.drafter import EarlyProposer
 from kerv_cli.methods.scout.drafter import ScoutProposer
 from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.targets.compact.program import stored_bytes
+
+_LOG = logging.getLogger("kerv")
 
 _WARM_UP = 2  # repeats that do not count
 _EVICTING = 16 * 2**20  # float32 numbers that are read before each decode, to empty the caches as a simulator does
@@ -261,7 +264,7 @@ def needs_of_draft(decoder: Any) -> tuple[float, float]:
         network, given = draft.scout, draft.inputs(blank(target))
     with FlopCounterMode(display=False) as counter:
         copy.deepcopy(network)(given)  # a copy is not compiled
-    return stored_bytes(network), float(counter.get_total_flops())
+    return stored_bytes(network.parameters()), float(counter.get_total_flops())
 
 
 def source_methods() -> dict[str, str]:
@@ -273,14 +276,14 @@ def source_methods() -> dict[str, str]:
 def source_decoders(settings: BenchSettings) -> dict[str, Any]:
     """Return decoders of the shipped policy that measure the drafts `early`, `retrieval` and `scout`, by these names.
 
-    The time of these drafts does not depend on the size of the target. If the shipped policy is missing, the result is
-    empty.
+    The time of these drafts does not depend on the size of the target. A draft that cannot be measured, for example
+    because its drafter is missing, is left out, and a warning says why.
     """
     words = [f"runtime.{name}={getattr(settings.runtime, name)}" for name in ("device", "threads")]
-    try:
-        return {
-            kind: decoder_for(compose("rollout", [f"method={method}", *words], RolloutSettings), _TASK)
-            for kind, method in {**source_methods(), SCOUT: "scout_unverified"}.items()
-        }
-    except KervError:
-        return {}
+    found = {}
+    for kind, method in {**source_methods(), SCOUT: "scout_unverified"}.items():
+        try:
+            found[kind] = decoder_for(compose("rollout", [f"method={method}", *words], RolloutSettings), _TASK)
+        except KervError as error:
+            _LOG.warning("the profile has no time of the draft '%s': %s", kind, error)
+    return found

@@ -89,7 +89,7 @@ def card_of(model: Model, machine: Machine, tokens: int) -> dict[str, Any]:
         By name: the model's sizes, the device's bandwidth and operations per second, and the floors. `card_rows` prints
         them.
     """
-    prompt, s, sizes = model.target.max_prompt, model.target.settings, model.sizes
+    prompt, sizes = model.target.max_prompt, model.sizes
     needs = {
         "one token": sizes.forward(1, prompt),
         f"verification of {tokens}": sizes.forward(tokens, prompt),
@@ -100,7 +100,7 @@ def card_of(model: Model, machine: Machine, tokens: int) -> dict[str, Any]:
     return {
         "weights": sizes.trunk_weights,
         "weight_bytes": weights,
-        "cache_bytes": 2.0 * s.layers * s.width * (prompt + tokens) * sizes.slot,
+        "cache_bytes": float(sizes.cached) * (prompt + tokens) * sizes.slot,
         "prompt": prompt,
         "tokens": tokens,
         "bandwidth": machine.bandwidth,
@@ -234,7 +234,7 @@ def projections(
         For each device its name, and the estimates as a JSON document.
     """
     shape = shape_of(settings.projected, model.size)
-    sizes = Sizes(shape, model.target.actions.tokens, _HALF, _HALF)
+    sizes = Sizes.of_shape(shape, model.target.actions.tokens, _HALF, _HALF)
     here, prompt = min(p.rows for p in phases if p.kind == "prefill"), prompt_of(shape)
     moved = []
     for p in phases:

@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from kerv_cli.base.spaces import ActionSpace, Observation
 
@@ -141,6 +141,10 @@ class ReadableTarget(Target, Protocol):
     @property
     def feed_forward(self) -> int:
         """Hidden width of each layer's feed-forward network."""
+
+    @property
+    def layers(self) -> nn.ModuleList:
+        """The decoder layers, whose matrices every forward reads. `kerv bench` counts them."""
 
     @property
     def dtype(self) -> torch.dtype:

@@ -15,7 +15,7 @@ import functools
 import logging
 import os
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -109,12 +109,9 @@ def matrix_of(weight: Tensor, bias: Tensor | None) -> Matrix:
     return found
 
 
-def stored_bytes(module: torch.nn.Module) -> float:
-    """Return how many bytes a module's parameters take in its program.
-
-    A weight with a `Matrix` counts in its stored format. Every other parameter counts as float32.
-    """
-    return sum(_MATRICES[p].nbytes if p in _MATRICES else 4.0 * p.numel() for p in module.parameters())
+def stored_bytes(tensors: Iterable[Tensor]) -> float:
+    """Return how many bytes weights take where they are read: those of a program in its stored format."""
+    return float(sum(_MATRICES[x].nbytes if x in _MATRICES else x.nbytes for x in tensors))
 
 
 def forget(module: torch.nn.Module) -> None:

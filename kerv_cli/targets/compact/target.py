@@ -174,6 +174,11 @@ class CompactTarget(Packable):
         return self.head.weight.device
 
     @property
+    def layers(self) -> nn.ModuleList:
+        """Decoder layers of the trunk."""
+        return self.trunk.layers
+
+    @property
     def dtype(self) -> torch.dtype:
         """Number format of the weights."""
         return self.head.weight.dtype

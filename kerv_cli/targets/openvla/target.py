@@ -76,6 +76,7 @@ class OpenVLATarget:
         """Load and freeze the checkpoint; arguments and errors as `build`."""
         source = Path(settings.checkpoint)
         self.settings, self.actions, self.cameras = settings, description.actions, tuple(description.cameras)
+        self.observation = description.observation
         self.shape = shape = read_shape(source)
         self.prompter = Prompter(source, shape, settings.prompt, settings.prompt_tokens)
         self.normalisations = read_normalisations(source)
@@ -85,6 +86,7 @@ class OpenVLATarget:
         self.max_prompt = shape.patches + settings.prompt_tokens
         last = shape.vocabulary
         self.action_rows = model.language_model.lm_head.weight[last - shape.bins : last].flip(0).contiguous()
+        self.layers = model.language_model.model.layers
         self.device, self.dtype = self.action_rows.device, self.action_rows.dtype
         self.words = functools.lru_cache(maxsize=64)(self._words)
 
