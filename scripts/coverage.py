@@ -3,7 +3,8 @@
 A simulated study has ten tasks, or one, in three groups of difficulty, and blocks of five seeds. Tasks differ in time,
 speedup and success. The speedup of a block is off by 8 % (the machine's state), that of a pair by 5 %; episodes
 that fail run to the horizon.
-Prints coverage in per cent, a row per interval and a column per number of blocks per task.
+Prints coverage in per cent, a row per interval and a column per number of blocks per task. Then the same of three runs,
+each with seeds of its own: a run's speedup is off by 8 %, in all tasks together.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from kerv_cli.report import statistics as stats
 from kerv_cli.report.statistics import Estimate
 
 BLOCKS = (1, 2, 4, 10, 50)
+SEEDS_OF_RUNS = (1, 2, 5)
 SEEDS, DRIFT, NOISE, HORIZON = 5, 0.08, 0.05, 500
 GROUPS = ("easy", "hard", "medium")
 Drawn = tuple[Estimate, float]
@@ -39,20 +41,25 @@ class Tasks:
 
 
 class Study:
-    """A simulated study of so many blocks per task; arrays (pairs,) but for the tasks'."""
+    """A simulated study of `blocks` blocks per task. Arrays (pairs,), except those of the tasks.
 
-    def __init__(self, tasks: Tasks, blocks: int, random: np.random.Generator) -> None:
-        per_task = blocks * SEEDS
+    `run` is the factor of the run on every speedup.
+    """
+
+    def __init__(
+        self, tasks: Tasks, blocks: int, random: np.random.Generator, run: float = 1.0, seeds: int = SEEDS
+    ) -> None:
+        per_task = blocks * seeds
         self.tasks, n = tasks, tasks.count * per_task
         self.task = np.repeat(np.arange(tasks.count), per_task)
-        self.block = np.repeat(np.arange(tasks.count * blocks), SEEDS)
+        self.block = np.repeat(np.arange(tasks.count * blocks), seeds)
         self.seed = np.tile(np.arange(per_task), tasks.count)
         self.group = tasks.group[self.task]
         u, t = random.random(n), tasks
         lost, won, neither = t.lost[self.task], t.won[self.task], t.neither[self.task]
         self.method = (u >= lost) & (u < 1 - neither)
         self.baseline = (u < lost) | ((u >= lost + won) & (u < 1 - neither))
-        drift = random.lognormal(-(DRIFT**2) / 2, DRIFT, tasks.count * blocks)[self.block]
+        drift = random.lognormal(-(DRIFT**2) / 2, DRIFT, tasks.count * blocks)[self.block] * run
         self.step_method = t.seconds[self.task] * random.lognormal(-(NOISE**2) / 2, NOISE, n)
         noise = random.lognormal(-(NOISE**2) / 2, NOISE, n)
         self.step_baseline = t.seconds[self.task] * t.speedup[self.task] * drift * noise
@@ -131,8 +138,19 @@ def coverage(tasks: int, blocks: int, studies: int, seed: int = 0) -> dict[str, 
     return {name: float(np.mean(hits)) for name, hits in inside.items()}
 
 
+def coverage_of_runs(runs: int, blocks: int, studies: int, per_episode: bool) -> float:
+    """Share of simulated studies whose interval over runs contains the truth. Each run has `blocks` seeds per task."""
+    random, truth, inside = np.random.default_rng([runs, blocks]), Tasks(10), 0
+    for _ in range(studies):
+        drifts = random.lognormal(-(DRIFT**2) / 2, DRIFT, runs)
+        drawn = [speedup(Study(truth, blocks, random, drift, seeds=1), per_episode, False) for drift in drifts]
+        found = stats.over_runs([estimate for estimate, _ in drawn], same_pairs=False)
+        inside += found.low <= drawn[0][1] <= found.high
+    return inside / studies
+
+
 def main(words: Sequence[str]) -> None:
-    """Prints the table."""
+    """Prints the tables."""
     studies = int(words[0]) if words else 1000
     for tasks in (10, 1):
         table = {blocks: coverage(tasks, blocks, studies) for blocks in BLOCKS}
@@ -140,6 +158,11 @@ def main(words: Sequence[str]) -> None:
         for name in table[BLOCKS[-1]]:
             row = [f"{100 * table[blocks].get(name, np.nan):5.1f}" for blocks in BLOCKS]
             print(f"  {name:28}", *row)
+    for runs in (3, 5):
+        print(f"10 tasks, {runs} runs with seeds of their own; seeds per task in a run:", *SEEDS_OF_RUNS)
+        for per_episode in (False, True):
+            row = [f"{100 * coverage_of_runs(runs, seeds, studies, per_episode):5.1f}" for seeds in SEEDS_OF_RUNS]
+            print(f"  {'speedup per episode' if per_episode else 'speedup per step':28}", *row)
 
 
 if __name__ == "__main__":

@@ -100,6 +100,8 @@ COLUMNS: dict[str, tuple[str, Callable[[Row], str]]] = {
     "non-inferior": ("non-inferior", _own(lambda row: {"True": "yes", "False": "no"}.get(row["non_inferior"], ""))),
     "speedup": ("speedup", lambda row: _ratio(row, "speedup")),
     "per-episode": ("per episode", lambda row: _ratio(row, "episode_speedup")),
+    "both-solved": ("both solved", lambda row: _ratio(row, "solved_speedup")),
+    "failed": ("failed", lambda row: f"{int(row['episodes']) - int(row['successes'])} of {row['episodes']}"),
     "p95": ("p95, ms", lambda row: _number(row, "latency_p95_ms", ".1f")),
     "AL": ("AL", lambda row: _number(row, "AL", ".1f")),
     "steps": ("control steps to success", lambda row: _number(row, "steps_to_success", ".0f")),

@@ -351,6 +351,49 @@ def test_the_interval_of_a_ratio_takes_the_run_as_a_cluster_from_three_runs_on(t
     assert reach > 4.3027 * logs.std(ddof=1) / np.sqrt(3) > 0  # 4.3027: Student's t with two degrees of freedom, 97.5 %
 
 
+def test_runs_with_seeds_of_their_own_are_the_only_cluster_of_a_ratio(tmp_path):
+    """Each run adds a seed per task. The interval is Student's t over the three ratios, pairs are not added again."""
+    said, alone = [], []
+    for episodes in (1, 2, 3):
+        store, _ = swept(tmp_path, threshold_study(["reach-v3", "push-v3"], episodes))
+        data = load_study(store)
+        row = row_of(data.table, averaging=MICRO, label="naive_sd")
+        said.append((row["runs"], row["episodes"]))
+        seeds = data.episodes[data.episodes["seed"] == data.episodes["seed"].max()]
+        sums = seeds.groupby("label")["seconds"].sum()
+        alone.append(sums["ar"] / sums["naive_sd"])
+    assert said == [(1, 2), (1, 4), (3, 6)]
+    logs = np.log(alone)
+    assert row["episode_speedup"] == pytest.approx(np.exp(logs.mean()))
+    reach = np.log(row["episode_speedup_high"] / row["episode_speedup"])
+    assert reach == pytest.approx(4.3027 * logs.std(ddof=1) / np.sqrt(3), rel=1e-4)
+
+
+def test_a_run_that_only_filled_gaps_is_no_run_of_its_own(tmp_path):
+    tasks = ["reach-v3", "push-v3"]
+    for episodes, used in ((1, tasks), (2, tasks), (3, tasks[:1]), (3, tasks)):
+        store, _ = swept(tmp_path, threshold_study(used, episodes))
+    assert set(load_study(store).table["runs"]) == {1}
+
+
+def test_a_failed_episode_does_not_decide_the_speed_over_pairs_that_both_solved(tmp_path):
+    store, _ = swept(tmp_path, threshold_study(["reach-v3", "push-v3"]))
+    with store.database.writing() as connection:
+        mine = sa.select(tables.WANTED.c.episode_id).join(tables.SETTINGS).where(tables.SETTINGS.c.label == "naive_sd")
+        numbers = connection.scalars(mine).all()
+        failed = {"success": False, "seconds": tables.EPISODES.c.seconds * 50}
+        solved = {"success": True}
+        connection.execute(sa.update(tables.EPISODES).values(solved))
+        connection.execute(sa.update(tables.EPISODES).where(tables.EPISODES.c.id == numbers[0]).values(failed))
+    data = load_study(store)
+    row = row_of(data.table, averaging=MICRO, label="naive_sd")
+    both = data.pairs[(data.pairs["label"] == "naive_sd") & (data.pairs["both"] == 1)]
+    assert len(both) == row["episodes"] - 1
+    expected = both["seconds_baseline"].sum() / both["seconds_method"].sum()
+    assert row["solved_speedup"] == pytest.approx(expected)
+    assert row["episode_speedup"] < row["solved_speedup"]
+
+
 # --- studies publish
 
 COMMIT = "c" * 40

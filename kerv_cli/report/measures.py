@@ -53,7 +53,7 @@ def measure(
 ) -> dict[Hashable, Row]:
     """Return every measure of each group of episodes.
 
-    `speedup` compares the time per control step, `episode_speedup` the time per episode. `same_run` says whether the
+    The speedups are explained in `speedups`. `same_run` says whether the
     two episodes of every pair come from one run. `same_block` is the share of pairs that were measured in one block
     (side by side in one process).
 
@@ -90,8 +90,6 @@ def measure(
         rows[group] = {
             "successes": row["successes"],
             **columns_of("success", success[group]),
-            **columns_of("speedup", speeds["speedup"].get(group, stats.NO_ESTIMATE)),
-            **columns_of("episode_speedup", speeds["episode_speedup"].get(group, stats.NO_ESTIMATE)),
             **means[group],
             **paired_columns(pooled, difference[group]),
             "pairs_to_settle": stats.pairs_to_settle(pooled, MARGIN),
@@ -101,6 +99,8 @@ def measure(
             "decodes": row["decodes"],
             "deviation_samples": row["deviation_count"],
         }
+        for name, found in speeds.items():
+            rows[group] |= columns_of(name, found.get(group, stats.NO_ESTIMATE))
     return rows
 
 
@@ -185,10 +185,12 @@ def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame
 def speedups(
     pairs: pd.DataFrame, by: list[str], averaging: str, all_pairs: bool = False
 ) -> dict[str, dict[Hashable, Estimate]]:
-    """Return two speedups of each group of pairs: mean time of the baseline ÷ mean time of the method.
+    """Return the speedups of each group of pairs: mean time of the baseline ÷ mean time of the method.
 
-    `speedup` compares seconds per control step, `episode_speedup` seconds per episode. A group has no speedup if it has
-    no usable pairs, if an episode was not timed, or if its setting runs no decoder (the scripted expert).
+    `speedup` compares seconds per control step, `episode_speedup` seconds per episode. `solved_speedup` is
+    `episode_speedup` over the pairs that both solved: one failed episode runs to the horizon and can decide the others.
+    A group has no speedup if it has no usable pairs, if an episode was not timed, or if its setting runs no decoder
+    (the scripted expert).
 
     Args:
         pairs: Table made by `paired`.
@@ -197,7 +199,7 @@ def speedups(
         all_pairs: Whether to use pairs that were not measured in one block (side by side in one process), too.
 
     Returns:
-        For each of the two names, the speedups by group.
+        For each of the three names, the speedups by group.
     """
     timed = pairs if all_pairs else pairs[pairs["same_block"]]
     blocks = timed["block_method"].astype(str) + "|" + timed["block_baseline"].astype(str)
@@ -205,15 +207,15 @@ def speedups(
     blocks = blocks.groupby([timed[name] for name in ("label", "task", "seed")]).transform("first")
     tasks, difficulties, clusters = (pd.factorize(one)[0] for one in (timed["task"], timed["difficulty"], blocks))
     decodes = timed["decodes"].to_numpy()
-    times = {
-        name: [timed[f"{column}_{side}"].to_numpy(float) for side in ("baseline", "method")]
-        for name, column in (("speedup", "time"), ("episode_speedup", "seconds"))
-    }
-    found: dict[str, dict[Hashable, Estimate]] = {name: {} for name in times}
-    for group, index in timed.groupby(by).indices.items():
-        about = tasks[index], difficulties[index] if averaging == MACRO else None, clusters[index]
-        for name, (baseline, method) in times.items():
-            if decodes[index].any() and not np.isnan(baseline[index] + method[index]).any():
+    solved = (timed["success_baseline"].astype(bool) & timed["success_method"].astype(bool)).to_numpy()
+    compared = {"speedup": ("time", None), "episode_speedup": ("seconds", None), "solved_speedup": ("seconds", solved)}
+    found: dict[str, dict[Hashable, Estimate]] = {name: {} for name in compared}
+    for name, (column, used) in compared.items():
+        baseline, method = (timed[f"{column}_{side}"].to_numpy(float) for side in ("baseline", "method"))
+        for group, members in timed.groupby(by).indices.items():
+            index = members if used is None else members[used[members]]
+            if decodes[members].any() and not np.isnan(baseline[members] + method[members]).any():
+                about = tasks[index], difficulties[index] if averaging == MACRO else None, clusters[index]
                 found[name][group] = stats.speedup(baseline[index], method[index], *about)
     return found
 

@@ -256,23 +256,25 @@ def speedup(
     return Estimate(mean_a / mean_b, mean_a / mean_b / reach, mean_a / mean_b * reach)
 
 
-def over_runs(estimates: Sequence[Estimate]) -> Estimate:
-    """Combine a speedup that several runs measured with the same pairs.
+def over_runs(estimates: Sequence[Estimate], same_pairs: bool) -> Estimate:
+    """Combine the speedups that several runs measured.
 
-    The value is the geometric mean. The half width of the logarithm's 95 % interval has two independent parts, whose
-    squares are added. The first comes from the pairs. More runs do not reduce it, because all runs have the same pairs.
-    The second comes from the k runs, by Student's t with k − 1 degrees of freedom.
+    The value is the geometric mean. The half width of the logarithm's 95 % interval is Student's t with k − 1 degrees
+    of freedom, over the k runs. If all runs have the same pairs, the runs do not show how much the pairs matter. Then
+    the half width of the interval over pairs is added in squares.
 
     Args:
         estimates: The speedup in each run, with the interval over its pairs.
+        same_pairs: Whether all runs measured the same pairs. Otherwise each run has its own seeds.
     """
     from scipy.special import stdtrit
 
     logs = np.log([one.value for one in estimates])
-    of_pairs = float(np.mean([math.log(one.high / one.value) for one in estimates]))
-    of_runs = float(stdtrit(len(logs) - 1, 0.975)) * float(logs.std(ddof=1)) / math.sqrt(len(logs))
-    value, reach = math.exp(logs.mean()), math.exp(math.hypot(of_pairs, of_runs))
-    return Estimate(value, value / reach, value * reach)
+    reach = float(stdtrit(len(logs) - 1, 0.975)) * float(logs.std(ddof=1)) / math.sqrt(len(logs))
+    if same_pairs:
+        reach = math.hypot(reach, float(np.mean([math.log(one.high / one.value) for one in estimates])))
+    value = math.exp(logs.mean())
+    return Estimate(value, value / math.exp(reach), value * math.exp(reach))
 
 
 def _spread(effects: np.ndarray, strata: np.ndarray, clusters: np.ndarray) -> float:

@@ -28,11 +28,11 @@ from kerv_cli.worlds import specs
 CSV_COLUMNS = (
     "study", "averaging", "label", "method", "stress", "stress_level", "task", "seeds", "episodes", "baseline",
     "successes", "success", "success_low", "success_high", "runs", "speedup", "speedup_low", "speedup_high",
-    "episode_speedup", "episode_speedup_low", "episode_speedup_high", "time_per_step_ms",
-    "time_per_episode_ms", "latency_p50_ms", "latency_p95_ms", "AL", "forwards_per_step",
-    "skip_rate", "unverified_share", "compensation_rate", "retrieval_share", "deviation", "pairs", "only_baseline",
-    "only_method", "mcnemar_p", "difference", "difference_low", "difference_high", "non_inferior", "pairs_to_settle",
-    "steps", "steps_to_success", "near_contact_failure", "matched_success_speed",
+    "episode_speedup", "episode_speedup_low", "episode_speedup_high", "solved_speedup", "solved_speedup_low",
+    "solved_speedup_high", "time_per_step_ms", "time_per_episode_ms", "latency_p95_ms", "AL", "forwards_per_step",
+    "skip_rate", "unverified_share", "compensation_rate", "retrieval_share", "pairs", "only_baseline", "only_method",
+    "mcnemar_p", "difference", "difference_low", "difference_high", "non_inferior", "pairs_to_settle",
+    "steps_to_success", "near_contact_failure", "matched_success_speed",
 )  # fmt: skip
 """Columns of a study's CSV files. The remaining values are in tables/<study>.json (`further_of`)."""
 
@@ -55,13 +55,16 @@ class StudyData:
         study: The settings, and the episodes that the study asks for.
         episodes: One row per stored episode (label, task, seed and repeat). Columns: those of `StudyStore.frame`, and
             difficulty, device, number format and threads.
-        runs: If at least three runs (commands) each measured all episodes of the study, with the same code on the same
-            machine: one table like `episodes` for each of these runs. Otherwise empty.
+        runs: One table like `episodes` for each of at least three runs (commands) with the same code on the same
+            machine. Each run measured all episodes of the study, or all settings and tasks on seeds of its own. Empty
+            if there are no such runs.
+        same_pairs: Whether each run measured all episodes of the study.
     """
 
     study: Study
     episodes: pd.DataFrame
     runs: tuple[pd.DataFrame, ...] = ()
+    same_pairs: bool = False
 
     @functools.cached_property
     def settings(self) -> dict[str, Setting]:
@@ -173,11 +176,24 @@ def load_study(store: StudyStore, wanted: Sequence[Episode] | None = None) -> St
     if frame.empty:
         raise UsageError(f"study '{store.name}' has no episode yet: {store.how_to_run()}")
     whole = store.whole_runs() if wanted is None else []
-    frames = [store.frame(run=run) for run in whole] if len(whole) > 2 else []
+    same_pairs = len(whole) > 2
+    frames = [store.frame(run=run) for run in whole] if same_pairs else _with_new_seeds(frame)
     names = [name for name in _ONE_STATE if name in frame]  # imported episodes may lack some
     alike = [one for one in frames if all(set(one[name]) == set(frame[name]) for name in names)]
     runs = [_labelled(study, one) for one in alike] if len(alike) > 2 else []
-    return StudyData(study, _labelled(study, frame), tuple(runs))
+    return StudyData(study, _labelled(study, frame), tuple(runs), same_pairs)
+
+
+def _with_new_seeds(episodes: pd.DataFrame) -> list[pd.DataFrame]:
+    """Return the episodes of each run, oldest first, if each run measured every setting in every task on its own seeds.
+
+    Otherwise return an empty list.
+    """
+    runs = [one for _, one in sorted(episodes.groupby("run"), key=lambda item: item[1]["started"].min())]
+    keys = [set(zip(one["label"], one["task"], strict=True)) for one in runs]
+    complete = all(len(one) == episodes["label"].nunique() * episodes["task"].nunique() for one in keys)
+    worlds = [episode for one in runs for episode in set(zip(one["task"], one["seed"], strict=True))]
+    return runs if complete and len(worlds) == len(set(worlds)) else []
 
 
 def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
@@ -245,7 +261,7 @@ def _rows(data: StudyData, averaging: str, by_task: bool = False) -> list[Row]:
                 "baseline": data.references[label],
                 **measured[group],
                 "runs": max(1, len(runs)),
-                **_over_runs(runs, group),
+                **_over_runs(runs, group, data.same_pairs),
                 "overrides": setting.overrides,
                 **flatten(without(setting.settings, NOT_DETERMINING - {"policy"})),
                 "observation": setting.identity.get(OBSERVATION, ""),
@@ -258,16 +274,17 @@ def _rows(data: StudyData, averaging: str, by_task: bool = False) -> list[Row]:
     return rows
 
 
-def _over_runs(runs: Sequence[Mapping[str, Mapping[Hashable, Estimate]]], group: Hashable) -> Row:
+def _over_runs(runs: Sequence[Mapping[str, Mapping[Hashable, Estimate]]], group: Hashable, same_pairs: bool) -> Row:
     """Return the speeds of a group over all runs, if there are several (docs/methods.md §7).
 
     Args:
         runs: What `measures.speedups` returned for each run.
         group: Key of the group in those results.
+        same_pairs: Whether all runs measured the same pairs.
     """
     row: Row = {}
     for name in runs[0] if runs else ():
-        row |= columns_of(name, over_runs([run[name].get(group, NO_ESTIMATE) for run in runs]))
+        row |= columns_of(name, over_runs([run[name].get(group, NO_ESTIMATE) for run in runs], same_pairs))
     return row
 
 
