@@ -296,6 +296,7 @@ ANSWERS = [
     ("rollout method=nothing.yaml", "method=nothing.yaml cannot be read: No such file"),
     # what is not there
     ("rollout policy.target=mine", "train it with 'kerv train target name=mine'"),
+    ("rollout policy.target=../../etc", "name a folder that holds target.json"),
     ("demos import source=file", "file is a file: name the folder of a LeRobot dataset"),
     ("rollout results=file", "results=file is a file: name a folder"),
     ("view nothing.rrd", "nothing.rrd does not exist or is no recording"),

@@ -230,9 +230,10 @@ def test_a_shape_that_is_too_small_is_refused(policies):
 def test_a_policy_grows_by_command_and_keeps_its_drafter(policies, tmp_path):
     shape = ["grow.width=128", "grow.heads=2", "grow.feed_forward=160", "grow.layers=3", "grow.drafter=true"]
     shape.append("grow.prompt=70")
-    command = ["build", "target", *shape, "policy.target=nano-vision", f"name={tmp_path}/large"]
-    kerv(*command, f"results={policies}", "--json")
-    folder = tmp_path / "large"
+    base = policies / "artifacts/target/nano-vision"
+    command = ["build", "target", *shape, f"policy.target={base}", "name=large"]
+    kerv(*command, f"results={tmp_path}", "--json")
+    folder = tmp_path / "artifacts/target/large"
     assert sorted(path.name for path in folder.iterdir()) == ["target.json"], "no weights"
     small = Artifacts(str(policies), PolicySettings(target="nano-vision"))
     large = Artifacts(str(policies), PolicySettings(target=str(folder)))
@@ -257,13 +258,14 @@ def test_a_policy_grows_by_command_and_keeps_its_drafter(policies, tmp_path):
 
 
 def test_a_grown_target_whose_policy_changed_is_refused(policies, tmp_path):
-    command = ["build", "target", "grow=60m", "policy.target=nano-vision", f"name={tmp_path}/large"]
-    kerv(*command, f"results={policies}")
-    path = tmp_path / "large/target.json"
+    base = policies / "artifacts/target/nano-vision"
+    command = ["build", "target", "grow=60m", f"policy.target={base}", "name=large"]
+    kerv(*command, f"results={tmp_path}")
+    path = tmp_path / "artifacts/target/large/target.json"
     content = json.loads(path.read_text())
     content["settings"]["grown"]["sha256"] = "0" * 64
     path.write_text(json.dumps(content))
-    run = kerv("doctor", f"policy.target={tmp_path}/large", f"results={policies}", code=1)
+    run = kerv("doctor", "policy.target=large", f"results={tmp_path}", code=1)
     assert "build it again" in run.output
 
 

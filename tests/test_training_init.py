@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from command import kerv
+from command import kerv, refusal
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UsageError
@@ -227,10 +227,10 @@ def test_a_target_acts_and_the_expert_labels(tmp_path):
 
 
 def test_a_policy_acts_by_its_method(tmp_path):
-    words = ("policy=vision", "method=early_unverified", "task=reach", f"name={tmp_path / 'visited'}", "episodes=1")
+    words = ("policy=vision", "method=early_unverified", "task=reach", "name=visited", "episodes=1")
     short = ("world.horizon=12", "expert_share=0", "frame_stride=4", "runtime.workers=1")
-    kerv("demos", *words, *short)
-    episode = DemoDataset.open(tmp_path / "visited").load(0)
+    kerv("demos", *words, *short, f"results={tmp_path}")
+    episode = DemoDataset.open(tmp_path / "artifacts/demos/visited").load(0)
     settings = compose("rollout", ["method=early_unverified"], RolloutSettings)
     decoder, world = decoder_for(settings, "reach-v3"), SPEC.open_world("reach-v3", SHORT)
     world.reset(0)
@@ -262,3 +262,28 @@ def test_the_chunk_counts_and_is_executed(method):
 def test_only_further_views_may_differ_from_what_the_target_was_trained_on(target, spec, camera, says):
     with pytest.raises((UsageError, CheckpointError), match=says) if says else nullcontext():
         assert acts_of(target, spec, WorldSettings(camera=camera)).sha256
+
+
+OUTSIDE = "../../../outside"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        f"demos name={OUTSIDE} task=reach",
+        f"demos import source=. name={OUTSIDE}",
+        f"train target name={OUTSIDE} demos=few target=nano target.observation=state train.steps=1",
+        f"train drafter policy.artifacts.drafter={OUTSIDE} demos=few train.steps=1",
+        f"train drafter drafter=early policy.artifacts.early={OUTSIDE} demos=few train.steps=1",
+        f"build target grow=60m name={OUTSIDE}",
+        f"build drafter checkpoint=public policy.artifacts.drafter={OUTSIDE}",
+        f"build datastore policy.artifacts.datastore={OUTSIDE} demos=few",
+        f"calibrate policy.artifacts.calibration={OUTSIDE} demos=few",
+        f"calibrate success policy.artifacts.certificate={OUTSIDE}",
+    ],
+)
+def test_a_command_writes_nothing_outside_the_results_folder(demonstrated, line):
+    policy = [] if line.startswith(("demos import", "demos name", "train target")) else ["policy.target=nano-vision"]
+    refused = refusal(*line.split(), *policy, f"results={demonstrated}", code=2)
+    assert f"'{OUTSIDE}' must be letters" in refused
+    assert not (demonstrated / "artifacts" / "target" / OUTSIDE).resolve().exists()

@@ -46,13 +46,23 @@ def check_writable(results: str) -> Path:
 
 
 def artifact(results: str, kind: str, name: str) -> Path:
-    """Return the folder of an artifact: <results>/artifacts/<kind>/<name>, or the path `name` if it contains a slash.
+    """Return the folder of an artifact in the results folder: <results>/artifacts/<kind>/<name>.
+
+    Commands write artifacts only to such folders. To read one that may be elsewhere, use `artifact_or_path`.
+
+    Raises:
+        UsageError: `name` cannot be the name of a folder, for example because it contains a slash.
+    """
+    return results_dir(results) / "artifacts" / kind / check_name(name, f"{kind} name")
+
+
+def artifact_or_path(results: str, kind: str, name: str) -> Path:
+    """Return the folder of an artifact to read: `artifact`, or the path `name` if it contains a slash.
 
     Raises:
         UsageError: `name` can be neither a folder's name nor a path.
     """
-    plain = "/" not in name
-    return results_dir(results) / "artifacts" / kind / check_name(name, f"{kind} name") if plain else as_path(name)
+    return as_path(name) if "/" in name else artifact(results, kind, name)
 
 
 def as_path(text: str) -> Path:

@@ -51,7 +51,7 @@ def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
     from kerv_cli.methods.artifacts import Artifacts
     from kerv_cli.methods.eagle.drafter import import_drafter
 
-    folder = Artifacts(settings.results, settings.policy).path("drafter")
+    folder = Artifacts(settings.results, settings.policy).new("drafter")
     with making(settings.results, "drafter", folder):
         folder, figures = import_drafter(settings)
     print_figures("drafter", figures, folder, as_json)

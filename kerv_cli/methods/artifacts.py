@@ -13,8 +13,9 @@ from typing import Any, Generic, TypeVar
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import sha256_of
+from kerv_cli.base.limits import check_name
 from kerv_cli.base.manifests import check_files, read_file
-from kerv_cli.base.places import artifact
+from kerv_cli.base.places import artifact_or_path
 from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import DTYPES
 from kerv_cli.base.spaces import ActionSpace
@@ -152,7 +153,7 @@ class Artifact(Generic[T]):
             name: Name of the artifact, or a path. None: the artifact beside the target.
             target: Folder of the target.
         """
-        return artifact(results, self.kind, name) if name else beside(target, self.kind)
+        return artifact_or_path(results, self.kind, name) if name else beside(target, self.kind)
 
     def json(self, path: Path) -> Path:
         """Return the path of the description of the artifact in `path`."""
@@ -268,6 +269,18 @@ class Artifacts:
         """Return the path of the policy's artifact of this kind."""
         beside = Path(self.description.origin.get("base", self.folder))
         return kind_of(kind).path(self.results, self.policy.artifacts.get(kind), beside)
+
+    def new(self, kind: str) -> Path:
+        """Return the path to write the policy's artifact of this kind to.
+
+        Raises:
+            UsageError: `policy.artifacts.KIND` is a path. A command writes only to the results folder, or to the folder
+                beside the target.
+        """
+        name = self.policy.artifacts.get(kind)
+        if name:
+            check_name(name, f"policy.artifacts.{kind}:")
+        return self.path(kind)
 
     def exists(self, kind: str) -> bool:
         """Return whether the policy has an artifact of this kind."""

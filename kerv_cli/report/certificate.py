@@ -63,7 +63,7 @@ def folder_of(resolved: ResolvedStudy) -> Path:
     first, tasks = candidates[0], resolve_tasks(baseline.task)
     seeds = range(first.seed, first.seed + first.episodes)
     spec_of(tasks[0]).seeds.check(seeds, "selection", f"seed={first.seed}")
-    folder = artifacts_of(first).path(CertificateArtifact.kind)
+    folder = artifacts_of(first).new(CertificateArtifact.kind)
     check_not_shipped(folder, "policy.artifacts.certificate")
     return folder
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.places import artifact, as_path, results_dir
+from kerv_cli.base.places import artifact_or_path, results_dir
 
 RELEASED = ("libero-state", "mt10-state", "mt10-vision", "mt10-vision-parallel", "mt50-plain", "mt50-vision")
 """Names of the shipped policies. A checkout contains all of them, the wheel only `mt10-vision`."""
@@ -36,9 +36,9 @@ def find_target(results: str, name: str) -> Path:
         UsageError: There is no such target. The message lists the existing ones.
     """
     policies = results_dir(results) / "pretrained"
-    folders = [artifact(results, "target", name), policies / name / "target", shipped_dir() / name / "target"]
-    if "/" in name:
-        folders = [as_path(name)]
+    folders = [artifact_or_path(results, "target", name)]
+    if "/" not in name:
+        folders += [policies / name / "target", shipped_dir() / name / "target"]
     for folder in folders:
         if (folder / "target.json").is_file():
             return folder
@@ -52,11 +52,12 @@ def find_target(results: str, name: str) -> Path:
             f"target '{name}' is unfinished: 'kerv runs show target/{name} results={results}' shows the command that "
             "goes on with its training"
         )
+    remedies = [
+        "name a folder that holds target.json" if "/" in name else f"train it with 'kerv train target name={name}'"
+    ]
     names = target_names(results)
-    raise UsageError(
-        f"no target '{name}' in {', '.join(map(str, folders))}: train it with 'kerv train target name={name}'"
-        + (f", or take one of {', '.join(names)}" if names else "")
-    )
+    remedies += [f"take one of {', '.join(names)}"] if names else []
+    raise UsageError(f"no target '{name}' in {', '.join(map(str, folders))}: {', or '.join(remedies)}")
 
 
 def check_not_shipped(path: Path, word: str) -> None:

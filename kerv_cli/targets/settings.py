@@ -31,7 +31,7 @@ class BuildTargetSettings(RunSettings):
     family: str = setting("openvla", "kind of target")
     grow: GrowSettings = setting(GrowSettings, "enlarge policy.target to this shape: 60m, 150m, 1b, openvla-7b")
     base: str = setting("mt10-vision", "the policy that is enlarged")
-    name: str = setting("openvla", "folder below <results>/artifacts/target, or a path")
+    name: str = setting("openvla", "name of the new folder in <results>/artifacts/target")
     statistics: str | None = setting(None, "data set whose action statistics it uses; null: the only one in it")
     environment: str | None = setting(
         None, "environment whose DoFs, control rate and camera it uses; null: OpenVLA's own"

@@ -98,7 +98,7 @@ class CalibrationRun:
         self.artifacts = Artifacts(settings.results, settings.policy, device=settings.runtime.device)
         self.description = self.artifacts.description
         self.description.check_autoregressive("kerv calibrate", "there is no draft to calibrate")
-        self.path = self.artifacts.path("calibration")
+        self.path = self.artifacts.new("calibration")
         self.chosen = choose_episodes(self.dataset, self.tasks, settings.episodes)
         self.method = Method.of(RolloutSettings(**{kind: find(kind, name).default for kind, name in DRAFTS.items()}))
         self.missing = [kind for kind in (*self.method.needs, "datastore") if not self.artifacts.exists(kind)]

@@ -59,7 +59,7 @@ class DatastoreBuild:
         self.artifacts = Artifacts(settings.results, settings.policy, device=self.device, dtype=settings.runtime.dtype)
         if not settings.key:
             raise UsageError("key=[]: name at least one part of the prompt: scene, vision, proprioception")
-        self.folder = self.artifacts.path("datastore")
+        self.folder = self.artifacts.new("datastore")
         check_not_shipped(self.folder, "policy.artifacts.datastore")
         entries, most = self.dataset.episodes, settings.episodes or None
         by_seed = sorted(range(len(entries)), key=lambda i: entries[i].seed)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.places import artifact, results_dir
+from kerv_cli.base.places import artifact_or_path, results_dir
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.episodes.settings import DEFAULT_TASKS
 from kerv_cli.lab.runs import command_to_go_on
@@ -41,8 +41,8 @@ def open_demos(results: str, names: str, tasks: Sequence[str] = (), episodes: in
         UsageError: A name cannot be the name of a folder.
         CheckpointError: A dataset is missing, unfinished or damaged, or the datasets cannot be joined.
     """
-    whole = artifact(results, "demos", names)
-    folders = [whole] if whole.is_dir() else [artifact(results, "demos", name) for name in names.split("+")]
+    whole = artifact_or_path(results, "demos", names)
+    folders = [whole] if whole.is_dir() else [artifact_or_path(results, "demos", name) for name in names.split("+")]
     datasets = []
     for folder in folders:
         try:
@@ -60,6 +60,8 @@ def open_demos(results: str, names: str, tasks: Sequence[str] = (), episodes: in
 
 
 def _remedy(results: str, folder: Path, tasks: Sequence[str], episodes: int) -> str:
+    if folder.parent != results_dir(results) / "artifacts/demos":
+        return "name a folder that holds manifest.json"
     tasks = [folder.name] if stands_for_tasks(folder.name) else tasks
     name = [] if folder.name == name_of(tasks) else [f"name={folder.name}"]
     task = [f"task={tasks[0]}" if len(tasks) == 1 else f"task=[{','.join(tasks)}]"] if tasks else []

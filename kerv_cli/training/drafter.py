@@ -44,7 +44,7 @@ class DrafterRun(TrainingRun):
         self.artifact: TrainableDrafter = part.built()
         self.artifact_kind = self.artifact.kind
         self.target_folder = find_target(settings.results, settings.policy.target)
-        self.folder = Artifacts(settings.results, settings.policy).path(self.artifact_kind)
+        self.folder = Artifacts(settings.results, settings.policy).new(self.artifact_kind)
         check_not_shipped(self.folder, f"policy.artifacts.{self.artifact_kind}")
         self.settings, self.dataset = demos_for(settings)
         if self.settings.task:

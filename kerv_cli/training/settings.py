@@ -59,7 +59,7 @@ class TrainTargetSettings(TaskSettings):
 
     groups: ClassVar = {"target": "small", "train": "target", "world": "default", "runtime": "auto"}
 
-    name: str = setting("mt10-vision", "folder below <results>/artifacts/target, or a path")
+    name: str = setting("mt10-vision", "name of the new folder in <results>/artifacts/target")
     task: list[str] = setting([], "tasks and suites; empty: all tasks of the demonstrations")
     demos: str = setting("", f"{DEMOS}; empty: the name that `kerv demos` gives to these tasks")
     quick: bool = setting(False, QUICK)

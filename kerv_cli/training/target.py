@@ -55,6 +55,7 @@ class TargetRun(TrainingRun):
 
     def __init__(self, settings: TrainTargetSettings) -> None:
         self.settings = settings
+        self.folder = artifact(settings.results, "target", settings.name)
         settings.demos = settings.demos or name_of(settings.task)
         self.dataset = open_demos(settings.results, settings.demos, settings.task)
         settings.task = settings.task or list(self.dataset.manifest.tasks)
@@ -68,7 +69,6 @@ class TargetRun(TrainingRun):
                 f"target.image_size={settings.target.image_size} but world.camera.size={settings.world.camera.size}: "
                 "the policy must be shown what it was trained on, set both alike"
             )
-        self.folder = artifact(settings.results, "target", settings.name)
         self.init = self.find_init()
         camera = self.world.camera.name
         check_spaces(self.dataset, self.spec.actions, self.spec.observation, f"the tasks' environment {self.spec.name}")

@@ -408,7 +408,7 @@ def import_drafter(settings: Any) -> tuple[Path, dict[str, Any]]:
     artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
     target: Any = artifacts.target
     shape, tensors = read_public(Path(settings.checkpoint).expanduser(), target, convention)
-    folder, layers = artifacts.path(EagleDrafter.kind), shape.language.num_hidden_layers
+    folder, layers = artifacts.new(EagleDrafter.kind), shape.language.num_hidden_layers
     network = PublicDrafter(shape)
     network.load_state_dict(tensors, assign=True)  # the weights keep their number format
     figures = {"parameters": sum(tensor.numel() for tensor in tensors.values())}
