@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 import sqlalchemy as sa
+from command import told
 from conftest import python, raising, refused, until
 from studies_synthetic import (
     count_calls,
@@ -243,6 +244,54 @@ def killed_at_the_third(setting: Setting, task: str) -> RunEpisode:
         return episode(setting, task, seed)
 
     return run
+
+
+KILLS_ITS_PROCESS_ONCE = """
+import os
+import signal
+from pathlib import Path
+from examples.point_mass import PointWorld
+
+start = PointWorld._start
+
+def start_or_die(self, seed):
+    armed = Path(__file__).with_name("armed")
+    if seed == 100_002 and armed.exists():
+        armed.unlink()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return start(self, seed)
+
+PointWorld._start = start_or_die
+"""
+POINTS = """
+baseline: short
+common: task=POINT policy=expert episodes=6 record=0
+block: 1
+settings: {short: world.horizon=30, long: world.horizon=60}
+"""
+
+
+def test_workers_run_each_episode_once_though_one_is_killed(tmp_path, monkeypatch):
+    """A worker lives on after its first block. The episode that was running is lost, and the same command runs it."""
+    importlib.import_module("examples.point_mass")
+    (tmp_path / "killing.py").write_text(KILLS_ITS_PROCESS_ONCE)
+    (tmp_path / "armed").touch()
+    monkeypatch.setenv("KERV_PLUGINS", "killing")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *filter(None, sys.path)]))
+    monkeypatch.syspath_prepend(str(tmp_path))  # loky gives it to its workers
+    (tmp_path / "points.yaml").write_text(POINTS)
+    words = ("sweep", f"study={tmp_path / 'points.yaml'}", f"results={tmp_path / 'results'}")
+
+    def sweep(workers: int, code: int | None) -> tuple[int, int]:
+        counts = re.search(r"(\d+) run, (\d+) reused", told(*words, f"runtime.workers={workers}", code=code))
+        assert counts
+        return int(counts[1]), int(counts[2])
+
+    run, reused = sweep(2, None)
+    assert (run in (11, 12), reused) == (True, 0)
+    assert not (tmp_path / "armed").exists()
+    assert sweep(1, 0) == (12 - run, run)
+    assert episodes(Database(tmp_path / "results")) == 12
 
 
 def test_episodes_whose_order_counts_run_whole_again_when_their_process_dies(tmp_path):

@@ -18,7 +18,8 @@ _PR_SET_PDEATHSIG = 1
 def end_with(parent: int) -> None:
     """Make this process end when its parent process ends, at most a few seconds later.
 
-    On Linux the kernel ends it, even if it is suspended.
+    On Linux the kernel ends it, even if it is suspended. The kernel also ends it if only the thread ends that started
+    it: start workers from a thread that lives as long as they do.
 
     Args:
         parent: Process id of the parent.

@@ -45,9 +45,19 @@ class Processes:
         self._all: list[Any] = []
 
     def submit(self, work: Callable[[], T], /) -> Future[T]:
-        """Give a function to a free worker process, or start a new one. Return the future of its result."""
+        """Give a function to a free worker process, or start a new one. Return the future of its result.
+
+        Call it in the main thread. A worker process ends with the thread that started it, see `end_with`.
+        """
+        from joblib.externals.loky.process_executor import BrokenProcessPool
+
         pool = self._free.pop() if self._free else self._new_pool()
-        return in_thread(lambda: self._result(pool, pool.submit(work)))
+        try:
+            future = pool.submit(work)
+        except BrokenProcessPool:  # the process died after its last block
+            self._all.remove(pool)
+            return self.submit(work)
+        return in_thread(lambda: self._result(pool, future))
 
     def _result(self, pool: Any, future: Future[T]) -> T:
         """Wait until a worker process has finished its work, and return the result.
