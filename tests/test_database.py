@@ -233,6 +233,7 @@ def test_a_study_that_is_not_there_names_what_to_run(database, tmp_path):
 def test_a_removed_study_leaves_nothing_but_what_others_want(database):
     store, _ = swept(database.results, STUDY)
     other, _ = swept(database.results, threshold_study(["reach-v3"], radii=(3,), name="other"))
+    swept(database.results, STUDY, rerun="all")  # the replaced episodes are the study's, too
     store.remove()
     assert [one.name for one in studies(database)] == ["other"]
     assert (count(database, EPISODES), count(database, DECODES)) == (12, 12)

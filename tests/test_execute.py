@@ -146,6 +146,20 @@ def test_a_study_that_is_deleted_while_it_runs_says_so(tmp_path, workers):
     assert (outcome.failed, store.counts(), claims(store.database)) == ([], (16, 16), 0)
 
 
+def test_a_sweep_goes_on_when_another_plans_fewer_episodes(database):
+    """The study is what was planned last. What the longer sweep runs is kept, and found by the next one."""
+    fewer = threshold_study(["reach-v3"], episodes=1)
+
+    def plan_fewer(event):
+        if isinstance(event, EpisodeEnd):
+            StudyStore(database, "threshold").save(fewer)
+
+    store, outcome = swept(database.results, STUDY, on_event=plan_fewer)
+    assert (len(outcome.done), outcome.failed, store.counts()[1]) == (16, [], 4)
+    _, outcome = swept(database.results, STUDY)
+    assert (outcome.done, len(outcome.reused), store.counts()) == ([], 16, (16, 16))
+
+
 SWEEP = """
 import os
 import sys

@@ -35,7 +35,7 @@ from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.episodes.identity import ENGINE, code_hash
 from kerv_cli.episodes.rows import decodes_table, episode_row, seconds_blob, table_blob
 from kerv_cli.lab import events
-from kerv_cli.lab.database import BLOCKS, now
+from kerv_cli.lab.database import BLOCKS, STUDIES, now
 from kerv_cli.lab.executors import Executor, WorkerLost, check_executor
 from kerv_cli.lab.plan import Block, Episode, Setting, seeds_text, split
 from kerv_cli.lab.runs import Run, is_running
@@ -371,10 +371,10 @@ class _Sweep:
                 here = sa.update(BLOCKS).where(BLOCKS.c.id == attempt.id)
                 connection.execute(here.values(about=message.about | about))
             number = insert_episode(connection, row, message.decodes)
-            linked = connection.execute(self.plan.store.update_of(one).values(episode_id=number, error=None)).rowcount
-        if not linked:
-            name = self.plan.study.name
-            raise KervError(f"study {name} was deleted while it ran: run the same command to start it again")
+            connection.execute(self.plan.store.update_of(one).values(episode_id=number, error=None))
+            name = self.plan.study.name  # another sweep may have planned the study anew, without this episode
+            if connection.scalar(sa.select(STUDIES.c.id).where(STUDIES.c.name == name)) is None:
+                raise KervError(f"study {name} was deleted while it ran: run the same command to start it again")
 
     def _fail(self, attempt: _Attempt, one: Episode, failure: events.SettingFailed) -> None:
         """Note that a setting failed on a task. Its remaining episodes in the block will not run."""

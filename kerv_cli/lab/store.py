@@ -337,12 +337,19 @@ class StudyStore:
         return sa.update(WANTED).where(WANTED.c.setting_id.in_(settings), *same)
 
     def remove(self) -> None:
-        """Delete the study, and those of its episodes that no other study uses."""
+        """Delete the study, and its episodes that no other study uses.
+
+        Its episodes are those that it uses, and those that its own commands ran, such as the ones that `rerun=all`
+        replaced.
+        """
         used = sa.select(WANTED.c.episode_id).select_from(WANTED.join(SETTINGS).join(STUDIES))
         used = used.where(WANTED.c.episode_id.is_not(None))
         mine, of_others = used.where(STUDIES.c.name == self.name), used.where(STUDIES.c.name != self.name)
+        own_runs = sa.select(RUNS.c.id).where(RUNS.c.kind == self.kind, RUNS.c.name == self.name)
+        own_blocks = sa.select(BLOCKS.c.id).where(BLOCKS.c.run.in_(own_runs))
+        unused = sa.or_(EPISODES.c.id.in_(mine), EPISODES.c.block.in_(own_blocks)), EPISODES.c.id.not_in(of_others)
         with self.database.writing() as connection:
-            connection.execute(sa.delete(EPISODES).where(EPISODES.c.id.in_(mine), EPISODES.c.id.not_in(of_others)))
+            connection.execute(sa.delete(EPISODES).where(*unused))
             connection.execute(sa.delete(STUDIES).where(STUDIES.c.name == self.name))
             full = sa.select(EPISODES.c.block)
             connection.execute(sa.delete(BLOCKS).where(BLOCKS.c.id.not_in(full), BLOCKS.c.claim.is_(None)))
