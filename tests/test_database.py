@@ -9,6 +9,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -261,6 +262,22 @@ def test_a_run_has_a_row_from_its_first_second_to_its_end(database, monkeypatch)
     with pytest.raises(ValueError, match="two"), Run(database, "target", "mine", ["train", "target"]):
         raise ValueError("two\nlines")
     assert row() == ("failed", 0, 0, "two lines")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux says when a process began")
+def test_a_run_whose_process_id_is_in_use_again_is_interrupted(database):
+    """A process that began after the last sign of life is another one."""
+    with Run(database, "target", "mine", ["train", "target"]):
+        pass
+    states = []
+    with subprocess.Popen(["sleep", "60"]) as process:
+        for heartbeat in (time.time(), time.time() - 10 * 24 * 3600):
+            with database.writing() as connection:
+                values = {"status": "running", "pid": process.pid, "heartbeat": heartbeat}
+                connection.execute(sa.update(RUNS).values(**values))
+            states.append(run_rows(database)[0].status)
+        process.kill()
+    assert states == ["running", "interrupted"]
 
 
 def test_one_query_says_whether_anything_has_changed(database):

@@ -36,8 +36,10 @@ def test_only_what_a_dead_process_left_is_left_over(tmp_path, dead):
     for path in (theirs, mine, far, tmp_path / ".hidden.tmp", tmp_path / "a.b.json", tmp_path / ".x.1-00.tmp"):
         path.touch()
     assert [path for path in tmp_path.iterdir() if is_left_over(path)] == [theirs]
-    os.utime(far, (0, time.time() - 8 * 24 * 3600))
-    assert is_left_over(far)
+    for path in (far, theirs, mine):
+        os.utime(path, (0, time.time() - 8 * 24 * 3600))
+    assert [is_left_over(path) for path in (far, mine)] == [True, sys.platform == "linux"]  # this process is younger
+    mine.touch()
     folder = of_process(tmp_path / "cell", dead)
     folder.mkdir(parents=True)
     (folder / theirs.name).touch()

@@ -16,6 +16,9 @@ from pathlib import Path
 OTHER_HOSTS_STALE_HOURS = 7 * 24.0
 """After this many hours a temporary file of another machine counts as left over by a killed process."""
 
+CLOCKS_DIFFER_SECONDS = 3600.0
+"""The clock of a network folder may be behind this machine's clock by this many seconds."""
+
 _NAME = re.compile(r"\..+\.(?P<host>[^/]+?)\.(?P<pid>\d+)-[0-9a-f]{8}\.tmp")
 
 
@@ -33,12 +36,13 @@ def is_left_over(path: Path) -> bool:
     match = _NAME.fullmatch(path.name)
     if match is None:
         return False
-    if match["host"] == socket.gethostname().replace(".", "-"):
-        return not is_alive(int(match["pid"]))
     try:
-        return time.time() - path.stat().st_mtime > 3600 * OTHER_HOSTS_STALE_HOURS
+        written = path.stat().st_mtime
     except OSError:  # it was renamed or removed meanwhile
         return False
+    if match["host"] == socket.gethostname().replace(".", "-"):
+        return not is_alive(int(match["pid"]), written + CLOCKS_DIFFER_SECONDS)
+    return time.time() - written > 3600 * OTHER_HOSTS_STALE_HOURS
 
 
 def clean(folder: Path) -> list[Path]:
@@ -61,12 +65,25 @@ def remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def is_alive(pid: int) -> bool:
-    """Return whether a process with this id exists on this machine."""
+def is_alive(pid: int, seen: float) -> bool:
+    """Return whether a process of this machine that was alive at the time `seen` is still alive.
+
+    A process that has the same id but began later is another one. Only Linux tells when a process began; elsewhere a
+    process with this id counts as the same.
+
+    Args:
+        pid: Its process id.
+        seen: Seconds since 1970.
+    """
     try:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
+        pass
+    try:
+        ticks = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19])
+        age = time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
+    except (OSError, AttributeError):
         return True
-    return True
+    return time.time() - age <= seen + 1.0  # the kernel counts in ticks of about 0.01 s

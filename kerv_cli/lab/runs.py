@@ -70,7 +70,7 @@ def _row_of(row: Any) -> RunRow:
     if row.host != socket.gethostname():
         is_live = time.time() - row.heartbeat < STALE_SECONDS
     else:
-        is_live = row.id in _open if row.pid == os.getpid() else is_alive(row.pid)
+        is_live = row.id in _open if row.pid == os.getpid() else is_alive(row.pid, row.heartbeat)
     status = INTERRUPTED if row.status == RUNNING and not is_live else row.status
     return RunRow(**{**row._mapping, "command": tuple(row.command), "status": status})
 
