@@ -346,6 +346,18 @@ def test_a_name_in_use_is_refused_and_a_killed_command_is_listed_with_how_to_go_
     assert listed(tmp_path) == []
 
 
+def test_a_command_whose_input_cannot_be_read_leaves_no_row(tmp_path):
+    """Unless it has made something before, which the row explains."""
+    words = ("demos", "import", f"source={tmp_path / 'mistyped'}", "name=mine", f"results={tmp_path}")
+    told(*words, code=1)
+    assert listed(tmp_path) == []
+    folder = tmp_path / "artifacts/target/mine"
+    folder.mkdir(parents=True)
+    with pytest.raises(CheckpointError), making(tmp_path, "target", folder):
+        raise CheckpointError("resume.pt is damaged")
+    assert [row.status for row in run_rows(Database(tmp_path))] == ["failed"]
+
+
 def test_a_store_is_used_by_one_command_and_no_password_is_kept(tmp_path, monkeypatch):
     monkeypatch.delenv(STORE, raising=False)
     other, where = Database(tmp_path, f"sqlite:///{tmp_path}/other.db"), f"results={tmp_path}"

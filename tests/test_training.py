@@ -20,6 +20,7 @@ from torch import nn
 from kerv_cli.base import files
 from kerv_cli.base.errors import CheckpointError, Interrupted
 from kerv_cli.base.files import sha256_of
+from kerv_cli.report.plots import save_curves
 from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.settings import TargetSettings
@@ -87,6 +88,17 @@ def test_ctrl_c_saves_the_step_that_ran_and_the_run_goes_on_there(
     assert steps[0] == last + 1
     for name, tensor in whole.module.state_dict().items():
         assert torch.equal(tensor, resumed.module.state_dict()[name])
+
+
+def test_a_finished_training_that_is_repeated_changes_no_file(tmp_path, quick_training):
+    """The time of its newest file is the training's own in `kerv runs list`."""
+    seen = []
+    for _ in range(2):
+        quadratic(tmp_path).run()
+        save_curves(tmp_path)
+        seen.append({path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()})
+    assert {"log.csv", "curves.png"} <= set(seen[0])
+    assert seen[0] == seen[1]
 
 
 def test_one_request_that_arrives_twice_is_one_and_a_run_without_validation_says_so(tmp_path):

@@ -143,6 +143,16 @@ def write_bytes(path: Path, content: bytes) -> None:
         temporary.write_bytes(content)
 
 
+def write_if_changed(path: Path, content: bytes) -> None:
+    """Write a file atomically, unless it has this content already: its time says when the content changed.
+
+    Raises:
+        StorageError: The disk is full or read-only, or permission is missing.
+    """
+    if not path.is_file() or path.read_bytes() != content:
+        write_bytes(path, content)
+
+
 def write_text(path: Path, text: str) -> None:
     """Write text in UTF-8 atomically; raises as `write_bytes`."""
     write_bytes(path, text.encode())

@@ -22,7 +22,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from kerv_cli.base.durations import about, left
-from kerv_cli.base.errors import Interrupted, KervError, StorageError, UsageError
+from kerv_cli.base.errors import CheckpointError, Interrupted, KervError, StorageError, UsageError
 from kerv_cli.base.leftovers import is_alive
 from kerv_cli.base.places import results_dir
 from kerv_cli.lab.command import current_command
@@ -170,7 +170,8 @@ class Run:
     """Writes the database row of a command, from its start to its end. Use it in a `with` statement.
 
     A thread updates the row every few seconds (a heartbeat), so that others see that the command is alive. A command
-    that ends with a UsageError leaves no row.
+    that ends with a UsageError leaves no row, nor does one that made nothing because its input cannot be read (a
+    CheckpointError).
 
     Args:
         database: Where the row is written.
@@ -253,7 +254,7 @@ class Run:
         self._heart.join()
         _open.discard(self.id)
         try:
-            if isinstance(error, UsageError):  # nothing was done: an earlier row is still the one to resume
+            if self._was_refused(error):  # nothing was done: an earlier row is still the one to resume
                 with self.database.writing() as connection:
                     connection.execute(sa.delete(RUNS).where(RUNS.c.id == self.id))
             elif error is None:
@@ -265,6 +266,14 @@ class Run:
         except StorageError:
             if error is None:  # otherwise show the first error
                 raise
+
+    def _was_refused(self, error: BaseException | None) -> bool:
+        """Return whether the command was refused: it is impossible, or its input cannot be read and it made nothing."""
+        if not isinstance(error, CheckpointError):
+            return isinstance(error, UsageError)
+        with self.database.reading() as connection:
+            study = connection.scalar(sa.select(STUDIES.c.id).where(STUDIES.c.name == self.name))
+        return study is None and not (self.database.results / "artifacts" / self.kind / self.name).exists()
 
 
 def name_in(results: str | Path, kind: str, folder: Path) -> str:

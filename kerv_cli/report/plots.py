@@ -18,7 +18,7 @@ from PIL import Image
 
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import write_bytes
+from kerv_cli.base.files import write_if_changed
 from kerv_cli.report.measures import MICRO
 from kerv_cli.report.stressed import NONE, is_stressed
 from kerv_cli.report.summary import MAIN, summary_frame
@@ -264,5 +264,5 @@ def save_curves(folder: Path) -> Path:
     """
     path, log = folder / "curves.png", read_log(folder)
     note = f"{len(log)} validations of the averaged weights; dashed: the saved ones, step {_best_step(log):.0f}"
-    write_bytes(path, png(curves_figure(log), f"{folder.parent.name} {folder.name}", note))
+    write_if_changed(path, png(curves_figure(log), f"{folder.parent.name} {folder.name}", note))
     return path

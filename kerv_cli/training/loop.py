@@ -25,7 +25,7 @@ import torch
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError, Interrupted, KervError
-from kerv_cli.base.files import write_bytes, write_text
+from kerv_cli.base.files import write_bytes, write_if_changed
 from kerv_cli.targets.folders import RESUME
 from kerv_cli.training.settings import TrainSettings
 
@@ -192,7 +192,8 @@ class Loop:
         import pandas as pd
 
         if self.history:
-            write_text(self.folder / "log.csv", pd.DataFrame(self.history).to_csv(index=False, float_format="%.6g"))
+            table = pd.DataFrame(self.history).to_csv(index=False, float_format="%.6g")
+            write_if_changed(self.folder / "log.csv", table.encode())
 
     def restore(self) -> None:
         """Load weights, optimiser and progress from the folder's resume file. Without a file, change nothing.
