@@ -31,6 +31,7 @@ from studies_synthetic import (
 )
 
 from kerv_cli.base.errors import KervError, StorageError, UsageError
+from kerv_cli.base.files import visible
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.cli.common import progress_bar
 from kerv_cli.cli.work import event_printer
@@ -244,6 +245,21 @@ def test_a_sweep_that_begins_in_the_middle_of_another_runs_nothing_twice(databas
     assert (len(outcome.done), len(outcome.reused)) == (0, 16)
 
 
+@pytest.mark.parametrize("seconds", [0.3, 60.0])
+def test_episodes_whose_message_comes_late_are_waited_for(seconds, tmp_path, monkeypatch):
+    """A network folder shows files late. Episodes that are never heard of have failed."""
+
+    def shown(folder):
+        return [path for path in visible(folder) if time.time() - path.stat().st_mtime > seconds]
+
+    monkeypatch.setattr("kerv_cli.lab.execute.visible", shown)
+    monkeypatch.setattr("kerv_cli.lab.execute.LATE_SECONDS", min(10.0, 60.0 - seconds), raising=False)
+    store, outcome = swept(tmp_path, STUDY, runtime=RuntimeSettings(workers=2))
+    lost = [one for failure in outcome.failed for one in failure.episodes]
+    assert (len(outcome.done), len(lost)) == ((16, 0) if seconds < 1 else (0, 16))
+    assert store.counts() == (len(outcome.done), 16)
+
+
 def in_order() -> Study:
     """A setting whose result depends on the order of its episodes, beside one that is not so."""
     settings = settings_of("retrieval")
@@ -437,3 +453,16 @@ def test_a_wrong_executor_is_refused_in_one_line(message, tmp_path, monkeypatch)
     monkeypatch.setenv("PATH", "")  # no srun, wherever the test runs
     with refused(message, error=UsageError):
         swept(tmp_path, STUDY, runtime=settings)
+
+
+def test_a_job_that_slurm_refuses_is_refused_in_one_line(tmp_path, monkeypatch):
+    pytest.importorskip("submitit")
+    for name, script in (
+        ("srun", ""),
+        ("sbatch", "echo 'error: Memory specification can not be satisfied' >&2; exit 1"),
+    ):
+        (tmp_path / name).write_text(f"#!/bin/sh\n{script}\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    with refused("Memory specification can not be satisfied", "runtime.executor_options", error=UsageError):
+        swept(tmp_path / "results", STUDY, runtime=runtime("slurm", memory_gb=100_000))

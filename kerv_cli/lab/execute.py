@@ -43,6 +43,8 @@ from kerv_cli.lab.store import Plan, insert_episode, stored_episodes
 from kerv_cli.targets.provenance import stamp
 
 _POLL_SECONDS = 0.2
+LATE_SECONDS = 70.0
+"""A network folder may show a worker's message this many seconds late (NFS caches a folder's list for up to 60 s)."""
 
 RunEpisode = Callable[[int], EpisodeRecord]
 """Function that runs the episode with a given seed."""
@@ -397,6 +399,12 @@ class _Sweep:
         """End a block: read its last messages, and queue the remaining episodes again if its worker was lost."""
         self._take(attempt)
         error = attempt.future.exception()
+        deadline = time.monotonic() + LATE_SECONDS
+        while error is None and attempt.rest and time.monotonic() < deadline:
+            time.sleep(_POLL_SECONDS)
+            self._take(attempt)
+        for one in attempt.rest if error is None else ():
+            self._fail(attempt, one, events.SettingFailed(f"its worker's messages are missing in {self.spool.parent}"))
         lost: list[Episode] = []
         if isinstance(error, StorageError) or (error is not None and self.is_here):
             raise error

@@ -55,8 +55,18 @@ class Jobs:
         self._submitted: list[Any] = []
 
     def submit(self, work: Callable[[], T], /) -> Future[T]:
-        """Queue a function as a job, and return the future of its result."""
-        job = self._jobs.submit(work)
+        """Queue a function as a job, and return the future of its result.
+
+        Raises:
+            UsageError: Slurm refuses the job, for example because no node has that much memory.
+        """
+        from submitit.core.utils import FailedJobError
+
+        try:
+            job = self._jobs.submit(work)
+        except FailedJobError as error:
+            refusal = " ".join(str(error).split())
+            raise UsageError(f"Slurm refuses the job: {refusal}: change runtime.executor_options") from None
         self._submitted.append(job)
         return in_thread(lambda: _result_of(job))
 
