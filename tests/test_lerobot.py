@@ -1,7 +1,10 @@
 """LeRobot datasets of version 3 are read and trained on; what was made for other actions is refused."""
 
+import io
 import json
+import resource
 import shutil
+import time
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +15,17 @@ import pytest
 from command import kerv, refusal, told
 from examples.tiny_openvla import TINY, write_checkpoint
 from loaded import of_target
+from PIL import Image
 from test_openvla import imported
 
+from kerv_cli.base import registry
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.openvla.config import Bounds, action_space
-from kerv_cli.worlds import instruction_of
+from kerv_cli.worlds import instruction_of, specs
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.files import encode_png
 from kerv_cli.worlds.demos.lerobot import DATA, VIDEO
@@ -184,6 +189,10 @@ def edited(results: Path, tmp_path: Path, **changes: Any) -> Path:
         ({"fps": 10}, ["environment=insertion"], "20 control steps per second"),
         ({}, ["environment=metaworld"], "unknown camera 'front'"),
         ({}, ["name=front"], "another name"),
+        ({}, ["name=metaworld"], "'metaworld' is an environment of kerv"),
+        ({"data_path": "{chunk_index:>9999999999}"}, [], "info.json: the template of a path"),
+        ({"data_path": "../copy/data/chunk-000/file-000.parquet"}, [], "outside its own folder"),
+        ({"data_path": 5}, [], "is no dataset as LeRobot writes them"),
     ],
 )
 def test_an_import_refuses_in_one_line(results, tmp_path, changes, words, said):
@@ -191,6 +200,68 @@ def test_an_import_refuses_in_one_line(results, tmp_path, changes, words, said):
     (tmp_path / "artifacts/demos/front").mkdir(parents=True)
     given = words if words and words[0].startswith("source=") else [f"source={source}", *words]
     assert said in refusal("demos", "import", *given, f"results={tmp_path}")
+
+
+def test_a_folders_name_may_begin_with_a_digit_and_no_dof_need_be_strict(results, tmp_path, monkeypatch):
+    monkeypatch.setitem(registry._PARTS, "environment", dict(registry._PARTS["environment"]))
+    source = edited(results, tmp_path).rename(tmp_path / "2024_lift")
+    kerv("demos", "import", f"source={source}", "episodes=1", "strict=[]", f"results={tmp_path}")
+    assert specs()["2024_lift"].suites["2024_LIFT"]
+    assert DemoDataset.open(tmp_path / "artifacts/demos/2024_lift").manifest.actions.strict == ()
+
+
+@pytest.fixture
+def two_gigabytes():
+    """The process may take 2 GB more than it has."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (now + 2**31, hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def long_action(rows: pa.Table) -> pa.Table:
+    """Every action is 20 million zeros: some kilobytes on disk."""
+    zeros = pa.array([np.zeros(20_000_000, np.float32)])
+    return rows.slice(0, 1).set_column(rows.column_names.index("action"), "action", zeros)
+
+
+def repeated_picture(rows: pa.Table) -> pa.Table:
+    """Every picture is the same 64 megapixels, a file of some kilobytes."""
+    buffer = io.BytesIO()
+    Image.new("1", (8_000, 8_000)).save(buffer, "PNG")
+    pictures = pa.array([{"bytes": buffer.getvalue(), "path": None}] * len(rows))
+    return rows.set_column(rows.column_names.index("observation.images.front"), "observation.images.front", pictures)
+
+
+@pytest.mark.usefixtures("two_gigabytes")
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (None, ("info.json", "at most 65536 numbers")),
+        (long_action, ("copy", "at most 65536 are read")),
+        (repeated_picture, ("file-000.parquet", "MiB in memory")),
+    ],
+)
+def test_a_small_file_cannot_choose_how_much_memory_is_taken(results, tmp_path, change, said):
+    source = edited(results, tmp_path)
+    info = json.loads((source / "meta/info.json").read_text())
+    if change is None:
+        info["features"]["action"]["shape"] = [2**20, 2**20]
+        (source / "meta/info.json").write_text(json.dumps(info))
+    else:
+        data, episodes = source / DATA.format(chunk_index=0, file_index=0), source / "meta/episodes/chunk-000"
+        rows = change(pq.read_table(data))
+        number = rows.column_names.index("episode_index")
+        rows = rows.set_column(number, "episode_index", pa.array(np.zeros(len(rows), np.int64)))
+        pq.write_table(rows, data, compression="zstd")
+        first = pq.read_table(episodes / "file-000.parquet").slice(0, 1).to_pylist()[0]
+        pq.write_table(pa.Table.from_pylist([{**first, "length": len(rows)}]), episodes / "file-000.parquet")
+        assert data.stat().st_size < 10_000_000
+    begun = time.monotonic()
+    refused = refusal("demos", "import", f"source={source}", "name=small", f"results={tmp_path}", code=1)
+    assert all(word in refused for word in said)
+    assert time.monotonic() - begun < 10
 
 
 def test_a_truncated_table_is_refused(results, tmp_path):

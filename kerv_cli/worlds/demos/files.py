@@ -249,32 +249,62 @@ def encode_png(frame: NDArray[np.uint8]) -> bytes:
 
 
 MOST_EXPANDED = 2**30
-"""Largest size of a table in memory, in bytes."""
+"""Largest size of a table, or of an episode's images, in memory, in bytes."""
 _BATCH = 1024  # rows
+_LEAST_ROW = 64  # bytes: a row counts as at least this large
+_WIDTHS = {"BOOLEAN": 1, "INT32": 4, "FLOAT": 4, "INT64": 8, "DOUBLE": 8, "INT96": 12}
 
 
-def foreign_table(source: Path | bytes, where: tuple[str, Any] | None = None) -> pa.Table:
+def foreign_table(
+    source: Path | bytes, where: tuple[str, Any] | None = None, columns: Sequence[str] = (), most: int = 0
+) -> pa.Table:
     """Read a table from a Parquet file of any origin. It is read part by part, so that its size can be limited.
 
     Args:
         source: The file's path or its bytes.
         where: (column, value). Read only the rows that have this value in this column. None: all rows.
+        columns: Names of the columns to read. Names that the file lacks are ignored. Empty: all columns.
+        most: Largest size of the table in memory, in bytes. 0: MOST_EXPANDED.
 
     Raises:
         OSError: The file is missing or is no Parquet file.
-        ValueError: The file is damaged, or takes more than MOST_EXPANDED bytes in memory.
+        ValueError: The file is damaged, or takes more than `most` bytes in memory.
     """
-    batches, total = [], 0
+    batches, total, most = [], 0, most or MOST_EXPANDED
+    name = "a table" if isinstance(source, bytes) else str(source)
+    too_large = ValueError(f"{name} expands to more than {most // 2**20} MiB in memory: split it")
     with pq.ParquetFile(io.BytesIO(source) if isinstance(source, bytes) else regular(source)) as file:
+        chosen = [column for column in file.schema_arrow.names if not columns or column in columns]
         groups = [n for n in range(file.num_row_groups) if not where or _may_hold(file.metadata.row_group(n), *where)]
+        sizes = [_expanded(file.metadata, n, chosen) for n in groups]
+        if max(sizes, default=0) > most:
+            raise too_large
+        # a cell of text can repeat: it is at most as large as its row group in the file
+        rows = min(_BATCH, most // max(sizes, default=1))
         # not pyarrow's dataset scanner, which would expand whole row groups before the total can be checked
-        for batch in file.iter_batches(_BATCH, groups, use_threads=False):
+        for batch in file.iter_batches(rows, groups, chosen, use_threads=False):
             batches.append(batch.filter(pc.equal(batch[where[0]], where[1])) if where else batch)
             total += batches[-1].nbytes
-            if total > MOST_EXPANDED:
-                name = "a table" if isinstance(source, bytes) else str(source)
-                raise ValueError(f"{name} expands to more than {MOST_EXPANDED // 2**20} MiB in memory: split it")
-        return pa.Table.from_batches(batches, file.schema_arrow)
+            if total > most:
+                raise too_large
+        fields = [file.schema_arrow.field(column) for column in chosen]
+        return pa.Table.from_batches(batches, pa.schema(fields, file.schema_arrow.metadata))
+
+
+def _expanded(metadata: pq.FileMetaData, group: int, columns: Sequence[str]) -> int:
+    """Return how many bytes some columns of a row group take in memory at most, as far as the file states it.
+
+    Text and bytes that repeat count once, unless they are in lists.
+    """
+    chunks, rows = metadata.row_group(group), metadata.row_group(group).num_rows
+    total = _LEAST_ROW * rows
+    for number in range(chunks.num_columns):
+        chunk = chunks.column(number)
+        if chunk.path_in_schema.partition(".")[0] in columns:
+            listed = max(1, chunk.total_uncompressed_size if chunk.num_values > rows else 1)
+            width = _WIDTHS.get(chunk.physical_type, metadata.schema.column(number).length or listed)
+            total += max(chunk.total_uncompressed_size, chunk.num_values * width)
+    return total
 
 
 def _may_hold(group: pq.RowGroupMetaData, column: str, value: Any) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from PIL import Image, UnidentifiedImageError
 
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
@@ -29,10 +31,11 @@ from kerv_cli.worlds.demos.dataset import (
     DemoDataset,
     EpisodeEntry,
     OnProgress,
+    check_recorded,
     episode_path,
     totals,
 )
-from kerv_cli.worlds.demos.files import DemoEpisode, foreign_table, save_episode
+from kerv_cli.worlds.demos.files import MOST_EXPANDED, DemoEpisode, foreign_table, save_episode
 from kerv_cli.worlds.settings import DemosImportSettings
 from kerv_cli.worlds.spec import EnvironmentSpec
 
@@ -45,6 +48,13 @@ IMAGES = "observation.images."
 
 Row: TypeAlias = Mapping[str, Any]
 """A row of a table, or an object of a JSON file."""
+
+VECTORS = (ACTION, EXECUTED, STATE, ENVIRONMENT)
+MOST_NUMBERS = 65_536
+"""Largest size of an action or a state: numbers per control step."""
+MOST_NAMED = 2**26
+"""Largest size of a table of episodes or tasks in memory, in bytes."""
+_TEMPLATE = re.compile(r"([^{}]|\{video_key\}|\{(chunk|file)_index(:0?\d{1,2}d)?\}){1,1000}")
 
 OPENVLA = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
 
@@ -103,11 +113,15 @@ class Source:
         if camera and camera not in keys:
             raise UnknownName("camera", camera, keys)
         camera = camera or next(iter(keys))
-        tables = [_table(path) for path in sorted(folder.glob("meta/episodes/[!.]*/[!.]*.parquet"))]
+        camera_file = [f"videos/{keys[camera]}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
+        columns = ["episode_index", "length", "data/chunk_index", "data/file_index", *camera_file]
+        paths = sorted(folder.glob("meta/episodes/[!.]*/[!.]*.parquet"))
+        tables = [_table(path, columns=columns, most=MOST_NAMED) for path in paths]
         rows = sorted((row for table in tables for row in table.to_pylist()), key=lambda row: row["episode_index"])
         if not rows:
             raise CheckpointError(f"{folder / 'meta/episodes'} is missing or names no episode: copy the dataset again")
-        names = _table(folder / TASKS).to_pylist()
+        columns = ["task_index", "task", "__index_level_0__"]
+        names = _table(folder / TASKS, columns=columns, most=MOST_NAMED).to_pylist()
         tasks = {int(row["task_index"]): str(row.get("task", row.get("__index_level_0__"))) for row in names}
         return cls(folder, info, rows, tasks, camera, keys[camera])
 
@@ -117,11 +131,20 @@ class Source:
         Args:
             feature: Name of the feature, such as `action`.
             prefix: If the dataset does not name all numbers, they are named `prefix`_0, `prefix`_1, ….
+
+        Raises:
+            CheckpointError: The feature has more than MOST_NUMBERS numbers.
         """
         entry = self.info["features"].get(feature)
         if entry is None:
             return []
-        names, count = entry.get("names"), int(np.prod(entry["shape"]))
+        names, shape = entry.get("names"), entry["shape"]
+        count = math.prod(map(int, shape)) if len(shape) < 9 else 0
+        if not 0 < count <= MOST_NUMBERS:
+            raise CheckpointError(
+                f"{self.folder / INFO}: {feature} is of shape {str(shape)[:80]}, at most {MOST_NUMBERS} numbers are "
+                "read"
+            )
         if isinstance(names, dict):
             names = next(iter(names.values()), None)
         if not isinstance(names, list) or len(names) != count or len(set(names)) != count:
@@ -136,9 +159,14 @@ class Source:
             columns: Prefix of the two columns of that row that say which file it is. `data` stands for
                 `data/chunk_index` and `data/file_index`.
             form: Template of the path, such as `DATA`.
+
+        Raises:
+            CheckpointError: The template is not of LeRobot's form, or leads out of the dataset.
         """
+        if not _TEMPLATE.fullmatch(form):
+            raise CheckpointError(f"{self.folder / INFO}: the template of a path, '{form[:80]}', is not like '{DATA}'")
         indices = {f"{x}_index": int(episode[f"{columns}/{x}_index"]) for x in ("chunk", "file")}
-        return self.folder / form.format(video_key=self.key, **indices)
+        return _below(self.folder, form.format(video_key=self.key, **indices))
 
     def table(self, episode: Row) -> pa.Table:
         """Return the rows of one episode, in order.
@@ -150,7 +178,8 @@ class Source:
             CheckpointError: Rows are missing, or the file is damaged.
         """
         path = self.path(episode, "data", self.info.get("data_path") or DATA)
-        table = _table(path, ("episode_index", int(episode["episode_index"])))
+        columns = ["episode_index", "task_index", *VECTORS, self.key]
+        table = _table(path, ("episode_index", int(episode["episode_index"])), columns)
         if len(table) != int(episode["length"]):
             raise CheckpointError(f"{path} has {len(table)} rows of episode {episode['episode_index']}, not its length")
         return table
@@ -161,12 +190,17 @@ class Source:
         Args:
             episode: The episode's row in meta/episodes.
             table: The episode's rows, from `table`.
+
+        Raises:
+            CheckpointError: A file is missing or damaged, or the images take more than MOST_EXPANDED bytes in memory.
         """
         if self.info["features"][self.key]["dtype"] == "image":
-            return np.stack([_picture(cell, self.folder) for cell in table[self.key].to_pylist()])
+            path = self.path(episode, "data", self.info.get("data_path") or DATA)
+            pictures = (_picture(cell.as_py(), self.folder) for cell in table[self.key])
+            return _decoded(pictures, len(table), path)
         path = self.path(episode, f"videos/{self.key}", self.info.get("video_path") or VIDEO)
         start, rate = float(episode[f"videos/{self.key}/from_timestamp"]), float(self.info["fps"])
-        return np.stack(list(_video_frames(path, start, rate, len(table))))
+        return _decoded(_video_frames(path, start, rate, len(table)), len(table), path)
 
 
 def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProgress) -> DemoDataset:
@@ -200,12 +234,15 @@ def _import(source: Source, settings: DemosImportSettings, folder: Path, progres
     chosen = source.episodes[: settings.episodes or None]
     world = _world_of(source, settings)
     names = _task_names(source.tasks, world)
+    environment = re.sub(r"\W+", "_", settings.name or source.folder.name).strip("_").lower() or "recorded"
+    if world is None:
+        check_recorded(environment)
     entries: dict[str, list[EpisodeEntry]] = {}
-    actions: list[np.ndarray] = []
+    limits: list[np.ndarray] = []
     state = 0
     for done, row in enumerate(chosen):
         episode = _episode(source, row, names, settings.tail)
-        actions.append(episode.executed)
+        limits.append(np.stack([episode.executed.min(0), episode.executed.max(0)]))
         state = episode.states.shape[1]
         path = episode_path(folder, episode.task, episode.seed)
         save_episode(path, episode)
@@ -213,16 +250,15 @@ def _import(source: Source, settings: DemosImportSettings, folder: Path, progres
         progress(done + 1, len(chosen))
     proprioception = tuple(source.names(STATE, "state")[:state])
     if world:
-        environment, space, instructions = world.name, world.actions, {}
+        space, instructions = world.actions, {}
         observation = _observation(source, state, world)
     else:
-        environment = re.sub(r"\W+", "_", settings.name or source.folder.name).strip("_").lower() or "recorded"
-        space = action_space(source, settings, np.concatenate(actions))
+        space = action_space(source, settings, np.concatenate(limits))
         observation = ObservationSpace(proprioception, state, (), (0.0, 0.0, 0.0))
         instructions = {names[i]: text for i, text in source.tasks.items() if names[i] in entries}
     recording = {
         "format": FORMAT,
-        "environment": environment,
+        "environment": world.name if world else environment,
         "config": {
             "source": str(source.folder.resolve()),
             "camera": {"name": source.camera},
@@ -302,11 +338,7 @@ def _episode(source: Source, row: Row, names: Mapping[int, str], tail: int) -> D
     """
     table = source.table(row)
     number = int(row["episode_index"])
-    columns = {
-        name: np.stack(table[name].to_pylist()).astype(np.float32).reshape(len(table), -1)
-        for name in (ACTION, EXECUTED, STATE, ENVIRONMENT)
-        if name in table.column_names
-    }
+    columns = {name: _vectors(table, name) for name in VECTORS if name in table.column_names}
     if not all(np.isfinite(values).all() for values in columns.values()):
         raise CheckpointError(f"episode {number} of {source.folder} holds numbers that are not finite")
     labels = columns[ACTION]
@@ -331,7 +363,7 @@ def action_space(source: Source, settings: DemosImportSettings, actions: np.ndar
     Args:
         source: The dataset.
         settings: Settings of `kerv demos import`: names of the DoFs, and strict DoFs (such as a gripper).
-        actions: (n, D) all recorded actions.
+        actions: (n, D) recorded actions, among them the smallest and the largest value of each DoF.
 
     Raises:
         UsageError: `dofs=openvla` was chosen, but the actions do not have seven DoFs.
@@ -342,7 +374,8 @@ def action_space(source: Source, settings: DemosImportSettings, actions: np.ndar
         if len(names) != len(OPENVLA):
             raise UsageError(f"dofs=openvla: the dataset has {len(names)} DoFs ({', '.join(names)}), OpenVLA has 7")
         names = OPENVLA
-    strict = tuple(settings.strict or (name for name in names if "gripper" in name.lower()))
+    grippers = [name for name in names if "gripper" in name.lower()]
+    strict = tuple(grippers if settings.strict is None else settings.strict)
     for name in strict:
         if name not in names:
             raise UnknownName("strict DoF", name, names)
@@ -382,29 +415,81 @@ def _task_names(tasks: Mapping[int, str], world: EnvironmentSpec | None) -> dict
                 raise UsageError(f"environment={world.name}: it has no task with the instruction '{text}'")
         return {number: known[text] for number, text in tasks.items()}
     names: dict[int, str] = {}
+    taken: set[str] = set()
     for number, text in tasks.items():
         name = re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:60] or f"task-{number}"
-        names[number] = name if name not in names.values() else f"{name}-{number}"
+        names[number] = name if name not in taken else f"{name}-{number}"
+        taken.add(names[number])
     return names
 
 
-def _table(path: Path, where: tuple[str, Any] | None = None) -> pa.Table:
-    """Read a Parquet file with `foreign_table`, which explains `where`.
+def _below(folder: Path, name: str) -> Path:
+    """Return the path `name` below a folder.
+
+    Raises:
+        CheckpointError: It leads out of the folder.
+    """
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        raise CheckpointError(f"{folder} names a file outside its own folder, '{name[:80]}': it is not read")
+    return folder / name
+
+
+def _table(path: Path, where: tuple[str, Any] | None = None, columns: Sequence[str] = (), most: int = 0) -> pa.Table:
+    """Read a Parquet file with `foreign_table`, which explains the arguments.
 
     Raises:
         CheckpointError: The file is missing or damaged.
     """
     try:
-        return foreign_table(path, where=where)
+        return foreign_table(path, where, columns, most)
     except (OSError, ValueError) as error:
-        raise CheckpointError(f"{path} is missing or damaged: {str(error)[:120]}") from error
+        why = str(error).replace(str(path), "it")[:120]
+        raise CheckpointError(f"{path} is missing or damaged: {why}") from error
+
+
+def _vectors(table: pa.Table, name: str) -> np.ndarray:
+    """Return the numbers (T, n) float32 of a column, whose rows may be lists of lists.
+
+    Raises:
+        ValueError: The rows have different lengths, or more than MOST_NUMBERS numbers.
+    """
+    parts = []
+    for part in filter(len, table[name].chunks):
+        rows = len(part)
+        while pa.types.is_nested(part.type):
+            lengths = pc.unique(pc.list_value_length(part)).to_pylist()
+            if len(lengths) > 1 or None in lengths:
+                raise ValueError(f"the rows of {name} have different lengths")
+            part = part.flatten()
+        if len(part) > MOST_NUMBERS * rows:
+            raise ValueError(f"{name} has {len(part) // rows} numbers per row, at most {MOST_NUMBERS} are read")
+        parts.append(part.to_numpy(zero_copy_only=False).astype(np.float32).reshape(rows, -1))
+    return np.concatenate(parts)
+
+
+def _decoded(images: Iterator[np.ndarray], count: int, path: Path) -> np.ndarray:
+    """Return `count` images as one array (count, height, width, 3) uint8.
+
+    Raises:
+        CheckpointError: They take more than MOST_EXPANDED bytes in memory.
+    """
+    first = next(images)
+    if count * first.nbytes > MOST_EXPANDED:
+        raise CheckpointError(
+            f"{path}: the {count} images of an episode take {count * first.nbytes // 2**20} MiB in memory, at most "
+            f"{MOST_EXPANDED // 2**20} are read: make them smaller"
+        )
+    frames = np.empty((count, *first.shape), np.uint8)
+    for number, image in enumerate(itertools.chain([first], images)):
+        frames[number] = image
+    return frames
 
 
 def _picture(cell: Row, folder: Path) -> np.ndarray:
     """Decode an image from a cell of a table, which holds the image's bytes or its path below `folder`."""
     data = cell.get("bytes")
     try:
-        with Image.open(io.BytesIO(data) if data else regular(folder / str(cell.get("path")))) as image:
+        with Image.open(io.BytesIO(data) if data else regular(_below(folder, str(cell.get("path"))))) as image:
             return np.asarray(image.convert("RGB"))
     except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         raise CheckpointError(f"an image in {folder} cannot be read: {str(error)[:120]}") from error
