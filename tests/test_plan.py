@@ -15,7 +15,7 @@ from studies_synthetic import IDENTITY, part, settings_of, study_of, swept, thre
 import kerv_cli
 from kerv_cli.base.errors import UsageError
 from kerv_cli.episodes import identity
-from kerv_cli.episodes.identity import ENGINE, code_hash, hash_of, work_of
+from kerv_cli.episodes.identity import ENGINE, _meaning, code_hash, hash_of, work_of
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.plan import Block, Setting, Study, all_episodes, blocks_of, plain_settings
 from kerv_cli.lab.runs import interrupted_since
@@ -109,6 +109,19 @@ def test_the_code_below_the_commands_counts_and_nothing_else(tmp_path, monkeypat
     assert hash_after("base/settings.py", '# a comment\n"""and a string that stands alone"""\n') == before
     computing = [hash_after(file, "x = 1") for file in ("engine/decoder.py", "base/settings.py", "episodes/runner.py")]
     assert len({before, *computing}) == 4
+
+
+def test_the_hash_of_code_is_the_same_in_every_version_of_python():
+    source = b'''"""Docstring."""
+def f(a, *, b: int = 0, **c) -> str:
+    """Docstring."""
+    print(f"{a:>{b}} {b!r:0{a}}x{{}}", {**c, None: "\\u2603\\U0001fae8"}, 1e400, b"x", ...)
+    return lambda: (yield)
+
+class A(list[int]):
+    x: float
+'''
+    assert hashlib.sha256(_meaning(source)).hexdigest()[:16] == "8a841cd085411114"
 
 
 def test_blocks_go_by_repeat_task_and_seeds():

@@ -237,14 +237,33 @@ def code_hash() -> str:
 
 
 def _meaning(source: bytes) -> bytes:
-    """Return the syntax tree of Python source without its docstrings, as the bytes of a text."""
-    return ast.dump(_WithoutDocstrings().visit(ast.parse(source))).encode()
+    """Return the syntax tree of Python source without its docstrings, as the bytes of a text.
+
+    The text is the same in every version of Python. That of `ast.dump` is not.
+    """
+    return json.dumps(_plain(_Essential().visit(ast.parse(source)))).encode()
 
 
-class _WithoutDocstrings(ast.NodeTransformer):
+def _plain(node: object) -> object:
+    """Return a syntax tree as lists and strings. Empty fields are left out: newer versions of Python have more."""
+    if isinstance(node, list):
+        return [_plain(one) for one in node]
+    if not isinstance(node, ast.AST):
+        return ascii(node)
+    given = [(name, value) for name, value in ast.iter_fields(node) if value is not None and value != []]
+    return [type(node).__name__, *((name, _plain(value)) for name, value in given)]
+
+
+class _Essential(ast.NodeTransformer):
+    """Removes docstrings, and the empty strings that some versions of Python add to f-strings."""
+
     def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
         alone = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
-        return None if alone else node
+        return None if alone else self.generic_visit(node)  # type: ignore[return-value]
+
+    def visit_JoinedStr(self, node: ast.JoinedStr) -> ast.AST:
+        node.values = [one for one in node.values if not (isinstance(one, ast.Constant) and one.value == "")]
+        return self.generic_visit(node)
 
 
 def _of_plugins() -> Iterator[tuple[str, Path]]:
