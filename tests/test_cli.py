@@ -251,6 +251,9 @@ FILES = {
     "range.yaml": "defaults:\n  - override /boundary: fused\nboundary:\n  f_star: 25\n",
     "key.yaml": "defaults:\n  - override /acceptance: relaxed\nthreshold:\n  radius: 5\n",
     "type.yaml": "threshold:\n  r: wide\n",
+    "aliases.yaml": "a0: &a0 [x, x]\n"
+    + "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 12)),
+    "nul.yaml": "title: a\0b\n",
     "file": "x",
     "one.rrd": "x",
 }
@@ -311,6 +314,8 @@ ANSWERS = [
     ("sweep study=empty.yaml", "study 'empty' has no settings: see conf/study/demo.yaml"),
     ("sweep study=list.yaml", "study=list.yaml holds no keys: write key: value"),
     ("sweep study=tabs.yaml", "tabs.yaml:2: it is not YAML"),
+    ("sweep study=aliases.yaml", "aliases.yaml: its aliases expand it to more than 20000 values"),
+    ("sweep study=nul.yaml", "nul.yaml: it is not YAML, unacceptable character #x0000"),
     ("sweep study=radius.yaml", "radius.yaml:3: unknown key 'threshold.radius': did you mean threshold"),
     ("sweep study=nested.yaml", "nested.yaml:1: study.settings={'ar': {'method': 'ar'}}: every element must be"),
     ("sweep study=axis.yaml", "axis.yaml:1: unknown axis 'threshold.rr': did you mean threshold.r?"),

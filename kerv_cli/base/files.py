@@ -7,6 +7,7 @@ import ctypes
 import errno
 import functools
 import hashlib
+import itertools
 import json
 import os
 import shutil
@@ -16,10 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from kerv_cli.base.errors import CheckpointError, StorageError, UsageError
-from kerv_cli.base.leftovers import clean, temporary_beside
+from kerv_cli.base.leftovers import clean, remove, temporary_beside
 
 MOST_TEXT = 2**28
-"""Maximum size of a JSON or YAML file in bytes. kerv's own files are far smaller."""
+"""Maximum size of a JSON file in bytes. kerv's own files are far smaller."""
+MOST_YAML = 2**18
+"""Maximum size of a YAML file in bytes. Reading one takes ten seconds per megabyte."""
+MOST_VALUES = 20_000
+"""Maximum number of keys and values in a YAML file, with the ones that its aliases repeat."""
 MOST_BYTES = 2**36
 """Maximum size of a file of weights or of a table in bytes."""
 
@@ -63,10 +68,11 @@ def atomic_path(path: Path) -> Iterator[Path]:
             yield temporary
             sync(temporary)
             os.replace(temporary, path)
+            temporary = None
             sync(path.parent)
     finally:
         if temporary is not None:
-            temporary.unlink(missing_ok=True)
+            remove(temporary)
 
 
 def write_folder(folder: Path, fill: Callable[[Path], object]) -> None:
@@ -186,14 +192,18 @@ def regular(path: Path, most: int = MOST_BYTES) -> Path:
     return Path(path)
 
 
-def read_text(path: Path) -> str:
+def read_text(path: Path, most: int = MOST_TEXT) -> str:
     """Return the text of a file.
+
+    Args:
+        path: The file.
+        most: Maximum size in bytes.
 
     Raises:
         OSError: The file is missing or not a regular file.
-        ValueError: The file is larger than MOST_TEXT bytes, or not UTF-8.
+        ValueError: The file is larger than `most` bytes, or not UTF-8.
     """
-    return regular(path, MOST_TEXT).read_text(encoding="utf-8")
+    return regular(path, most).read_text(encoding="utf-8")
 
 
 def read_json(path: Path) -> Any:
@@ -233,13 +243,16 @@ def read_yaml_lines(path: Path, what: str) -> tuple[dict[str, Any], dict[str, in
         The mapping, and the line number of each key. Nested keys are joined by dots, such as `threshold.r`.
 
     Raises:
-        UsageError: The file cannot be read, contains no mapping, or gives a key twice.
+        UsageError: The file cannot be read, contains no mapping, gives a key twice, or is too large.
     """
     import yaml
 
     lines: dict[str, int] = {}
+    noted = itertools.count(1)
 
     def note(node: yaml.Node | None, prefix: str) -> None:
+        if next(noted) > MOST_VALUES:
+            raise UsageError(f"{path}: its aliases expand it to more than {MOST_VALUES} values: write fewer")
         if isinstance(node, yaml.SequenceNode):
             for index, child in enumerate(node.value):
                 note(child, f"{prefix}{index}.")
@@ -252,7 +265,7 @@ def read_yaml_lines(path: Path, what: str) -> tuple[dict[str, Any], dict[str, in
                 note(child, f"{name}.")
 
     try:
-        loader = yaml.SafeLoader(read_text(path))
+        loader = yaml.SafeLoader(read_text(path, MOST_YAML))
         node = loader.get_single_node()
         note(node, "")
         value = loader.construct_document(node) if node else {}
@@ -261,6 +274,8 @@ def read_yaml_lines(path: Path, what: str) -> tuple[dict[str, Any], dict[str, in
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
         raise UsageError(f"{path}:{line}: it is not YAML, {error.problem}") from error
+    except yaml.YAMLError as error:  # a character that no YAML file may have, such as NUL
+        raise UsageError(f"{path}: it is not YAML, {' '.join(str(error).split())}") from error
     if not isinstance(value, dict):
         raise UsageError(f"{what} holds no keys: write key: value")
     return value, lines
