@@ -367,6 +367,11 @@ def test_a_store_is_used_by_one_command_and_no_password_is_kept(tmp_path, monkey
     assert STORE not in os.environ
     store = "store=postgresql://me:secret@127.0.0.1:1/kerv"
     assert "store: postgresql://me@127.0.0.1:1/kerv" in told("build", "target", store, "--cfg")
+    query = "store=postgresql://me@127.0.0.1:1/kerv?password=secret&connect_timeout=3&sslpassword=secret"
+    shown = told("build", "target", query, "--cfg")
+    assert "postgresql://me@127.0.0.1:1/kerv?connect_timeout=3" in shown
+    assert "secret" not in shown
+    assert "secret" not in told("runs", "list", query, where, code=1)
     line = told("runs", "list", store, where, code=1)
     assert "127.0.0.1:1" in line
     assert "secret" not in line

@@ -6,6 +6,7 @@ import contextlib
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from urllib.parse import unquote
 
 STORE = "KERV_STORE"
 """Environment variable with the URL of the database. If empty, it is a SQLite file in the results folder."""
@@ -32,6 +33,13 @@ def noted(words: Sequence[str]) -> Iterator[None]:
         _words[:] = before
 
 
+def without_passwords(url: str) -> str:
+    """Return a database's URL without the password before its host and without those in its query."""
+    address, _, query = re.sub(r"(://[^/@:]*):[^/@]*@", r"\1@", url).partition("?")
+    pairs = [one for one in query.split("&") if not unquote(one.partition("=")[0]).lower().endswith("password")]
+    return "?".join(filter(None, (address, "&".join(pairs))))
+
+
 @contextlib.contextmanager
 def chosen_store(overrides: Iterable[str]) -> Iterator[list[str]]:
     """Use the database named by the override `store=URL`, in this process and its workers, for the `with` block.
@@ -48,7 +56,7 @@ def chosen_store(overrides: Iterable[str]) -> Iterator[list[str]]:
     for number, override in enumerate(overrides):
         if override.startswith("store="):
             os.environ[STORE] = url = override.removeprefix("store=").strip("'\"")
-            url = re.sub(r"(://[^/@:]*):[^/@]*@", r"\1@", url)
+            url = without_passwords(url)
             overrides[number] = f"store={url}" if re.fullmatch(r"[\w:/@.%+-]*", url) else f"store='{url}'"
     try:
         yield overrides

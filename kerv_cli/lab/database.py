@@ -20,7 +20,7 @@ from kerv_cli.base.errors import CheckpointError, KervError, StorageError, Usage
 from kerv_cli.base.files import storage_errors
 from kerv_cli.base.places import results_dir
 from kerv_cli.episodes.rows import EPISODE_SCHEMA, FLAG, FLOAT, INT
-from kerv_cli.lab.command import STORE
+from kerv_cli.lab.command import STORE, without_passwords
 
 FILE = "kerv.db"
 SCHEMA = 1
@@ -143,11 +143,13 @@ class Database:
         try:
             parsed = sa.make_url(self.url)
         except (sa.exc.ArgumentError, ValueError) as error:
-            raise UsageError(f"store={self.url} is not a URL: write postgresql://USER@HOST/DB") from error
+            raise UsageError(
+                f"store={without_passwords(self.url)} is not a URL: write postgresql://USER@HOST/DB"
+            ) from error
         self.file = Path(parsed.database or "") if parsed.drivername == "sqlite" else None
         if self.file is None and parsed.drivername not in ("postgresql", "postgresql+psycopg"):
             raise UsageError(f"store={parsed.drivername}:// is not supported: use postgresql://USER@HOST/DB")
-        self.shown = str(self.file or parsed.render_as_string())
+        self.shown = str(self.file or without_passwords(self.url))
         self._url = parsed if self.file else parsed.set(drivername="postgresql+psycopg")
         self._engine: sa.Engine | None = None
         self._is_complete = False  # whether the table of episodes is known to have all columns
