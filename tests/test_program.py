@@ -18,7 +18,7 @@ from kerv_cli.methods.eagle.drafter import EagleDrafter
 from kerv_cli.targets.checkpoint import compact, expanded
 from kerv_cli.targets.compact.bfloat16 import Bfloat16Layers, multiplies_bfloat16
 from kerv_cli.targets.compact.packable import pack
-from kerv_cli.targets.compact.program import Program, kernels
+from kerv_cli.targets.compact.program import Program, kernels, own_folder
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
@@ -33,6 +33,20 @@ ALONE = ObservationSpace(("x", "y", "z"), 3, (Place("hole", 0),), (0.1, 0.2, 0.3
 THREE = ObservationSpace(
     ("x", "y", "z", "roll", "open"), 20, tuple(Place(n, 3 * i) for i, n in enumerate("abc")), (0.0, 0.0, 0.1)
 )
+
+
+def test_compiled_code_is_kept_where_only_this_user_can_write(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    folder = own_folder()
+    assert folder == own_folder()
+    assert folder.stat().st_mode & 0o777 == 0o700
+    folder.chmod(0o777)
+    assert own_folder() != folder, "anybody may have written into it"
+    folder.rmdir()
+    (tmp_path / "theirs").mkdir()
+    folder.symlink_to(tmp_path / "theirs")
+    assert own_folder() != folder
+    assert own_folder().stat().st_mode & 0o777 == 0o700
 
 
 def shaken(module: torch.nn.Module, seed: int) -> torch.nn.Module:

@@ -5,17 +5,20 @@ A program computes in *frames*: the float32 memory of one row of a batch. A *pla
 
 numba compiles the kernels when they are first used on a machine. It stores the machine code in NUMBA_CACHE_DIR if that
 is set, else in `__pycache__`. If this folder cannot be written, numba takes the user's cache folder. If that cannot be
-written either, kerv chooses a temporary folder.
+written either, kerv chooses a temporary folder that only this user can write.
 """
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import functools
 import logging
 import os
+import stat
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -29,6 +32,20 @@ from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.compact.recording import ARGMAX, COLUMNS, FLOAT, HALF, INT8, PANEL, Tape
 
 _LOG = logging.getLogger("kerv")
+
+
+def own_folder() -> Path:
+    """Return a temporary folder that only this user can write: the code in it is run.
+
+    It is the same in every process of the user. If another user has taken its name, it is a new one.
+    """
+    folder = Path(tempfile.gettempdir(), f"kerv-{os.getuid()}")
+    with contextlib.suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    status = folder.lstat()
+    if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o022:
+        return folder
+    return Path(tempfile.mkdtemp(prefix="kerv-"))
 
 
 @functools.lru_cache(maxsize=1)
@@ -49,13 +66,13 @@ def kernels() -> ModuleType:
         def on_end(self, event: Any) -> None:
             pass
 
-    mine = os.path.join(tempfile.gettempdir(), f"kerv-{os.getuid()}")
-    with open(f"{mine}.lock", "w", encoding="ascii") as lock, event.install_listener("numba:compile", Told()):
+    mine = own_folder()
+    with open(mine / "lock", "w", encoding="ascii") as lock, event.install_listener("numba:compile", Told()):
         fcntl.flock(lock, fcntl.LOCK_EX)
         try:
             from kerv_cli.targets.compact import kernels
         except RuntimeError:  # numba finds no folder that it can write to
-            numba.config.CACHE_DIR = mine
+            numba.config.CACHE_DIR = str(mine)
             from kerv_cli.targets.compact import kernels
     return kernels
 
