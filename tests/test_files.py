@@ -3,6 +3,7 @@
 import errno
 import os
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -10,11 +11,13 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 
 from kerv_cli.base import files
 from kerv_cli.base.errors import CheckpointError, StorageError
-from kerv_cli.base.files import atomic_path, read_json, sha256_of, write_folder, write_json
+from kerv_cli.base.files import atomic_path, read_json, sha256_of, write_bytes, write_folder, write_json
 from kerv_cli.base.leftovers import clean, is_left_over, temporary_beside
+from kerv_cli.targets.checkpoint import Description, read_description, save_module
 
 
 def of_process(path: Path, pid: int, host: str = "") -> Path:
@@ -173,3 +176,31 @@ def test_unreadable_files_are_checkpoint_errors(tmp_path):
     for read, name in ((read_json, "none.json"), (read_json, "bad.json"), (sha256_of, "none.bin")):
         with pytest.raises(CheckpointError, match=name):
             read(tmp_path / name)
+
+
+def test_an_interrupted_removal_ends_nothing(tmp_path, monkeypatch):
+    def interrupted(path, missing_ok=False):
+        raise InterruptedError(errno.EINTR, "Interrupted system call")
+
+    monkeypatch.setattr(Path, "unlink", interrupted)
+    write_bytes(tmp_path / "state", b"new")
+    assert (tmp_path / "state").read_bytes() == b"new"
+    with pytest.raises(ValueError, match="diverged"), atomic_path(tmp_path / "state"):
+        raise ValueError("diverged")
+
+
+def test_a_checkpoint_is_the_old_one_or_the_new_one(tmp_path, monkeypatch):
+    folder = tmp_path / "drafter"
+    save_module(folder, "drafter", torch.nn.Linear(2, 2), {})
+    (folder / "log.csv").write_text("step")
+    before = read_description(folder, "drafter", Description)
+    with monkeypatch.context() as patch:
+        patch.setattr("kerv_cli.targets.checkpoint.write_json", lambda *_: signal.raise_signal(signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):
+            save_module(folder, "drafter", torch.nn.Linear(2, 2), {})
+    assert read_description(folder, "drafter", Description) == before
+    digest = save_module(folder, "drafter", torch.nn.Linear(2, 2), {})
+    assert read_description(folder, "drafter", Description).sha256 == digest != before.sha256
+    assert sorted(path.name for path in folder.parent.rglob("*")) == [
+        "drafter", "drafter.json", "log.csv", "model.safetensors"
+    ]  # fmt: skip

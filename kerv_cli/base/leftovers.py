@@ -5,6 +5,7 @@ A temporary name is hidden and names the machine and the process: `.<name>.<host
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import secrets
@@ -58,11 +59,12 @@ def clean(folder: Path) -> list[Path]:
 
 
 def remove(path: Path) -> None:
-    """Remove a file, or a folder with its content. Files in a folder that cannot be removed are skipped."""
+    """Remove a file, or a folder with its content. What cannot be removed stays, for a later command to remove."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
-        path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            path.unlink()
 
 
 def is_alive(pid: int, seen: float) -> bool:

@@ -6,13 +6,15 @@ The description contains settings, action and observation space, vocabulary and 
 from __future__ import annotations
 
 import functools
+import os
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.files import read_mapping, sha256_of, write_bytes, write_json
+from kerv_cli.base.files import read_mapping, sha256_of, write_bytes, write_folder, write_json
 from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import find, load, parts
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
@@ -221,7 +223,10 @@ def expanded(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def save_module(
     folder: Path, kind: str, module: nn.Module, description: Mapping[str, Any], stored: str = FLOAT32
 ) -> str:
-    """Write the weights of a module, then their description `<kind>.json`. Return the SHA-256 of the weights.
+    """Write the weights of a module and their description `<kind>.json`. Return the SHA-256 of the weights.
+
+    Both are replaced in one step: a process that is killed leaves the old pair or the new one. Other files in the
+    folder stay.
 
     Args:
         folder: Folder to write to.
@@ -230,11 +235,25 @@ def save_module(
         description: Fields of the description besides format, kind and sha256.
         stored: Number format of the stored weights. `load_state` converts them back to float32.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    save_tensors(folder / WEIGHTS, compact(module.state_dict(), stored))
-    digest = sha256_of(folder / WEIGHTS)
-    write_json(folder / f"{kind}.json", {"format": FORMAT, "kind": kind, "sha256": digest, **description})
-    return digest
+    folder = folder.resolve()  # a link to a folder on another disk stays one
+
+    def fill(new: Path) -> None:
+        if folder.exists():
+            shutil.copytree(folder, new, symlinks=True, copy_function=_linked, dirs_exist_ok=True)
+        save_tensors(new / WEIGHTS, compact(module.state_dict(), stored))
+        digest = sha256_of(new / WEIGHTS)
+        write_json(new / f"{kind}.json", {"format": FORMAT, "kind": kind, "sha256": digest, **description})
+
+    write_folder(folder, fill)
+    return sha256_of(folder / WEIGHTS)
+
+
+def _linked(source: str, new: str) -> None:
+    """Give a file a second name, or copy it if the file system has no hard links."""
+    try:
+        os.link(source, new)
+    except OSError:
+        shutil.copy2(source, new)
 
 
 def target_fields(
