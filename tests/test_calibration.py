@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import read_json, sha256_of, write_json
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
-from kerv_cli.engine.record import Round
+from kerv_cli.engine.record import Measure, Round
 from kerv_cli.methods.artifacts import MadeFor
 from kerv_cli.methods.calibration import (
     NEVER,
@@ -220,9 +221,22 @@ def test_a_run_writes_what_the_next_session_reads(results, target):
     assert "12 demonstrations of 2 tasks; 4 decodes per task" in run.plan()
     made = run.run(quiet)
     assert {row.decodes for row in made.variability.values()} == {4}
-    run.episode_levels = lambda decoder, index, decodes: [0.1, 5.0, 0.3]  # type: ignore[method-assign]
-    assert {row.k_s for row in run.presample(quiet).values()} == {0.3}
-    run.episode_levels = lambda decoder, index, decodes: [0.0] * decodes  # type: ignore[method-assign]
+
+    def decodes_off_by(*bins: int) -> Any:
+        """Decodes of two draft tokens: one accepted and off by these bins, one rejected and off by 30."""
+        drafts = [Round("verify", "x", 0, (100 + b, 130), (100, 100, 7), 1, 2, 2, ()) for b in bins]
+        return lambda decoder, index, decodes: [SimpleNamespace(rounds=[draft]) for draft in drafts]
+
+    run.episode_decodes = decodes_off_by(1, 50, 3)  # type: ignore[method-assign]
+    for row in run.presample(quiet).values():
+        assert row.k_s == row.levels["mean of compared"] == pytest.approx(33 / 2 * BIN)
+        found = [row.levels[name] for name in ("sum of compared", "mean of accepted", "sum of accepted")]
+        assert found == pytest.approx([33 * BIN, 3 * BIN, 3 * BIN])
+    assert made.k_s("reach-v3", Measure(total=True)) == made.variability["reach-v3"].levels["sum of compared"]
+    run.episode_decodes = decodes_off_by(0, 0)  # type: ignore[method-assign]
+    assert {row.levels["sum of accepted"] for row in run.presample(quiet).values()} == {BIN}
+    zero = [SimpleNamespace(rounds=[Round("verify", "x", 0, (9,), (9,), 1, 1, 1, ())])]
+    run.episode_decodes = lambda decoder, index, decodes: zero  # type: ignore[method-assign,assignment,return-value]
     assert {row.k_s for row in run.presample(quiet).values()} == {BIN / 12}  # it can divide: one token off by one bin
     folder = find_target(str(results), target)
     assert run.path == results / f"artifacts/calibration/{target}/calibration.json"
@@ -235,6 +249,30 @@ def test_a_run_writes_what_the_next_session_reads(results, target):
     for kind, predictor_class in PREDICTORS.items():
         predictor = predictor_class(SPACE.is_strict, loaded.noise.get(kind), window=loaded.window)
         np.testing.assert_allclose(predictor.predict(np.full((10, 4), 0.25), 4), 0.25)
+
+
+def test_a_calibration_is_completed_and_keeps_its_numbers(own):
+    """As one of an earlier version: one measure of K, no quantiles of F, filters that know no gripper."""
+    run = run_of(own, "decodes=4")
+    made = run.run(quiet)
+    ranges = {"15": replace(made.ranges(15), radius_high=7.0, points=())}
+    unfitted = {kind: replace(noise, q=(7.0, *noise.q[1:3], 0.0)) for kind, noise in made.noise.items()}
+    rows = {task: Variability(0.7, 5) for task in made.variability}
+    old = replace(made, noise=unfitted, variability=rows, boundary=replace(made.boundary, windows=ranges))
+    write_json(run.path, dataclasses.asdict(old))
+    with refused("sum of accepted tokens", "kerv calibrate complete=true", error=CheckpointError):
+        old.k_s("reach-v3", Measure(True, True))
+    completed = run_of(own, "decodes=4", "complete=true").run(quiet)
+    assert completed.skip == old.skip
+    for kind, noise in completed.noise.items():
+        assert noise.q == (7.0, *made.noise[kind].q[1:])
+    for task, row in completed.variability.items():
+        assert (row.k_s, row.decodes) == (0.7, 5)
+        assert row.levels == made.variability[task].levels | {"mean of compared": 0.7}
+    assert replace(completed.ranges(15), points=()) == ranges["15"]
+    assert completed.ranges(15).limit(0.25, 0.5) > 0
+    assert completed.ranges(30) == made.ranges(30)
+    assert CalibrationArtifact().checked(run.path, read_target(find_target(str(own), "nano-state"))) == completed
 
 
 def calibration() -> Calibration:

@@ -38,17 +38,27 @@ PRESETS: dict[str, dict[str, Any]] = {
     # what differs from AR, spelled out, in the presets whose tokens tests/golden does not hold
     "naive_sd": {"proposer": DrafterProposerSettings(depth=5)},
     "jacobi": {"proposer": JacobiProposerSettings(depth=0)},
-    "kerv": {
-        "proposer": DrafterProposerSettings(shape="tree", depth=5, top_k=8, nodes=50),
+    "spec_vla": {
+        "proposer": DrafterProposerSettings(shape="tree", depth=5, top_k=8, nodes=49),
         "acceptance": RelaxedAcceptanceSettings(strict_dofs=False),
-        "threshold": KinematicThresholdSettings("quoted", r_min=5, r_max=15, phi=2.0, k_s=None),
+    },
+    "kerv": {
+        "proposer": DrafterProposerSettings(shape="tree", depth=5, top_k=8, nodes=49),
+        "acceptance": RelaxedAcceptanceSettings(strict_dofs=False),
+        "threshold": KinematicThresholdSettings("offset", r_min=5, r_max=15, phi=2.0, k_s=None),
         "rectifier": CompensateSettings(predictor="kalman", use_target_token=False, drop=False, min_verified=0, rest=4),
     },
     "heisd": {
-        "proposer": heisd.HybridProposerSettings(shape="tree", depth=5, top_k=8, nodes=50, neighbours=5),
+        "proposer": heisd.HybridProposerSettings(shape="tree", depth=5, top_k=8, nodes=49, neighbours=5),
         "acceptance": heisd.HybridAcceptanceSettings(strict_dofs=False, group_limit=30, token_limit=15),
-        "boundary": heisd.FusedBoundarySettings(alpha=0.5, window=15, f_star=0.5),
-        "skip": heisd.SimilaritySkipSettings(s_min=None, max_skips=2, up=0.0, down=0.0),
+        "boundary": heisd.FusedBoundarySettings(alpha=0.5, window=15, quantile=0.25, f_star=None),
+        "skip": heisd.SimilaritySkipSettings(s_min=None, max_skips=2, up=0.25, down=0.05),
+    },
+    "heisd_code": {
+        "proposer": heisd.HybridProposerSettings(shape="tree", depth=5, top_k=8, nodes=49, neighbours=5),
+        "acceptance": heisd.HybridAcceptanceSettings(strict_dofs=False, group_limit=44, token_limit=24),
+        "boundary": heisd.FusedBoundarySettings(alpha=0.5, window=15, quantile=0.25, f_star=None),
+        "skip": heisd.SimilaritySkipSettings(s_min=-1.0, max_skips=2, up=0.0, down=0.0),
     },
     "sp_vla": {"skip": SpeedSkipSettings(v_min=0.3, v_max=1000, buffer=6, share=0.5, penalty=1e-4)},
 }

@@ -18,7 +18,8 @@ def golden():
 @pytest.mark.bits
 def test_every_method_of_the_main_study_decodes_the_same_tokens(golden):
     """Also under each of `make test-cpus`' kernels: the logits' last bits differ there, their argmax does not."""
-    assert golden.measure() == json.loads(golden.FILE.read_text())
+    assert golden.measure_engine() == json.loads(golden.FILE.read_text())
+    assert golden.measure_presets() == json.loads(golden.PRESETS.read_text())
 
 
 def test_the_engine_is_that_of_the_golden_tokens(golden):

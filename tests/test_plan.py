@@ -13,6 +13,7 @@ from conftest import raising
 from studies_synthetic import IDENTITY, part, settings_of, study_of, swept, threshold_study
 
 import kerv_cli
+from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UsageError
 from kerv_cli.episodes import identity
 from kerv_cli.episodes.identity import ENGINE, _meaning, code_hash, hash_of, work_of
@@ -24,6 +25,8 @@ from kerv_cli.report.summary import not_in_turn
 from kerv_cli.report.tables import load_study
 
 TASKS = ("reach-v3", "push-v3")
+KNOWN = {"one_pass": "9c60b00642c8dfff", "kerv_tuned": "dae9f3020f7fd9a3", "heisd_tuned": "0d5d8289113af100"}
+"""Identities of these presets in version 1.0.0, on a target whose hash is 64 times a."""
 Found = dict[tuple[str, str], tuple[list[int], str]]
 
 
@@ -82,6 +85,17 @@ def test_what_determines_a_result_is_another_episode():
         "rollout.latency_ms": 5.0,
     }.items():  # fmt: skip
         assert work(changed(path, value)) == work(settings_of("spec_vla", 9)), path
+
+
+def test_a_setting_that_came_later_leaves_stored_episodes_their_identity():
+    """The hashes are of version 1.0.0, which knew neither threshold.over nor rectifier.hold_strict."""
+    weights = {"target": "a" * 64}
+    for method, stored in KNOWN.items():
+        plain = plain_settings(asdict(compose("rollout", [f"method={method}"], RolloutSettings)))
+        assert work_of(plain, weights) == stored, method
+        if plain["rectifier"]["kind"] == "compensate":
+            other = {**plain, "rectifier": {**plain["rectifier"], "hold_strict": False}}
+            assert work_of(other, weights) != stored, method
 
 
 def test_weights_and_engine_are_part_of_the_meaning():

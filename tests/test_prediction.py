@@ -6,12 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from filterpy.kalman import KalmanFilter
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from mock_target import MockTarget
 from test_decoding_lossless import plain_greedy
 
+from kerv_cli.base.errors import CheckpointError
 from kerv_cli.engine.chunk import WINDOW, ActionHistory, Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
@@ -23,10 +25,13 @@ from kerv_cli.methods.kerv.prediction import (
     PREDICTORS,
     Compensation,
     Hold,
+    Kalman,
     Linear,
     Noise,
     Predictor,
+    Walk,
     assemble,
+    kalman_weights,
 )
 from kerv_cli.worlds.metaworld.spec import SPEC
 
@@ -104,6 +109,36 @@ def test_the_filter_rests_after_a_compensation():
     assert closed == [True, False, False, True, False, False, True]
     resting.reset()
     assert resting.resting == 0
+
+
+def test_the_public_codes_filter_is_a_random_walk():
+    """Against filterpy, with KERV's Q = 1 and R = 1e-3; the strict DoF is held, or filtered like the others."""
+    actions = np.random.default_rng(0).uniform(-1, 1, (10, D))
+    held = Walk(SPACE.is_strict)
+    for predictor, strict in ((held, actions[-1, 3]), (held.released(), None)):
+        expected = np.empty(D)
+        for dof in range(D):
+            model = KalmanFilter(dim_x=1, dim_z=1)
+            model.F = model.H = np.eye(1)
+            model.Q, model.R, model.P = np.array([[1.0]]), np.array([[1e-3]]), np.array([[1e-3]])
+            model.x = actions[:1, dof : dof + 1]
+            for action in actions[1:, dof]:
+                model.predict()
+                model.update(action)
+            expected[dof] = model.x[0, 0]
+        if strict is not None:
+            expected[3] = strict
+        assert predictor.predict(actions, 2) == pytest.approx(np.tile(expected, (2, 1)))
+
+
+def test_a_gripper_is_filtered_only_with_a_fitted_noise():
+    actions = np.random.default_rng(1).uniform(-1, 1, (10, D))
+    unfitted, fitted = (Noise((1.0, 1.0, 1.0, q), (1.0,) * D, (1.0,) * D) for q in (0.0, 1.0))
+    assert Kalman(SPACE.is_strict, fitted).predict(actions, 1)[0, 3] == actions[-1, 3]
+    free = Kalman(SPACE.is_strict, fitted).released().predict(actions, 1)[0]
+    assert free[3] == pytest.approx(np.clip(kalman_weights(1.0, 1.0, 10, 1) @ actions[:, 3], -1, 1)[0])
+    with pytest.raises(CheckpointError, match="complete=true"):
+        Kalman(SPACE.is_strict, unfitted).released()
 
 
 class Known(Proposer):

@@ -17,7 +17,7 @@ from kerv_cli.base.limits import check_settings
 from kerv_cli.base.registry import find
 from kerv_cli.engine.chunk import Choice
 from kerv_cli.engine.parts import Boundary, Threshold
-from kerv_cli.engine.record import path_length
+from kerv_cli.engine.record import Round, path_length, variability
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.heisd.rules import STILL, BoundaryRanges, radius_of_curvature
@@ -31,7 +31,7 @@ seeds = st.integers(0, 2**32 - 1)
 def boundary_of(kind: str, **values: Any) -> Boundary:
     """As a method's part: its numbers are checked, then it is built; the calibration has `RANGES` for 10 and 15."""
     part = find("boundary", kind)
-    chosen = part.settings(kind=kind, **values)
+    chosen = part.settings(kind=kind, **({"f_star": 0.3} if kind == "fused" else {}) | values)
     check_settings(chosen, "boundary")
     calibration = SimpleNamespace(ranges={10: RANGES, WINDOW: RANGES}.__getitem__)
 
@@ -101,6 +101,14 @@ def test_ranges_are_the_minimum_and_the_95th_percentile_of_finite_values():
     assert (ranges.radius_low, ranges.radius_high) == (min(finite), pytest.approx(np.percentile(finite, 95)))
     lengths = [path_length(w) for w in windows]
     assert (ranges.length_low, ranges.length_high) == (min(lengths), pytest.approx(np.percentile(lengths, 95)))
+    # the limit F* is a quantile of F over the same windows, also if the ranges were known before
+    for known, alpha in ((None, 0.5), (RANGES, 0.5), (RANGES, 0.2)):
+        used = BoundaryRanges.fit(paths, WINDOW, known)
+        levels = [used.fused(r, d, alpha) for r, d in zip(radii, lengths, strict=True)]
+        for quantile in (0.1, 0.25, 0.6):
+            exact = np.quantile(levels, quantile)
+            assert used.limit(quantile, alpha) == pytest.approx(exact, abs=0.02 if alpha == 0.5 else 0.08)
+    assert replace(used, points=()) == RANGES
 
 
 def test_demonstrations_without_a_curved_path_have_no_ranges():
@@ -126,6 +134,8 @@ def test_fused_sends_straight_reaches_to_retrieval_and_bends_to_the_drafter():
     reach, bend = boundary.choose(line(rng, 0.14)), boundary.choose(arc(rng, 0.02, 0.05))
     assert (reach.mode, bend.mode) == ("retrieval", "drafter")
     assert reach.metric > 0.9 > 0.3 > bend.metric
+    with pytest.raises(CheckpointError, match=r"boundary\.quantile.*complete=true"):
+        boundary_of("fused", f_star=None)  # a calibration of an earlier version
     exact = boundary_of("fused", f_star=reach.metric)
     assert exact.choose(line(np.random.default_rng(3), 0.14)).mode == "retrieval"  # F ≥ F*
 
@@ -164,14 +174,14 @@ def test_random_keeps_its_share_and_repeats_itself():
 # --- thresholds
 
 levels = st.floats(0, 50)
-CLOSED_LOOP = ("kinematic", "change")
+CLOSED_LOOP = ("kinematic", "change", "offset", "quoted")
 TASKS = {"reach-v3": 0.7}
 
 
 def artifact(kind: str) -> Any:
     """A calibration, and nothing else."""
     assert kind == "calibration"
-    return SimpleNamespace(k_s=TASKS.__getitem__)
+    return SimpleNamespace(k_s=lambda task, measure: TASKS[task])
 
 
 def built(chosen: Any, task: str = "reach-v3") -> Threshold:
@@ -215,19 +225,56 @@ def test_kinematic_at_its_landmarks():
     assert chosen.radius() == 9
 
 
-@given(st.lists(st.one_of(st.none(), levels, st.floats(0, 1)), max_size=20))
-def test_change_is_its_closed_form(history):
-    chosen = threshold("change")
-    r, last = 5 + 10 * math.exp(-1), 0.4
-    assert chosen.radius() == 9
+def bump(change: float) -> float:
+    """Δr of KERV's formula, with K_S = 0.4, φ = 2 and r within 5 … 15."""
+    return 10 * math.exp(-((abs(change) / 0.4) ** 2))
+
+
+READINGS = {  # r after a decode, from r before it and the change of K; and the first r of an episode
+    "change": (lambda r, change: r - math.copysign(10 - bump(change), change), 5 + 10 / math.e),
+    "offset": (lambda r, change: 5 + bump(change), 5 + 10 / math.e),
+    "quoted": (lambda r, change: r + bump(change), 5.0),
+}
+
+
+@pytest.mark.parametrize("kind", READINGS)
+@given(history=st.lists(st.one_of(st.none(), levels, st.floats(0, 1)), max_size=20))
+def test_a_reading_of_the_threshold_is_its_closed_form(kind, history):
+    chosen = threshold(kind)
+    step, first = READINGS[kind]
+    r, last = first, 0.4
+    assert chosen.radius() == rounded(first)
     for k in history:
         if k is not None:
-            move = 10 * (1 - math.exp(-((abs(k - last) / 0.4) ** 2)))
-            r = min(15.0, max(5.0, r - move if k > last else r + move))
-            last = k
+            r, last = min(15.0, max(5.0, step(r, k - last))), k
         assert abs(radius_after(chosen, k) - r) <= 0.5 + 1e-9
     chosen.reset()
-    assert chosen.radius() == 9
+    assert chosen.radius() == rounded(first)
+
+
+def test_the_offset_tightens_when_the_motion_changes_and_the_literal_formula_never_does():
+    offset, literal = threshold("offset"), threshold("quoted")
+    for k in (0.1, 0.1, 0.1):
+        assert radius_after(literal, k) <= 15 >= radius_after(offset, k)
+    assert (offset.radius(), literal.radius()) == (15, 15)
+    assert (radius_after(offset, 2.0), radius_after(literal, 2.0)) == (5, 15)
+
+
+@pytest.mark.parametrize("over", ["compared", "accepted"])
+@pytest.mark.parametrize("total", [False, True])
+def test_k_counts_the_tokens_that_its_settings_name(over, total):
+    rounds = [
+        Round("prefill", start=0, target_tokens=(100,), committed=1),
+        Round("verify", start=1, drafted=(10, 20, 254, 40), target_tokens=(13, 20, 0, 50), accepted=3, committed=4),
+        Round("skip", drafted=(7,) * 4, accepted=4, committed=4),
+    ]
+    # DoFs: dy, dz, gripper (left out), dx; the last one was rejected
+    distances = [3, 0] if over == "accepted" else [3, 0, 10]
+    expected = sum(distances) * 2 / 255 / (1 if total else len(distances))
+    chosen = built(compose("rollout", ["threshold=offset", f"threshold.over={over}", f"threshold.total={total}"],
+                           RolloutSettings).threshold)  # fmt: skip
+    assert variability(rounds, SPEC.actions, chosen.measure) == pytest.approx(expected)
+    assert variability(rounds[::2], SPEC.actions, chosen.measure) is None
 
 
 def test_schedule_is_the_public_codes_and_open_loop():
@@ -248,7 +295,7 @@ def test_the_reference_level_is_the_tasks_where_none_is_given(kind):
     assert find("threshold", kind).needs(replace(asked, k_s=0.4)) == ()
     for k in (0.0, 0.3, 2.0):
         assert radius_after(built(asked), k) == radius_after(threshold(kind, k_s=0.7), k)
-    assert radius_after(built(asked), 0.5) != radius_after(threshold(kind, k_s=0.3), 0.5)
+    assert radius_after(built(asked), 0.5, 0.6) != radius_after(threshold(kind, k_s=0.05), 0.5, 0.6)
     with pytest.raises(KeyError, match="push-v3"):
         built(asked, "push-v3")
 

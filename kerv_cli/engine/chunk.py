@@ -17,7 +17,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.draft import check_tokens
 from kerv_cli.engine.protocol import Cache
-from kerv_cli.engine.record import PARALLEL, DecodeRecord, Round
+from kerv_cli.engine.record import PARALLEL, DecodeRecord, Round, variability
 
 WINDOW = 10  # number of past actions that a prediction reads (KERV's action context AC)
 
@@ -154,7 +154,6 @@ class Chunk:
     reason: str | None = None  # as in `DecodeRecord`
     closed: np.ndarray | None = None  # (steps, D) normalised actions, if a rectifier ended the chunk
     filled: dict[int, float] = field(default_factory=dict)  # index -> normalised value that a rectifier predicted
-    _differences: list[float] = field(default_factory=list)  # |draft − target| of compared tokens, normalised units
 
     @property
     def dofs(self) -> int:
@@ -200,10 +199,9 @@ class Chunk:
     def variability(self) -> float | None:
         """Kinematic variability K: the mean difference of draft and target tokens, in normalised action units.
 
-        None if no draft token was compared. Strict DoFs (those that must equal the target's token, such as a gripper)
-        are left out, because one wrong gripper token would outweigh all other differences (docs/methods.md §3.2).
+        None if no draft token was compared (docs/methods.md §3.2).
         """
-        return float(np.mean(self._differences)) if self._differences else None
+        return variability(self.rounds, self.space)
 
     def distance(self, tokens: Sequence[int], others: Sequence[int]) -> float:
         """Return the mean absolute difference of two token sequences, in normalised action units.
@@ -247,11 +245,6 @@ class Chunk:
         self.tokens += tokens
         self.rounds.append(record)
         self.rejection = rejection or Rejection()
-        if record.drafted:
-            both = np.array((record.drafted, record.target_tokens[: len(record.drafted)]))
-            drafted, targets = self.space.values_of(both)
-            moving = ~self.space.strict_tokens(self.size)[record.start : record.start + len(drafted)]
-            self._differences += np.abs(drafted - targets)[moving].tolist()
 
     def commit_token(self, token: int) -> None:
         """Commit the single token of a forward that verified no draft."""

@@ -22,7 +22,7 @@ from kerv_cli.engine.draft import EMPTY, Draft
 from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import ContinuesGreedily, Target
-from kerv_cli.engine.record import DecodeRecord, Round
+from kerv_cli.engine.record import MEAN, DecodeRecord, Round, variability
 from kerv_cli.engine.stopwatch import Stopwatch
 from kerv_cli.engine.transfer import read, upload
 from kerv_cli.engine.tree import TokenTree
@@ -129,7 +129,9 @@ class Decoder(ActionDecoder):
         stopwatch = Stopwatch(self.target.device)
         chunk = self.decode_prompt(self._encoding(observation, stopwatch), stopwatch, observation)
         actions = chunk.actions()
-        self.threshold.update(chunk.variability)
+        # a plugin's threshold need not have the attribute `measure`
+        measure = getattr(self.threshold, "measure", MEAN)
+        self.threshold.update(variability(chunk.rounds, self.space, measure))
         if self.parts.rectifier is not None:
             self.parts.rectifier.next_decode()
         record = chunk.record(actions, stopwatch.stop(), stopwatch.phases)

@@ -6,6 +6,7 @@ Notation (docs/methods.md §0): D degrees of freedom, H control steps in a chunk
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -120,6 +121,55 @@ class DecodeRecord:
             if r.is_verification:
                 return r.start + r.accepted if r.accepted < len(r.drafted) else self.size or len(self.tokens)
         return None
+
+
+@dataclass(frozen=True)
+class Measure:
+    """How the kinematic variability K of a decode is computed (docs/methods.md §3.2).
+
+    Attributes:
+        accepted: Whether only accepted draft tokens count. Else the rejected token after them counts, too.
+        total: Whether K is the sum of the differences. Else it is their mean.
+    """
+
+    accepted: bool = False
+    total: bool = False
+
+    @property
+    def name(self) -> str:
+        """Name in a calibration, such as `mean of compared`."""
+        return f"{'sum' if self.total else 'mean'} of {'accepted' if self.accepted else 'compared'}"
+
+
+MEAN = Measure()
+"""The measure that `DecodeRecord.variability` holds."""
+MEASURES = tuple(Measure(accepted, total) for accepted in (False, True) for total in (False, True))
+
+
+def variability(rounds: Sequence[Round], space: ActionSpace, measure: Measure = MEAN) -> float | None:
+    """Return the kinematic variability K: how far a decode's drafts were from the target's tokens.
+
+    Strict DoFs (those that must equal the target's token, such as a gripper) are left out, because one wrong gripper
+    token would outweigh all other differences.
+
+    Args:
+        rounds: The rounds of the decode.
+        space: The action space.
+        measure: Which tokens count, and whether their differences are added or averaged.
+
+    Returns:
+        K in normalised action units. None if no draft token counts.
+    """
+    differences: list[float] = []
+    for one in rounds:
+        count = one.accepted if measure.accepted else len(one.drafted)
+        if count and one.mode != "skip":
+            drafted, targets = space.values_of(np.array((one.drafted[:count], one.target_tokens[:count])))
+            moving = ~space.strict_tokens(one.start + count)[one.start :]
+            differences += np.abs(drafted - targets)[moving].tolist()
+    if not differences:
+        return None
+    return float(np.sum(differences) if measure.total else np.mean(differences))
 
 
 def path_length(points: np.ndarray) -> float:

@@ -58,6 +58,11 @@ def _canonical(value: object) -> str:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
 
 
+# Settings that version 1.0.0 did not have, and the values that do what it did. Such values are not hashed, so
+# episodes that were stored before keep their identity.
+LATER: Mapping[str, Any] = {"threshold.over": "compared", "threshold.total": False, "rectifier.hold_strict": True}
+
+
 def work_of(settings: Plain, identity: Identity, engine: int = ENGINE) -> str:
     """Return the hash of everything that determines a setting's results, except task, seed and repetition.
 
@@ -92,6 +97,10 @@ def effective(settings: Plain) -> dict[str, Any]:
     determining = without(asdict(complete), NOT_DETERMINING)
     for key in idle_keys(complete) if complete.policy.kind != EXPERT else ():
         _drop(determining, key.split("."))
+    for key, usual in LATER.items():
+        part, name = key.split(".")
+        if determining.get(part, {}).get(name) == usual:
+            del determining[part][name]
     determining["runtime"] = without(determining["runtime"], NOT_DETERMINING_RUNTIME)
     if not stress_of(determining)["level"]:
         determining["world"] = without(determining["world"], {"stress"})  # level 0 of every kind is the same world

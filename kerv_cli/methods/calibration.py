@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from kerv_cli.base.errors import CheckpointError
+from kerv_cli.engine.record import MEAN, Measure
 from kerv_cli.methods.artifacts import Artifact, MadeFor, Use, check_sources
+from kerv_cli.methods.heisd import FusedBoundarySettings
 from kerv_cli.methods.heisd.rules import BoundaryRanges
 from kerv_cli.methods.kerv import KinematicThresholdSettings
 from kerv_cli.methods.kerv.prediction import Noise
@@ -41,10 +43,13 @@ class Variability:
     Attributes:
         k_s: Reference level K_S: the median K over the decodes that were measured, in normalised action units.
         decodes: Number of decodes that were measured.
+        levels: The median of every `Measure` of K, by its name. `k_s` is that of `MEAN`. Empty in calibrations before
+            version 1.1.
     """
 
     k_s: float
     decodes: int
+    levels: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -136,18 +141,28 @@ class Calibration:
         """Tasks for which the reference level K_S of the variability was measured."""
         return self.variability
 
-    def k_s(self, task: str) -> float:
+    def k_s(self, task: str, measure: Measure = MEAN) -> float:
         """Return the task's reference level K_S of the variability, in normalised action units.
 
+        Args:
+            task: Full name of the task.
+            measure: How K is computed.
+
         Raises:
-            CheckpointError: K_S was not measured for this task.
+            CheckpointError: K_S was not measured for this task or this measure.
         """
         if task not in self.variability:
             raise CheckpointError(
                 f"the calibration has no reference level K_S for {task}, only for "
                 f"{', '.join(self.variability) or 'no task'}: run 'kerv calibrate task={task}'"
             )
-        return self.variability[task].k_s
+        row = self.variability[task]
+        if measure != MEAN and measure.name not in row.levels:
+            raise CheckpointError(
+                f"the calibration has no reference level K_S for K as the {measure.name} tokens: run 'kerv calibrate "
+                "complete=true' for the policy, or name threshold.k_s"
+            )
+        return row.levels.get(measure.name, row.k_s)
 
     def ranges(self, window: int) -> BoundaryRanges:
         """Return the ranges of the path's radius of curvature and length, for a boundary that sees `window` positions.
@@ -213,15 +228,17 @@ class CalibrationArtifact(Artifact[Calibration]):
         return path
 
     def check_use(self, description: Calibration, use: Use) -> None:
-        """Refuse a task for which K_S, KERV's reference level of motion, was not measured, if the threshold needs it.
+        """Refuse a method that reads a number which was not measured: K_S of a task, or the quantiles of F.
 
         Raises:
-            CheckpointError: K_S was not measured for a task.
+            CheckpointError: The number was not measured.
         """
-        threshold = use.method["threshold"]
+        threshold, boundary = use.method["threshold"], use.method["boundary"]
+        if isinstance(boundary, FusedBoundarySettings) and boundary.f_star is None:
+            description.ranges(boundary.window).limit(boundary.quantile, boundary.alpha)
         if isinstance(threshold, KinematicThresholdSettings) and threshold.k_s is None:
             for task in use.tasks:
-                description.k_s(task)
+                description.k_s(task, threshold.measure)
 
     def is_complete(self, description: Calibration, kinds: Collection[str]) -> bool:
         """Return whether everything was measured that a policy with artifacts of these `kinds` needs.

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass, replace
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from kerv_cli.base.files import read_mapping, write_json
 from kerv_cli.base.registry import find
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.decoder import Decoder
+from kerv_cli.engine.record import MEAN, MEASURES, DecodeRecord, Measure, variability
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.calibration import (
@@ -104,8 +105,10 @@ class CalibrationRun:
         self.missing = [kind for kind in (*self.method.needs, "datastore") if not self.artifacts.exists(kind)]
         if "datastore" not in self.missing:
             self.artifacts.check(["datastore"])
+        self.old = self.artifacts.load("calibration") if settings.complete else None
         fills = self.path.is_file() and read_mapping(self.path).get("skip") is None
-        if "datastore" in self.missing or not fills:  # skip levels may be added to a shipped calibration
+        # a shipped calibration may be completed, and skip levels may be added to it
+        if self.old is None and ("datastore" in self.missing or not fills):
             check_not_shipped(self.path, "policy.artifacts.calibration")
         self.notes: list[str] = []
 
@@ -139,12 +142,13 @@ class CalibrationRun:
             windows = read_windows(self.dataset, self.chosen, space, settings.window, chunk, progress)
         variability, skip = self.presample(stage), self.skip(stage)
         with stage("boundary ranges") as progress:
-            ranges = {}
+            known = self.old.boundary.windows if self.old is not None and self.old.boundary is not None else {}
+            ranges = dict(known)
             for number, window in enumerate(settings.boundary_windows, 1):
-                ranges[str(window)] = BoundaryRanges.fit(windows.paths, window)
+                ranges[str(window)] = BoundaryRanges.fit(windows.paths, window, known.get(str(window)))
                 progress(number, len(settings.boundary_windows))
         with stage("fitting the predictors"):
-            noise = fit_filters(windows, space.is_strict)
+            noise = fit_filters(windows)
         if not variability:
             drafter = "".join(f", no {kind}" for kind in self.missing if kind != "datastore")
             self.notes.append(f"no reference levels K_S: decodes={settings.decodes}{drafter}")
@@ -160,6 +164,8 @@ class CalibrationRun:
             skip=skip,
             provenance=provenance_of("kerv calibrate", settings, settings.runtime.device),
         )
+        if self.old is not None:
+            calibration = completed(self.old, calibration)
         write_json(self.path, asdict(calibration))
         return calibration
 
@@ -182,26 +188,31 @@ class CalibrationRun:
             return {}
         decoder, actions = self.method.decoder(self.artifacts.target, self.artifacts.load), self.description.actions
         # decoding divides by K_S, so it is at least the smallest K above 0: one token of a chunk is off by one bin
-        least = 2.0 / actions.tokens / (self.description.chunk * int((~actions.is_strict).sum()))
+        least = 2.0 / actions.tokens
+        moving = self.description.chunk * int((~actions.is_strict).sum())
         variability = {}
         with stage("pre-sampling") as progress:
             for number, name in enumerate(self.tasks, 1):
-                levels: list[float] = []
+                records: list[DecodeRecord] = []
                 for index in self.chosen:
-                    if self.dataset.episodes[index].task == name and len(levels) < decodes:
-                        budget = min(math.ceil(decodes / PRESAMPLED), decodes - len(levels))
-                        levels += self.episode_levels(decoder, index, budget)
-                if not levels:
+                    if self.dataset.episodes[index].task == name and len(records) < decodes:
+                        budget = min(math.ceil(decodes / PRESAMPLED), decodes - len(records))
+                        records += self.episode_decodes(decoder, index, budget)
+                if not records:
                     raise KervError(f"{name}: no decode compared a draft with a target token, so there is no K_S")
-                variability[name] = Variability(max(float(np.median(levels)), least), len(levels))
+                levels = {
+                    measure.name: max(level_of(records, actions, measure), least / (1 if measure.total else moving))
+                    for measure in MEASURES
+                }
+                variability[name] = Variability(levels[MEAN.name], len(records), levels)
                 progress(number, len(self.tasks))
         return variability
 
-    def episode_levels(self, decoder: Decoder, index: int, decodes: int) -> list[float]:
-        """Decode observations that are spread evenly over one demonstration, and return each decode's variability K.
+    def episode_decodes(self, decoder: Decoder, index: int, decodes: int) -> list[DecodeRecord]:
+        """Decode observations that are spread evenly over one demonstration.
 
         The decoder also gets every executed action in between, because some methods use a history. A decode that
-        compared no draft with the target has no K and is left out.
+        compared no draft with the target is left out.
 
         Args:
             decoder: The decoder.
@@ -210,7 +221,7 @@ class CalibrationRun:
         """
         episode = self.dataset.load(index)
         rows = np.unique(np.linspace(0, len(episode.frame_steps) - 1, decodes).round().astype(int))
-        steps, levels, executed = episode.frame_steps[rows], [], 0
+        steps, records, executed = episode.frame_steps[rows], [], 0
         observations = observations_of(decoder.target, episode, steps, self.dataset.manifest.observation)
         decoder.reset(episode.task, episode.seed, episode.end_effector[0])
         for step, observation in zip(steps, observations, strict=True):
@@ -219,8 +230,39 @@ class CalibrationRun:
             executed = step
             record = decoder.decode(observation)
             if record.variability is not None:
-                levels.append(record.variability)
-        return levels
+                records.append(record)
+        return records
+
+
+def completed(old: Calibration, new: Calibration) -> Calibration:
+    """Return the old calibration with numbers of the new one where the old one has none.
+
+    Its boundary ranges are those of `new`, which kept the old ones where there were any.
+    """
+    noise = {
+        kind: Noise(
+            *(tuple(np.where(known.q, a, b).tolist()) for a, b in zip(astuple(known), astuple(found), strict=True))
+        )
+        for kind, known, found in ((kind, old.noise[kind], new.noise[kind]) for kind in FILTERS)
+    }
+    variability = dict(new.variability)
+    for task, row in old.variability.items():
+        measured = new.variability[task].levels if task in new.variability else {}
+        variability[task] = replace(row, levels={**measured, MEAN.name: row.k_s, **row.levels})
+    return replace(
+        old,
+        noise=noise,
+        variability=variability,
+        boundary=new.boundary,
+        skip=old.skip or new.skip,
+        provenance={**old.provenance, "completed": new.provenance},
+    )
+
+
+def level_of(records: Sequence[DecodeRecord], actions: ActionSpace, measure: Measure) -> float:
+    """Return the median over decodes of the variability K; 0 if no draft token counts."""
+    levels = [k for record in records if (k := variability(record.rounds, actions, measure)) is not None]
+    return float(np.median(levels)) if levels else 0.0
 
 
 @dataclass(frozen=True)
@@ -330,23 +372,19 @@ def fit_noise(past: np.ndarray, future: np.ndarray, dampings: Sequence[float]) -
     return min(((float(q), damping) for damping in dampings for q in RATIOS), key=error)
 
 
-def fit_filters(windows: Windows, held: np.ndarray) -> dict[str, Noise]:
+def fit_filters(windows: Windows) -> dict[str, Noise]:
     """Fit the Kalman filters `kalman` and `damped`.
 
     Args:
         windows: Actions before each moment, and after it, which the filters should predict.
-        held: (D,) bool. True: predictions hold this DoF at its last value, so it is not fitted.
 
     Returns:
-        For each filter's name, the noise and damping per DoF.
+        For each filter's name, the noise and damping per DoF, strict DoFs included.
     """
     past, future, noise = windows.past, windows.future, {}
     for kind in FILTERS:
         dampings = DAMPINGS if kind == "damped" else (1.0,)
-        fits = [
-            (0.0, 1.0) if is_held else fit_noise(past[..., dof], future[..., dof], dampings)
-            for dof, is_held in enumerate(held)
-        ]
+        fits = [fit_noise(past[..., dof], future[..., dof], dampings) for dof in range(past.shape[2])]
         noise[kind] = Noise(tuple(q for q, _ in fits), (1.0,) * len(fits), tuple(d for _, d in fits))
     return noise
 

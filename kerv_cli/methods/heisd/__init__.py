@@ -51,8 +51,7 @@ add("datastore", "exact", _DATASTORE + "ExactIndex")
 class HybridProposerSettings(DrafterProposerSettings):
     """HeiSD: draft by retrieval or with the drafter, as the boundary chooses (docs/methods.md §4.4).
 
-    The paper's five neighbours make a tree of about 50 nodes, which costs more than it gains on a CPU. So the defaults
-    are smaller.
+    Five neighbours make a tree of about 50 nodes, which costs more than it gains on a CPU. So the defaults are smaller.
     """
 
     kind: str = "hybrid"
@@ -93,7 +92,7 @@ class HybridAcceptanceSettings(SequenceAcceptanceSettings):
     """HeiSD: judge retrieved drafts by acceptance=sequence, and all other drafts by acceptance=relaxed."""
 
     kind: str = "hybrid"
-    strict_dofs: bool = True  # relaxed: whether strict DoFs, such as the gripper, must match; paper: false
+    strict_dofs: bool = True  # relaxed: whether strict DoFs, such as the gripper, must match (ours); public code: false
 
 
 add("acceptance", "sequence", _RULES + "GroupRule.build", SequenceAcceptanceSettings, reads_threshold=False)
@@ -105,12 +104,16 @@ add("acceptance", "hybrid", _RULES + "by_proposer", HybridAcceptanceSettings)
 
 @dataclass
 class FusedBoundarySettings:
-    """HeiSD: retrieval drafts if the hand moves straight and fast, the drafter if it moves in a curve or slowly."""
+    """HeiSD: retrieval drafts if the hand moves straight and fast, the drafter if it moves in a curve or slowly.
+
+    F is the weighted sum of the path's radius of curvature and length. Retrieval drafts if F is at least F*.
+    """
 
     kind: str = "fused"
     alpha: float = number(0.5, 0, 1)  # weight of the radius of curvature; the path length has the weight 1 − alpha
     window: int = number(15, 3, MOST_DECODES)  # number of newest hand positions to look at
-    f_star: float = number(0.3, 0, 1)  # retrieval drafts if the weighted sum is at least this (paper: 0.5)
+    quantile: float = number(0.25, 0, 1)  # the limit F* is this quantile of F in the demonstrations (public code: 0.25)
+    f_star: float | None = number(None, 0, 1)  # the limit F* itself, in place of a quantile (ours)
 
 
 @dataclass
@@ -124,7 +127,15 @@ class RandomBoundarySettings:
 
 for _name in ("always_retrieval", "always_drafter"):
     add("boundary", _name, _RULES + "Random.always", chooses=True)
-add("boundary", "fused", _RULES + "Fused.build", FusedBoundarySettings, ("calibration",), chooses=True)
+add(
+    "boundary",
+    "fused",
+    _RULES + "Fused.build",
+    FusedBoundarySettings,
+    ("calibration",),
+    chooses=True,
+    idle=lambda settings: {} if settings.f_star is None else {"quantile": "boundary.f_star names the limit"},
+)
 add("boundary", "random", _RULES + "Random.build", RandomBoundarySettings, chooses=True)
 
 
@@ -137,9 +148,9 @@ class SimilaritySkipSettings:
 
     kind: str = "similarity"
     s_min: float | None = number(None, -1e9, 1e9)  # smallest sufficient cosine; None: the task's calibrated value
-    max_skips: int = number(2, 1, MOST_DECODES)  # maximum number of decodes in a row without verification
-    # feedback, as a share of the calibrated range: s_min rises by `up` after a failed episode (HeiSD: 0.25) and falls
-    # by `down` after a successful episode (usual: 0.05); above 0, results depend on the order of the episodes
+    max_skips: int = number(2, 1, MOST_DECODES)  # maximum number of decodes in a row without verification (public code)
+    # feedback, as a share of the calibrated range: s_min rises by `up` after a failed episode and falls by `down` after
+    # a successful one; above 0, results depend on the order of the episodes
     up: float = number(0.0, 0, 1e9)
     down: float = number(0.0, 0, 1e9)
 

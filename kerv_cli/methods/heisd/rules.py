@@ -11,7 +11,7 @@ import functools
 import math
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from itertools import count
 
@@ -46,6 +46,7 @@ from kerv_cli.methods.spec_vla import RelaxedRule
 
 CROSS = 0.1  # assumed probability that a path of retrieved groups changes to another neighbour after a group
 LEAST = 3  # minimum number of positions for a curvature
+POINTS = 100  # number of windows of the demonstrations that a calibration keeps
 STILL = 1e-3  # metres; a hand with a shorter path is at rest (in Meta-World, a control step at full speed is 10 mm)
 COINCIDENT = 1e-7  # metres; float32 positions with a smaller spread are the same point
 STRAIGHT = 1e-6  # points form a line if their spread across it is less than this share of the spread along it
@@ -411,6 +412,8 @@ class BoundaryRanges:
         radius_high: 95th percentile of R.
         length_low: Minimum of D.
         length_high: 95th percentile of D.
+        points: R and D, both scaled to [0, 1], of about a hundred windows. They are evenly spread in the order of
+            R + D, so for α = 0.5 they give the quantiles of F. Empty in calibrations before version 1.1.
 
     Raises:
         CheckpointError: A range is empty or not finite.
@@ -420,6 +423,7 @@ class BoundaryRanges:
     radius_high: float
     length_low: float
     length_high: float
+    points: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
         pairs = ((self.radius_low, self.radius_high), (self.length_low, self.length_high))
@@ -427,12 +431,13 @@ class BoundaryRanges:
             raise CheckpointError(f"{self} is no range: build it from demonstrations in which the hand moves")
 
     @classmethod
-    def fit(cls, paths: Iterable[np.ndarray], window: int) -> BoundaryRanges:
+    def fit(cls, paths: Iterable[np.ndarray], window: int, known: BoundaryRanges | None = None) -> BoundaryRanges:
         """Measure the ranges over all windows that a boundary would see, including short ones when an episode begins.
 
         Args:
             paths: Measured hand positions of each episode, (T, 3) metres.
             window: Number of positions in a window.
+            known: Ranges to keep, if only `points` is to be measured.
 
         Raises:
             CheckpointError: No path is curved, or the hand never moves.
@@ -447,7 +452,30 @@ class BoundaryRanges:
         if not len(radii):
             raise CheckpointError("the demonstrations hold no curved path: the boundary's ranges cannot be taken")
         high = (float(np.percentile(x, 95)) for x in (radii, lengths))
-        return cls(float(radii.min()), next(high), float(lengths.min()), next(high))
+        ranges = known or cls(float(radii.min()), next(high), float(lengths.min()), next(high))
+        scaled = sorted((ranges.normalise(*one) for one in measured), key=sum)
+        kept = (np.arange(POINTS) + 0.5) / POINTS * len(scaled)
+        # rounded down, so that windows whose F is the limit itself reach it
+        points = np.floor(np.array([scaled[int(i)] for i in kept]) * 1e4) / 1e4
+        return replace(ranges, points=tuple((radius, length) for radius, length in points.tolist()))
+
+    def limit(self, quantile: float, alpha: float) -> float:
+        """Return the limit F*: a quantile of F over the windows of the demonstrations.
+
+        Args:
+            quantile: Share of the windows whose F is smaller.
+            alpha: Weight of the radius. The length has the weight 1 − alpha.
+
+        Raises:
+            CheckpointError: The calibration holds no points, because an earlier version made it.
+        """
+        if not self.points:
+            raise CheckpointError(
+                "the calibration has no quantiles of F for boundary.quantile: run 'kerv calibrate complete=true' for "
+                "the policy, or name the limit with boundary.f_star"
+            )
+        radii, lengths = np.array(self.points).T
+        return float(np.quantile(alpha * radii + (1 - alpha) * lengths, quantile))
 
     def normalise(self, radius: float, length: float) -> tuple[float, float]:
         """Scale a path's radius and length (metres) by the ranges. Return both in [0, 1].
@@ -522,7 +550,10 @@ class Fused(Boundary):
     def build(cls, settings: FusedBoundarySettings, context: Context) -> Fused:
         """Build the part that the setting `boundary=fused` chooses."""
         ranges = context.calibration.ranges(settings.window)
-        return cls(ranges, settings.alpha, settings.window, settings.f_star)
+        f_star = settings.f_star
+        if f_star is None:
+            f_star = ranges.limit(settings.quantile, settings.alpha)
+        return cls(ranges, settings.alpha, settings.window, f_star)
 
     def choose(self, path: np.ndarray) -> Choice:
         """Choose retrieval or the drafter from the newest `window` positions of the path (m, 3), in metres."""

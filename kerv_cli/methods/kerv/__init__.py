@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, number
+from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, choice, number
 from kerv_cli.base.registry import PREFILL, NoSettings, Part, add, parts
+from kerv_cli.engine.record import Measure
 
 if TYPE_CHECKING:
     from kerv_cli.methods.context import Context
@@ -32,11 +33,13 @@ for _name, _fitted, _colour in (
     ("linear", False, 0x0072B2),
     ("kalman", True, 0xD55E00),  # Kalman filters need the noise that `kerv calibrate` fitted
     ("damped", True, 0xA0522D),
+    ("walk", False, 0x999933),
 ):
     _drafts = (_PREDICTION + "PredictionProposer.build", NoSettings, ("calibration",) if _fitted else ())
     _predictor = _PREDICTION + "predictor_of"
     add("proposer", _name, *_drafts, colour=_colour, when=PREFILL, chains=True, predictor=_predictor)
 
+ACCEPTED = "accepted"
 DRAFT = "draft"
 """Value of `rectifier.predictor` that fills with the rejected draft instead of a kinematic prediction."""
 
@@ -61,7 +64,9 @@ class CompensateSettings:
     """KERV: after a rejection, predict the rest of that control step."""
 
     kind: str = "compensate"
-    predictor: str = "hold"  # hold, linear, kalman, damped; or draft: the rejected draft's remaining tokens (ours)
+    # kalman, damped, hold, linear (ours); walk (public code); draft: the rejected draft's remaining tokens (ours)
+    predictor: str = "hold"
+    hold_strict: bool = True  # true: strict DoFs keep their last value (ours); false: predicted like others (summary)
     steps: int = number(1, 1, MOST_TOKENS)  # control steps that a prediction may fill (paper: predict length PL)
     use_target_token: bool = True  # true: keep the target's token at the rejected position (ours); false: predict it
     drop: bool = True  # true: end the chunk after the filled steps (ours); false: decode on, drop nothing (paper)
@@ -115,10 +120,12 @@ class RadiusRange:
 
 @dataclass
 class KinematicThresholdSettings(RadiusRange):
-    """KERV: the acceptance radius r depends on the variability K, the mean distance of the last drafts to the target.
+    """KERV: the acceptance radius r follows the variability K, the distance of the last drafts to the target.
 
-    With `kinematic`, r is large where K is small (docs/methods.md §3.2). With `change`, an ablation, r shrinks when K
-    has risen since the last decode. With `quoted`, the paper's formula, r never shrinks.
+    Its authors' summaries leave open how Δr = (r_max − r_min) · exp(−(ΔK / K_S)^φ) changes r (docs/methods.md §3.2).
+    Readings: `offset`: r = r_min + Δr, so r shrinks when K changes, as KERV's README says. `quoted`: r ← r + Δr, the
+    literal formula, which never shrinks. `change`: r shrinks when K has risen. `kinematic` (ours): r is large where K
+    is small.
     """
 
     kind: str = "kinematic"
@@ -126,6 +133,18 @@ class KinematicThresholdSettings(RadiusRange):
     r_max: int = number(15, 0, MOST_BINS)  # largest radius, bins
     phi: float = number(2.0, above=0, most=50)  # exponent φ of K / K_S
     k_s: float | None = number(None, above=0, most=1e9)  # reference level K_S of K; None: the task's calibrated value
+    over: str = choice(
+        "compared",
+        "compared",
+        ACCEPTED,
+        help="draft tokens that count for K: with the rejected ones, or without (README)",
+    )
+    total: bool = False  # true: K is the sum of the differences (summary); false: their mean (ours)
+
+    @property
+    def measure(self) -> Measure:
+        """How K is computed."""
+        return Measure(self.over == ACCEPTED, self.total)
 
 
 @dataclass
@@ -155,6 +174,7 @@ class Kinematic:
 
     Attributes:
         r: The radius of the next decode, in bins, not rounded.
+        measure: How K is computed.
         last: K of the last decode in which drafts were compared.
     """
 
@@ -166,8 +186,13 @@ class Kinematic:
             CheckpointError: The calibration has no K_S for the task.
         """
         context.check_radius("r_max", settings.r_max)
-        self.settings = settings
-        self.k_s = settings.k_s if settings.k_s is not None else context.calibration.k_s(context.task)
+        self.settings, self.measure = settings, settings.measure
+        if settings.k_s is not None:
+            self.k_s = settings.k_s
+        else:
+            self.k_s = context.calibration.k_s(context.task, self.measure)
+            if self.measure.total and context.chunk:  # a sum over fewer control steps than the calibration's
+                self.k_s *= context.chunk / context.target.chunk
         self.reset()
 
     def reset(self) -> None:
@@ -203,7 +228,7 @@ class Kinematic:
 
 
 class Change(Kinematic):
-    """Ablation of KERV: the acceptance radius r shrinks if the variability K grows, and grows if K shrinks.
+    """KERV, read with a signed change: the acceptance radius r shrinks if the variability K grows, else it grows.
 
     r ← clamp(r − (r_max − r_min) · sign(Δ) · (1 − exp(−|Δ / K_S|^φ)), r_min, r_max). Δ is the change of K between the
     last two decodes in which drafts were compared. An episode begins as if the last K were K_S.
@@ -213,6 +238,19 @@ class Change(Kinematic):
         """Return r, lowered if K has risen and raised if K has fallen."""
         change = variability - self.last
         return self.r - math.copysign(self.settings.r_max - self.falling(abs(change)), change)
+
+
+class Offset(Kinematic):
+    """KERV, read as its README says: r = r_min + (r_max − r_min) · exp(−(|ΔK| / K_S)^φ).
+
+    ΔK is the change of the variability K between the last two decodes in which drafts were compared. So r is large
+    while K is steady, and tightens when it changes. The first change of K in an episode is measured from K_S.
+    An episode begins with the radius for |ΔK| = K_S.
+    """
+
+    def next(self, variability: float) -> float:
+        """Return the radius for the change of K since the last decode."""
+        return self.falling(abs(variability - self.last))
 
 
 class Quoted(Kinematic):
@@ -275,6 +313,7 @@ def nearest(r: float) -> int:
 
 _kinematic = (KinematicThresholdSettings, needs_of_variability)
 add("threshold", "kinematic", f"{__name__}:Kinematic", *_kinematic)
+add("threshold", "offset", f"{__name__}:Offset", *_kinematic)
 add("threshold", "change", f"{__name__}:Change", *_kinematic)
 add("threshold", "quoted", f"{__name__}:Quoted", *_kinematic)
 add("threshold", "schedule", f"{__name__}:Schedule", ScheduleThresholdSettings)

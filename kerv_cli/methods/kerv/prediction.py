@@ -12,9 +12,11 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
+from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.registry import NoSettings, load
 from kerv_cli.engine.chunk import WINDOW, Chunk
 from kerv_cli.engine.proposer import ChainProposer
@@ -30,12 +32,12 @@ class Noise:
     """Parameters of a Kalman filter, one number per DoF.
 
     Only the ratio q / r matters, because the filter's initial covariance is r times the identity. The numbers of strict
-    DoFs (such as the gripper) are not used, because a prediction repeats the last value of these DoFs.
+    DoFs (such as the gripper) are used only if `rectifier.hold_strict` is false. q = 0: the DoF was not fitted.
 
     Attributes:
         q: Process noise: variance of the random acceleration per control step.
         r: Measurement noise: variance of the observed actions.
-        damping: Factor of the velocity per control step. 1: constant velocity, as in the paper. Less than 1: *ours*.
+        damping: Factor of the velocity per control step. 1: constant velocity, *ours*, too; less than 1 for `damped`.
     """
 
     q: tuple[float, ...]
@@ -135,6 +137,18 @@ class Predictor:
         weights[:, -1] = 1.0
         return weights
 
+    def released(self) -> Self:
+        """Return the predictor that also predicts the strict DoFs, instead of holding them.
+
+        Raises:
+            CheckpointError: It is a Kalman filter, and the calibration has no noise for a strict DoF.
+        """
+        if self.noise is not None and not all(self.noise.q):
+            raise CheckpointError(
+                "the calibration's filters were not fitted to strict DoFs: run 'kerv calibrate complete=true'"
+            )
+        return type(self)(np.zeros(self.dofs, bool), self.noise, self.minimum, self.window, self.horizon)
+
     def _table(self, window: int) -> np.ndarray:
         """Return the weights (D, horizon, window) of all DoFs, for this number of past actions."""
         last = Predictor.weights(self, 0, window)
@@ -208,6 +222,27 @@ class Damped(Kalman):
     name = "damped"
 
 
+class Walk(Predictor):
+    """The filter of KERV's public code: a random walk per DoF, on token ids, with Q = 1 and R = 1e-3.
+
+    It is a Kalman filter whose state is the action alone. Its gain is 0.999, so it nearly repeats the last action. It
+    begins at the first action with the variance R. Token ids differ from normalised values by a scale and an offset,
+    which change no weight.
+    """
+
+    name = "walk"
+    noise_ratio = 1.0 / 1e-3  # Q / R
+
+    def weights(self, dof: int, window: int) -> np.ndarray:
+        """Return the weights (horizon, window): the filtered last action, for every step ahead."""
+        state, variance = np.eye(1, window)[0], 1.0  # all variances divided by R
+        for newest in np.eye(window)[1:]:
+            variance += self.noise_ratio
+            gain = variance / (variance + 1.0)
+            state, variance = state + gain * (newest - state), (1.0 - gain) * variance
+        return np.tile(state, (self.horizon, 1))
+
+
 class Ridge(Predictor):
     """SP-VLA: continues the line through the last `window` actions, fitted by ridge regression on time.
 
@@ -234,7 +269,7 @@ class Ridge(Predictor):
 
 
 FILTERS = ("kalman", "damped")
-PREDICTORS = {kind.name: kind for kind in (Hold, Linear, Kalman, Damped)}
+PREDICTORS = {kind.name: kind for kind in (Hold, Linear, Kalman, Damped, Walk)}
 
 
 def predictor_of(settings: NoSettings, context: Context) -> Predictor:
@@ -260,7 +295,7 @@ class PredictionProposer(ChainProposer):
 
     @classmethod
     def build(cls, settings: NoSettings, context: Context) -> PredictionProposer:
-        """Build proposer=hold, linear, kalman or damped."""
+        """Build proposer=hold, linear, kalman, damped or walk."""
         return cls(predictor_of(settings, context))
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
@@ -283,6 +318,7 @@ class Compensation:
     - `use_target_token` (ours): also keep the target's token at the rejected position, which is already computed.
     - `drop` (ours): end the chunk after the predicted steps. Otherwise the target decodes the later steps.
     - `steps` (the paper's predict length PL): how many control steps to fill.
+    - `hold_strict` (ours): strict DoFs, such as the gripper, keep their last value. Otherwise they are predicted, too.
     - `predictor=draft` (ours): fill with the rejected draft's remaining tokens first. A draft was made from the
       observation, a prediction only from past actions.
     - `rest`: in how many decodes after each compensation nothing is compensated.
@@ -296,7 +332,8 @@ class Compensation:
     def build(cls, settings: CompensateSettings, context: Context) -> Compensation:
         """Build the part that the setting `rectifier=compensate` chooses."""
         name = Hold.name if settings.predictor == DRAFT else settings.predictor
-        return cls(settings, load(find_predictor(name).traits["predictor"])(NoSettings(name), context))
+        predictor: Predictor = load(find_predictor(name).traits["predictor"])(NoSettings(name), context)
+        return cls(settings, predictor if settings.hold_strict else predictor.released())
 
     @property
     def uses_target_token(self) -> bool:
