@@ -166,11 +166,9 @@ def until(condition: Callable[[], Any], seconds: float = 60.0) -> None:
 @contextlib.contextmanager
 def served(results: Path) -> Iterator[str]:
     """The address of a board of a results folder, which runs in a thread."""
-    import uvicorn
+    from kerv_cli.board.app import web_server
 
-    from kerv_cli.board.app import make_app
-
-    server = uvicorn.Server(uvicorn.Config(make_app(results), port=0, log_level="error"))
+    server = web_server(results, port=0)
     thread = threading.Thread(target=server.run)
     thread.start()
     try:

@@ -1,7 +1,9 @@
 """`kerv board`: its pages in a browser, what it refuses, and how fast it is."""
 
+import contextlib
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -16,7 +18,7 @@ from starlette.testclient import TestClient
 from studies_synthetic import episode, swept, threshold_study, unhurried
 
 from kerv_cli.base.errors import KervError
-from kerv_cli.board import studies
+from kerv_cli.board import app, studies
 from kerv_cli.board.app import make_app
 from kerv_cli.episodes.rows import episode_row, seconds_blob
 from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, SETTINGS, WANTED, Database, now
@@ -90,15 +92,68 @@ def test_hostile_names_are_text(tmp_path):
         assert "img" in page, path
 
 
-def test_ctrl_c_ends_the_command_quietly(tmp_path):
-    words = [sys.executable, "-m", "kerv_cli", "board", "port=0", "open=false", f"results={tmp_path}"]
+SLOW = """
+import time
+from starlette.responses import Response
+from starlette.routing import Route
+from kerv_cli.__main__ import main
+from kerv_cli.board import runs
+def slow(request):
+    print("asked", flush=True)
+    time.sleep(30)
+runs.ROUTES.append(Route("/slow", slow))
+main()
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_command_ends_quietly_and_at_once(tmp_path, number):
+    """With a page in the making, too, and with a request that is not finished."""
+    words = [sys.executable, "-c", SLOW, "board", "port=0", "open=false", f"results={tmp_path}"]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         address = process.stdout.readline().split()[0]
         assert address.startswith(f"{HERE}:")
         with urllib.request.urlopen(address) as page:
             assert b"Runs" in page.read()
-        process.send_signal(signal.SIGINT)
-        assert (process.wait(60), process.stderr.read()) == (0, "")
+        with unfinished(address) as waiting, unfinished(address):
+            waiting.sendall(b"/slow HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+            assert process.stdout.readline() == "asked\n"
+            process.send_signal(number)
+            assert (process.wait(3), process.stderr.read()) == (0, "")
+
+
+def unfinished(address):
+    """A connection with the beginning of a request."""
+    connection = socket.create_connection(("127.0.0.1", int(address.strip("/").rpartition(":")[2])))
+    connection.sendall(b"GET ")
+    return connection
+
+
+def test_requests_that_are_not_finished_are_dropped(tmp_path, monkeypatch):
+    monkeypatch.setattr(app, "PATIENCE", 0.3)
+    with served(tmp_path) as address, contextlib.ExitStack() as stack:
+        late = stack.enter_context(unfinished(address))
+        late.sendall(b"/ HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        assert late.recv(2**16).startswith(b"HTTP/1.1 200")
+        late.sendall(b"GET ")  # a second request, on the same connection
+        waiting = [late, *(stack.enter_context(unfinished(address)) for _ in range(200))]
+        for connection in waiting:
+            connection.settimeout(3)
+            while connection.recv(2**16):
+                pass  # until the server has closed it
+        assert urllib.request.urlopen(address).status == 200
+
+
+def test_a_script_or_style_inside_a_page_does_not_run(address, open_page):
+    page = open_page(address, record_troubles=False)
+    page.evaluate("""() => {
+        const script = document.createElement("script");
+        script.textContent = "window.ran = true";
+        document.body.append(script);
+        document.body.setAttribute("style", "color: rgb(1, 2, 3)");
+    }""")
+    assert page.evaluate("window.ran") is None
+    assert page.evaluate("getComputedStyle(document.body).color") != "rgb(1, 2, 3)"
 
 
 # --- speed ---
@@ -160,9 +215,12 @@ def open_page(browser):
     """Opens an address. A page must raise no error and must ask nobody else."""
     troubles = []
 
-    def opened(address, **options):
+    def opened(address, record_troubles=True, **options):
         page = browser.new_context(**options).new_page()
         page.set_default_timeout(15_000)
+        if not record_troubles:
+            page.goto(address)
+            return page
         page.on("pageerror", lambda error: troubles.append(str(error)))
         page.on("console", lambda message: message.type == "error" and troubles.append(message.text))
         page.on("request", lambda asked: asked.url.startswith((HERE, "data:")) or troubles.append(asked.url))

@@ -6,9 +6,13 @@ import io
 import json
 import shlex
 import sqlite3
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
+from urllib.request import Request, urlopen
 
 import pytest
 import rerun_synthetic
@@ -21,7 +25,7 @@ from starlette.testclient import TestClient
 from studies_synthetic import episode, part, settings_of, study_of, swept, threshold_study
 
 from kerv_cli.board.app import make_app
-from kerv_cli.board.episode import command_of
+from kerv_cli.board.episode import RECORDER, command_of
 from kerv_cli.board.episodes import phase_of
 from kerv_cli.board.recorder import record_episode
 from kerv_cli.catalogue.episodes import find_episode
@@ -206,6 +210,19 @@ def test_an_episode_whose_policy_has_changed_is_not_recorded(tmp_path):
     error = record_episode(one.setting, one.task, [one.seed], str(tmp_path), store.rollouts / one.recording)
     assert "of ar has changed" in error
     assert not store.recordings
+
+
+def test_pages_that_load_do_not_end_the_thread_that_started_a_recording(address, rolled, monkeypatch):
+    """With that thread the kernel would end the process that records."""
+    starters = []
+    monkeypatch.setattr(RECORDER, "record", lambda found: starters.append(threading.current_thread()))
+    monkeypatch.setattr("anyio._backends._asyncio.WorkerThread.MAX_IDLE_TIME", 0)  # seconds, else 10
+    urlopen(Request(f"{address}/episodes/{rows_of_wanted(rolled)[0]}/record", method="POST"))
+    with ThreadPoolExecutor(4) as pages:
+        for _ in range(10):
+            list(pages.map(urlopen, [address] * 4))
+    time.sleep(0.2)
+    assert starters[0].is_alive()
 
 
 def test_a_person_gets_from_a_failure_to_its_film_a_decode_and_rerun(page, address, rolled):

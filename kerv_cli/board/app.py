@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import socket
+import threading
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import uvicorn
@@ -19,6 +22,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Mount
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.board import episode, episodes, runs, studies, training
@@ -28,6 +32,10 @@ from kerv_cli.lab.database import Database
 HOST = "127.0.0.1"
 _HOSTS = [HOST, "localhost"]
 _READS = ("GET", "HEAD")
+PATIENCE = 5.0
+"""Seconds between two checks of a connection. One that asked for nothing since the last check is closed."""
+LAST_ANSWERS = 1.0
+"""Seconds that a board that stops gives to answers that are being computed."""
 
 
 class SameOrigin:
@@ -47,6 +55,23 @@ class SameOrigin:
                 await PlainTextResponse("refused: another site's page sent this", 403)(scope, receive, send)
                 return
         await self.app(scope, receive, send)
+
+
+class Impatient(H11Protocol):
+    """A connection that is closed if it begins a request and does not finish it."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin to serve a connection."""
+        super().connection_made(transport)
+        self.loop.call_later(PATIENCE, self._check, None)
+
+    def _check(self, before: object) -> None:
+        """Close the connection if it waits and asked for nothing since the last check. `before`: the request then."""
+        waits = self.cycle is None or self.cycle.response_complete
+        if waits and self.cycle is before:
+            self.transport.close()
+        elif not self.transport.is_closing():
+            self.loop.call_later(PATIENCE, self._check, self.cycle)
 
 
 def make_app(results: str | Path) -> Starlette:
@@ -73,6 +98,16 @@ async def _failed(request: Request, error: Exception) -> Response:
     return render(request, "error.html", 404 if isinstance(error, UsageError) else 500, reason=reason)
 
 
+def web_server(results: str | Path, **options: Any) -> uvicorn.Server:
+    """Return the server of the web app.
+
+    Args:
+        results: The results folder.
+        **options: More options of uvicorn.
+    """
+    return uvicorn.Server(uvicorn.Config(make_app(results), http=Impatient, log_level="critical", **options))
+
+
 def serve(results: str | Path, port: int, opened: Callable[[str], None], browser: bool) -> None:
     """Serve the web app until Ctrl-C.
 
@@ -85,7 +120,7 @@ def serve(results: str | Path, port: int, opened: Callable[[str], None], browser
     Raises:
         UsageError: The port is taken.
     """
-    server = uvicorn.Server(uvicorn.Config(make_app(results), log_level="critical", timeout_graceful_shutdown=1))
+    server = web_server(results)
     with socket.socket() as listening:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -99,6 +134,11 @@ def serve(results: str | Path, port: int, opened: Callable[[str], None], browser
         opened(address)
         if browser:
             webbrowser.open(address)
+        # a daemon, as are the threads that it starts: no answer delays the end
+        answering = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
+        answering.start()
         with contextlib.suppress(KeyboardInterrupt):
-            server.run(sockets=[listening])
+            answering.join()
+        server.should_exit = True
+        answering.join(LAST_ANSWERS)
         episode.RECORDER.close()

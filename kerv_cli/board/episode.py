@@ -17,13 +17,14 @@ from typing import Any
 from urllib.error import URLError
 from urllib.parse import quote
 
+from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
 from kerv_cli.base.errors import KervError
-from kerv_cli.board.pages import database_of, inside, render
+from kerv_cli.board.pages import CONTENT_POLICY, database_of, inside, render
 from kerv_cli.board.recorder import Recorder
 from kerv_cli.catalogue.episodes import FoundEpisode, find_episode, outcomes
 from kerv_cli.engine.record import PHASES, DecodeRecord
@@ -120,13 +121,17 @@ def show_film(request: Request) -> Response:
     return render(request, "episode_film.html", **_film_values(request, _found(request)))
 
 
-def record(request: Request) -> Response:
-    """Start to record an episode, unless it is being recorded already."""
-    found = _found(request)
+async def record(request: Request) -> Response:
+    """Start to record an episode, unless it is being recorded already.
+
+    This thread starts the process, because it lives as long as the board. Threads that make pages end, and the kernel
+    ends a process with the thread that started it (`end_with`).
+    """
+    found = await run_in_threadpool(_found, request)
     if found.store.kind == IMPORT:
         raise HTTPException(409, "an imported episode cannot be recorded: another program ran it")
     RECORDER.record(found)
-    return show_film(request)
+    return await run_in_threadpool(show_film, request)
 
 
 _FOREVER = {"cache-control": "max-age=86400"}
@@ -156,6 +161,12 @@ def recording(request: Request) -> Response:
 
 _VIEWER_FILES = ("", "re_viewer.js", "re_viewer_bg.wasm", "favicon.ico")
 _VIEWER_SECONDS = 20.0
+_VIEWER_CONTENT = (
+    "default-src 'none'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' data: blob:; worker-src 'self' blob:; "
+    "base-uri 'none'; frame-ancestors 'none'"
+)
+"""Content security policy of Rerun's viewer: a WebAssembly program with a script in its page."""
 
 
 @functools.cache
@@ -207,7 +218,7 @@ def viewer(request: Request) -> Response:
     if name not in _VIEWER_FILES:
         raise HTTPException(404, "Rerun's viewer has no such file")
     content, kind = viewer_files()[name]
-    return Response(content, media_type=kind, headers=_FOREVER)
+    return Response(content, media_type=kind, headers=_FOREVER | {CONTENT_POLICY: _VIEWER_CONTENT})
 
 
 ROUTES = [

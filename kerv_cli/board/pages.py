@@ -23,6 +23,14 @@ TEMPLATES = Environment(
     lstrip_blocks=True,
 )
 
+CONTENT_POLICY = "content-security-policy"
+"""Header that says what a page may load and run."""
+_OWN_CONTENT = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
+    "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+"""The policy of the board's pages: files of the board alone. No page contains a script or a style."""
+
 
 def few(names: Iterable[str], most: int = 3) -> str:
     """Return the first names, and how many more there are: `ar, kerv, jacobi +4`."""
@@ -58,7 +66,8 @@ def render(request: Request, template: str, status: int = 200, **values: Any) ->
         status: HTTP status.
         **values: Values that the template shows. They are escaped.
     """
-    return HTMLResponse(TEMPLATES.get_template(template).render(request=request, **values), status)
+    text = TEMPLATES.get_template(template).render(request=request, **values)
+    return HTMLResponse(text, status, {CONTENT_POLICY: _OWN_CONTENT})
 
 
 def inside(request: Request, path: Path) -> Path:

@@ -57,7 +57,10 @@ class Recorder:
         return self._jobs.get(path)
 
     def record(self, found: FoundEpisode) -> None:
-        """Start to record an episode, unless it is being recorded already."""
+        """Start to record an episode, unless it is being recorded already.
+
+        Call it in a thread that lives as long as the board: the recording process ends with it.
+        """
         from joblib.externals.loky import get_reusable_executor
 
         path = found.recording

@@ -9,6 +9,7 @@ import typer
 from kerv_cli.base.limits import number, setting
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
+from kerv_cli.cli.common import end_at_once
 
 
 @dataclass(kw_only=True)
@@ -37,3 +38,4 @@ def board(settings: BoardSettings) -> None:
         lambda address: typer.echo(f"{address}  (Ctrl-C ends it)"),
         settings.open and has_display(),
     )
+    end_at_once()

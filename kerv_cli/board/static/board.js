@@ -1,3 +1,8 @@
+// A page that nobody sees does not ask for news.
+document.addEventListener("htmx:beforeRequest", (event) => {
+  if (document.hidden && event.target.matches("[hx-trigger*=every], [hx-trigger*=visibilitychange]")) event.preventDefault();
+});
+
 // Only two runs can be compared.
 document.addEventListener("change", (event) => {
   if (event.target.name !== "run") return;

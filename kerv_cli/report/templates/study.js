@@ -72,7 +72,7 @@ function showStudy(root) {
       spec.columns = across;
       for (const panel of spec.concat) panel.width = Math.max(70, (width - beside - 28 * (across - 1) - 14) / across);
       if (view) views.splice(views.indexOf(view), 1)[0].finalize();
-      view = (await vegaEmbed(place, spec, { actions: false, renderer: "svg", tooltip: showTip, config })).view;
+      view = (await vegaEmbed(place, spec, { actions: false, ast: true, defaultStyle: false, renderer: "svg", tooltip: showTip, config })).view;
       views.push(view);
       view.addEventListener("click", (event, item) => item?.datum?.setting && pick(item.datum.setting));
       view.signal("picked", picked).runAsync();
