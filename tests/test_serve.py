@@ -6,7 +6,6 @@ import socket
 import struct
 import subprocess
 import sys
-import threading
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -75,12 +74,8 @@ def policy(policies):
 def serving(policy: Policy, **chosen: Any) -> Iterator[tuple[int, list[str]]]:
     """The port of a server that runs in a thread, and its log. chosen: settings."""
     log: list[str] = []
-    with PolicyServer(policy, replace(policy.settings, **chosen), log.append).listening("127.0.0.1", 0) as listening:
-        thread = threading.Thread(target=listening.serve_forever)
-        thread.start()
-        yield listening.socket.getsockname()[1], log
-        listening.shutdown()
-        thread.join(5)
+    with PolicyServer(policy, replace(policy.settings, **chosen), log.append).listening("127.0.0.1", 0) as port:
+        yield port, log
 
 
 def seen(seed: int, **changes: Any) -> dict[str, Any]:
@@ -229,17 +224,25 @@ def test_a_server_that_cannot_start_says_so(policies):
     assert "cannot listen on 256.1.1.1:0" in refusal(*words, "host=256.1.1.1", "port=0")
 
 
-def test_the_command_answers_and_stops_when_told(policies, tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_the_command_answers_and_stops_when_told(policies, tmp_path, number):
+    """At once, whatever its clients do: one is silent, one is in mid message, one has not even asked for anything."""
     words = ["serve", "policy.target=nano-state", f"results={policies}", "port=0"]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with (tmp_path / "log").open("w") as log:
         process = subprocess.Popen([sys.executable, "-m", "kerv_cli", *words], stderr=log, env=environment)
         try:
             until(lambda: "listens on" in (tmp_path / "log").read_text(), 60)
-            client = Client(int((tmp_path / "log").read_text().rsplit(":", 1)[1]))
+            port = int((tmp_path / "log").read_text().rsplit(":", 1)[1])
+            client = Client(port)
             assert client.infer({"observation/state": np.zeros(39), "prompt": ""})["actions"].shape == (4, 4)
-            process.send_signal(signal.SIGTERM)
-            assert process.wait(20) == 0
+            client.connection.close()
+            until(lambda: "disconnected" in (tmp_path / "log").read_text())
+            with silent(port) as seated, socket.create_connection(("127.0.0.1", port)):
+                until(lambda: (tmp_path / "log").read_text().count(" connected") == 2)
+                seated.sendall(b"\x82\xfe\xff\xff")  # the beginning of a frame of 65535 bytes
+                process.send_signal(number)
+                assert process.wait(3) == 0
         finally:
             process.kill()
     assert "stopped" in (tmp_path / "log").read_text()

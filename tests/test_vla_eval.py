@@ -32,6 +32,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.catalogue.evaluations import labelled, read_evaluations, read_served
 from kerv_cli.episodes.runner import Runner
 from kerv_cli.episodes.settings import RolloutSettings
+from kerv_cli.serve import vla_eval as serve_vla_eval
 from kerv_cli.serve.policy import Policy
 from kerv_cli.serve.settings import ServeSettings
 from kerv_cli.serve.vla_eval import dim_specs
@@ -185,6 +186,18 @@ def test_a_wrong_message_gets_one_line_and_the_next_one_an_answer(policy, kind, 
         assert said in told["error"]
         assert "\n" not in told["error"]
         assert any(said in line for line in log)
+        assert client.act().shape == (4,)
+
+
+def test_an_episode_that_never_ends_is_refused_before_it_fills_the_memory(policy, monkeypatch):
+    monkeypatch.setattr(serve_vla_eval, "MOST_STEPS", 6)
+    with serving(policy) as (port, _):
+        client = Client(port)
+        for _ in range(6):
+            client.act()
+        kind, told = client.ask("observation", seen(0))
+        assert (kind, "6 control steps" in told["error"]) == ("error", True)
+        client.tell("episode_end", {})
         assert client.act().shape == (4,)
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import signal
+import contextlib
 import threading
 import time
 
 import typer
 
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import ShowPlan, end_with_plan
+from kerv_cli.cli.common import ShowPlan, end_at_once, end_with_plan
 from kerv_cli.serve.settings import ServeSettings
 
 
@@ -28,13 +28,11 @@ def serve(settings: ServeSettings, plan: ShowPlan = False) -> None:
     server = PolicyServer(Policy(settings), settings, _log)
     if plan:
         end_with_plan(f"{settings.policy.target} with {settings.method} on ws://{settings.host}:{settings.port}")
-    with server.listening(settings.host, settings.port) as listening:
-        port = listening.socket.getsockname()[1]
+    with server.listening(settings.host, settings.port) as port, contextlib.suppress(KeyboardInterrupt):
         _log(f"{settings.policy.target} with {settings.method} listens on ws://{settings.host}:{port}")
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: threading.Thread(target=listening.shutdown).start())
-        listening.serve_forever()
+        threading.Event().wait()
     _log("stopped")
+    end_at_once()
 
 
 def _log(line: str) -> None:

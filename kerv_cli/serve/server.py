@@ -11,7 +11,7 @@ import http
 import logging
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -24,7 +24,7 @@ try:
     import msgpack  # noqa: F401 - the protocols need it
     from websockets.exceptions import ConnectionClosed
     from websockets.http11 import Request, Response
-    from websockets.sync.server import Server, ServerConnection, serve
+    from websockets.sync.server import ServerConnection, serve
 except ImportError as error:
     raise KervError("the policy server needs more packages: pip install 'kerv[serve]'") from error
 
@@ -39,7 +39,9 @@ LONGEST = 500
 PATIENCE = 1.0
 """Seconds that a new client waits for a free place: its own previous connection may just be closing."""
 FAREWELL = 2.0
-"""Seconds to wait for a connection to close."""
+"""Seconds to wait for a client that must close its connection."""
+LAST_ANSWERS = 1.0
+"""Seconds that a server that stops gives to answers that are being computed and to clients that must leave."""
 
 
 class PolicyServer:
@@ -58,8 +60,10 @@ class PolicyServer:
         self._connections: set[ServerConnection] = set()
 
     @contextlib.contextmanager
-    def listening(self, host: str, port: int) -> Iterator[Server]:
-        """Start to listen. Yield the server, which has `serve_forever()` and `shutdown()`.
+    def listening(self, host: str, port: int) -> Iterator[int]:
+        """Serve clients until the end of the block. Yield the port.
+
+        All threads are daemons. No client can delay the end by more than LAST_ANSWERS, even during its handshake.
 
         Args:
             host: Address to listen on.
@@ -84,10 +88,17 @@ class PolicyServer:
             )
         except OSError as error:
             raise UsageError(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
-        with server:
-            yield server
-        for connection in list(self._connections):
-            connection.close(GONE, "the server stops")
+        port = server.socket.getsockname()[1]
+        _start(server.serve_forever)
+        try:
+            yield port
+        finally:
+            for connection in list(self._connections):
+                _start(connection.close, GONE, "the server stops")
+            _start(server.shutdown)
+            end = time.monotonic() + LAST_ANSWERS
+            while self._connections and time.monotonic() < end:
+                time.sleep(0.02)
 
     def handle(self, connection: ServerConnection) -> None:
         """Serve one client until it disconnects. Runs in the client's thread."""
@@ -110,7 +121,7 @@ class PolicyServer:
         except TimeoutError:
             why = f": no message for {self.protocol.idle_s:g} s"
             # close in a thread, because the client may never answer
-            threading.Thread(target=connection.close, args=(GONE, why[2:]), daemon=True).start()
+            _start(connection.close, GONE, why[2:])
         finally:
             self._connections.discard(connection)
             self._seats.release()
@@ -149,6 +160,11 @@ class PolicyServer:
             line = " ".join((str(error) if isinstance(error, KervError) else internal).split())[:LONGEST]
             conversation.log(f"error: {line}")
             return conversation.fault(line)
+
+
+def _start(function: Callable[..., object], *arguments: object) -> None:
+    """Call a function in a new daemon thread. Threads that it starts are daemons, too."""
+    threading.Thread(target=function, args=arguments, daemon=True).start()
 
 
 def _summary(times: list[float]) -> str:

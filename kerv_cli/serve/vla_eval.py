@@ -24,6 +24,8 @@ from kerv_cli.serve.interface import OPEN, Interface, Message, hand_of, keys_of,
 from kerv_cli.serve.policy import Conversation, Log, Policy
 
 PROTOCOL_VERSION = 1
+MOST_STEPS = 20_000
+"""Most control steps of an episode. Its record grows with every step, until the client ends the episode."""
 _FORMATS = {("position", 3): "delta_xyz", ("rotation", 3): "axis_angle"}
 """The name that vla-eval gives to a group of DoFs, by the group's name and size."""
 
@@ -152,8 +154,14 @@ class VlaEval(Conversation):
         self.episode = _Episode(payload)  # errors are reported at the first observation
 
     def _observe(self, payload: Message) -> bytes:
-        """Return the next action. If the last chunk is used up, decode this observation first."""
+        """Return the next action. If the last chunk is used up, decode this observation first.
+
+        Raises:
+            UsageError: Something is wrong with the observation, or the episode has MOST_STEPS control steps.
+        """
         episode = self.episode = self.episode or _Episode({})
+        if len(episode.sent) >= MOST_STEPS:
+            raise UsageError(f"the episode has {MOST_STEPS} control steps, the most: send episode_end or episode_start")
         numbers = self.interface.numbers(payload.get("state", payload.get("states")), "state", payload)
         state = Observation(*numbers)
         hand, step = hand_of(state), len(episode.sent)
