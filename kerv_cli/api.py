@@ -19,10 +19,10 @@ import pandas as pd
 
 from kerv_cli.base.config import as_overrides, compose
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
-from kerv_cli.base.places import results_dir
 from kerv_cli.catalogue.entries import RunEntry, find_run, find_runs, matching, store_of
 from kerv_cli.episodes.resolve import resolve, resolve_rollout, study_name
 from kerv_cli.lab.command import chosen_store
+from kerv_cli.lab.database import Database
 from kerv_cli.lab.store import ROLLOUT, StudyStore
 from kerv_cli.lab.study import plan, plan_rollout, run
 from kerv_cli.report.measures import MICRO, Row
@@ -91,7 +91,7 @@ class Study:
         """
         if self.store.kind == ROLLOUT:
             raise UsageError(f"{self.name} is a rollout: kerv reports sweeps")
-        return write_report(self.store.database.results, self.name).files
+        return write_report(self.store.database, self.name).files
 
 
 def rollout(*overrides: str, grid: bool = False, **settings: object) -> Study:
@@ -154,7 +154,8 @@ def load_study(name: str, results: str | Path = "results", store: str = "") -> S
         UsageError: Nothing matches the name, several things match, or the match is no sweep or rollout.
     """
     with chosen_store([f"store={store}"] if store else []):
-        return Study(store_of(find_run(results_dir(str(results)), study_name(name))))
+        database = Database(results)
+    return Study(store_of(find_run(database, study_name(name)), database))
 
 
 def runs(results: str | Path = "results", store: str = "", **filters: str) -> pd.DataFrame:
@@ -170,7 +171,7 @@ def runs(results: str | Path = "results", store: str = "", **filters: str) -> pd
         UsageError: There is no such filter or kind.
     """
     with chosen_store([f"store={store}"] if store else []):
-        there = matching(find_runs(results_dir(str(results))), filters)
+        there = matching(find_runs(Database(results)), filters)
     return pd.DataFrame([asdict(run) for run in there], columns=[column.name for column in fields(RunEntry)])
 
 

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import refused
+from studies_synthetic import swept, threshold_study
 
 import kerv_cli as kerv
 from kerv_cli.base.config import as_overrides
+from kerv_cli.lab.command import STORE
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT: dict[str, Any] = {"task": "reach", "episodes": 1, "record": 0, "world": {"horizon": 6}}
@@ -76,6 +78,17 @@ def test_a_study_is_run_once_reported_and_loaded(study, mine):
     assert loaded.folder == study.folder
     files = {path.name for path in loaded.report()}
     assert {"both.csv", "both_per_task.csv", "report.html"} <= files
+
+
+def test_a_study_stays_in_the_database_that_was_named(tmp_path, monkeypatch):
+    results, store = tmp_path / "results", f"sqlite:///{tmp_path}/other.db"
+    with monkeypatch.context() as patch:
+        patch.setenv(STORE, store)
+        swept(results, threshold_study(["reach-v3"]))
+    loaded = kerv.load_study("threshold", results=results, store=store)
+    assert "report.html" in {file.name for file in loaded.report()}
+    assert loaded.to_pandas()["episodes"].tolist() == [4] * 4
+    assert not list(results.glob("*.db"))
 
 
 def test_runs_are_listed_and_narrowed(run, study, mine):

@@ -84,7 +84,7 @@ def test_runs_are_listed_and_filtered(results):
     assert listed(results, "kind=target")[0]["id"] == "target/nano-state"
     assert listed(results, "task=push") == []
     assert "did you mean method" in kerv("runs", "list", "methd=ar", f"results={results}", code=2).stderr
-    assert matching(find_runs(results), {"since": "2999"}) == []
+    assert matching(find_runs(Database(results)), {"since": "2999"}) == []
 
 
 def test_a_run_is_shown_and_a_wrong_name_refused(results):
@@ -198,7 +198,7 @@ def test_a_method_composed_on_the_command_line_is_called_what_it_is(words, label
 
 
 def test_episodes_are_exported_as_csv(results, tmp_path):
-    grid = next(run for run in find_runs(results) if "spec_vla" in run.methods)
+    grid = next(run for run in find_runs(Database(results)) if "spec_vla" in run.methods)
     (path,) = works("runs", "export", grid.id, "--dir", str(tmp_path), f"results={results}").split()
     table = pd.read_csv(path)
     assert list(table["label"]) == ["spec_vla r=5", "spec_vla r=5", "spec_vla r=9", "spec_vla r=9"]
@@ -213,6 +213,7 @@ KILLED = """
 import os, sys
 from pathlib import Path
 from kerv_cli.catalogue.entries import find_run, remove
+from kerv_cli.lab.database import Database
 
 left = int(sys.argv[3])
 
@@ -223,9 +224,10 @@ def kill_at(event, arguments):
         if left < 0:
             os.kill(os.getpid(), 9)
 
-run = find_run(sys.argv[1], sys.argv[2])
+database = Database(sys.argv[1])
+run = find_run(database, sys.argv[2])
 sys.addaudithook(kill_at)
-remove(run, sys.argv[1])
+remove(run, database)
 """
 
 

@@ -284,7 +284,7 @@ def results(tmp_path_factory):
 @pytest.fixture(scope="module")
 def written(results):
     """The files of its report."""
-    return report(results).files
+    return report(Database(results)).files
 
 
 def test_report_writes_the_same_bytes_again(results, written):
@@ -303,7 +303,7 @@ def test_report_writes_the_same_bytes_again(results, written):
     before = {path: path.read_bytes() for path in written}
     for path in written:
         path.unlink()
-    again = report(results, "threshold").files
+    again = report(Database(results), "threshold").files
     assert again == written
     assert {path: path.read_bytes() for path in again} == {path: before[path] for path in again}
     assert all(content.startswith(b"\x89PNG") for path, content in before.items() if path.suffix == ".png")
@@ -413,9 +413,9 @@ def commit(monkeypatch):
 
 def test_one_run_of_one_commit_is_published_where_it_is_committed(tmp_path):
     swept(tmp_path, STUDY)
-    draft = report(tmp_path, "threshold")
+    draft = report(Database(tmp_path), "threshold")
     assert not (tmp_path / "tables").exists()
-    published = report(tmp_path, "threshold", publish=True)
+    published = report(Database(tmp_path), "threshold", publish=True)
     table = tmp_path / "tables" / "threshold.csv"
     assert table in published.files
     assert table.read_bytes() == (tmp_path / "report" / "tables" / "threshold.csv").read_bytes()
@@ -427,7 +427,7 @@ def test_what_is_missing_or_not_committed_is_refused(tmp_path, commit):
     swept(tmp_path, replace(STUDY, episodes=STUDY.episodes[:-1]))
     StudyStore(tmp_path, "threshold").save(STUDY, plan_study(Database(tmp_path), STUDY).existing)
     with refused("1 of its episodes are missing", "not committed", error=Unpublishable):
-        report(tmp_path, "threshold", publish=True)
+        report(Database(tmp_path), "threshold", publish=True)
     assert not (tmp_path / "tables").exists()
 
 

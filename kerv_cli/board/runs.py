@@ -39,7 +39,7 @@ def show_runs(request: Request) -> Response:
     if request.query_params.get("known") == version:
         return Response(status_code=204)  # htmx leaves the page as it is
     asked = {name: request.query_params.get(name, "") for name in ("kind", "state", "text", "sort")}
-    every = find_runs(database_of(request).results)
+    every = find_runs(database_of(request))
     kinds = Counter(run.kind for run in every)
     runs = [run for run in every if _agrees(run, asked)]
     order = asked["sort"].removeprefix("-")
@@ -78,7 +78,7 @@ def show_comparison(request: Request) -> Response:
     names = request.query_params.getlist("run")
     if len(names) != 2:
         raise UsageError("choose two runs to compare")
-    pairs = pairs_to_compare(str(database_of(request).results), *names)
+    pairs = pairs_to_compare(database_of(request), *names)
     return render(request, "compare.html", names=names, comparisons=[compare(a, b) for a, b in pairs])
 
 

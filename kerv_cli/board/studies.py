@@ -6,7 +6,6 @@ import functools
 import os
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlencode
 
@@ -17,6 +16,7 @@ from starlette.routing import Route
 from kerv_cli.base.errors import UsageError
 from kerv_cli.board.pages import database_of, render
 from kerv_cli.catalogue.entries import find_runs, parents
+from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import RUNNING, pulse, run_rows
 from kerv_cli.lab.store import StudyStore
 
@@ -27,18 +27,18 @@ _SECONDS = 5.0
 
 
 @functools.lru_cache(maxsize=16)
-def _parts(results: Path, name: str, version: str) -> tuple[dict[str, Any], float]:
+def _parts(database: Database, name: str, version: str) -> tuple[dict[str, Any], float]:
     """Return the values of a study's report, and the seconds to wait before the next refresh.
 
     Args:
-        results: The results folder.
+        database: The database.
         name: Name of the study.
         version: `StudyStore.version` of the study. A study is read again only if its version has changed.
     """
     from kerv_cli.report.page import study_parts  # imports Altair, which takes a second
 
     clock = time.thread_time()
-    parts = study_parts(StudyStore(results, name))
+    parts = study_parts(StudyStore(database, name))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return parts, max(_SECONDS, (time.thread_time() - clock) / (_SHARE * cores))
 
@@ -49,7 +49,7 @@ def show_study(request: Request) -> Response:
     version, is_live = pulse(database)
     if request.query_params.get("known") == version:
         return Response(status_code=204)
-    runs = find_runs(database.results)
+    runs = find_runs(database)
     run = next((run for run in runs if run.id == request.path_params["name"] and run.has_episodes), None)
     if run is None:
         raise UsageError(f"there is no study '{request.path_params['name']}'")
@@ -77,7 +77,7 @@ def show_tables(request: Request) -> Response:
     if request.query_params.get("known") == version:
         return Response(status_code=204)
     has_episodes = store.counts()[0] > 0
-    parts, seconds = _parts(database.results, name, version) if has_episodes else ({}, _SECONDS)
+    parts, seconds = _parts(database, name, version) if has_episodes else ({}, _SECONDS)
     hidden: dict[str, Any] = {"recordings": [], "files": []} | ({"missing": 0} if is_running else {})
     if len(parts.get("settings", ())) == 1:
         hidden["charts"] = []  # nothing to compare

@@ -19,8 +19,8 @@ def show_artifact(request: Request) -> Response:
     version, is_live = pulse(database)
     if request.query_params.get("known") == version:
         return Response(status_code=204)
-    runs = find_runs(database.results)
-    run = find_run(database.results, request.path_params["name"], exact=True)
+    runs = find_runs(database)
+    run = find_run(database, request.path_params["name"], exact=True)
     if not run.folder.is_relative_to(database.results):
         raise UsageError(f"{run.id} is outside {database.results}")
     described = description_of(run)

@@ -110,9 +110,8 @@ class RunEntry:
         return not self.has_episodes and any((self.folder / name).is_file() for name in (LOG, WEIGHTS))
 
 
-def find_runs(results: str | Path) -> list[RunEntry]:
-    """Return all entries of the results folder, newest first."""
-    database = Database(results)
+def find_runs(database: Database) -> list[RunEntry]:
+    """Return all entries of a database and its results folder, newest first."""
     rows: dict[tuple[str, str], RunRow] = {}
     for row in run_rows(database):
         rows.setdefault((row.kind, row.name), row)
@@ -136,11 +135,11 @@ def find_runs(results: str | Path) -> list[RunEntry]:
     return sorted([*runs, *made.values()], key=lambda run: (run.started, run.id), reverse=True)
 
 
-def find_run(results: str | Path, name: str, exact: bool = False) -> RunEntry:
-    """Return one entry of the results folder.
+def find_run(database: Database, name: str, exact: bool = False) -> RunEntry:
+    """Return one entry of a database and its results folder.
 
     Args:
-        results: The results folder.
+        database: The database.
         name: Id of the entry, a part of it that no other id contains, or `last` for the newest entry.
         exact: Whether to accept only a whole id.
 
@@ -148,9 +147,9 @@ def find_run(results: str | Path, name: str, exact: bool = False) -> RunEntry:
         UsageError: Several entries match, or the folder has no entries.
         UnknownName: The folder has entries, but none matches.
     """
-    runs = find_runs(results)
+    runs = find_runs(database)
     if not runs:
-        raise UsageError(f"no runs in {results}: make one with 'kerv rollout method=spec_vla task=reach'")
+        raise UsageError(f"no runs in {database.results}: make one with 'kerv rollout method=spec_vla task=reach'")
     if name == LAST and not exact:
         return runs[0]
     found = [run for run in runs if run.id == name] or [run for run in runs if name in run.id and not exact]
@@ -198,15 +197,19 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
     return [run for run in runs if agrees(run)]
 
 
-def store_of(run: RunEntry) -> StudyStore:
+def store_of(run: RunEntry, database: Database) -> StudyStore:
     """Return the stored study (settings and episodes) of an entry.
+
+    Args:
+        run: The entry.
+        database: The database that `find_run` found it in.
 
     Raises:
         UsageError: The entry is not a sweep, rollout or import.
     """
     if not run.has_episodes:
         raise UsageError(f"{run.id} is a {run.kind}: it has no episodes")
-    return StudyStore(run.folder.parent.parent, run.folder.name, run.kind)
+    return StudyStore(database, run.folder.name, run.kind)
 
 
 def _studies(database: Database, rows: Mapping[tuple[str, str], RunRow]) -> list[RunEntry]:
@@ -381,7 +384,7 @@ def check_removable(run: RunEntry) -> None:
         raise UsageError(f"{run.id} is running: stop it first")
 
 
-def remove(run: RunEntry, results: str | Path) -> None:
+def remove(run: RunEntry, database: Database) -> None:
     """Remove an entry: its folder and its rows in the database.
 
     The folder is renamed first, to a temporary name that every command ignores and that a later command deletes. If
@@ -389,7 +392,7 @@ def remove(run: RunEntry, results: str | Path) -> None:
 
     Args:
         run: The entry to remove.
-        results: Its results folder.
+        database: Its database.
 
     Raises:
         StorageError: The disk is full or not writable.
@@ -400,8 +403,8 @@ def remove(run: RunEntry, results: str | Path) -> None:
             run.folder.rename(gone)
             sync(run.folder.parent)
     if run.has_episodes:
-        store_of(run).remove()
-    forget(Database(results), run.kind, run.id if run.has_episodes else run.id.removeprefix(f"{run.kind}/"))
+        store_of(run, database).remove()
+    forget(database, run.kind, run.id if run.has_episodes else run.id.removeprefix(f"{run.kind}/"))
     shutil.rmtree(gone, ignore_errors=True)
 
 
@@ -410,18 +413,18 @@ def again_words(run: RunEntry, results: str) -> list[str]:
     return ["runs", "rerun", run.id, *([] if results == CommandSettings().results else [f"results={results}"])]
 
 
-def plan_of(run: RunEntry, results: str) -> Plan:
+def plan_of(run: RunEntry, database: Database) -> Plan:
     """Plan to run a sweep or a rollout again. If an earlier repetition was interrupted, plan the rest of that one.
 
     Args:
         run: The sweep or rollout to repeat.
-        results: The results folder.
+        database: Its database.
 
     Raises:
         CheckpointError: The weights or data of the run have changed since.
         UsageError: A setting cannot run.
     """
-    database, study = Database(results), store_of(run).load()
+    results, study = str(database.results), store_of(run, database).load()
     new = {setting.label: checked(setting, study.tasks, results) for setting in study.settings}
     episodes = tuple(Episode(new[one.setting.label], one.task, one.seed, one.repeat) for one in study.episodes)
     study = dataclasses.replace(study, settings=tuple(new.values()), episodes=episodes)

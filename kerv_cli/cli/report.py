@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from kerv_cli.base.limits import number, setting
-from kerv_cli.base.places import results_dir
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, end_with_json
@@ -58,6 +57,7 @@ def report(
     """Write CSV tables (per task and aggregated), plots and an HTML page about the studies."""
     from kerv_cli.cli.work import print_prices, print_study, print_verdict
     from kerv_cli.episodes.resolve import study_name
+    from kerv_cli.lab.database import Database
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.report import report as write_report
     from kerv_cli.report.tables import rows_of
@@ -66,32 +66,33 @@ def report(
     if choose:
         _print_choice(settings, as_json)
         return
-    results = results_dir(settings.results)
-    output = write_report(results, settings.only, publish, settings.on, settings.loss, settings.baseline)
+    database = Database(settings.results)
+    output = write_report(database, settings.only, publish, settings.on, settings.loss, settings.baseline)
     if as_json:
         tables = {name: rows_of(table) for name, table in output.tables.items()}
         priced = {} if output.priced is None else {"priced": rows_of(output.priced)}
         end_with_json({"files": output.files, "studies": tables, **priced})
     for name, table in output.tables.items():
-        print_study(table, StudyStore(results, name), all_columns, "--all")
+        print_study(table, StudyStore(database, name), all_columns, "--all")
     print_prices(output.priced)
     for name, table in output.tables.items():
         if settings.only is None:
             typer.echo(name)
-        print_verdict(table, StudyStore(results, name), settings.loss)
+        print_verdict(table, StudyStore(database, name), settings.loss)
 
 
 def _print_choice(settings: ReportSettings, as_json: bool) -> None:
     """Print which setting to use in the chosen study, or in each study with results."""
+    from kerv_cli.lab.database import Database
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.decide import choices
     from kerv_cli.report.report import names_to_report
     from kerv_cli.report.tables import load_study
     from kerv_cli.report.verdict import sentence, short_sentence
 
-    results, answers = results_dir(settings.results), {}
-    for name in names_to_report(results, settings.only):
-        data = load_study(StudyStore(results, name))
+    database, answers = Database(settings.results), {}
+    for name in names_to_report(database, settings.only):
+        data = load_study(StudyStore(database, name))
         groups = choices(data.table, data.per_task, settings.loss)
         answers[name] = [choice.as_dict() for choice in groups]
         if not as_json:

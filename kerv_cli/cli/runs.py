@@ -10,7 +10,6 @@ import typer
 
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import Interrupted, KervError, UsageError
-from kerv_cli.base.places import results_dir
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import (
@@ -42,7 +41,7 @@ Folder = Annotated[Path | None, typer.Option("--dir", help="Folder to write to; 
 
 def _command_on_runs(name: str, *examples: str) -> Callable[[F], F]:
     """Decorate a function to make it the command `kerv runs NAME`, whose arguments are names of runs."""
-    return command(f"runs {name}", names=RUNS, keys="results", examples=examples)
+    return command(f"runs {name}", names=RUNS, keys="results", examples=examples, writes=name in ("rerun", "rm"))
 
 
 def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a run") -> list[str]:
@@ -65,14 +64,19 @@ def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a r
 
 
 @command(
-    "runs list", names=FILTERS, keys="results", examples=("kerv runs list", "kerv runs list kind=rollout method=ar")
+    "runs list",
+    names=FILTERS,
+    keys="results",
+    examples=("kerv runs list", "kerv runs list kind=rollout method=ar"),
+    writes=False,
 )
 def list_(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """List the runs of a results folder, the newest first."""
     from kerv_cli.catalogue.entries import find_runs, matching
+    from kerv_cli.lab.database import Database
 
     filters = dict(word.partition("=")[::2] for word in names)
-    runs = matching(find_runs(settings.results), filters)
+    runs = matching(find_runs(Database(settings.results)), filters)
     if as_json:
         end_with_json([_entry_row(run) for run in runs])
     if not runs:
@@ -104,17 +108,18 @@ def _entry_row(run: RunEntry) -> dict[str, object]:
 def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Show one run, ID or ID:SETTING: its command, its results, the artifacts it was made from, its folder."""
     from kerv_cli.catalogue.entries import disk_bytes, find_runs, parents, store_of
+    from kerv_cli.lab.database import Database
     from kerv_cli.report.compare import compared_runs
     from kerv_cli.report.summary import SummaryTable
     from kerv_cli.report.tables import load_study, rows_of
 
-    results, (name,) = settings.results, _run_names(names)
-    chosen = compared_runs(results, name)
+    database, (name,) = Database(settings.results), _run_names(names)
+    chosen = compared_runs(database, name)
     run = chosen[0].run
-    table = load_study(store_of(run)).table if run.has_episodes and run.episodes else None
+    table = load_study(store_of(run, database)).table if run.has_episodes and run.episodes else None
     if table is not None:
         table = table[table["label"].isin([side.label for side in chosen])]
-    size, origin = disk_bytes(run.folder), parents(run, find_runs(results))
+    size, origin = disk_bytes(run.folder), parents(run, find_runs(database))
     if as_json:
         rows = [] if table is None else rows_of(table)
         end_with_json({**_entry_row(run), "made_from": origin, "bytes": size, "settings": rows})
@@ -133,10 +138,11 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
 @_command_on_runs("compare", "kerv runs compare main:ar main:kerv", "kerv runs compare main last")
 def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Compare two runs, ID or ID:SETTING: differences in settings, and in results with confidence intervals."""
+    from kerv_cli.lab.database import Database
     from kerv_cli.report import compare as comparing
 
     runs = _run_names(names, 2, 2, "two runs, ID or ID:SETTING")
-    comparisons = [comparing.compare(a, b) for a, b in comparing.pairs_to_compare(settings.results, *runs)]
+    comparisons = [comparing.compare(a, b) for a, b in comparing.pairs_to_compare(Database(settings.results), *runs)]
     if as_json:
         end_with_json(comparisons)
     for comparison in comparisons:
@@ -165,25 +171,26 @@ def rerun(
 ) -> None:
     """Repeat a sweep or rollout under a new name, and say whether the tokens are the same."""
     from kerv_cli.catalogue.entries import find_run
+    from kerv_cli.lab.database import Database
 
-    results, (name,) = settings.results, _run_names(names)
-    run = find_run(results, name)
+    database, (name,) = Database(settings.results), _run_names(names)
+    run = find_run(database, name)
     if run.kind not in ("sweep", "rollout"):
         made = f", which '{run.command_line}' makes" if run.command else ""
         raise UsageError(f"{run.id} is of the kind {run.kind}{made}: only sweeps and rollouts are repeated")
-    from kerv_cli.catalogue.entries import plan_of
+    from kerv_cli.catalogue.entries import plan_of, store_of
     from kerv_cli.cli.work import run_study
     from kerv_cli.report.compare import same_tokens
 
-    planned = plan_of(run, results)
+    planned = plan_of(run, database)
     name = planned.store.name
     if plan:
         end_with_plan(f"{run.id} again as {name}: {count(len(planned.to_run), 'episode')}", as_json)
     failed = run_study(planned).failed
     if failed:
         raise KervError(failed[0].reason)
-    entry = find_run(results, name, exact=True)
-    same, shared = same_tokens(run, entry)
+    entry = find_run(database, name, exact=True)
+    same, shared = same_tokens(store_of(run, database), store_of(entry, database))
     if as_json:
         end_with_json({"run": entry.id, "folder": entry.folder, "episodes": shared, "same_tokens": same})
     typer.echo(f"{entry.id}: the same tokens in {same} of {shared} episodes of {run.id}")
@@ -194,8 +201,10 @@ def rerun(
 def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
     """Remove runs and everything in their folders, after asking for confirmation."""
     from kerv_cli.catalogue.entries import check_removable, disk_bytes, find_run, remove
+    from kerv_cli.lab.database import Database
 
-    runs = [find_run(settings.results, name, exact=yes) for name in _run_names(names, 1, 1000)]
+    database = Database(settings.results)
+    runs = [find_run(database, name, exact=yes) for name in _run_names(names, 1, 1000)]
     for run in runs:
         check_removable(run)
     total = sum(disk_bytes(run.folder) for run in runs)
@@ -208,7 +217,7 @@ def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
     if not sure:
         raise typer.Exit(1)
     for run in runs:
-        remove(run, settings.results)
+        remove(run, database)
     typer.echo(f"removed {what}")
 
 
@@ -218,11 +227,13 @@ def export(
 ) -> None:
     """Write the episodes of a run as CSV, Parquet or a database that 'kerv runs import' reads."""
     from kerv_cli.catalogue.entries import find_run
+    from kerv_cli.lab.database import Database
     from kerv_cli.report.export import export as hand_over
 
     (name,) = _run_names(names)
-    folder = folder or results_dir(settings.results) / "exports" / to
-    written = hand_over(find_run(settings.results, name), to, folder)
+    database = Database(settings.results)
+    folder = folder or database.results / "exports" / to
+    written = hand_over(find_run(database, name), database, to, folder)
     if as_json:
         end_with_json({"folder": folder, "written": written})
     for path in written:

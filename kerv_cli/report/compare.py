@@ -9,7 +9,9 @@ import pandas as pd
 from kerv_cli.base.errors import UsageError
 from kerv_cli.catalogue.entries import RunEntry, description_of, find_run, store_of
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, without
+from kerv_cli.lab.database import Database
 from kerv_cli.lab.plan import seeds_text
+from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import Row, measure, paired
 from kerv_cli.report.summary import DIFFERENCE, SPEEDS
 from kerv_cli.report.tables import StudyData, differences, flatten, is_number, load_study, values_of
@@ -47,11 +49,11 @@ class ComparedRun:
         return self.data.episodes[self.data.episodes["label"] == self.label]
 
 
-def compared_runs(results: str, name: str) -> list[ComparedRun]:
+def compared_runs(database: Database, name: str) -> list[ComparedRun]:
     """Find what a name on the command line stands for.
 
     Args:
-        results: Results folder.
+        database: The database.
         name: `ID` stands for every setting of the run with that id, `ID:LABEL` for one setting.
 
     Raises:
@@ -59,12 +61,12 @@ def compared_runs(results: str, name: str) -> list[ComparedRun]:
         UnknownName: There is no such run.
     """
     identifier, _, label = name.partition(":")
-    run = find_run(results, identifier)
+    run = find_run(database, identifier)
     if not run.has_episodes:
         if label:
             raise UsageError(f"{run.id} is a {run.kind}: it has no setting '{label}'")
         return [ComparedRun(run.id, run)]
-    labels = store_of(run).load().labels
+    labels = store_of(run, database).load().labels
     if label and label not in labels:
         raise UsageError(f"run {run.id} has no setting '{label}': it has {', '.join(labels)}")
     return [
@@ -73,14 +75,14 @@ def compared_runs(results: str, name: str) -> list[ComparedRun]:
     ]
 
 
-def pairs_to_compare(results: str, first: str, second: str) -> list[tuple[ComparedRun, ComparedRun]]:
+def pairs_to_compare(database: Database, first: str, second: str) -> list[tuple[ComparedRun, ComparedRun]]:
     """Return which settings of two runs to compare with each other.
 
     Settings with the same label form pairs. If the runs share fewer than two labels, the first run's first setting is
     compared with each setting of the second run.
 
     Args:
-        results: Results folder.
+        database: The database.
         first: Name of the first run, as in `compared_runs`.
         second: Name of the second run.
 
@@ -89,14 +91,14 @@ def pairs_to_compare(results: str, first: str, second: str) -> list[tuple[Compar
         UnknownName: There is no such run.
         CheckpointError: A run is damaged.
     """
-    ours, theirs = compared_runs(results, first), compared_runs(results, second)
+    ours, theirs = compared_runs(database, first), compared_runs(database, second)
     if ours[0].run.has_episodes != theirs[0].run.has_episodes:
         raise UsageError(f"{ours[0].run.id} and {theirs[0].run.id} cannot be compared: only one of them has episodes")
     pairs = [(a, b) for a in ours for b in theirs if a.label == b.label]
     if len(pairs) < 2 and not (pairs and len(ours) == len(theirs) == 1):
         pairs = [(ours[0], side) for side in theirs if side != ours[0]]
     runs = {side.run.id: side.run for side in (ours[0], theirs[0]) if side.run.has_episodes}
-    data = {name: load_study(store_of(run)) for name, run in runs.items()}
+    data = {name: load_study(store_of(run, database)) for name, run in runs.items()}
     return [(replace(a, data=data.get(a.run.id)), replace(b, data=data.get(b.run.id))) for a, b in pairs]
 
 
@@ -175,19 +177,18 @@ def _interval(values: Row, name: str, what: str) -> Row:
     return {"change": values[name], "low": values[f"{name}_low"], "high": values[f"{name}_high"], "what": what}
 
 
-def same_tokens(first: RunEntry, second: RunEntry) -> tuple[int, int]:
-    """Return how many of the shared episodes have equal tokens, and how many episodes the two runs share.
+def same_tokens(first: StudyStore, second: StudyStore) -> tuple[int, int]:
+    """Return how many of the shared episodes have equal tokens, and how many episodes the two studies share.
 
     Raises:
-        UsageError: A run has no episode.
+        UsageError: A study has no episode.
     """
     shared = _tokens(first).merge(_tokens(second), on=["label", "task", "seed", "repeat"])
     return int((shared["tokens_x"] == shared["tokens_y"]).sum()), len(shared)
 
 
-def _tokens(run: RunEntry) -> pd.DataFrame:
+def _tokens(store: StudyStore) -> pd.DataFrame:
     """Return a row per episode: label, task, seed, repeat, and the tokens of all its decodes."""
-    store = store_of(run)
     frame = store.frame()[["episode", "label", "task", "seed", "repeat"]]
     decodes = store.decodes(frame["episode"].tolist(), ["tokens"]).to_pandas()  # `episode` is a position in the list
     tokens = decodes.groupby("episode")["tokens"].agg(lambda rows: tuple(map(tuple, rows)))

@@ -11,6 +11,7 @@ from kerv_cli.base.files import atomic_path, write_text
 from kerv_cli.catalogue.entries import RunEntry, store_of
 from kerv_cli.catalogue.imports import export_database
 from kerv_cli.episodes.rows import DECODE_SCHEMA
+from kerv_cli.lab.database import Database
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.tables import csv_text
 
@@ -18,11 +19,12 @@ FORMATS = ("csv", "parquet", "db")
 _AT_ONCE = 100  # episodes in memory at a time
 
 
-def export(run: RunEntry, to: str, folder: Path) -> list[Path]:
+def export(run: RunEntry, database: Database, to: str, folder: Path) -> list[Path]:
     """Export a run to files, and return their paths.
 
     Args:
         run: A sweep, rollout or import.
+        database: Its database.
         to: A format: one of FORMATS.
         folder: Where the files go.
 
@@ -33,7 +35,7 @@ def export(run: RunEntry, to: str, folder: Path) -> list[Path]:
     """
     if to not in FORMATS:
         raise UnknownName("format", to, FORMATS)
-    store = store_of(run)
+    store = store_of(run, database)
     if to == "db":
         return [export_database(store, folder / run.id)]
     if to == "parquet":

@@ -19,20 +19,20 @@ from kerv_cli.report.stressed import is_stressed, summed_table
 from kerv_cli.report.tables import CSV_COLUMNS, StudyData, csv_text, further_of, latency_table, load_study, values_of
 
 
-def names_to_report(results: Path | str, study: str | None) -> list[str]:
+def names_to_report(database: Database, study: str | None) -> list[str]:
     """Return the names of the studies to report.
 
     Args:
-        results: Results folder.
+        database: The database.
         study: Name of one study. None: every study that has at least one episode.
 
     Raises:
         UsageError: No study has an episode.
     """
-    present = [] if study else [one for one in studies(Database(results)) if one.kind != ROLLOUT and one.counts()[0]]
+    present = [] if study else [one for one in studies(database) if one.kind != ROLLOUT and one.counts()[0]]
     names = [study] if study else sorted(store.name for store in present)
     if not names:
-        raise UsageError(f"no study in {results} has an episode: run `kerv sweep study=demo`")
+        raise UsageError(f"no study in {database.results} has an episode: run `kerv sweep study=demo`")
     return names
 
 
@@ -52,7 +52,7 @@ class Report:
 
 
 def report(
-    results: Path | str,
+    database: Database,
     study: str | None = None,
     publish: bool = False,
     on: Sequence[str] = (),
@@ -65,7 +65,7 @@ def report(
     give the same bytes.
 
     Args:
-        results: Results folder.
+        database: The database. Files are written to its results folder.
         study: Name of the study. None: all studies.
         publish: Write tables and plots into the results folder itself instead of its report/. Refused for studies that
             do not meet the conditions for publishing.
@@ -82,10 +82,10 @@ def report(
     if (on or baseline) and not study:
         given = f"on={','.join(on)}" if on else f"baseline={baseline}"
         raise UsageError(f"{given}: name the study with study=NAME")
-    names = names_to_report(results, study)
-    profiles, output = open_profiles(results, on), Report([], {})
+    names = names_to_report(database, study)
+    profiles, output = open_profiles(database.results, on), Report([], {})
     for name in names:
-        store = StudyStore(results, name)
+        store = StudyStore(database, name)
         data = load_study(store)
         data = data.compared_with(baseline) if baseline else data
         output.priced = repriced_table(data, store, profiles) if profiles else own_prices(data, store)
