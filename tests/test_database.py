@@ -5,17 +5,21 @@ import dataclasses
 import json
 import os
 import resource
+import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import sqlalchemy as sa
-from command import kerv, told
+from command import kerv, refusal, told
 from conftest import python, refused, until
 from studies_synthetic import episode, settings_of, still_episode, study_of, swept, threshold_study
 
@@ -24,7 +28,7 @@ from kerv_cli.catalogue.imports import import_results
 from kerv_cli.episodes.rows import decodes_table, episode_row
 from kerv_cli.lab import database as module
 from kerv_cli.lab.command import STORE, noted
-from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, FILE, RUNS, STUDIES, Database
+from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, FILE, RUNS, STUDIES, WANTED, Database
 from kerv_cli.lab.runs import Run, making, pulse, run_rows, time_left
 from kerv_cli.lab.store import StudyStore, studies
 from kerv_cli.report.tables import load_study
@@ -50,6 +54,22 @@ def begun(database: Database, name: str) -> None:
     with database.writing() as connection:
         if connection.execute(STUDIES.select().where(STUDIES.c.name == name)).first() is None:
             connection.execute(STUDIES.insert().values(name=name, kind="sweep", created="", about={}))
+
+
+def change(results: Path, *statements: str) -> None:
+    """Change a database as another program might."""
+    with contextlib.closing(sqlite3.connect(results / FILE)) as file:
+        for statement in statements:
+            file.execute(statement)
+        file.commit()
+
+
+@pytest.fixture(scope="module")
+def damageable(tmp_path_factory):
+    """Bytes of a database with a study."""
+    folder = tmp_path_factory.mktemp("damageable")
+    swept(folder, STUDY)
+    return (folder / FILE).read_bytes()
 
 
 def test_reading_creates_nothing(database, tmp_path):
@@ -177,6 +197,97 @@ def test_a_damaged_file_is_one_line(tmp_path, harm):
     assert "Traceback" not in result.output
 
 
+def test_an_error_text_and_a_state_that_databases_refuse_are_stored(database):
+    study = study_of({"ar": settings_of("ar"), "naive_sd": settings_of("naive_sd")}, ["reach-v3"])
+
+    def run(setting, task):
+        def run_episode(seed):
+            if setting.label == "ar":
+                return dataclasses.replace(episode(setting, task, seed), initial_state=np.array([np.nan, np.inf, 1.5]))
+            raise ValueError("a\0b \udc80")
+
+        return run_episode
+
+    store, outcome = swept(database.results, study, run)
+    assert [len(failure.episodes) for failure in outcome.failed] == [4]
+    assert store.frame()["initial_state"].tolist() == [[None, None, 1.5]] * 4
+    with database.reading() as connection:
+        errors = set(connection.scalars(sa.select(WANTED.c.error).where(WANTED.c.error.is_not(None))))
+    assert all(r"a\x00b \udc80" in error for error in errors)
+    with pytest.raises(ValueError, match=r"^a"), Run(database, "target", "mine", ["train", "target"]):
+        raise ValueError("a\0b")
+    assert run_rows(database, "target")[0].message == r"a\x00b"
+
+
+@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
+def test_a_server_that_freezes_is_one_line(database, monkeypatch):
+    monkeypatch.setattr("kerv_cli.lab.postgresql.STATEMENT_SECONDS", 1)
+    monkeypatch.setattr("kerv_cli.lab.postgresql._SPARE_SECONDS", 0)
+    begun(database, "a")
+    frozen = []
+    try:
+        with (
+            refused("no answer for 1 s", "check that the server", error=StorageError),
+            database.reading() as connection,
+        ):
+            frozen.append(connection.scalar(sa.text("SELECT pg_backend_pid()")))
+            os.kill(frozen[0], signal.SIGSTOP)
+            connection.scalar(sa.text("SELECT 1"))
+        assert len(studies(database)) == 1  # over a new connection
+    finally:
+        for pid in frozen:
+            os.kill(pid, signal.SIGCONT)
+
+
+@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
+def test_a_statement_that_takes_too_long_ends(database, monkeypatch):
+    monkeypatch.setattr("kerv_cli.lab.postgresql.STATEMENT_SECONDS", 1)
+    with refused("statement timeout", error=StorageError), database.reading() as connection:
+        connection.execute(sa.text("SELECT pg_sleep(20)"))
+    with refused("refused a statement", "check the rights", error=StorageError), database.reading() as connection:
+        connection.execute(sa.text("SELECT * FROM nowhere"))
+
+
+@pytest.mark.parametrize("version", ["'x'", "''", "-1", "0", "'1.5'", "x'31'", "'٣'", "99999999999999999999"])
+def test_an_odd_schema_version_is_one_line(tmp_path, version):
+    begun(Database(tmp_path), "a")
+    change(tmp_path, f"UPDATE kerv SET value = {version}")
+    assert str(tmp_path / FILE) in refusal("runs", "list", f"results={tmp_path}", code=1)
+
+
+ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT 'schema_version', max(i) FROM n"
+
+
+@pytest.mark.parametrize("table", ["kerv", "studies", "episodes"])
+def test_a_view_in_place_of_a_table_is_refused(tmp_path, table):
+    begun(Database(tmp_path), "a")
+    change(tmp_path, f"DROP TABLE {table}", f"CREATE VIEW {table} (key, value) AS {ENDLESS}")
+    with refused("is damaged", f"{table} is a view", error=CheckpointError):
+        studies(Database(tmp_path))
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        "runs.started = 'x'", "runs.heartbeat = 'x'", "runs.command = '5'", "runs.command = '{'",
+        "runs.message = x'ff'", "studies.about = '[]'", "studies.about = '{\"other\": 1}'",
+        "studies.kind = 'x'", "studies.created = x'ff'",
+        "settings.identity = '[]'", "settings.settings = '{}'", "settings.label = x'ff'",
+        "settings.identity = '{\"target\": 5}'", "episodes.decode_seconds = x'ff'", "episodes.steps = 'x'",
+        "episodes.started = x'ff'", "episodes.initial_state = '{'", "blocks.about = '['", "wanted.task = x'ff'",
+    ],
+)  # fmt: skip
+def test_a_damaged_row_is_one_line(damageable, tmp_path, row):
+    table, _, change_of = row.partition(".")
+    (tmp_path / FILE).write_bytes(damageable)
+    change(tmp_path, f"UPDATE {table} SET {change_of} WHERE rowid = (SELECT min(rowid) FROM {table})")
+    refusals = [
+        kerv(*words, f"results={tmp_path}", code=None) for words in (["runs", "list"], ["runs", "show", "last"])
+    ]
+    assert any(run.exit_code == 1 and "is damaged" in run.output for run in refusals)
+    assert all("internal error" not in run.output for run in refusals)
+
+
 def test_a_folder_that_cannot_be_written_to_can_be_read(tmp_path, monkeypatch):
     swept(tmp_path, STUDY)
     before = set(tmp_path.iterdir())
@@ -185,6 +296,80 @@ def test_a_folder_that_cannot_be_written_to_can_be_read(tmp_path, monkeypatch):
     assert set(tmp_path.iterdir()) == before
     with refused("cannot use", "readonly", error=StorageError):
         begun(Database(tmp_path), "b")
+
+
+def as_reader(look: Callable[[], Any]) -> Any:
+    """What a function returns in a process that may not write to others' folders. It must be JSON."""
+    receiving, sending = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            if os.geteuid() == 0:
+                os.setgroups([])
+                os.setuid(65534)
+            os.write(sending, json.dumps(look()).encode())
+        finally:
+            os._exit(0)
+    os.close(sending)
+    with os.fdopen(receiving) as answer:
+        text = answer.read()
+    os.waitpid(child, 0)
+    return json.loads(text)
+
+
+def test_a_reader_of_another_user_sees_all_rows_of_a_running_sweep_and_creates_nothing(monkeypatch):
+    monkeypatch.delenv(STORE, raising=False)
+    with tempfile.TemporaryDirectory(prefix="kerv-reader-") as folder:  # others cannot enter tmp_path
+
+        def seen() -> list[str]:
+            return as_reader(lambda: sorted(run["id"] for run in listed(Path(folder))))
+
+        swept(folder, STUDY)
+        names = [f"s{number}" for number in range(9)]
+        with contextlib.closing(sqlite3.connect(Path(folder, FILE))) as sweep:
+            sweep.execute("SELECT * FROM runs").fetchall()
+            for name in names:
+                begun(Database(folder), name)
+            before = {path.name for path in Path(folder).iterdir()}
+            os.chmod(folder, 0o555)
+            assert Path(folder, f"{FILE}-wal").stat().st_size > 0
+            assert seen() == [*names, "threshold"]
+            assert {path.name for path in Path(folder).iterdir()} == before
+            os.chmod(folder, 0o755)
+        os.chmod(folder, 0o555)
+        assert seen() == [*names, "threshold"]  # the log is in the file now
+        os.chmod(folder, 0o755)
+
+
+def test_a_log_that_cannot_be_read_is_not_left_out(tmp_path, monkeypatch):
+    monkeypatch.delenv(STORE, raising=False)
+    with tempfile.TemporaryDirectory(prefix="kerv-reader-") as folder:
+        with contextlib.closing(sqlite3.connect(tmp_path / FILE)) as sweep:
+            sweep.execute("PRAGMA journal_mode=WAL")
+            sweep.execute("SELECT * FROM sqlite_schema").fetchall()
+            begun(Database(tmp_path), "a")
+            for name in (FILE, f"{FILE}-wal"):  # without the third file, which says where the log's rows are
+                shutil.copy(tmp_path / name, folder)
+        os.chmod(folder, 0o555)
+        line = as_reader(lambda: refusal("runs", "list", f"results={folder}"))
+        assert f"copy {folder} to where you can write" in line
+        os.chmod(folder, 0o755)
+
+
+def test_a_reader_without_locks_notices_a_change(tmp_path, monkeypatch):
+    begun(Database(tmp_path), "a")
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)
+    with refused("was written while it was read"), Database(tmp_path).reading():
+        change(tmp_path, "DELETE FROM studies")
+
+
+@pytest.mark.parametrize("name", ["a?b", "a%20b", "a#b", "mode=ro"])
+def test_a_results_folder_may_have_any_name(tmp_path, monkeypatch, name):
+    monkeypatch.delenv(STORE, raising=False)
+    begun(Database(tmp_path / name), "a")
+    assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")] == [name, f"{name}/{FILE}"]
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)
+    assert [one.name for one in studies(Database(tmp_path / name))] == ["a"]
 
 
 def test_a_locked_file_says_what_else_to_use(tmp_path, monkeypatch):
@@ -303,6 +488,8 @@ def test_one_query_says_whether_anything_has_changed(database):
 
 HOLD = """
 import sys
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from kerv_cli.lab.command import noted
 from kerv_cli.lab.runs import making
@@ -360,8 +547,9 @@ def test_a_command_whose_input_cannot_be_read_leaves_no_row(tmp_path):
 
 def test_a_store_is_used_by_one_command_and_no_password_is_kept(tmp_path, monkeypatch):
     monkeypatch.delenv(STORE, raising=False)
-    other, where = Database(tmp_path, f"sqlite:///{tmp_path}/other.db"), f"results={tmp_path}"
-    told("build", "target", f"checkpoint={tmp_path}", f"store={other.url}", where, code=1)
+    url, where = f"sqlite:///{tmp_path}/other.db", f"results={tmp_path}"
+    other = Database(tmp_path, url)
+    told("build", "target", f"checkpoint={tmp_path}", f"store={url}", where, code=1)
     assert [row.status for row in run_rows(other)] == ["failed"]
     assert run_rows(Database(tmp_path)) == []
     assert STORE not in os.environ

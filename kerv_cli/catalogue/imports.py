@@ -26,7 +26,7 @@ from kerv_cli.episodes.identity import ENGINE
 from kerv_cli.episodes.rows import DECODE_SCHEMA
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab import database as tables
-from kerv_cli.lab.database import FILE, MEASURES, SCHEMA, Database, measures_in, newer
+from kerv_cli.lab.database import FILE, MEASURES, SCHEMA, Database, file_url, measures_in, newer
 from kerv_cli.lab.plan import Episode, Setting, Study, plain_settings
 from kerv_cli.lab.store import ROLLOUT, SWEEP, ImportedEpisode, StudyStore, stored_study
 from kerv_cli.methods.settings import with_artifacts
@@ -335,7 +335,7 @@ def export_database(store: StudyStore, folder: Path) -> Path:
     """
 
     def fill(new: Path) -> None:
-        copy = Database(new, f"sqlite:///{new.absolute() / FILE}")
+        copy = Database(new, file_url(new))
         with store.database.reading() as connection:
             row = connection.execute(sa.select(tables.STUDIES).where(tables.STUDIES.c.name == store.name)).one()
             found = _stored(connection, row)

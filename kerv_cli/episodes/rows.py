@@ -117,11 +117,13 @@ DECODE_SCHEMA = pa.schema({**_POSITION, **{name: kind for name, (kind, _) in _DE
 
 
 def episode_row(record: EpisodeRecord) -> dict[str, Any]:
-    """Return the columns of one episode as values that JSON can store. NaN becomes None."""
+    """Return the columns of one episode as values that JSON can store. NaN becomes None, in a list infinity, too."""
     return {name: _plain(value(record)) for name, (_, value) in _EPISODE.items()}
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, list):
+        return [one if math.isfinite(one) else None for one in value]
     value = value.item() if isinstance(value, np.generic) else value
     return None if isinstance(value, float) and math.isnan(value) else value
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
+import re
+import sqlite3
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -29,10 +31,99 @@ SCHEMA = 1
 A new column in MEASURES needs no new version: it is added at the next write, and until then it reads as null.
 """
 LOCK_SECONDS = 60
-"""Longest time to wait for another process's transaction, seconds."""
+"""Longest time to wait for another process's transaction in a SQLite file, seconds."""
 
 _META = sa.MetaData()
-_JSON = sa.JSON(none_as_null=True)
+
+
+class Damaged(ValueError):
+    """A stored value is not what its column holds. `Database.reading` makes it a CheckpointError."""
+
+
+class _Checked(sa.types.TypeDecorator[Any]):
+    """Type of a column whose values are checked when they are read: SQLite stores any value in any column."""
+
+    impl: Any = sa.Text
+    kinds: tuple[type, ...]
+
+    def __init_subclass__(cls) -> None:
+        """Allow SQLAlchemy to cache statements. It looks for this attribute in each class."""
+        cls.cache_ok = True
+
+    def result_processor(self, dialect: sa.Dialect, coltype: object) -> Any:
+        """Return the function that turns a stored value into Python's."""
+        inner = super().result_processor(dialect, coltype)
+
+        def process(stored: Any) -> Any:
+            try:
+                value = inner(stored) if inner else stored
+                if value is None or isinstance(value, self.kinds):
+                    return self.check(value)
+            except (ValueError, TypeError, RecursionError):
+                pass
+            raise Damaged(f"{stored!r:.60} is no {self.kinds[0].__name__}")
+
+        return process
+
+    def check(self, value: Any) -> Any:
+        """Return the value, or raise ValueError."""
+        return value
+
+
+class _Text(_Checked):
+    kinds = (str,)
+
+
+class _Time(_Text):
+    """A time, ISO 8601."""
+
+    def check(self, value: Any) -> Any:
+        """Return the text, or raise ValueError if it is no time."""
+        if value is not None:
+            datetime.fromisoformat(value)
+        return value
+
+
+class _Kind(_Text):
+    """The kind of a study."""
+
+    def check(self, value: Any) -> Any:
+        """Return the kind, or raise ValueError if there is no such kind."""
+        if value not in ("sweep", "rollout", "import"):
+            raise ValueError(value)
+        return value
+
+
+class _Message(_Text):
+    """Text of an error. It may contain what databases refuse, such as NUL: that is written as an escape."""
+
+    def process_bind_param(self, value: str | None, dialect: sa.Dialect) -> str | None:
+        """Return the text to store."""
+        return value and value.encode("utf-8", "backslashreplace").decode().replace("\0", r"\x00")
+
+
+class _Integer(_Checked):
+    impl = sa.Integer
+    kinds = (int,)
+
+
+class _Float(_Checked):
+    impl = sa.Float
+    kinds = (float, int)
+
+
+class _Object(_Checked):
+    """A JSON object."""
+
+    impl = sa.JSON(none_as_null=True)
+    kinds = (dict,)
+
+
+class _List(_Checked):
+    """A JSON list."""
+
+    impl = sa.JSON(none_as_null=True)
+    kinds = (list,)
 
 
 def _table(name: str, *columns: sa.schema.SchemaItem) -> sa.Table:
@@ -49,53 +140,56 @@ def _to(name: str, column: str, **options: Any) -> sa.Column[Any]:
     return sa.Column(name, sa.ForeignKey(column, ondelete="CASCADE"), **options)
 
 
-ABOUT = _table("kerv", sa.Column("key", sa.Text, primary_key=True), sa.Column("value", sa.Text, nullable=False))
+ABOUT = _table("kerv", sa.Column("key", _Text, primary_key=True), sa.Column("value", _Text, nullable=False))
 RUNS = _table(
     "runs",  # one row per command that was started
     # kind: sweep, rollout, import, or a kind of artifact; name: of the study or the artifact; started: ISO 8601, UTC;
     # command: command-line arguments without `kerv`; heartbeat: seconds since 1970
-    sa.Column("id", sa.Text, primary_key=True),
-    *_required(sa.Text, "kind", "name", "status", "message", "host", "started", "git_commit"),
-    *_required(sa.Integer, "done", "total", "pid"),
-    *_required(_JSON, "command"),
-    *_required(sa.Float, "heartbeat"),
-    sa.Column("finished", sa.Text),
+    sa.Column("id", _Text, primary_key=True),
+    *_required(_Text, "kind", "name", "status", "host", "git_commit"),
+    *_required(_Time, "started"),
+    *_required(_Message, "message"),
+    *_required(_Integer, "done", "total", "pid"),
+    *_required(_List, "command"),
+    *_required(_Float, "heartbeat"),
+    sa.Column("finished", _Time),
     sa.Index("runs_of_name", "kind", "name"),
 )
 STUDIES = _table(
     "studies",
     sa.Column("id", sa.Integer, primary_key=True),
-    sa.Column("name", sa.Text, nullable=False, unique=True),
-    *_required(sa.Text, "kind", "created"),  # kind: sweep, rollout, import
-    *_required(_JSON, "about"),  # title, baseline, axis, note, block, machines
+    sa.Column("name", _Text, nullable=False, unique=True),
+    *_required(_Kind, "kind"),
+    *_required(_Text, "created"),
+    *_required(_Object, "about"),  # title, baseline, axis, note, block, machines
 )
 SETTINGS = _table(
     "settings",  # a row of a study's table
     sa.Column("id", sa.Integer, primary_key=True),
     _to("study_id", "studies.id", nullable=False, index=True),
-    sa.Column("work", sa.Text, nullable=False, index=True),  # hash of what determines a result
-    *_required(sa.Integer, "position"),
-    *_required(sa.Text, "label", "name", "method", "overrides"),  # name: shared by the settings of a grid
+    sa.Column("work", _Text, nullable=False, index=True),  # hash of what determines a result
+    *_required(_Integer, "position"),
+    *_required(_Text, "label", "name", "method", "overrides"),  # name: shared by the settings of a grid
     # varies: key -> value in a grid; identity: hashes of weights and data
-    *_required(_JSON, "varies", "settings", "identity"),
+    *_required(_Object, "varies", "settings", "identity"),
     sa.UniqueConstraint("study_id", "label"),
 )
 BLOCKS = _table(
     "blocks",  # one attempt to run a group of episodes in one process, with settings taking turns
-    sa.Column("id", sa.Text, primary_key=True),
+    sa.Column("id", _Text, primary_key=True),
     sa.Column("claim", sa.Text),  # JSON: the episodes that are running; null after the block has ended
-    *_required(sa.Text, "run", "seeds", "started", "code"),  # code: hash of the source code
-    *_required(_JSON, "about"),  # machine, versions, commit, executor, workers
+    *_required(_Text, "run", "seeds", "started", "code"),  # code: hash of the source code
+    *_required(_Object, "about"),  # machine, versions, commit, executor, workers
 )
 _TYPES = {FLAG: sa.Boolean, INT: sa.BigInteger, FLOAT: sa.Double}
-MEASURES = tuple(sa.Column(field.name, _TYPES.get(field.type, _JSON)) for field in EPISODE_SCHEMA)
+MEASURES = tuple(sa.Column(field.name, _TYPES.get(field.type, sa.JSON(none_as_null=True))) for field in EPISODE_SCHEMA)
 """Columns from an episode's record."""
 EPISODES = _table(
     "episodes",
     sa.Column("id", sa.Integer, primary_key=True),
-    *_required(sa.Text, "work", "task", "started"),
+    *_required(_Text, "work", "task", "started"),
     *_required(sa.BigInteger, "seed"),
-    *_required(sa.Integer, "repeat", "order"),  # order: number of episodes that the block ran before it
+    *_required(_Integer, "repeat", "order"),  # order: number of episodes that the block ran before it
     sa.Column("block", sa.ForeignKey("blocks.id"), nullable=False),
     *MEASURES,
     *_required(sa.LargeBinary, "decode_seconds"),  # (decodes,) little-endian float64
@@ -108,12 +202,12 @@ DECODES = _table(
 WANTED = _table(
     "wanted",  # all episodes of a study; an episode without episode_id has not run
     _to("setting_id", "settings.id", primary_key=True),
-    sa.Column("task", sa.Text, primary_key=True),
+    sa.Column("task", _Text, primary_key=True),
     sa.Column("seed", sa.BigInteger, primary_key=True),
     sa.Column("repeat", sa.Integer, primary_key=True),
-    *_required(sa.Integer, "position"),
+    *_required(_Integer, "position"),
     sa.Column("episode_id", sa.ForeignKey("episodes.id", ondelete="SET NULL"), index=True),
-    sa.Column("error", sa.Text),  # traceback, if the last attempt failed
+    sa.Column("error", _Message),  # traceback, if the last attempt failed
 )
 
 
@@ -137,19 +231,19 @@ class Database:
         CheckpointError: The file is damaged, or was written by a newer version of kerv.
     """
 
-    def __init__(self, results: str | Path, url: str = "") -> None:
+    def __init__(self, results: str | Path, url: str | sa.URL = "") -> None:
         self.results = results_dir(str(results))
-        self.url = url or os.environ.get(STORE) or f"sqlite:///{self.results.absolute() / FILE}"
+        url = url or os.environ.get(STORE) or file_url(self.results)
         try:
-            parsed = sa.make_url(self.url)
+            parsed = sa.make_url(url)
         except (sa.exc.ArgumentError, ValueError) as error:
             raise UsageError(
-                f"store={without_passwords(self.url)} is not a URL: write postgresql://USER@HOST/DB"
+                f"store={without_passwords(str(url))} is not a URL: write postgresql://USER@HOST/DB"
             ) from error
         self.file = Path(parsed.database or "") if parsed.drivername == "sqlite" else None
         if self.file is None and parsed.drivername not in ("postgresql", "postgresql+psycopg"):
             raise UsageError(f"store={parsed.drivername}:// is not supported: use postgresql://USER@HOST/DB")
-        self.shown = str(self.file or without_passwords(self.url))
+        self.shown = str(self.file or without_passwords(str(url)))
         self._url = parsed if self.file else parsed.set(drivername="postgresql+psycopg")
         self._engine: sa.Engine | None = None
         self._is_complete = False  # whether the table of episodes is known to have all columns
@@ -176,7 +270,11 @@ class Database:
                     yield connection
                 return
             with self._opened().connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
-                yield connection
+                try:
+                    yield connection
+                finally:
+                    if self.file and connection.info.get(_CHANGED, found := _changed(self.file)) != found:
+                        raise StorageError(f"{self.file} was written while it was read: type the command again")
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[sa.Connection]:
@@ -196,6 +294,7 @@ class Database:
                     self.file.parent.mkdir(parents=True, exist_ok=True)
             engine = _server(self._url) if self.file is None else _file(self.file)
             with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+                _check_tables(connection)
                 version = _version(connection)
             if version is None:
                 with engine.execution_options(kerv_writes=True).begin() as connection:
@@ -212,43 +311,114 @@ class Database:
             yield
         except sa.exc.DBAPIError as error:
             raise self._explained(error) from error
+        except Damaged as error:
+            raise self._damaged(error) from error
+
+    @contextlib.contextmanager
+    def checking(self, what: str) -> Iterator[None]:
+        """Report an error in the `with` block, which converts stored values, as damage of the database.
+
+        Args:
+            what: What is converted, for the message.
+
+        Raises:
+            CheckpointError: A value is not what kerv stores.
+        """
+        try:
+            yield
+        except (ValueError, TypeError, LookupError, AttributeError, OverflowError, OSError) as error:
+            raise self._damaged(f"{what}: {type(error).__name__} {error}") from error
+
+    def _damaged(self, why: object) -> CheckpointError:
+        text = " ".join(str(why).split())[:160]
+        return CheckpointError(f"{self.shown} is damaged ({text}): restore a copy of it, or move it aside")
 
     def _explained(self, error: sa.exc.DBAPIError) -> KervError:
         why = " ".join(str(error.orig).split())[:160]
         if self.file is None:
-            return StorageError(f"store={self.shown} failed ({why}): check that the server runs, or leave out store=")
+            is_away = isinstance(error, sa.exc.OperationalError | sa.exc.InterfaceError)
+            hint = "check that the server runs, or leave out store=" if is_away else "check the rights of its user"
+            return StorageError(f"store={self.shown} {'failed' if is_away else 'refused a statement'} ({why}): {hint}")
         if "malformed" in why or "not a database" in why:
-            return CheckpointError(f"{self.file} is damaged ({why}): restore a copy of it, or move it aside")
-        hint = (
-            ": put results= on a local disk, or use a server, store=postgresql://USER@HOST/DB" if "lock" in why else ""
-        )
+            return self._damaged(why)
+        hint = ""
+        if "lock" in why:
+            hint = ": put results= on a local disk, or use a server, store=postgresql://USER@HOST/DB"
+        elif "unable to open" in why and _log(self.file):
+            hint = f": copy {self.results} to where you can write, its newest rows are in {self.file.name}-wal"
         return StorageError(f"cannot use {self.file}: {why}{hint}")
+
+
+def file_url(results: Path) -> sa.URL:
+    """Return the URL of the SQLite file in a results folder."""
+    return sa.URL.create("sqlite", database=str(results.absolute() / FILE))
 
 
 @functools.cache
 def _server(url: sa.URL) -> sa.Engine:
     """Return the SQLAlchemy engine for a server. It is shared within this process."""
-    seconds = {"connect_timeout": 5, "options": f"-c lock_timeout={LOCK_SECONDS}s"}
     try:
-        engine = sa.create_engine(url, connect_args=seconds, pool_pre_ping=True)
+        from kerv_cli.lab.postgresql import connect
     except ModuleNotFoundError:
         raise UsageError("store=postgresql:// needs the package psycopg: pip install 'kerv[postgres]'") from None
+    engine = sa.create_engine(url, pool_pre_ping=True)
+    sa.event.listen(engine, "do_connect", connect)
     sa.event.listen(engine, "begin", _begin)
     return engine
+
+
+_CHANGED = "changed"
+"""Key of a connection's `info`: when the file was changed, if the connection takes no locks."""
+
+
+class _Unlocked(sqlite3.Connection):
+    """A connection that takes no locks, because its user cannot write to the folder."""
 
 
 def _file(path: Path) -> sa.Engine:
-    # SQLite cannot write its log in a read-only folder
-    is_frozen = path.exists() and not os.access(path.parent, os.W_OK)
-    name = f"file:{path}?mode=ro&immutable=1&uri=true" if is_frozen else str(path)
-    engine = sa.create_engine(f"sqlite:///{name}", poolclass=sa.pool.NullPool, connect_args={"timeout": LOCK_SECONDS})
-    sa.event.listen(engine, "connect", _configure)
+    connect = functools.partial(_connection, path)
+    engine = sa.create_engine("sqlite://", creator=connect, poolclass=sa.pool.NullPool)
+    sa.event.listen(engine, "connect", functools.partial(_configure, path))
     sa.event.listen(engine, "begin", _begin)
     return engine
 
 
-def _configure(connection: Any, record: object) -> None:
+def _connection(path: Path) -> sqlite3.Connection:
+    """Open a SQLite file. Create nothing if this user cannot write the file or its folder.
+
+    Such a user reads through the log of a process that is writing. Without a log the file has everything.
+    """
+    options: Any = {"uri": True, "timeout": LOCK_SECONDS, "check_same_thread": False}
+    uri = path.absolute().as_uri()
+    if all(os.access(one, os.W_OK) for one in (path.parent, path) if one.exists()):
+        return sqlite3.connect(uri, **options)
+    while _log(path):
+        connection = sqlite3.connect(f"{uri}?mode=ro&readonly_shm=1", **options)
+        try:
+            connection.execute("SELECT count(*) FROM sqlite_schema")
+            return connection
+        except sqlite3.OperationalError:
+            connection.close()
+            if _log(path):  # otherwise its writer has just ended, and moved the log into the file
+                raise
+    return sqlite3.connect(f"{uri}?mode=ro&immutable=1", factory=_Unlocked, **options)
+
+
+def _log(path: Path) -> bool:
+    """Return whether SQLite's write-ahead log of a file has rows."""
+    log = path.with_name(f"{path.name}-wal")
+    return log.is_file() and log.stat().st_size > 0
+
+
+def _changed(path: Path) -> int:
+    """Return when a file was changed last, ns."""
+    return path.stat().st_mtime_ns
+
+
+def _configure(path: Path, connection: Any, record: Any) -> None:
     """Set up a new SQLite connection."""
+    if isinstance(connection, _Unlocked):
+        record.info[_CHANGED] = _changed(path)
     connection.isolation_level = None  # `_begin` begins the transactions
     for pragma in ("journal_mode=WAL", "foreign_keys=ON"):
         with contextlib.suppress(Exception):  # a read-only folder refuses the first
@@ -265,11 +435,19 @@ def _begin(connection: sa.Connection) -> None:
         connection.exec_driver_sql("SELECT pg_advisory_xact_lock(5271009)" if postgresql else "BEGIN IMMEDIATE")
 
 
+def _check_tables(connection: sa.Connection) -> None:
+    """Refuse a view in place of a table: its query may never end."""
+    for name in _META.tables.keys() & set(sa.inspect(connection).get_view_names()):
+        raise Damaged(f"{name} is a view, not a table")
+
+
 def _version(connection: sa.Connection) -> int | None:
     if not sa.inspect(connection).has_table(ABOUT.name):
         return None
-    row = connection.execute(sa.select(ABOUT.c.value).where(ABOUT.c.key == "schema_version")).first()
-    return None if row is None else int(row.value)
+    version = connection.scalar(sa.select(ABOUT.c.value).where(ABOUT.c.key == "schema_version"))
+    if version is not None and not re.fullmatch(r"[1-9]\d{0,8}", version, re.ASCII):
+        raise Damaged(f"schema_version is {version!r:.60}")
+    return None if version is None else int(version)
 
 
 def _created(connection: sa.Connection) -> int:

@@ -23,6 +23,7 @@ from kerv_cli.lab.database import (
     SETTINGS,
     STUDIES,
     WANTED,
+    Damaged,
     Database,
     measures_in,
     now,
@@ -150,7 +151,7 @@ class StudyStore:
         row = self._row()
         if row is None:
             raise UsageError(f"no study '{self.name}' in {self.database.shown}: {self.how_to_run()}")
-        with self.database.reading() as connection:
+        with self.database.reading() as connection, self.database.checking(f"study {self.name}"):
             return stored_study(connection, row)[0]
 
     def save(self, study: Study, existing: Mapping[Episode, StoredEpisode] | None = None) -> None:
@@ -250,7 +251,7 @@ class StudyStore:
         keys = ("label", "task", "seed", "repeat")
         which = WANTED.c.episode_id == EPISODES.c.id if run is None else _same_episode()
         circumstances = [EPISODES.c[name] for name in ("block", "order", "started", "decode_seconds")]
-        with self.database.reading() as connection:
+        with self.database.reading() as connection, self.database.checking(f"episodes of {self.name}"):
             query = (
                 sa.select(
                     SETTINGS.c.label, WANTED.c.task, WANTED.c.seed, WANTED.c.repeat, EPISODES.c.id.label("episode"),
@@ -261,16 +262,18 @@ class StudyStore:
                 .order_by(WANTED.c.position)
             )  # fmt: skip
             frame = pd.DataFrame(connection.execute(query).mappings().all())
-        if frame.empty:
-            return frame
+            if frame.empty:
+                return frame
+            numbers = [column.name for column in MEASURES if isinstance(column.type, sa.Double | sa.BigInteger)]
+            frame[numbers] = frame[numbers].apply(pd.to_numeric)
+            unknown = [name for name in numbers if frame[name].isna().all()]
+            frame = frame.astype(dict.fromkeys(unknown, float))
+            frame["decode_seconds"] = frame["decode_seconds"].map(lambda blob: np.frombuffer(blob, "<f8"))
+            about = pd.DataFrame(list(frame.pop("about")), index=frame.index)
         if episodes is not None:
             chosen = {(one.setting.label, one.task, one.seed, one.repeat) for one in episodes}
-            frame = frame[[key in chosen for key in zip(*(frame[name] for name in keys), strict=True)]]
-        numbers = [column.name for column in MEASURES if isinstance(column.type, sa.Double | sa.BigInteger)]
-        unknown = [name for name in numbers if frame[name].isna().all()]
-        frame = frame.astype(dict.fromkeys(unknown, float))
-        frame["decode_seconds"] = frame["decode_seconds"].map(lambda blob: np.frombuffer(blob, "<f8"))
-        about = pd.DataFrame(list(frame.pop("about")), index=frame.index)
+            mine = [key in chosen for key in zip(*(frame[name] for name in keys), strict=True)]
+            frame, about = frame[mine], about[mine]
         return pd.concat([frame, about], axis=1).reset_index(drop=True)
 
     def decodes(self, episodes: Sequence[int], columns: Sequence[str] | None = None) -> pa.Table:
@@ -291,9 +294,10 @@ class StudyStore:
                 found = connection.execute(sa.select(DECODES).where(DECODES.c.episode_id.in_(part)))
                 blobs |= {row.episode_id: row.parquet for row in found}
         tables = []
-        for index, number in enumerate(episodes):
-            table = read_decodes(blobs[int(number)], columns and list(columns))
-            tables.append(table.append_column("episode", pa.array([index] * table.num_rows, pa.int64())))
+        with self.database.checking(f"decodes of {self.name}"):
+            for index, number in enumerate(episodes):
+                table = read_decodes(blobs[int(number)], columns and list(columns))
+                tables.append(table.append_column("episode", pa.array([index] * table.num_rows, pa.int64())))
         return pa.concat_tables(tables, promote_options="default")
 
     def add(self, study: Study, episodes: Iterable[ImportedEpisode], command: Sequence[str]) -> None:
@@ -392,7 +396,14 @@ def insert_episode(connection: sa.Connection, row: Mapping[str, Any], decodes: b
 
 
 def setting_of(row: Any) -> Setting:
-    """Return the setting that a row of the table `settings` describes."""
+    """Return the setting that a row of the table `settings` describes.
+
+    Raises:
+        Damaged: It names no method, or what identifies its weights is no text.
+    """
+    texts = [row.settings.get("method"), *row.identity.values()]
+    if not all(isinstance(text, str) for text in texts):
+        raise Damaged(f"the method or the identity of setting {row.label}")
     return Setting(check_label(row.label), row.overrides, row.settings, row.identity, row.varies, row.name)
 
 

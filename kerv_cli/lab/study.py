@@ -11,7 +11,7 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
-from kerv_cli.base.errors import Interrupted, KervError
+from kerv_cli.base.errors import Interrupted, KervError, StorageError
 from kerv_cli.base.places import check_writable
 from kerv_cli.base.runtime import set_up
 from kerv_cli.engine.record import EpisodeRecord
@@ -169,12 +169,19 @@ def run(planned: Plan, on_event: OnEvent = lambda event: None, *, save: Save = l
             store.save(planned.study, planned.existing)
             return execute(planned, runner, record, forward)
         except KeyboardInterrupt:
-            existing, total = store.counts()
             raise Interrupted(
-                f"interrupted: {existing} of {total} episodes of {store.name} are kept: run the same command to resume"
+                f"interrupted: {_kept(store)} of {store.name} are kept: run the same command to resume"
             ) from None
         finally:
             close_worlds()
+
+
+def _kept(store: StudyStore) -> str:
+    """Return how many episodes of a study are stored, as text. If the database does not answer: `all complete …`."""
+    try:
+        return "{} of {} episodes".format(*store.counts())
+    except StorageError:
+        return "all complete episodes"
 
 
 def plan_rows(planned: Plan) -> list[dict[str, object]]:

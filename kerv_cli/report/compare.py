@@ -67,6 +67,8 @@ def compared_runs(database: Database, name: str) -> list[ComparedRun]:
             raise UsageError(f"{run.id} is a {run.kind}: it has no setting '{label}'")
         return [ComparedRun(run.id, run)]
     labels = store_of(run, database).load().labels
+    if not labels:
+        raise UsageError(f"study {run.id} has no setting: remove it with 'kerv runs rm {run.id}'")
     if label and label not in labels:
         raise UsageError(f"run {run.id} has no setting '{label}': it has {', '.join(labels)}")
     return [

@@ -1,0 +1,56 @@
+"""Connections to PostgreSQL that end when the server does not answer."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator, Sequence
+from typing import Any
+
+import psycopg
+
+STATEMENT_SECONDS = 30
+"""Longest time that a statement may take, waiting for other transactions included, seconds."""
+CONNECT_SECONDS = 5
+"""Longest time to wait for a connection, seconds."""
+_SPARE_SECONDS = 5
+"""Time that the server has to report its own timeout before it counts as frozen, seconds."""
+
+
+class Connection(psycopg.Connection[Any]):
+    """A connection that is closed if the server is silent for too long, for example because it was stopped."""
+
+    def wait(self, gen: Any, *arguments: Any, **options: Any) -> Any:
+        """Wait for the answer to a statement.
+
+        Raises:
+            OperationalError: Nothing has come from the server for STATEMENT_SECONDS and a few more.
+        """
+        try:
+            return super().wait(_limited(gen, STATEMENT_SECONDS + _SPARE_SECONDS), *arguments, **options)
+        except TimeoutError as error:
+            self.pgconn.finish()
+            raise psycopg.OperationalError(str(error)) from None
+
+
+def _limited(gen: Any, seconds: float) -> Generator[Any, Any, Any]:
+    """Forward a generator of psycopg, which yields what it waits for and is sent 0 while nothing has come.
+
+    Raises:
+        TimeoutError: Nothing has come for this many seconds.
+    """
+    try:
+        wanted, heard = next(gen), time.monotonic()
+        while True:
+            if ready := (yield wanted):
+                heard = time.monotonic()
+            elif time.monotonic() - heard > seconds:
+                raise TimeoutError(f"no answer for {seconds:g} s")
+            wanted = gen.send(ready)
+    except StopIteration as end:
+        return end.value
+
+
+def connect(dialect: object, record: object, arguments: Sequence[Any], options: dict[str, Any]) -> Connection:
+    """Return a new connection, for SQLAlchemy's event `do_connect`."""
+    limits = {"connect_timeout": CONNECT_SECONDS, "options": f"-c statement_timeout={STATEMENT_SECONDS}s"}
+    return Connection.connect(*arguments, **{**options, **limits})
