@@ -86,6 +86,13 @@ def _lost_won(row: Row) -> str:
     return f"{row['only_baseline']} / {row['only_method']}, {'<0.001' if p < 0.001 else f'{p:.2g}'}"
 
 
+def _encoders(row: Row) -> str:
+    """The speed with an encoder at its floor, at twice its floor, and with one of 8 ms."""
+    return " / ".join(
+        "1" if _is_baseline(row) else _number(row, f"encoder_{at}", ".2f") for at in ("floor", "twice", "8ms")
+    )
+
+
 def _again(row: Row) -> str:
     value, low, high = (_number(row, f"speedup{end}_again", ".2f") for end in ("", "_low", "_high"))
     return f"{value} ({low}–{high})"
@@ -102,6 +109,7 @@ COLUMNS: dict[str, tuple[str, Callable[[Row], str]]] = {
     "per-episode": ("per episode", lambda row: _ratio(row, "episode_speedup")),
     "both-solved": ("both solved", lambda row: _ratio(row, "solved_speedup")),
     "failed": ("failed", lambda row: f"{int(row['episodes']) - int(row['successes'])} of {row['episodes']}"),
+    "encoders": ("encoder at its floor / twice / 8 ms", _encoders),
     "p95": ("p95, ms", lambda row: _number(row, "latency_p95_ms", ".1f")),
     "AL": ("AL", lambda row: _number(row, "AL", ".1f")),
     "steps": ("control steps to success", lambda row: _number(row, "steps_to_success", ".0f")),

@@ -13,7 +13,7 @@ from studies_synthetic import episode, still_episode, swept, threshold_study
 
 from kerv_cli.engine.cost import Profile, prices, work_of_record
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.reprice import NamedProfile, open_profiles, repriced_table
+from kerv_cli.report.reprice import NamedProfile, open_profiles, repriced_summary, repriced_table
 from kerv_cli.report.tables import load_study
 
 PROFILE = Profile(
@@ -90,6 +90,25 @@ def test_a_report_prices_the_study_on_several_machines(results):
     page = (results / "studies/threshold/report.html").read_text()
     assert "On other machines" in page
     assert "same tokens in the same control steps" in page
+
+
+def test_a_table_shows_how_a_row_depends_on_the_encoder(results, data):
+    """At its floor, twice its floor, and 8 ms, each with the engine's system time."""
+    about = {**ABOUT, "projected": True, "engine": "eager", "encoder_floor": 0.001, "encoder_system": 0.006}
+    named = NamedProfile("there", dataclasses.replace(PROFILE, about=about))
+    assert named.title == "vla-150m, GPU, eager, projected"
+    table = repriced_table(data, StudyStore(results, "threshold"), [named])
+    rows = table.set_index("label")
+    for column, seconds in (("encoder_floor", 0.007), ("encoder_twice", 0.008), ("encoder_8ms", 0.014)):
+        other = dataclasses.replace(PROFILE, phases={**PROFILE.phases, "encode": ((1,), (seconds,))})
+        priced = repriced_table(data, StudyStore(results, "threshold"), [NamedProfile("other", other)])
+        assert list(rows[column]) == pytest.approx(list(priced["episode_speedup"]))
+        assert "encoder_floor" not in priced, "a measured encoder has one cost"
+    fast, slow = rows.loc["spec_vla r=9", ["encoder_floor", "encoder_8ms"]]
+    assert abs(1 - fast) > abs(1 - slow), "what every method pays hides their difference"
+    (shown,) = (repriced_summary(table).filter(regex="encoder")).to_dict("list").values()
+    assert shown[0] == "1 / 1 / 1×"
+    assert shown[-1] == f"{fast:.2f} / {rows.loc['spec_vla r=9', 'encoder_twice']:.2f} / {slow:.2f}×"
 
 
 def test_a_report_prices_the_study_on_the_machines_that_the_study_names(tmp_path):

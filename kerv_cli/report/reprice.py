@@ -6,8 +6,8 @@ from a profile: a file of `kerv bench` with the seconds that each operation of a
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ from kerv_cli.episodes.identity import batch_of
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MICRO, Row, measure, paired
 from kerv_cli.report.summary import SPEEDS, intervals
-from kerv_cli.report.tables import StudyData, is_baseline, rows_of
+from kerv_cli.report.tables import StudyData, is_baseline, is_number, rows_of
 from kerv_cli.targets.folders import shipped_dir
 
 ASSUMES = (
@@ -33,6 +33,9 @@ _COLUMNS = ("index", "rounds", "similarity", *(f"seconds.{phase}" for phase in R
 _SHIPPED = "-profile.json"
 _ROUND = ("mode", "proposer", "start", "tree_size", "accepted")
 _TIMES = ("time_per_episode_ms", "time_per_step_ms", "latency_p95_ms")
+_EIGHT_MS = 0.008  # what HeiSD's encoder takes on an A100 (arXiv 2603.17573)
+ENCODERS = {"encoder_floor": "its floor", "encoder_twice": "twice its floor", "encoder_8ms": "8 ms"}
+"""Column with the speed per episode at another cost of the target's encoder -> that cost, in words."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +52,23 @@ class NamedProfile:
 
     @property
     def title(self) -> str:
-        """Target and device. Ends in "projected" if the costs were not measured."""
+        """Target, device and, of computed costs, the engine. Ends in "projected" if the costs were not measured."""
         about = self.profile.about
-        names = [str(about[key]) for key in ("target", "device_name") if about.get(key)]
+        names = [str(about[key]) for key in ("target", "device_name", "engine") if about.get(key)]
         return ", ".join(names or [self.name]) + (", projected" if about.get("projected") else "")
+
+    @property
+    def encoders(self) -> dict[str, Profile]:
+        """The same costs with a faster or slower encoder, by `ENCODERS`. Empty if the encoder's floor is unknown.
+
+        An engine's system time comes on top.
+        """
+        about, phases = self.profile.about, self.profile.phases
+        if not is_number(about.get("encoder_floor")):
+            return {}
+        floor, system = float(about["encoder_floor"]), float(about.get("encoder_system", 0.0))
+        costs = zip(ENCODERS, (floor + system, 2 * floor + system, _EIGHT_MS + system), strict=True)
+        return {name: replace(self.profile, phases={**phases, "encode": ((1,), (cost,))}) for name, cost in costs}
 
 
 def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfile]:
@@ -93,7 +109,8 @@ def repriced_table(data: StudyData, store: StudyStore, profiles: Sequence[NamedP
 
     Returns:
         One row per profile and setting, pooled over tasks: the estimated speeds against the baseline with their
-        intervals, the estimated times, and the speeds as measured. Settings that run no decoder are left out.
+        intervals, the estimated times, and the speeds as measured. A computed profile also gives the speeds per episode
+        with another encoder, see `ENCODERS`. Settings that run no decoder are left out.
 
     Raises:
         UsageError: A profile lacks a cost that the study needs, or has costs for shorter chunks only. Or a setting has
@@ -108,8 +125,8 @@ def repriced_table(data: StudyData, store: StudyStore, profiles: Sequence[NamedP
     for named in profiles:
         for label, work in works.items():
             _check(named, label, work)
-        priced = pd.concat([_priced(episodes[label], works[label], named.profile) for label in labels])
-        estimated = measure(priced, paired(priced, data.references), all_pairs=True)
+        estimated = _estimated(data, works, named.profile)
+        otherwise = {name: _estimated(data, works, profile) for name, profile in named.encoders.items()}
         rows += [
             {
                 "study": data.study.name,
@@ -120,6 +137,7 @@ def repriced_table(data: StudyData, store: StudyStore, profiles: Sequence[NamedP
                 "projected": bool(named.profile.about.get("projected")),
                 **_speeds(estimated[label], ""),
                 **{name: estimated[label][name] for name in _TIMES},
+                **{name: values[label]["episode_speedup"] for name, values in otherwise.items()},
                 **_speeds(measured[label], "measured_"),
                 "measured_on": ";".join(dict.fromkeys(episodes[label]["device_name"])),
                 "episodes": len(episodes[label]),
@@ -128,6 +146,13 @@ def repriced_table(data: StudyData, store: StudyStore, profiles: Sequence[NamedP
             for label in labels
         ]
     return pd.DataFrame(rows)
+
+
+def _estimated(data: StudyData, works: Mapping[str, _LabelWork], profile: Profile) -> dict[Hashable, Row]:
+    """Return the measures of every setting, by its label, if its decodes took what the profile says."""
+    episodes = data.episodes
+    priced = pd.concat([_priced(episodes[episodes["label"] == label], work, profile) for label, work in works.items()])
+    return measure(priced, paired(priced, data.references), all_pairs=True)
 
 
 def own_prices(data: StudyData, store: StudyStore) -> pd.DataFrame | None:
@@ -194,7 +219,7 @@ def _check(named: NamedProfile, label: str, work: _LabelWork) -> None:
     Raises:
         UsageError: The message names the missing cost and the command that measures it.
     """
-    command, reason = f"kerv bench target={named.profile.about.get('target', 'TARGET')} tokens=[{work.size}]", ""
+    command, reason = f"kerv bench target={named.profile.about.get('target', 'TARGET')} tokens={work.size}", ""
     if lacks := named.profile.lacks(work.work.needs):
         reason = f"no cost of '{lacks[0]}', which setting '{label}' needs"
     elif named.profile.tokens < work.size:
@@ -218,7 +243,8 @@ def _priced(episodes: pd.DataFrame, work: _LabelWork, profile: Profile) -> pd.Da
 def repriced_summary(table: pd.DataFrame) -> pd.DataFrame:
     """Return a table of speeds to print: one row per setting.
 
-    Two columns hold the speeds as measured. Two more columns per machine hold the estimated ones.
+    Two columns hold the speeds as measured. Two more columns per machine hold the estimated ones. For a computed
+    profile, a third one holds the speeds with another encoder, see `ENCODERS`.
     """
     rows: dict[str, dict[str, str]] = {}
     for row in rows_of(table):
@@ -227,4 +253,7 @@ def repriced_summary(table: pd.DataFrame) -> pd.DataFrame:
             for name, heading in SPEEDS.items():
                 text = "1×" if is_baseline(row) else intervals(f"{prefix}{name}", unit="×")(row)
                 cells[f"{machine}: {heading.removeprefix('speed, ')}"] = text
+        if is_number(row.get("encoder_floor")):
+            speeds = " / ".join("1" if is_baseline(row) else f"{row[name]:.2f}" for name in ENCODERS)
+            cells[f"{row['machine']}: per episode, if the encoder takes {', '.join(ENCODERS.values())}"] = f"{speeds}×"
     return pd.DataFrame(rows.values())
