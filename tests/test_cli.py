@@ -335,7 +335,7 @@ ANSWERS = [
     ("train drafter drafter=erly", "unknown drafter 'erly': did you mean early"),
     ("train drafter drafter.kind=early", "drafter.kind=early: choose drafter=early, each has settings of its own"),
     ("bench target=vla-15m", "did you mean vla-150m"),
-    ("bench tokens=[]", "tokens=[]: name at least one N"),
+    ("bench tokens=2", "tokens=2"),
     ("bench projections.mine=[1]", "GB/s and TFLOP/s"),
     ("serve gripper=loose", "unknown gripper 'loose'"),
     ("serve port=70000", "port=70000"),

@@ -12,6 +12,7 @@ from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.runtime import DTYPES, set_up
 from kerv_cli.base.spaces import Observation
+from kerv_cli.bench.physics import Sizes
 from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.episodes.policy import still_observation
@@ -31,84 +32,6 @@ from kerv_cli.worlds.metaworld.spec import SPEC
 
 _SPARE = 1.15  # free memory that is needed, relative to the weights: also for encoder, caches, a copy of one layer
 _COMPILED = 2  # bytes of a weight in a compiled network, which holds them a second time
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """The sizes of a target, from which the bytes and operations of its forwards are computed.
-
-    Attributes:
-        layers: Number of weights in the matrices of all layers.
-        head: Number of weights in the head.
-        drafter: Number of weights that a pass of the drafter reads, with the head's.
-        channels: Channels of all layers' attention: four operations each, per key that a token attends to.
-        cached: Numbers in the key/value cache per token.
-        weight: Bytes of a weight, on average.
-        slot: Bytes of a number in the key/value cache.
-        padding: Tokens that a prefill computes beyond the prompt. Only grown targets have them.
-        drafter_padding: The same of the drafter, when it reads the prompt's states.
-    """
-
-    layers: int
-    head: int
-    drafter: int
-    channels: int
-    cached: int
-    weight: float
-    slot: int
-    padding: int = 0
-    drafter_padding: int = 0
-
-    @classmethod
-    def of_shape(cls, shape: TargetSettings, vocabulary: int, weight: float, slot: int) -> Sizes:
-        """Return the sizes of a compact target of a shape, and of its one-layer drafter.
-
-        Args:
-            shape: Shapes of the target.
-            vocabulary: V, number of action tokens.
-            weight: Bytes of a weight.
-            slot: Bytes of a number in the key/value cache.
-        """
-        layer, head, channels = layer_weights(shape), shape.width * vocabulary, shape.layers * shape.width
-        return cls(layer * shape.layers, head, layer + 2 * shape.width**2 + head, channels, 2 * channels, weight, slot)
-
-    @property
-    def trunk_weights(self) -> int:
-        """Number of weights that every forward reads: the layers' matrices and the head."""
-        return self.layers + self.head
-
-    def forward(self, rows: int, cached: int) -> tuple[float, float]:
-        """Return the bytes that a forward reads, and its number of arithmetic operations.
-
-        Every weight, key and value counts as read once. There are two operations per weight and token, and four per
-        channel of each key that a token attends to.
-
-        Args:
-            rows: Number of tokens in the forward. A grown target adds its padding to a prefill.
-            cached: Number of earlier tokens in the cache. 0: a prefill.
-        """
-        rows += 0 if cached else self.padding
-        read = self.trunk_weights * self.weight + float(self.cached) * (cached + rows) * self.slot
-        attended = rows * cached + rows * (rows + 1) / 2
-        return read, 2.0 * self.trunk_weights * rows + 4.0 * self.channels * attended
-
-    def needs(self, kind: str, rows: int, prompt: int) -> tuple[float, float]:
-        """Return the bytes that a phase of a decode reads, and its number of arithmetic operations.
-
-        Both are 0 if the phase is no forward of the target or the drafter.
-
-        Args:
-            kind: Kind of phase, see `phases.Phase`.
-            rows: Number of tokens, or for a drafted tree its depth; see `phases.Phase`.
-            prompt: P, number of prompt tokens.
-        """
-        if kind in ("prefill", "verify"):
-            return self.forward(rows, prompt if kind == "verify" else 0)
-        # number of passes over the drafter's weights, and of rows in all passes; its tree has eight nodes per level
-        fed = rows + (self.drafter_padding if rows >= prompt else 0)
-        passes = {"feed": (1, fed), "draft": (rows - 1, rows - 1), "tree": (rows - 1, 8 * (rows - 1))}
-        times, tokens = passes.get(kind, (0, 0))
-        return times * self.drafter * self.weight, 2.0 * tokens * self.drafter
 
 
 @dataclass(frozen=True)
@@ -221,7 +144,7 @@ def open_model(settings: BenchSettings) -> Model:
 
 
 def _shape(settings: BenchSettings) -> Model:
-    shape = shape_of(settings.model, max(settings.tokens))
+    shape = shape_of(settings.model, settings.tokens)
     device = torch.device(set_up(settings.runtime)[0])
     on_cpu = device.type == "cpu"
     dtype = DTYPES[{"auto": "float32" if on_cpu else "bfloat16"}.get(settings.dtype, settings.dtype)]

@@ -17,7 +17,8 @@ from kerv_cli.base.config import compose
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.registry import parts
 from kerv_cli.bench.machine import Machine, measure_machine
-from kerv_cli.bench.model import Model, Sizes, blank
+from kerv_cli.bench.model import Model, blank
+from kerv_cli.bench.physics import Sizes
 from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.cost import FORWARDS
@@ -43,10 +44,6 @@ _EVICTING = 16 * 2**20  # float32 numbers that are read before each decode, to e
 _TREE = (5, 8, 50)  # depth, children, nodes of EAGLE-2's tree
 _MERGED = 30  # nodes of a merged in-prefill draft
 _TASK = "reach-v3"
-SCOUT = "scout"
-"""Kind of the phase in which a scout, the smallest drafter, drafts. It is measured for information only: estimates for
-other machines keep the recorded seconds."""
-
 Key = tuple[str, int]
 """Kind and rows of a phase, see `Phase`."""
 Lap = tuple[str, float]
@@ -239,7 +236,7 @@ def phases_of(
         drafts: Bytes and operations of the network that makes a draft, by the draft's kind and rows. Zeros if no
             network makes the draft.
     """
-    order = (*FORWARDS, *source_methods(), SCOUT)
+    order = (*FORWARDS, *source_methods())
     phases, prompt = [], min(rows for kind, rows in seconds if kind == "prefill")
     for (kind, rows), times in sorted(seconds.items(), key=lambda item: (order.index(item[0][0]), item[0][1])):
         read, flops = drafts.get((kind, rows)) or sizes.needs(kind, rows, prompt)
@@ -268,7 +265,7 @@ def needs_of_draft(decoder: Any) -> tuple[float, float]:
 
 
 def source_methods() -> dict[str, str]:
-    """Return by kind of draft, except SCOUT, the method that measures it: {"early": "early_unverified", …}."""
+    """Return by kind of draft the method that measures it: {"early": "early_unverified", …}."""
     measured = [part.traits for part in parts("proposer").values() if "measured_by" in part.traits]
     return {traits["cost"]: traits["measured_by"] for traits in measured}
 
@@ -281,7 +278,7 @@ def source_decoders(settings: BenchSettings) -> dict[str, Any]:
     """
     words = [f"runtime.{name}={getattr(settings.runtime, name)}" for name in ("device", "threads")]
     found = {}
-    for kind, method in {**source_methods(), SCOUT: "scout_unverified"}.items():
+    for kind, method in source_methods().items():
         try:
             found[kind] = decoder_for(compose("rollout", [f"method={method}", *words], RolloutSettings), _TASK)
         except KervError as error:

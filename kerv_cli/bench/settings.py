@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.limits import choice, limits, number, setting
+from kerv_cli.base.limits import choice, number, setting
 from kerv_cli.base.settings import RunSettings
+from kerv_cli.bench.physics import DEVICES, SHAPES, SHARE
 
-PROJECTIONS = {"A100 80GB": [2039.0, 312.0], "H100 SXM": [3350.0, 989.0], "RTX 4090": [1008.0, 165.0]}
+PROJECTIONS = {name: [device.bandwidth / 1e9, device.flops / 1e12] for name, device in DEVICES.items()}
 
 
 @dataclass
@@ -20,9 +21,12 @@ class BenchSettings(RunSettings):
         "auto", "auto", "float32", "bfloat16", "float16", help="number format of a shape; auto: bfloat16 on a GPU"
     )
     repeats: int = number(30, 3, 100_000, help="repeats of every measurement, for medians and 95th percentiles")
-    tokens: list[int] = setting([7, 16], "N, tokens of a chunk; a shape decodes the largest", **limits(4, 256))
-    projected: str = setting("", "a shape of conf/target: also estimate its times on the devices of projections=")
-    projections: dict[str, list[float]] = setting(PROJECTIONS, "device -> published GB/s and dense bfloat16 TFLOP/s")
+    tokens: int = number(16, 4, 256, help="N, tokens of a shape's chunk, at least")
+    projected: str = choice("none", "none", *SHAPES, help="compute its times on GPUs, measure nothing")
+    projections: dict[str, list[float]] = setting(PROJECTIONS, "GPU -> published GB/s and dense bfloat16 TFLOP/s")
+    share: float = number(
+        SHARE, above=0, most=1, help="share of these that a computed profile reaches (gpt-fast, Llama-2 7B, A100: 0.69)"
+    )
 
     def check_together(self, prefix: str) -> None:
         """Check settings that depend on each other.
@@ -31,10 +35,8 @@ class BenchSettings(RunSettings):
             prefix: Start of the settings' names in error messages.
 
         Raises:
-            UsageError: `tokens` is empty, or a device of `projections` does not have two positive numbers.
+            UsageError: A device of `projections` does not have two positive numbers.
         """
-        if not self.tokens:
-            raise UsageError(f"{prefix}tokens=[]: name at least one N")
         for name, figures in self.projections.items():
             if len(figures) != 2 or min(figures) <= 0:
                 raise UsageError(f"{prefix}projections.{name}={figures}: two numbers above 0, GB/s and TFLOP/s")

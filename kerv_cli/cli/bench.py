@@ -18,28 +18,41 @@ AsJson = Annotated[bool, typer.Option("--json", help="Also print the whole resul
     "bench",
     BenchSettings,
     keys="target dtype tokens repeats projected runtime.device runtime.dtype runtime.threads results",
-    examples=("kerv bench", "kerv bench target=vla-150m projected=openvla-7b"),
+    examples=("kerv bench target=vla-150m", "kerv bench projected=openvla-7b"),
     typed={"target": "model"},  # renamed, because Hydra would take target= as a choice among the files of conf/target
 )
 def bench(settings: BenchSettings, as_json: AsJson = False) -> None:
     """Measure how long a target's decodes take, compared with what the device could do at best.
 
     target= is a policy, or a shape with random weights: vla-150m, smolvla, openvla-7b. 'kerv report study=NAME
-    on=PROFILE' estimates from the profile how long a study's decodes would take.
+    on=PROFILE' estimates from the profile how long a study's decodes would take. projected=openvla-7b computes profiles
+    for GPUs that are not here.
     """
+    if settings.projected != "none":
+        _project(settings, as_json)
+        return
     from kerv_cli.bench.machine import measure_machine
     from kerv_cli.bench.model import open_model
-    from kerv_cli.bench.results import PHASE_COLUMNS, card_of, card_rows, ceiling_rows, phase_rows, run, write
+    from kerv_cli.bench.results import PHASE_COLUMNS, card_of, card_rows, phase_rows, run, write
 
     model = open_model(settings)
     machine = measure_machine(model.target.device, model.dtype)
-    card = card_of(model, machine, max(settings.tokens))
-    print_table(("card", ""), card_rows(card), f"{model.name}, {model.dtype}".replace("torch.", ""))
+    print_table(("card", ""), card_rows(card_of(model, machine)), f"{model.name}, {model.dtype}".replace("torch.", ""))
     done = run(settings, model, machine)
     print_table(PHASE_COLUMNS, phase_rows(done.phases), done.title)
-    columns = [name for n in settings.tokens for name in (f"N = {n}", "ceiling", "with its drafter")]
-    print_table(("method", *columns), ceiling_rows(done.ceilings), "speedup if every draft were accepted whole")
-    for path in write(settings, done):
-        typer.echo(str(path))
+    typer.echo(str(write(settings, done)))
     if as_json:
         typer.echo(json.dumps(done.document(), allow_nan=False))
+
+
+def _project(settings: BenchSettings, as_json: bool) -> None:
+    """Compute and write profiles for GPUs, and print them beside what others published."""
+    from kerv_cli.bench.projection import ANCHOR_COLUMNS, PROJECTION_COLUMNS, anchor_rows, projections, write
+
+    computed = list(projections(settings))
+    print_table(PROJECTION_COLUMNS, [one.row for one in computed], f"{settings.projected}, computed, not measured")
+    print_table(ANCHOR_COLUMNS, anchor_rows(), "one action of OpenVLA-7B, as published and as computed")
+    for one in computed:
+        typer.echo(str(write(settings, one)))
+    if as_json:
+        typer.echo(json.dumps({one.name: one.document for one in computed}, allow_nan=False))

@@ -31,4 +31,6 @@ add_drafter(
     when=PREFILL,
     chains=True,
     drafts_whole_chunk=True,
+    cost="scout",
+    measured_by="scout_unverified",
 )

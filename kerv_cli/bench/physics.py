@@ -1,0 +1,301 @@
+"""Compute what a decode costs on a GPU from the model's shape and the GPU's published figures. Nothing is run.
+
+A phase of a decode (prefill, verification, …) reads bytes and executes operations. Its floor is the longer of two
+times: reading at the memory's full bandwidth, and computing at the full rate. An engine is slower than that. The
+constants here say by how much, and who measured it. This module needs no torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from kerv_cli.engine.cost import Profile
+from kerv_cli.targets.openvla.config import TOWERS, Language, Tower
+
+_HALF = 2.0  # bytes of a bfloat16 number
+_TREE_WIDTH = 8  # nodes per level of the drafter's tree
+_TRUNK, _CHAIN, _LEVEL = 21, 13, 31  # kernels outside the layers, counted: of a trunk, a drafted token, a tree's level
+_ROWS = (1, 2, 4, 8, 16, 32, 64)
+CHUNK = 64
+"""Largest number of tokens per chunk that a computed profile prices."""
+
+
+@dataclass(frozen=True)
+class Device:
+    """A GPU, or a board with one.
+
+    Attributes:
+        title: Name in tables.
+        bandwidth: Published bytes per second of its memory.
+        flops: Published operations per second in bfloat16: dense, sums in float32.
+    """
+
+    title: str
+    bandwidth: float
+    flops: float
+
+    def floor(self, read: float, flops: float) -> float:
+        """Return the seconds in which `read` bytes can be read and `flops` operations executed, at best."""
+        return max(read / self.bandwidth, flops / self.flops)
+
+
+DEVICES = {
+    "h100": Device("H100 SXM", 3350e9, 989e12),
+    "a100": Device("A100 80GB", 2039e9, 312e12),
+    "4090": Device("RTX 4090", 1008e9, 165e12),
+    "3090": Device("RTX 3090", 936e9, 71e12),
+    "orin": Device("AGX Orin 64GB", 204.8e9, 42.5e12),
+}
+"""Devices by short name, with the figures of NVIDIA's data sheets. Orin's rate is half of its dense int8 rate."""
+
+
+class Needs(NamedTuple):
+    """What a phase of a decode needs on any device.
+
+    Attributes:
+        read: Bytes that are read.
+        flops: Arithmetic operations.
+        layers: Layers of the language model or drafter that run one after the other.
+        blocks: Blocks of a vision encoder that run one after the other.
+        kernels: Kernels outside of layers and blocks.
+        asks: Whether the target runs: its encoder or its trunk.
+    """
+
+    read: float
+    flops: float
+    layers: int = 0
+    blocks: int = 0
+    kernels: int = 0
+    asks: bool = False
+
+
+@dataclass(frozen=True)
+class Engine:
+    """How a program executes a decode.
+
+    A phase takes its floor ÷ `share`, or the time of launching its kernels if that is longer, and the system time.
+
+    Attributes:
+        name: Name of the engine.
+        share: Share of the device's bandwidth and rate that the program reaches.
+        launch: Seconds of launching a kernel.
+        layer: Kernels of a layer of the language model or of the drafter.
+        block: Kernels of a block of a vision encoder.
+        system: Further seconds of each run of the target's encoder or trunk.
+        source: Who measured these figures.
+    """
+
+    name: str
+    share: float
+    launch: float
+    layer: int
+    block: int
+    system: float
+    source: str
+
+    def seconds(self, needs: Needs, device: Device) -> float:
+        """Return the seconds of a phase on a device."""
+        kernels = needs.layers * self.layer + needs.blocks * self.block + needs.kernels
+        busy = max(device.floor(needs.read, needs.flops) / self.share, kernels * self.launch)
+        return busy + self.system * needs.asks
+
+
+SHARE = 0.69
+"""Share of the peak: gpt-fast reads 1,397 of an A100's 2,039 GB/s with Llama-2 7B, one sequence, in bfloat16."""
+
+ENGINES = {
+    "tuned": Engine(
+        "tuned",
+        SHARE,
+        launch=1.3e-6,
+        layer=7,
+        block=7,
+        system=0.0,
+        source="1.3 µs per kernel in a CUDA graph and 7 kernels per layer (Hazy Research, H100)",
+    ),
+    "eager": Engine(
+        "eager",
+        SHARE,
+        launch=13.3e-6,
+        layer=38,
+        block=14,
+        system=53e-3 / 8,
+        source="38 and 14 kernels per layer and vision block (counted in transformers); 13.3 µs each, so that HeiSD's "
+        "trunk takes 113 ms (A100, 7 forwards of 32 layers); HeiSD's 53 ms of system time, over encoder and 7 forwards",
+    ),
+}
+"""Engines by name. *tuned*: captured graphs and fused kernels. *eager*: the code that the papers measure."""
+ROOFLINE = Engine("roofline", 1.0, 0.0, 0, 0, 0.0, "the floor: the longer of reading and computing")
+"""An engine that takes no longer than the floor."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """The sizes of a target, from which the bytes and operations of its forwards are computed.
+
+    Attributes:
+        layers: Number of weights in the matrices of all layers.
+        head: Number of weights in the head.
+        drafter: Number of weights that a pass of the drafter reads, with the head's.
+        channels: Channels of all layers' attention: four operations each, per key that a token attends to.
+        cached: Numbers in the key/value cache per token.
+        weight: Bytes of a weight, on average.
+        slot: Bytes of a number in the key/value cache.
+        padding: Tokens that a prefill computes beyond the prompt. Only grown targets have them.
+        drafter_padding: The same of the drafter, when it reads the prompt's states.
+    """
+
+    layers: int
+    head: int
+    drafter: int
+    channels: int
+    cached: int
+    weight: float
+    slot: float
+    padding: int = 0
+    drafter_padding: int = 0
+
+    @classmethod
+    def of(cls, width: int, layers: int, feed_forward: int, vocabulary: int, weight: float, slot: float) -> Sizes:
+        """Return the sizes of a Llama-style target, and of its drafter of one such layer.
+
+        Args:
+            width: Width of the hidden states.
+            layers: Number of layers.
+            feed_forward: Hidden units of a layer's feed-forward part.
+            vocabulary: Number of tokens that the head knows.
+            weight: Bytes of a weight.
+            slot: Bytes of a number in the key/value cache.
+        """
+        layer, head, channels = 4 * width**2 + 3 * width * feed_forward, width * vocabulary, layers * width
+        return cls(layers * layer, head, layer + 2 * width**2 + head, channels, 2 * channels, weight, slot)
+
+    @property
+    def trunk_weights(self) -> int:
+        """Number of weights that every forward reads: the layers' matrices and the head."""
+        return self.layers + self.head
+
+    def forward(self, rows: int, cached: int) -> tuple[float, float]:
+        """Return the bytes that a forward reads, and its number of arithmetic operations.
+
+        Every weight, key and value counts as read once. There are two operations per weight and token, and four per
+        channel of each key that a token attends to.
+
+        Args:
+            rows: Number of tokens in the forward. A grown target adds its padding to a prefill.
+            cached: Number of earlier tokens in the cache. 0: a prefill.
+        """
+        rows += 0 if cached else self.padding
+        read = self.trunk_weights * self.weight + float(self.cached) * (cached + rows) * self.slot
+        attended = rows * cached + rows * (rows + 1) / 2
+        return read, 2.0 * self.trunk_weights * rows + 4.0 * self.channels * attended
+
+    def needs(self, kind: str, rows: int, prompt: int) -> tuple[float, float]:
+        """Return the bytes that a phase of a decode reads, and its number of arithmetic operations.
+
+        Both are 0 if the phase is no forward of the target or the drafter.
+
+        Args:
+            kind: Kind of phase, see `phases.Phase`.
+            rows: Number of tokens, or for a drafted tree its depth; see `phases.Phase`.
+            prompt: P, number of prompt tokens.
+        """
+        if kind in ("prefill", "verify"):
+            return self.forward(rows, prompt if kind == "verify" else 0)
+        # number of passes over the drafter's weights, and of rows in all passes
+        fed = rows + (self.drafter_padding if rows >= prompt else 0)
+        passes = {"feed": (1, fed), "draft": (rows - 1, rows - 1), "tree": (rows - 1, _TREE_WIDTH * (rows - 1))}
+        times, tokens = passes.get(kind, (0, 0))
+        return times * self.drafter * self.weight, 2.0 * tokens * self.drafter
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The shape of a VLA, of its drafters and of a datastore.
+
+    Attributes:
+        name: Name of the model.
+        sizes: Sizes of trunk, head and EAGLE's drafter.
+        layers: Number of the trunk's layers.
+        prompt: P, number of prompt tokens.
+        parts: Needs of what runs at most once per decode, by kind of cost: `encode` (vision towers and projector),
+            `early`, `scout`, `retrieval`.
+    """
+
+    name: str
+    sizes: Sizes
+    layers: int
+    prompt: int
+    parts: Mapping[str, Needs]
+
+    def needs(self, kind: str, rows: int) -> Needs:
+        """Return what a phase needs; the arguments are those of `Sizes.needs`."""
+        if kind in self.parts:
+            return self.parts[kind]
+        bounds = self.sizes.needs(kind, rows, self.prompt)
+        if kind in ("prefill", "verify"):
+            return Needs(*bounds, layers=self.layers, kernels=_TRUNK, asks=True)
+        passes = 1 if kind == "feed" else rows - 1
+        return Needs(*bounds, layers=passes, kernels=passes * (_LEVEL if kind == "tree" else _CHAIN))
+
+
+def priced(shape: Shape, device: Device, engine: Engine) -> Profile:
+    """Return the cost of each phase of a decode of up to `CHUNK` tokens, as a profile that prices studies."""
+    rows = {
+        "encode": (1,),
+        "prefill": (shape.prompt, *(shape.prompt + n for n in _ROWS)),
+        "verify": _ROWS,
+        "feed": (*_ROWS, shape.prompt),
+        "draft": _ROWS[1:],
+        "tree": _ROWS[1:4],
+        **dict.fromkeys(shape.parts, (1,)),
+    }
+    phases = {
+        kind: (counts, tuple(engine.seconds(shape.needs(kind, n), device) for n in counts))
+        for kind, counts in rows.items()
+    }
+    return Profile(shape.prompt, phases, CHUNK, {"target": shape.name, "device_name": device.title})
+
+
+def _block(tower: Tower) -> int:
+    """Return the number of weights in the matrices of a block of a vision tower."""
+    return 4 * tower.width**2 + 2 * tower.width * tower.feed_forward
+
+
+def _encoder(towers: list[Tower], width: int) -> Needs:
+    """Return what OpenVLA's encoder needs: all blocks but the last of each tower, and the projector of three layers."""
+    weights, flops, blocks = 0.0, 0.0, 0
+    for tower in towers:
+        tokens, depth = tower.patches + tower.prefix, tower.depth - 1
+        patch = 3 * tower.patch**2 * tower.width
+        weights += depth * _block(tower) + patch
+        flops += 2.0 * tokens * (depth * _block(tower) + patch) + 4.0 * depth * tower.width * tokens**2
+        blocks += depth
+    channels = sum(tower.width for tower in towers)
+    projector = channels * 4 * channels + 4 * channels * width + width**2
+    flops += 2.0 * projector * towers[0].patches
+    return Needs(_HALF * (weights + projector), flops, blocks=blocks, kernels=20, asks=True)
+
+
+def _openvla() -> Shape:
+    """Return the shape of OpenVLA-7B: two vision towers, a projector, and Llama-2 7B."""
+    llama, towers = Language(), list(TOWERS.values())
+    width, layers = llama.hidden_size, llama.num_hidden_layers
+    sizes = Sizes.of(width, layers, llama.intermediate_size, llama.vocab_size, _HALF, _HALF)
+    # The early drafter reads two pooled vectors, has two blocks of 384 units and spreads 32 features over 7 tokens. Its
+    # kernels and the scout's are counted in the shipped drafters, the scout's other figures, too. A datastore has the
+    # shipped one's 45,221 keys of 32 numbers.
+    early = 2 * width * 384 + 6 * 384**2 + 384 * 7 * 32 + 32 * 256
+    parts = {
+        "encode": _encoder(towers, width),
+        "early": Needs(_HALF * early, 2.0 * early, kernels=57),
+        "scout": Needs(_HALF * 1.253e6, 30.2e6, kernels=121),
+        "retrieval": Needs(_HALF * 45_221 * 32, 2.0 * 45_221 * 32, kernels=10),
+    }
+    return Shape("openvla-7b", sizes, layers, towers[0].patches + 25, parts)
+
+
+SHAPES = {"openvla-7b": _openvla()}
+"""Shapes by name. The prompt of OpenVLA-7B is 256 patches and an instruction of 25 tokens."""
