@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command import kerv
+from command import kerv, refusal
 from conftest import refused, until
 from safetensors.torch import load_file
 from torch import nn
@@ -20,6 +20,7 @@ from torch import nn
 from kerv_cli.base import files
 from kerv_cli.base.errors import CheckpointError, Interrupted
 from kerv_cli.base.files import sha256_of
+from kerv_cli.methods.drafters import TrainableDrafter
 from kerv_cli.report.plots import save_curves
 from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.folder import save_target
@@ -279,3 +280,32 @@ def test_vision_target_and_its_drafter_train_from_the_command_line(results):
     described = json.loads((results / "artifacts/drafter/seen/drafter.json").read_text())
     target = json.loads((results / "artifacts/target/seen/target.json").read_text())
     assert described["target"] == target["sha256"]
+
+
+@pytest.mark.usefixtures("quick_training")
+@pytest.mark.parametrize(("kind", "score"), [("drafter", "acceptance_length_r9"), ("early", "accepted_r9")])
+def test_a_drafter_is_trained_for_the_target_in_the_number_format_that_is_recorded(
+    demonstrated, monkeypatch, kind, score
+):
+    decoded = []
+    examples = TrainableDrafter.examples
+
+    def seen(self, target, *rest):
+        decoded.append(target.dtype)
+        return examples(self, target, *rest)
+
+    monkeypatch.setattr(TrainableDrafter, "examples", seen)
+    words = [f"drafter={kind}", "policy.target=nano-vision", f"policy.artifacts.{kind}=bf16", "demos=few"]
+    words += ["task=drawer-close", "train.steps=2", "train.batch=2", "train.validate_every=2", "drafter.samples=8"]
+    words += [f"results={demonstrated}", "runtime.device=cpu"]
+    assert score in kerv("train", "drafter", *words, "runtime.dtype=bfloat16").output
+    assert decoded == [torch.bfloat16]
+    described = json.loads((demonstrated / f"artifacts/{kind}/bf16/{kind}.json").read_text())
+    assert described["provenance"]["settings"]["runtime"]["dtype"] == "bfloat16"
+    assert "another policy.artifacts" in refusal("train", "drafter", *words)
+
+
+def test_a_target_is_not_said_to_be_trained_in_another_number_format(results):
+    words = ["target=nano", "task=drawer-close", "name=half", "runtime.dtype=bfloat16", f"results={results}"]
+    assert "remove runtime.dtype" in refusal("train", "target", *words, code=2)
+    assert not (results / "artifacts/target/half").exists()

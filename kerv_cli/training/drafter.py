@@ -68,21 +68,27 @@ class DrafterRun(TrainingRun):
         )
 
     def load(self, progress: OnProgress) -> None:
-        """Load the target, decode the demonstrations with it, and make the drafter.
+        """Load the target in the number format `runtime.dtype`, decode demonstrations with it, and make the drafter.
+
+        The drafter's own weights are trained in float32.
 
         Raises:
             CheckpointError: The target or the demonstrations are damaged.
             UsageError: The device does not exist.
         """
-        self.device, _ = set_up(self.settings.runtime)
-        target: Any = load_target(self.target_folder, self.device)[0]
+        self.device, dtype = set_up(self.settings.runtime)
+        target: Any = load_target(self.target_folder, self.device, dtype)[0]
         self.objective = self.artifact.objective(target, self.dataset, self.settings, progress)
 
     def identity(self) -> dict[str, Any]:
-        """Return the drafter's settings, the hash of the target's weights and the tasks."""
-        task = self.settings.task
+        """Return the drafter's settings, the hash of the target's weights, the tasks, and the number format.
+
+        float32 is left out, so that trainings from before it counted can be resumed.
+        """
+        task, dtype = self.settings.task, self.settings.runtime.dtype
         tasks = list(resolve_tasks(task)) if task else []
-        return {"drafter": asdict(self.settings.drafter), "target": self.description.sha256, "task": tasks}
+        shared = {"drafter": asdict(self.settings.drafter), "target": self.description.sha256, "task": tasks}
+        return shared if dtype == "float32" else {**shared, "dtype": dtype}
 
     def write(self, module: nn.Module, provenance: dict[str, Any]) -> None:
         """Write the weights and their description into the drafter's folder."""

@@ -56,6 +56,10 @@ class TargetRun(TrainingRun):
     def __init__(self, settings: TrainTargetSettings) -> None:
         self.settings = settings
         self.folder = artifact(settings.results, "target", settings.name)
+        if settings.runtime.dtype != "float32":
+            raise UsageError(
+                f"runtime.dtype={settings.runtime.dtype}: a target is trained in float32; remove runtime.dtype"
+            )
         settings.demos = settings.demos or name_of(settings.task)
         self.dataset = open_demos(settings.results, settings.demos, settings.task)
         settings.task = settings.task or list(self.dataset.manifest.tasks)

@@ -10,6 +10,7 @@ Shapes: B sequences, T new tokens, P prompt tokens, N tokens of a chunk, E width
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -356,19 +357,22 @@ class EagleDrafter(TrainableDrafter):
             The smooth L1 loss of the states, and the cross-entropy of the drafter's token distribution with the
             target's.
         """
-        teacher = training.target.head(hidden).softmax(-1)
-        cross_entropy = -(teacher * F.log_softmax(training.target.head(predicted), -1)).sum(-1).mean()
+        target = training.target
+        teacher, logits = (target.head(states.to(target.dtype)).float() for states in (hidden, predicted))
+        cross_entropy = -(teacher.softmax(-1) * F.log_softmax(logits, -1)).sum(-1).mean()
         return F.smooth_l1_loss(predicted, hidden), cross_entropy
 
     def validate(self, training: Training, module: EagleNetwork) -> Metrics:
         """Decode held-out observations. Return the acceptance lengths with strict and relaxed (r = 9) acceptance.
 
         The acceptance length is the number of tokens committed per verification. The score is the sum of both lengths.
+        The network drafts in the target's number format, as it will when it is loaded.
         """
         target, held_out = training.target, training.held_out
         chosen = torch.linspace(0, len(held_out) - 1, min(VALIDATED, len(held_out))).long().tolist()
-        prompts = [held_out.prompt[i, : held_out.lengths[i]][None].to(target.device).float() for i in chosen]
-        strict, relaxed = (acceptance_length(target, module, prompts, r) for r in (0, 9))
+        prompts = [held_out.prompt[i, : held_out.lengths[i]][None].to(target.device, target.dtype) for i in chosen]
+        network = copy.deepcopy(module).to(target.dtype)
+        strict, relaxed = (acceptance_length(target, network, prompts, r) for r in (0, 9))
         return {"score": relaxed + strict, "acceptance_length_strict": strict, "acceptance_length_r9": relaxed}
 
 
