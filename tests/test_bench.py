@@ -19,7 +19,9 @@ from kerv_cli.bench.phases import Laps, Phase, costs_of, decoders, measure
 from kerv_cli.bench.physics import Sizes
 from kerv_cli.bench.results import card_of, profile_of
 from kerv_cli.bench.settings import BenchSettings
-from kerv_cli.engine.cost import READ_PHASES, Profile, Work, prices, read_profile, work_of
+from kerv_cli.engine.cost import READ_PHASES, Profile, Work, prices, read_profile, work_of, work_of_record
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.methods.eagle.drafter import DrafterProposer
 
 NANO = BenchSettings(model="nano", dtype="float32")
 
@@ -28,12 +30,13 @@ Played = tuple[str, int, int, int, str]
 PREFILL: Played = ("prefill", 0, 0, 0, "none")
 
 
-def work(*rounds: Played, looked_up: bool = False, drafter: tuple[int, int] | None = None, vision: float = 1.0) -> Work:
+def work(*rounds: Played, looked_up: bool = False, levels: int = 0, vision: float = 1.0) -> Work:
     """Of one decode of sixteen tokens."""
     names = ("mode", "start", "tree_size", "accepted", "proposer")
     columns = {name: np.array(column) for name, column in zip(names, zip(*rounds, strict=True), strict=True)}
+    columns["levels"] = np.full(len(rounds), levels)
     times = dict(zip(READ_PHASES, np.array([[vision], [0.5], [0.25], [0.0], [0.125]]), strict=True))
-    return work_of(columns, np.array([len(rounds)]), times, np.array([looked_up]), 16, drafter)
+    return work_of(columns, np.array([len(rounds)]), times, np.array([looked_up]), 16)
 
 
 def test_a_recorded_decode_becomes_its_forwards():
@@ -70,7 +73,20 @@ def test_a_skipped_decode_has_no_forward():
 
 def test_a_tree_has_the_levels_of_its_settings_and_of_the_chunk():
     rounds = (PREFILL, ("verify", 1, 50, 4, "drafter"), ("verify", 13, 50, 1, "drafter"))
-    assert work(*rounds, drafter=(5, True)).calls["tree"].rows.tolist() == [5, 2]
+    assert work(*rounds, levels=5).calls["tree"].rows.tolist() == [5, 2]
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize(("top_k", "nodes", "kind"), [(2, 6, "tree"), (1, 6, "draft")])
+def test_a_record_says_whether_a_tree_was_drafted_however_small_it_is(top_k, nodes, kind):
+    model = open_model(NANO)
+    drafter = DrafterProposer(model.drafter, model.target, 6, top_k, nodes)
+    decoder = Decoder(model.target, Parts(proposer=drafter))
+    decoder.reset("reach-v3", 0, np.zeros(3))
+    decode = decoder.decode(model.observation)
+    drafted = [one for one in decode.rounds if one.tree_size]
+    assert {one.levels for one in drafted[:1]} == {6 if top_k > 1 else 0}
+    assert {"tree", "draft"} & set(work_of_record(decode).calls) == {kind}
 
 
 def test_bytes_and_operations_of_a_forward():

@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
 from command import refusal, told
 from studies_synthetic import episode, still_episode, swept, threshold_study
 
 from kerv_cli.engine.cost import Profile, prices, work_of_record
+from kerv_cli.episodes.rows import decode_records
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.reprice import NamedProfile, open_profiles, repriced_summary, repriced_table
 from kerv_cli.report.tables import load_study
@@ -73,6 +75,24 @@ def test_an_episode_costs_its_decodes_at_the_profiles_costs(results, data):
     first = data.episodes[data.episodes["label"] == "ar"].iloc[0]
     assert table.loc["ar", "latency_p95_ms"] == pytest.approx(1000 * (0.005 + 0.008 + 15 * 0.002 + 0.001))
     assert first["decodes"] == len(first["decode_seconds"])
+
+
+def test_decodes_from_before_rounds_had_levels_cost_what_their_settings_say(results, data, monkeypatch):
+    store = StudyStore(results, "threshold")
+    profiles = [NamedProfile("there", PROFILE)]
+    whole, decodes = repriced_table(data, store, profiles), store.decodes
+
+    def old(*arguments: Any) -> pa.Table:
+        table = decodes(*arguments)
+        place = table.schema.get_field_index("rounds")
+        fields = [field for field in table["rounds"].type.value_type if field.name != "levels"]
+        rounds = pa.chunked_array([pa.array(table["rounds"].to_pylist(), pa.list_(pa.struct(fields)))])
+        return table.set_column(place, "rounds", rounds)
+
+    monkeypatch.setattr(store, "decodes", old)
+    pd.testing.assert_frame_equal(repriced_table(data, store, profiles), whole)
+    table = old([int(data.episodes["episode"].iloc[-1])])
+    assert {one.levels for decode in decode_records(table) for one in decode.rounds} == {0}
 
 
 def report(results: Path, *words: str) -> str:

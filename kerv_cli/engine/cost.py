@@ -28,8 +28,9 @@ FORMAT = 2
 READ_PHASES = ("vision", "propose", "accept", "rectify", "other")
 """Phases whose recorded seconds the cost model reads. For `vision` it only matters whether they are zero."""
 
-_WIDE = 32  # a draft of at least this many nodes counts as a tree, if the drafter's settings are unknown
-_LEVELS = 5  # assumed depth of such a tree
+
+COUNTED = ("mode", "proposer", "start", "tree_size", "accepted", "levels")
+"""Attributes of `Round` that the cost model reads."""
 
 
 def source_costs() -> dict[str, list[str]]:
@@ -162,19 +163,16 @@ def work_of(
     phases: Mapping[str, np.ndarray],
     looked_up: np.ndarray,
     size: int,
-    drafter: tuple[int, int] | None = None,
 ) -> Work:
     """Return what several decodes computed, from the columns of their records.
 
     Args:
         rounds: Values (n,) over the n rounds of all decodes, for each of the `Round` attributes mode, proposer, start,
-            tree_size and accepted.
+            tree_size, accepted and levels.
         counts: Number of rounds of each decode, (decodes,).
         phases: Recorded seconds of each of `READ_PHASES`, (decodes,).
         looked_up: Whether the decode searched the datastore, (decodes,) bool.
         size: Number of tokens N in a chunk.
-        drafter: The drafter's depth, and whether it drafts a tree. None if unknown: a draft of many nodes then counts
-            as a tree.
     """
     decodes, decode = len(counts), np.repeat(np.arange(len(counts)), counts)
     mode, proposer, start = rounds["mode"], rounds["proposer"], rounds["start"]
@@ -183,8 +181,8 @@ def work_of(
     has_drafter = np.bincount(decode, drafts, decodes) > 0
     nodes = np.where(mode == PARALLEL, size, rounds["tree_size"])
     accepted = np.where(mode == PARALLEL, 0, rounds["accepted"])
-    depth, is_tree = drafter or (_LEVELS, False)
-    trees = drafts & ((nodes >= _WIDE) if drafter is None else is_tree)
+    levels = rounds["levels"]
+    trees = drafts & (levels > 0)
     forward, prefill = mode != "skip", start == 0
     feeds = forward & has_drafter[decode] & (np.diff(decode, append=decodes) == 0)  # not after the last round
 
@@ -198,7 +196,7 @@ def work_of(
         "verify": calls(forward & ~prefill, 1 + nodes),
         "feed": calls(feeds, accepted + ~prefill, prefill),
         DRAFTING: calls(drafts & ~trees, nodes),
-        "tree": calls(trees, np.minimum(depth, size - start - 1)),
+        "tree": calls(trees, np.minimum(levels, size - start - 1)),
     }
     sources = {kind: np.bincount(decode, np.isin(proposer, names), decodes) > 0 for kind, names in costs.items()}
     for kind, names in costs.items():
@@ -214,9 +212,8 @@ def work_of(
 
 def work_of_record(decode: DecodeRecord) -> Work:
     """Return what a single decode computed (forwards, drafts, other seconds), from its record."""
-    names = ("mode", "proposer", "start", "tree_size", "accepted")
     return work_of(
-        {name: np.array([getattr(one, name) for one in decode.rounds]) for name in names},
+        {name: np.array([getattr(one, name) for one in decode.rounds]) for name in COUNTED},
         np.array([len(decode.rounds)]),
         {name: np.array([decode.phases.get(name, float(name == "vision"))]) for name in READ_PHASES},
         np.array([decode.similarity is not None]),

@@ -50,11 +50,13 @@ class Verified(NamedTuple):
         tree: The draft's n nodes, on the CPU.
         target_tokens: 1 + n tokens, on the CPU: the target's prediction after the last committed token, then its
             prediction after each node.
+        levels: Depth down to which a tree was drafted. 0 for a chain.
     """
 
     hidden: Tensor
     tree: TokenTree
     target_tokens: list[int]
+    levels: int
 
 
 class ActionDecoder(EpisodeState):
@@ -272,7 +274,8 @@ class Decoder(ActionDecoder):
         hidden = target.forward(x, draft.positions(cache.length, before, x.device), cache, draft.visible(before))
         # the only place in a round where the CPU waits for the GPU
         targets, *remote = read(target.head(hidden[0, before - 1 :]).argmax(-1), *draft.remote)
-        return Verified(hidden, draft.judged(remote), targets.astype(np.int64).tolist())
+        tree = draft.judged(remote)
+        return Verified(hidden, tree, targets.astype(np.int64).tolist(), draft.levels or tree.levels)
 
     def accept(self, chunk: Chunk, verified: Verified, proposer: Proposer | None) -> Accepted:
         """Return the path that the acceptance rule chooses. It is empty if there was no proposer."""
@@ -306,6 +309,7 @@ class Decoder(ActionDecoder):
             committed=len(path) + len(bonus),
             tree_size=len(tree),
             threshold=self.acceptance.of_drafts_from(proposer.name).limits(self.threshold.radius()),
+            levels=verified.levels,
         )
         rejection = Rejection(
             draft=tuple(tree.tokens[node] for node in after_rejection[1:]),

@@ -40,6 +40,7 @@ class Round:
         committed: Number of committed tokens: the accepted ones and the bonus.
         tree_size: Number of draft tokens in the verified tree.
         threshold: Largest accepted distance per DoF, in bins. Empty if no acceptance rule ran.
+        levels: Depth down to which a tree was drafted; its kept nodes may be less deep. 0 for a chain.
     """
 
     mode: str
@@ -51,6 +52,7 @@ class Round:
     committed: int = 0
     tree_size: int = 0
     threshold: tuple[int, ...] = ()
+    levels: int = 0
 
     @property
     def is_verification(self) -> bool:

@@ -51,6 +51,12 @@ class TokenTree:
     def __len__(self) -> int:
         return len(self.tokens)
 
+    @property
+    def levels(self) -> int:
+        """Number of nodes on the longest path. 0 for a chain, which has no branches."""
+        depth = max(self.depths, default=-1) + 1
+        return depth if depth < len(self) else 0
+
     def down_from(self, node: int) -> list[int]:
         """Return the path from `node` down to a leaf, `node` first. At each node it takes the first child."""
         nodes = [node]

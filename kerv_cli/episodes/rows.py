@@ -85,7 +85,7 @@ EPISODE_SCHEMA = pa.schema((name, kind) for name, (kind, _) in _EPISODE.items())
 """Columns that are computed from an episode's record. The database adds others, such as the task and the time."""
 
 _TOKENS = pa.list_(pa.int32())
-_COUNTS = ("start", "accepted", "committed", "tree_size")
+_COUNTS = ("start", "accepted", "committed", "tree_size", "levels")
 _ROUND = pa.struct(
     [
         (field.name, TEXT if field.name in ("mode", "proposer") else pa.int32() if field.name in _COUNTS else _TOKENS)
@@ -166,7 +166,9 @@ def decode_records(table: pa.Table) -> list[DecodeRecord]:
 
 
 def _round(values: dict[str, Any]) -> Round:
-    plain: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+    # episodes from before a field existed have None there
+    known = {name: v for name, v in values.items() if v is not None}
+    plain: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in known.items()}
     return Round(**plain)
 
 

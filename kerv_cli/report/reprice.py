@@ -17,7 +17,7 @@ import pyarrow.compute as pc
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.places import as_path
-from kerv_cli.engine.cost import READ_PHASES, Profile, Work, prices, read_profile, work_of
+from kerv_cli.engine.cost import COUNTED, READ_PHASES, Profile, Work, prices, read_profile, work_of
 from kerv_cli.episodes.identity import batch_of
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MICRO, Row, measure, paired
@@ -31,7 +31,6 @@ ASSUMES = (
 )
 _COLUMNS = ("index", "rounds", "similarity", *(f"seconds.{phase}" for phase in READ_PHASES))
 _SHIPPED = "-profile.json"
-_ROUND = ("mode", "proposer", "start", "tree_size", "accepted")
 _TIMES = ("time_per_episode_ms", "time_per_step_ms", "latency_p95_ms")
 _EIGHT_MS = 0.008  # what HeiSD's encoder takes on an A100 (arXiv 2603.17573)
 ENCODERS = {"encoder_floor": "its floor", "encoder_twice": "twice its floor", "encoder_8ms": "8 ms"}
@@ -202,14 +201,21 @@ def _work_of_label(data: StudyData, label: str, store: StudyStore) -> _LabelWork
     table = store.decodes(episodes.tolist(), _COLUMNS).combine_chunks()
     rounds = table["rounds"].combine_chunks()
     counts = pc.list_value_length(rounds).to_numpy(zero_copy_only=False).astype(np.int64)
-    columns = {name: rounds.flatten().field(name).to_numpy(zero_copy_only=False) for name in (*_ROUND, "committed")}
+    every = rounds.flatten()
+    stored = {field.name for field in every.type}
+    columns = {
+        name: every.field(name).to_numpy(zero_copy_only=False) for name in (*COUNTED, "committed") if name in stored
+    }
     decode = np.repeat(np.arange(len(counts)), counts)
     size = int(np.bincount(decode, columns.pop("committed")).max())
     phases = {phase: np.nan_to_num(table[f"seconds.{phase}"].to_numpy()) for phase in READ_PHASES}
     looked_up = ~np.isnan(table["similarity"].to_numpy(zero_copy_only=False).astype(float))
+    # episodes from before rounds had levels: the settings say what was drafted
     proposer = setting.settings.get("proposer", {})
-    drafter = (int(proposer["depth"]), proposer.get("shape") == "tree") if "shape" in proposer else None
-    work = work_of(columns, counts, phases, looked_up, size, drafter)
+    drafted = int(proposer["depth"]) if proposer.get("shape") == "tree" else 0
+    levels = columns.get("levels", np.full(len(decode), np.nan)).astype(float)
+    columns["levels"] = np.where(np.isnan(levels), drafted, levels).astype(int)
+    work = work_of(columns, counts, phases, looked_up, size)
     return _LabelWork(work, table["episode"].to_numpy(), size)
 
 
