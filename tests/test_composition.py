@@ -7,11 +7,14 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
 from conftest import refused
 
 from kerv_cli.base.config import compose, conf_dir, groups
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.registry import NoSettings
+from kerv_cli.base.runtime import set_up
+from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.episodes.identity import effective, idle_keys, without_effect
 from kerv_cli.episodes.policy import check as check_rollout
 from kerv_cli.episodes.resolve import Point, ResolvedStudy, idle_overrides
@@ -23,6 +26,7 @@ from kerv_cli.methods.jacobi import JacobiProposerSettings
 from kerv_cli.methods.kerv import CompensateSettings, KinematicThresholdSettings
 from kerv_cli.methods.sp_vla import SpeedSkipSettings
 from kerv_cli.methods.spec_vla import FixedThresholdSettings, RelaxedAcceptanceSettings
+from kerv_cli.targets.checkpoint import load_target
 
 METHODS = groups()["method"]
 AR: dict[str, Any] = {
@@ -232,3 +236,26 @@ def test_a_sweep_names_what_none_of_its_settings_reads():
     common = ("acceptance=relaxed", "policy.artifacts.early=mine", "runtime.workers=2")
     found = idle_overrides(ResolvedStudy(SweepSettings(), settings, points, common))
     assert list(found) == ["a: threshold.r=3", "policy.artifacts.early=mine"]
+
+
+def test_a_merged_draft_needs_what_its_sources_need():
+    asked = composed("method=one_pass", "prefill_draft.sources=[scoped,early]")
+    assert {"certificate", "early"} <= set(Method.of(asked).needs)
+
+
+def test_a_tree_with_more_children_than_there_are_tokens_is_refused(policies):
+    target = load_target(policies / "artifacts/target/nano-vision")[0]
+    method = Method.of(composed("method=spec_vla", "proposer.shape=tree", "proposer.top_k=300"))
+    with refused("proposer.top_k=300: the target has only 255 action tokens", error=UsageError):
+        method.decoder(target, lambda kind: None)
+
+
+def test_a_numbered_gpu_becomes_the_one_that_is_measured(monkeypatch):
+    chosen: list[str] = []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "set_device", chosen.append)
+    assert set_up(RuntimeSettings(device="cuda:1"))[0] == "cuda:1"
+    assert chosen == ["cuda:1"]
+    with refused("runtime.device=cuda:2: torch sees 2 here", error=UsageError):
+        set_up(RuntimeSettings(device="cuda:2"))

@@ -194,6 +194,38 @@ def test_a_token_out_of_range_is_refused_with_its_proposers_name(where, token):
         Decoder(target, Parts(**{where: Wrong()})).decode_prompt(random_prompt(target, 1))
 
 
+HOST_TREE = Draft.of([0, 1, 2, 3, 4], [-1, 0, 1, 2, 0])
+DEVICE = torch.device("meta")  # any device but the CPU
+
+
+@pytest.mark.parametrize(
+    ("draft", "says"),
+    [
+        (Draft.of(range(4)), "drafted 4 tokens on a path: at most 3"),
+        (HOST_TREE, "drafted 4 tokens on a path: at most 3"),
+        (Draft(torch.zeros(4, dtype=torch.long, device=DEVICE)), "drafted 4 tokens on a path: at most 3"),
+        (Draft(*torch.zeros(2, 4, dtype=torch.long, device=DEVICE), levels=4), "drafted 4 tokens on a path: at most 3"),
+        (Draft(*torch.zeros(2, 4, dtype=torch.long, device=DEVICE)), "without Draft.levels"),
+        (Draft(torch.zeros(2, dtype=torch.long), torch.zeros(2, dtype=torch.long, device=DEVICE)), "on one device"),
+        (Draft(torch.zeros(2, dtype=torch.long, device=DEVICE), torch.tensor([-1, 0])), "on one device"),
+    ],
+)
+@pytest.mark.parametrize("where", ["proposer", "prefill_draft"])
+def test_a_draft_that_cannot_be_verified_is_refused_with_its_proposers_name(where, draft, says):
+    target = random_target(1, 1, 1, 1)  # four tokens
+
+    class Wrong(Proposer):
+        name = "mine"
+
+        def propose(self, chunk, depth):
+            return draft
+
+    if where == "proposer":
+        says = says.replace("at most 3", "at most 2")
+    with pytest.raises(KervError, match=f"'mine' .*{says}"):
+        Decoder(target, Parts(**{where: Wrong()})).decode_prompt(random_prompt(target, 1))
+
+
 # on a target that is no transformer: any action space, prompts of any length
 
 

@@ -14,7 +14,9 @@ DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch
 
 
 def set_up(settings: RuntimeSettings) -> tuple[str, torch.dtype]:
-    """Set the number of torch's threads, and resolve the device.
+    """Set the number of torch's threads, and resolve the device. A numbered GPU becomes torch's current one.
+
+    Stopwatches and CUDA graphs use the current device.
 
     Returns:
         The device (`auto` is resolved to cpu or cuda), and the number format.
@@ -28,5 +30,10 @@ def set_up(settings: RuntimeSettings) -> tuple[str, torch.dtype]:
         raise UsageError(f"runtime.device={device}: known are cpu, cuda, cuda:N, auto")
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise UsageError(f"runtime.device={device}: torch sees no CUDA device here, use runtime.device=cpu")
+    if device.startswith("cuda:"):
+        devices = torch.cuda.device_count()
+        if int(device[5:]) >= devices:
+            raise UsageError(f"runtime.device={device}: torch sees {devices} here, cuda:0 to cuda:{devices - 1}")
+        torch.cuda.set_device(device)
     torch.set_num_threads(settings.threads)
     return device, DTYPES[settings.dtype]

@@ -250,12 +250,13 @@ class Decoder(ActionDecoder):
         A draft is at most `remaining − 1` tokens deep, because the target itself gives the chunk's last token.
 
         Raises:
-            KervError: A drafted token is out of range.
+            KervError: The draft cannot be verified, see `Draft.check`.
         """
         if proposer is None or chunk.remaining < 2:
             return EMPTY
-        draft = proposer.propose(chunk, chunk.remaining - 1)
-        draft.check(self.space.tokens, proposer.name)
+        depth = chunk.remaining - 1
+        draft = proposer.propose(chunk, depth)
+        draft.check(self.space.tokens, proposer.name, depth)
         stopwatch.lap("propose")
         return draft
 

@@ -47,18 +47,38 @@ class Draft:
     def __len__(self) -> int:
         return self.tokens.shape[0]
 
-    def check(self, vocabulary: int, proposer: str) -> None:
-        """Refuse tokens out of range. Tokens on the GPU are not checked: each is an argmax, which is always in range.
+    def check(self, vocabulary: int, proposer: str, depth: int) -> None:
+        """Refuse a draft that cannot be verified.
+
+        Tokens on the GPU are not checked: each is an argmax, which is always in range. A tree on the GPU counts as deep
+        as its `levels`.
 
         Args:
             vocabulary: Number of action tokens.
-            proposer: Name of the proposer, for the error message.
+            proposer: Name of the proposer, for the error messages.
+            depth: Maximum number of tokens on a path.
 
         Raises:
-            KervError: A token is out of range.
+            KervError: A token is out of range, a path is too long, or a tree on the GPU has no `levels`. Or tokens and
+                parents are on two devices.
         """
-        if self.tokens.device == HOST:
+        device, is_chain = self.tokens.device, self.parents is None
+        if self.parents is not None and self.parents.device != device:
+            raise KervError(
+                f"the proposer '{proposer}' drafted tokens on {device} and parents on {self.parents.device}: put both "
+                "on one device"
+            )
+        if device == HOST:
             check_tokens(self.tokens.numpy(), vocabulary, proposer)
+        reached = len(self)
+        if not is_chain:
+            reached = max(self.tree.depths, default=-1) + 1 if device == HOST else self.levels
+            if len(self) and not reached:
+                raise KervError(f"the proposer '{proposer}' drafted a tree on {device} without Draft.levels")
+        if reached > depth:
+            raise KervError(
+                f"the proposer '{proposer}' drafted {reached} tokens on a path: at most {depth} fit into the chunk"
+            )
 
     @cached_property
     def tree(self) -> TokenTree:

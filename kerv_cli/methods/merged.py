@@ -49,8 +49,8 @@ class MergedProposerSettings:
 
 def needs_of_sources(settings: MergedProposerSettings) -> tuple[str, ...]:
     """Return the kinds of artifacts that the proposers in `sources` and `fallback` need, without repetitions."""
-    names = (*settings.sources, *settings.fallback)
-    return tuple(dict.fromkeys(kind for name in names for kind in find("proposer", name).needs(None)))
+    sources = [find("proposer", name) for name in (*settings.sources, *settings.fallback)]
+    return tuple(dict.fromkeys(kind for part in sources for kind in part.needs(part.default)))
 
 
 class MergedProposer(ChainProposer):

@@ -282,7 +282,13 @@ class EagleDrafter(TrainableDrafter):
         """Build the part that proposer=drafter chooses, or that proposer=hybrid contains.
 
         The settings of both proposers have the fields shape, depth, top_k and nodes.
+
+        Raises:
+            UsageError: A node of the tree would have more children than there are action tokens.
         """
+        tokens = context.target.actions.tokens
+        if settings.shape == "tree" and settings.top_k > tokens:
+            raise UsageError(f"proposer.top_k={settings.top_k}: the target has only {tokens} action tokens")
         top_k, nodes = (settings.top_k, settings.nodes) if settings.shape == "tree" else (1, settings.depth)
         return DrafterProposer(context.artifact(cls.kind), context.target, settings.depth, top_k, nodes)
 
