@@ -106,10 +106,9 @@ def test_bytes_and_operations_of_a_forward():
 
 def test_the_sizes_of_a_grown_target_are_those_of_its_new_layers(policies, tmp_path):
     shape = ["grow.width=128", "grow.heads=2", "grow.feed_forward=160", "grow.layers=3", "grow.prompt=70"]
-    large = f"{tmp_path}/large"
-    shape += ["grow.drafter=true", "policy.target=nano-vision", f"name={large}"]
-    kerv("build", "target", *shape, f"results={policies}")
-    model, base = (open_model(BenchSettings(model=name, results=str(policies))) for name in (large, "nano-vision"))
+    nano = f"{policies}/artifacts/target/nano-vision"
+    kerv("build", "target", *shape, "grow.drafter=true", f"policy.target={nano}", "name=large", f"results={tmp_path}")
+    model, base = (open_model(BenchSettings(model=name, results=str(tmp_path))) for name in ("large", nano))
     sizes, s = model.sizes, base.target.settings
     tokens = base.target.actions.tokens
     assert sizes.trunk_weights == 3 * (4 * 128**2 + 3 * 128 * 160) + s.width * tokens
