@@ -23,13 +23,14 @@ needs_libero = pytest.mark.skipif(find_spec("libero") is None, reason="needs pip
 FIRST = SPEC.seeds.evaluation.start
 
 
+@pytest.mark.parametrize("plan", ["", "--plan"])
 @pytest.mark.parametrize("command", ["rollout policy=expert episodes=1", "demos episodes=1"])
-def test_without_the_extra_a_command_says_what_to_install(command, tmp_path, monkeypatch):
+def test_without_the_extra_a_command_says_what_to_install(command, plan, tmp_path, monkeypatch):
     def absent(name):
         raise PackageNotFoundError(name)
 
     monkeypatch.setattr(spec_module, "version", absent)
-    run = kerv(*command.split(), "task=bowl-on-stove", f"results={tmp_path}", code=2)
+    run = kerv(*command.split(), *plan.split(), "task=bowl-on-stove", f"results={tmp_path}", code=2)
     assert "pip install 'kerv[libero]'" in run.output
 
 

@@ -30,6 +30,7 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
     from kerv_cli.worlds.demos.recording import record
 
     config, actor = recording_of(settings)
+    config.spec.check_installed()
     folder = artifact(settings.results, "demos", settings.name or name_of(settings.task))
     if plan:
         what = f"{count(len(config.tasks), 'task')} x {count(settings.episodes, 'episode')}"

@@ -65,11 +65,14 @@ def planned_study(resolved: ResolvedStudy, command: Sequence[str], is_rollout: b
     typer.echo(f"{what} of {whose} on {_few(tasks, 'tasks')}: {count(number, 'episode')}", err=True)
     from kerv_cli.episodes.policy import unseen_tasks
     from kerv_cli.lab.study import plan, plan_rollout
+    from kerv_cli.worlds import spec_of
 
     planned = (plan_rollout if is_rollout else plan)(resolved, command)
     for target, names in dict.fromkeys((s.policy.target, tuple(unseen_tasks(s, tasks))) for s in settings.values()):
         if names:
             typer.echo(f"kerv: warning: policy {target} was never trained on {', '.join(names)}", err=True)
+    for task in dict.fromkeys(one.task for one in planned.to_run):
+        spec_of(task).check_installed()
     if is_rollout and planned.existing:
         there, wanted = len(planned.existing), len(planned.study.episodes)
         typer.echo(f"resuming {planned.store.name}: {there} of {wanted} episodes are there", err=True)
