@@ -80,6 +80,7 @@ def test_it_is_reported_as_it_was(older):
     inferred = {f"{name}_{end}" for name in ratios for end in ("low", "high")}
     inferred |= {"pairs_to_settle", "proposer.top_k", "proposer.nodes"}  # of a chain, the last two have no meaning now
     later = {"steps_to_success", "near_contact_failure", "matched_success_speed", "runs"}
+    later |= {"solved_speedup", "solved_speedup_low", "solved_speedup_high"}
     of_macro = {"difference", "difference_low", "difference_high", "non_inferior"}
     for rows, anew in ((~macro, inferred), (macro, inferred | of_macro)):
         columns = [name for name in text if name not in anew]
