@@ -1,6 +1,7 @@
 """What is executed unverified: always, by similarity, by agreement or by speed; and what lies inside the clock."""
 
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,14 @@ from mock_target import SEVEN, MockTarget
 from test_decoding_lossless import plain_greedy, random_prompt, random_target
 from test_proposers import stored
 
+from kerv_cli.base.config import compose
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.chunk import Choice, Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.parts import Boundary
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.record import DecodeRecord
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.heisd import SimilaritySkipSettings
 from kerv_cli.methods.heisd.rules import RetrievalProposer, VerifySkip
 from kerv_cli.methods.kerv.prediction import Hold, PredictionProposer, Ridge
@@ -43,6 +46,36 @@ class Near(ChainProposer):
         self.calls += 1
         time.sleep(self.pause)
         return [self.drafted[len(chunk.tokens) :][:depth]]
+
+
+# --- HeiSD's public code: two of three
+
+
+def test_two_retrieved_chunks_of_three_are_skipped_and_the_drafters_none():
+    """Decision by decision against the rule, for random choices of the boundary and any similarity."""
+    asked = compose("rollout", ["method=heisd_code"], RolloutSettings).skip
+    random = np.random.default_rng(0)
+    modes, similarities = random.choice(["retrieval", "drafter"], 200, p=[0.75, 0.25]), random.uniform(-1, 1, 200)
+    found: list[bool] = []
+
+    class Stored:
+        name = "retrieval"
+
+        def neighbours(self, chunk):
+            left, chunks = np.array([99]), np.zeros((1, 4), int)
+            return SimpleNamespace(similarity=similarities[[len(found)]], seeds=np.array([0]), left=left, chunks=chunks)
+
+    skip = VerifySkip(asked, Stored(), (asked.s_min,) * 3)  # type: ignore[arg-type]
+    skip.begin("reach-v3", 0)
+    for mode in modes:
+        chunk = SimpleNamespace(choice=Choice(mode), steps=1, skip=lambda tokens, name: None)
+        found.append(skip.take(chunk))  # type: ignore[arg-type]
+    expected, row = [], 0
+    for mode in modes:
+        row = row + 1 if mode == "retrieval" and row < 2 else 0
+        expected.append(row > 0)
+    assert found == expected
+    assert 0.4 < np.mean(found) < 0.6  # about half of the decodes
 
 
 # --- the clock

@@ -35,6 +35,7 @@ MODULES = (
     "kerv_cli.methods.parallel",
     "kerv_cli.methods.streak",
     "kerv_cli.methods.sp_vla",
+    "kerv_cli.methods.contact",
     "kerv_cli.methods.heisd",
     "kerv_cli.methods.jacobi",
     "kerv_cli.methods.merged",

@@ -4,6 +4,7 @@
     spec_vla                    Spec-VLA: accept a draft token if it is equal, or within a radius of the target's
     eagle                       EAGLE-2: drafters that read the target's hidden states, our own and published ones
     kerv                        KERV: predictions from the motion, and thresholds that follow the motion
+    contact                     ours: a threshold that shrinks near the object
     heisd                       HeiSD: retrieved drafts, a boundary between two drafters, skipped verification
     jacobi, parallel            decoding as in PD-VLA and in OpenVLA-OFT
     early, merged               ours: drafts from the prompt, before the prefill (`method=one_pass`)

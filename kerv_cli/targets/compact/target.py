@@ -100,6 +100,8 @@ class CompactTarget(Packable):
         feed_forward: Number of hidden units of a layer, also in a drafter's layers.
         grown_drafter: Shape of the drafter if the target was enlarged together with it (docs/methods.md §0.2), else
             None.
+        hand_and_object: Positions (3,) in metres of the hand and the object in the last observation that `encode` read.
+            A vision policy estimates the object's. None: nothing was read.
     """
 
     centre: Tensor
@@ -117,6 +119,7 @@ class CompactTarget(Packable):
         s = self.settings = settings
         self.actions, self.observation, self.words, self.sha256 = actions, observation, words, ""
         self.grown_drafter: Any = None
+        self.hand_and_object: tuple[Tensor, Tensor] | None = None
         self.chunk, self.parallel = s.chunk, s.parallel
         self.width, self.heads, self.feed_forward = s.width, s.heads, s.feed_forward
         self.cameras = (camera,) if s.observation == "vision" else ()
@@ -217,7 +220,10 @@ class CompactTarget(Packable):
 
     def encode(self, observation: Observation) -> Tensor:
         """Encode an observation as a prompt (1, P, E); errors as `inputs`."""
-        return self.encode_batch(self.inputs(observation))[0]
+        inputs = self.inputs(observation)
+        prompt, places = self.encode_batch(inputs)
+        self.hand_and_object = inputs.proprioception[0, :3], places[0, 0]
+        return prompt
 
     def encode_many(self, observations: Sequence[Observation]) -> Tensor:
         """Encode B observations as prompts (B, P, E); errors as `inputs`."""

@@ -1,0 +1,60 @@
+"""A threshold that knows contact (*ours*; docs/methods.md §3.2): the acceptance radius shrinks near the object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.limits import MOST_BINS, number
+from kerv_cli.base.registry import add
+from kerv_cli.methods.kerv import RadiusRange, nearest
+
+if TYPE_CHECKING:
+    from kerv_cli.methods.context import Context
+
+
+@dataclass
+class ContactThresholdSettings(RadiusRange):
+    """The radius grows with the distance from hand to object, as the policy itself estimates it."""
+
+    kind: str = "contact"
+    r_min: int = number(3, 0, MOST_BINS)  # radius at the object, bins
+    r_max: int = number(15, 0, MOST_BINS)  # radius from the distance `near` on, bins
+    near: float = number(0.1, above=0, most=100)  # metres
+
+
+class Contact:
+    """The acceptance radius r is r_min at the object, r_max from a distance `near` on, and linear between.
+
+    The distance is that of the last observation that the policy encoded, in the decode before. The first decode of an
+    episode has r_min.
+    """
+
+    def __init__(self, settings: ContactThresholdSettings, context: Context) -> None:
+        """Read the settings.
+
+        Raises:
+            UsageError: The policy estimates no positions. Or the largest radius is larger than the distance of any two
+                tokens.
+        """
+        context.check_radius("r_max", settings.r_max)
+        if not hasattr(context.target, "hand_and_object"):
+            raise UsageError("threshold=contact: this policy estimates no position of an object. Use another threshold")
+        self.settings, self.target = settings, context.target
+
+    def reset(self) -> None:
+        """Begin an episode: forget the last observation."""
+        self.target.hand_and_object = None
+
+    def radius(self) -> int:
+        """Return the acceptance radius r, rounded to whole bins."""
+        seen, s = self.target.hand_and_object, self.settings
+        distance = float((seen[0] - seen[1]).norm()) if seen is not None else 0.0
+        return nearest(s.r_min + (s.r_max - s.r_min) * min(1.0, distance / s.near))
+
+    def update(self, variability: float | None) -> None:
+        """Do nothing: the radius depends on the observation alone."""
+
+
+add("threshold", "contact", f"{__name__}:Contact", ContactThresholdSettings)
