@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
-from kerv_cli.engine.draft import Draft
+from kerv_cli.engine.draft import HOST, Draft
 from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.drafter import EagleDrafter
+from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.targets.checkpoint import compact, expanded
 from kerv_cli.targets.compact.bfloat16 import Bfloat16Layers, multiplies_bfloat16
 from kerv_cli.targets.compact.packable import pack
@@ -204,6 +204,38 @@ def test_the_drafter_is_packed_too(final_norm):
     if final_norm:
         states = states / (states.square().mean(-1, keepdim=True) + 1e-5).sqrt() * plain.norm.weight
     assert close(outputs[0], states)
+
+
+@settings(max_examples=20)
+@given(
+    seed=st.integers(0, 10_000),
+    depth=st.integers(1, 5),
+    top_k=st.integers(2, 9),
+    nodes=st.integers(1, 70),
+    equal=st.sampled_from([1, 2, 3, 255]),
+)
+def test_the_compiled_tree_is_the_tree(seed, depth, top_k, nodes, equal):
+    """Also where `equal` tokens at a time are equally probable and have the same children: the first ones count."""
+    target = both_targets("state", seed)[1]
+    for part in (target.head, target.embedding):
+        rows = torch.randn(255, 32, generator=torch.Generator().manual_seed(seed)) * 0.3
+        part.weight.data.copy_(rows[torch.arange(255) // equal * equal])
+    drafter = shaken(EagleDrafter().network(DrafterSettings(), target), seed)
+    pack(target)
+    pack(drafter)
+    proposer = DrafterProposer(drafter, target, depth, top_k, nodes)
+    drafts = []
+    with torch.inference_mode():
+        for compiled in (proposer.compiled, None):
+            proposer.compiled = compiled
+            proposer.observe(*torch.randn(2, 1, 6, 32, generator=torch.Generator().manual_seed(seed)), 0)
+            drafts.append(proposer.tree(depth))
+        assert proposer.cache.length == 6
+    compiled, plain = drafts
+    assert compiled.paths is not None
+    assert compiled.tree == plain.tree
+    assert np.array_equal(compiled.ancestors, plain.ancestors) or plain.ancestors is None
+    assert torch.equal(compiled.positions(6, 1, HOST), plain.positions(6, 1, HOST))
 
 
 def test_packed_weights_never_outlive_their_weights():

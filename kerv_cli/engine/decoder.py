@@ -21,7 +21,7 @@ from kerv_cli.engine.chunk import Chunk, EpisodeState, Rejection, deviation, ste
 from kerv_cli.engine.draft import EMPTY, Draft
 from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold
 from kerv_cli.engine.proposer import Proposer
-from kerv_cli.engine.protocol import ContinuesGreedily, Target
+from kerv_cli.engine.protocol import ContinuesGreedily, PredictsTokens, Target
 from kerv_cli.engine.record import MEAN, DecodeRecord, Round, variability
 from kerv_cli.engine.stopwatch import Stopwatch
 from kerv_cli.engine.transfer import read, upload
@@ -83,6 +83,7 @@ class Decoder(ActionDecoder):
         """
         super().__init__(target.actions, target.cameras)
         self.target, self.parts = target, parts or Parts()
+        self.predicts = target if isinstance(target, PredictsTokens) else None
         self.steps = steps_of(chunk, target.chunk)
         self.acceptance: DistanceRule = self.parts.acceptance or StrictRule(target.actions)
         self.threshold: Threshold = self.parts.threshold or Fixed(0)
@@ -268,13 +269,18 @@ class Decoder(ActionDecoder):
         """
         target, cache, uncached = self.target, chunk.cache, chunk.uncached
         before = len(uncached) or chunk.prompt_length
-        x = chunk.prompt
-        if uncached or len(draft):
-            x = target.embed(draft.tokens_after(uncached, target.device)[None])
-            x = x if uncached else torch.cat([chunk.prompt, x], 1)
-        hidden = target.forward(x, draft.positions(cache.length, before, x.device), cache, draft.visible(before))
+        positions, seen = draft.positions(cache.length, before, target.device), draft.visible(before)
+        x = draft.tokens_after(uncached, target.device) if uncached or len(draft) else None
+        if x is not None and uncached and self.predicts is not None:
+            found, hidden = self.predicts.predict(x, positions, cache, seen)
+            predicted = found[before - 1 :]
+        else:
+            x = chunk.prompt if x is None else target.embed(x[None])
+            x = x if uncached or not len(draft) else torch.cat([chunk.prompt, x], 1)
+            hidden = target.forward(x, positions, cache, seen)
+            predicted = target.head(hidden[0, before - 1 :]).argmax(-1)
         # the only place in a round where the CPU waits for the GPU
-        targets, *remote = read(target.head(hidden[0, before - 1 :]).argmax(-1), *draft.remote)
+        targets, *remote = read(predicted, *draft.remote)
         tree = draft.judged(remote)
         return Verified(hidden, tree, targets.astype(np.int64).tolist(), draft.levels or tree.levels)
 

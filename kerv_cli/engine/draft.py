@@ -28,11 +28,13 @@ class Draft:
         tokens: (n,) int64.
         parents: Index of each token's parent, (n,) int64; −1 is the last committed token. None for a chain.
         levels: Maximum depth of the tree. Needed only when `parents` is on the GPU.
+        paths: `ancestors` of a tree, if they are known already.
     """
 
     tokens: Tensor
     parents: Tensor | None = None
     levels: int = 0
+    paths: np.ndarray | None = None
 
     @classmethod
     def of(cls, tokens: Sequence[int], parents: Sequence[int] | None = None) -> Draft:
@@ -114,6 +116,8 @@ class Draft:
             return None
         if self.parents.device != HOST:
             return ancestors_on_device(self.parents, self.levels)
+        if self.paths is not None:
+            return self.paths
         parents = self.parents.tolist()
         return None if parents == list(range(ROOT, len(self) - 1)) else ancestors_of(parents)
 

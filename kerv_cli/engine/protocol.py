@@ -123,6 +123,26 @@ class ContinuesGreedily(Protocol):
         """
 
 
+@runtime_checkable
+class PredictsTokens(Protocol):
+    """A target with a faster way from new tokens to the tokens after them than `embed`, `forward` and `head`."""
+
+    def predict(
+        self, tokens: Tensor, positions: Tensor, cache: Any, seen: np.ndarray | Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Process T new tokens that follow the cached ones.
+
+        Args:
+            tokens: The new tokens (T,) int64.
+            positions: As in `Target.forward`, like `cache` and `seen`.
+            cache: From `new_cache`.
+            seen: Attention mask. None for a causal mask.
+
+        Returns:
+            The most probable token after each new token, (T,) int64, and their hidden states (1, T, E).
+        """
+
+
 class ReadableTarget(Target, Protocol):
     """A target that also describes its prompt and the shape of its layers. Drafters and the datastore need both."""
 

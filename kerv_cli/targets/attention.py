@@ -34,6 +34,8 @@ class Cache:
         buffer: (layers, 2, B, A, slots, C) keys and values. A fixed cache has a spare slot after its capacity.
         layers: (2, B, A, slots, C) per layer, views of the buffer.
         length: Number of cached tokens. They are in the first slots.
+        copied: Number of slots that `copies` holds as they are in the buffer. It may exceed `length`: slots from there
+            on are written anew before they are read.
     """
 
     def __init__(
@@ -44,7 +46,23 @@ class Cache:
         self.buffer = like.new_zeros((layers, 2, batch, heads, slots, channels))
         self.layers = list(self.buffer)  # (2, B, A, slots, C): keys, values
         self.capacity = capacity
-        self.length = 0
+        self.length = self.copied = 0
+        self._copies: tuple[np.ndarray, np.ndarray] | None = None
+
+    def copies(self, width: int) -> tuple[np.ndarray, np.ndarray, int]:
+        """Return memory for copies of keys and values in panels `width` slots or channels wide, for compiled programs.
+
+        Returns:
+            The keys (layers, B · A, panels, C, width) and the values (layers, B · A, panels, slots, width); and the
+            number of the first slots that they hold already.
+        """
+        if self._copies is None:
+            layers, _, batch, heads, slots, channels = self.buffer.shape
+            self._copies = (
+                np.empty((layers, batch * heads, -(-slots // width), channels, width), np.float32),
+                np.empty((layers, batch * heads, -(-channels // width), slots, width), np.float32),
+            )
+        return *self._copies, min(self.copied, self.length)
 
     def compact(self, start: int, slots: Tensor) -> None:
         """Keep the tokens of an accepted path, and drop the rest of the draft tree.
@@ -57,7 +75,7 @@ class Cache:
         """
         n = slots.shape[0]
         self.buffer[..., start : start + n, :] = self.buffer.index_select(-2, slots)
-        self.length = start + n
+        self.length, self.copied = start + n, min(self.copied, start)
 
     def next_slots(self, tokens: int) -> Slots:
         """Return the slots in which the next `tokens` new tokens go, right after the cached tokens.
@@ -65,6 +83,7 @@ class Cache:
         The result is a slice. For a cache of fixed shapes it is a tensor of indices (tokens,).
         """
         start, stop = self.length, self.length + tokens
+        self.copied = min(self.copied, start)
         return torch.arange(start, stop, device=self.buffer.device) if self.fixed else slice(start, stop)
 
 

@@ -90,15 +90,20 @@ class EagleNetwork(LayerStack):
         """
         return self.run((following, hidden), positions, cache, seen)
 
-    def compiled_chain(self, target: Any) -> Program | None:
-        """Return a compiled program that drafts one token after another, with the target's embeddings and head.
+    def compiled(self, target: Any, tree: bool) -> Program | None:
+        """Return a compiled program that drafts level after level, with the target's embeddings and head.
 
         None if this drafter or the target is not compiled.
+
+        Args:
+            target: The target.
+            tree: Whether the program drafts trees (`Program.grow`), not chains (`Program.repeat`).
         """
 
-        def step(hidden: Tensor) -> Tensor:
-            token = target.head(hidden).argmax(-1)
-            return self.recorded(target.embedding(token)[None], hidden)
+        def step(hidden: Any) -> Tensor:
+            logits = target.head(hidden)
+            token, parent = logits.branch(hidden) if tree else (logits.argmax(-1), hidden)
+            return self.recorded(target.embedding(token)[None], parent)
 
         compiled = isinstance(target, CompactTarget) and target.packed is not None and isinstance(self.packed, Program)
         return Program(step, (1, 1, self.outer), repeats=True) if compiled else None
@@ -121,10 +126,10 @@ class DrafterProposer(Proposer):
         self, drafter: EagleNetwork | PublicDrafter, target: Target, depth: int, top_k: int, nodes: int
     ) -> None:
         self.drafter, self.target = drafter, target
-        self.depth, self.top_k, self.nodes = depth, top_k, nodes
+        self.depth, self.top_k, self.nodes = depth, min(top_k, target.actions.tokens), nodes
         capacity = target.max_prompt + target.chunk * target.actions.dofs + top_k * depth
         self.cache, self.hidden = drafter.new_cache(1, capacity), torch.empty(0)
-        self.compiled = drafter.compiled_chain(target) if isinstance(drafter, EagleNetwork) else None
+        self.compiled = drafter.compiled(target, top_k > 1) if isinstance(drafter, EagleNetwork) else None
 
     def begin(self, chunk: Chunk) -> None:
         """Let the drafter read the prompt: run it over the prompt's embeddings and the prefill's hidden states."""
@@ -187,34 +192,40 @@ class DrafterProposer(Proposer):
         end the most probable nodes of all are kept, `nodes` in number. They form a tree, because a child is never more
         probable than its parent.
         """
-        target, top_k, device = self.target, self.top_k, self.hidden.device
-        scores = torch.log_softmax(target.head(self.hidden).float(), -1)
-        values, tokens = scores.topk(min(top_k, self.nodes))
-        width = tokens.shape[0]
-        every, parents, cumulative = [tokens], [torch.full_like(tokens, ROOT)], [values]
-        base, offset = self.cache.length, width
+        target, top_k, device, base = self.target, self.top_k, self.hidden.device, self.cache.length
         first = self.drafter.draft_position(base)
-        hidden = self.hidden.expand(1, width, -1)
-        level = torch.arange(width, device=device)
-        itself = torch.eye(max(width, top_k), dtype=torch.bool, device=device)
-        seen = itself[:width, :width]  # which earlier draft nodes each node of this depth sees
+        if self.compiled is not None:
+            root = self.hidden[None, None]
+            grown = self.compiled.grow(depth, top_k, self.nodes, root, position=first, cache=self.cache)
+            return Draft(torch.from_numpy(grown[0]), torch.from_numpy(grown[1]), depth, grown[2])
+        values, tokens = _most(torch.log_softmax(target.head(self.hidden).float(), -1), top_k)
+        every, parents, cumulative = [tokens], [torch.full_like(tokens, ROOT)], [values]
+        hidden, offset = self.hidden.expand(1, top_k, -1), top_k
+        level = torch.arange(top_k, device=device)
+        seen = itself = torch.eye(top_k, dtype=torch.bool, device=device)  # draft nodes that each node of a level sees
         for reached in range(1, depth):
             following = target.embed(tokens[None])
-            position = torch.full((width,), first + reached - 1, device=device)
+            position = torch.full((top_k,), first + reached - 1, device=device)
             hidden = self.drafter(following, hidden, position, self.cache, seen.numpy() if device == HOST else seen)
             logp = torch.log_softmax(target.head(hidden[0]).float(), -1) + values[:, None]
-            child_values, child_tokens = (best.flatten() for best in logp.topk(top_k, -1))
-            values, flat = child_values.topk(top_k)
+            child_values, child_tokens = (best.flatten() for best in _most(logp, top_k))
+            values, flat = _most(child_values, top_k)
             # all children may become nodes of the tree, but only the best top_k get children
             parents.append(level[:, None].expand(-1, top_k).flatten())
             every.append(child_tokens)
             cumulative.append(child_values)
-            level, offset, width = offset + flat, offset + child_tokens.shape[0], top_k
+            level, offset = offset + flat, offset + child_tokens.shape[0]
             tokens, rows = child_tokens[flat], flat // top_k
             hidden = hidden[:, rows]
-            seen = torch.cat([seen[rows], itself[:top_k, :top_k]], 1)
+            seen = torch.cat([seen[rows], itself], 1)
         self.cache.length = base
         return _best(torch.cat(every), torch.cat(parents), torch.cat(cumulative), self.nodes, depth)
+
+
+def _most(scores: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return the `count` highest scores in the last dimension, and their indices. Of equal scores the first wins."""
+    values, indices = scores.sort(dim=-1, descending=True, stable=True)
+    return values[..., :count], indices[..., :count]
 
 
 def _best(tokens: Tensor, parents: Tensor, scores: Tensor, nodes: int, depth: int) -> Draft:

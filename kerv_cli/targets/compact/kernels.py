@@ -243,7 +243,7 @@ def attention(frames, out, qkv, tables, cache, start, filled, mask, keys, values
         cache: (2, B, A, slots, C) keys and values of this layer, for A heads of C channels.
         start: Number of valid slots in the cache. The new tokens get the next T slots.
         filled: Number of slots that `keys` and `values` hold already.
-        mask: (T, start + T), 0 for slots that a token sees. Shape (0, 1) means that attention is causal.
+        mask: (T, start + T or more), 0 for slots that a token sees. Shape (0, 1) means that attention is causal.
         keys: (B · A, panels, C, PANEL) copy of the cached keys. It is stored like the weights of a linear layer with
             the channels as inputs and the slots as outputs, in panels of PANEL outputs. So one matrix product gives the
             scores of a query.
@@ -251,7 +251,8 @@ def attention(frames, out, qkv, tables, cache, start, filled, mask, keys, values
             the channels as outputs. So one matrix product applies the attention weights.
     """
     tokens, heads, channels = tables.shape[0], cache.shape[2], tables.shape[2]
-    stop, size, panels, parts = start + tokens, 4 * frames.shape[1], keys.shape[1], values.shape[1]
+    stop, size, parts = start + tokens, 4 * frames.shape[1], values.shape[1]
+    panels = (stop + PANEL - 1) // PANEL
     queries, scores = np.empty((tokens, channels), np.float32), np.empty((tokens, panels * PANEL), np.float32)
     result, factors = np.empty((tokens, parts * PANEL), np.float32), np.zeros((panels + parts, 2, PANEL), np.float32)
     factors[:, 0] = _ONE
@@ -338,38 +339,109 @@ def elementwise(code, frame, columns, numbers, indices):
                 y[r * width + i] = row[i] * factor * gain[i]
 
 
+@compiled
+def ranked(values, best):
+    """Fill `best` (n,) with the indices of the n greatest values, in falling order. Equal values stay in their order.
+
+    There must be n values above minus infinity.
+    """
+    held, count = np.full(len(best), np.float32(-np.inf)), len(best)
+    for i in range(len(values)):
+        value, place = values[i], count
+        if value > held[count - 1]:
+            while place > 0 and value > held[place - 1]:
+                place -= 1
+            for j in range(count - 1, place, -1):
+                held[j], best[j] = held[j - 1], best[j - 1]
+            held[place], best[place] = value, i
+
+
+@compiled
+def sum_of_exponentials(x, most):
+    """Return the sum of e^(x − most)."""
+    total = _ZERO
+    for i in range(len(x)):
+        total += exponential(x[i] - most)
+    return total
+
+
+@numba.njit(error_model="numpy", fastmath=FAST - {"reassoc"})
+def branch(frames, columns, time, start, mask, results):
+    """Grow a level of EAGLE-2's tree: choose the k children of each of the k nodes, and the k best of all children.
+
+    The best children become the nodes that the k frames stand for. In the first execution all frames stand for the
+    tree's root, so that only the first one counts.
+
+    Args:
+        frames: (k, size), one frame per node. It holds the logits of the node's children, and the node's hidden state.
+        columns: The operation's line in the table of operations.
+        time: Number of earlier executions.
+        start: Slot of the first drafted node in the cache.
+        mask: (k, slots), 0 for slots that a node sees. Afterwards those that the new nodes see.
+        results: (times, 4, k²). Of every child of this level: its token, its parent, and the sum of the logarithms of
+            the probabilities on its path; then the indices of the k best children in the level. A parent is an index
+            among all children so far, −1 for the root. The first level has only k children.
+    """
+    nodes, out, a, b = len(frames), columns[1], columns[2], columns[3]
+    width, hidden, rows = columns[5], columns[6], nodes if time else 1
+    best, values, seen = np.empty(nodes, np.int64), np.empty(width, np.float32), mask.copy()
+    tokens, parents, scores, chosen = results[time]
+    for row in range(rows):
+        logits, parent, score = frames[row, a : a + width], -1, _ZERO
+        if time:
+            known = int(results[time - 1, 3, row])
+            parent, score = (nodes * nodes * (time - 2) + nodes if time > 1 else 0) + known, results[time - 1, 2, known]
+        most = logits.max()
+        rest = np.log(sum_of_exponentials(logits, most))
+        for i in range(width):
+            values[i] = ((logits[i] - most) - rest) + score
+        ranked(values, best)
+        for i in range(nodes):
+            child = row * nodes + i
+            tokens[child], parents[child], scores[child] = best[i], parent, values[best[i]]
+    ranked(scores[: rows * nodes], best)
+    for node in range(nodes):
+        child, row = best[node], best[node] // nodes
+        chosen[node], frames[node, out] = child, tokens[child]
+        frames[node, out + 1 : out + 1 + hidden] = frames[row, b : b + hidden]
+        mask[node] = seen[row]
+        mask[node, start + nodes * time + node] = _ZERO
+
+
 _F, _I = types.float32, types.int64
-_TABLES = _I[:, ::1], _I, _I, _I[::1], _F[::1]
-SIGNATURE = types.void(*_TABLES, _F[:, ::1], _I[::1], _I, _F[:, :, :, :, :, ::1], _F[:, ::1], _F[:, ::1])
+_TABLES = _I[:, ::1], _I, _I, _I, _I[::1], _F[::1]
+_COPIES = _F[:, :, :, :, ::1], _F[:, :, :, :, ::1], _I
+SIGNATURE = types.void(*_TABLES, _F[:, ::1], _I[::1], _I, _F[:, :, :, :, :, ::1], *_COPIES, _F[:, ::1], _F[:, :, ::1])
 
 
 @numba.njit(SIGNATURE, error_model="numpy", fastmath=FAST, cache=True)
-def run(ops, times, last, indices, numbers, frames, positions, start, cache, mask, results):
-    """Execute a table of operations on all frames, `times` times.
+def run(ops, begin, end, last, indices, numbers, frames, positions, start, cache, keys, values, filled, mask, results):
+    """Execute a table of operations on all frames, from the `begin`-th time to the `end`-th.
 
-    After each execution the rotary positions and the number of cached tokens grow by one.
+    After each execution the rotary positions grow by one, and the number of cached tokens by T.
 
     Args:
         ops: (operations, columns) int64, see `recording.COLUMNS`.
-        times: Number of executions.
+        begin: Number of earlier executions.
+        end: Number of executions, earlier ones included.
         last: Number of operations in the last execution. It leaves out those that only prepare a further execution.
         indices: Places (indices in a frame) that GATHER operations copy from.
         numbers: Constants of all operations.
         frames: (B · T, size) float32, one frame (memory) per row. They hold the inputs, and afterwards the outputs.
-        positions: (T,) rotary positions of the first execution.
-        start: Number of valid slots in the cache at the beginning.
+        positions: (T,) rotary positions of the first of all executions.
+        start: Number of valid slots in the cache before the first of all executions.
         cache: (layers, 2, B, A, slots, C) keys and values, to which new ones are appended.
-        mask: (T, start + T), 0 for slots that a row sees. Shape (0, 1) means that attention is causal.
-        results: (times, B · T), filled with the result of ARGMAX in each execution.
+        keys: (layers, B · A, panels, C, PANEL) copy of the keys, see `attention`.
+        values: (layers, B · A, panels, slots, PANEL) copy of the values.
+        filled: Number of slots that `keys` and `values` hold already.
+        mask: (T, start + T · times), 0 for slots that a row sees. Shape (0, 1) means that attention is causal.
+        results: (times, 1, B · T), filled with the result of ARGMAX in each execution; or those of `branch`.
     """
     rows, size = frames.shape
-    tokens, memory, held = len(positions), frames.ctypes.data, cache.shape[0] if times > 1 else 1
-    slots, sequences, channels = start + tokens + times - 1, cache.shape[2] * cache.shape[3], cache.shape[5]
-    keys = np.empty((held, sequences, (slots + PANEL - 1) // PANEL, channels, PANEL), np.float32)
-    values = np.empty((held, sequences, (channels + PANEL - 1) // PANEL, slots, PANEL), np.float32)
+    tokens, memory, channels = len(positions), frames.ctypes.data, cache.shape[5]
     tables = np.empty((tokens, 2, channels), np.float32)
-    for time in range(times):
-        for i in range(last if time == times - 1 else len(ops)):
+    for time in range(begin, end):
+        for i in range(last if time == end - 1 else len(ops)):
             columns = ops[i]
             code, out, a, lines, width = columns[0], columns[1], columns[2], columns[4], columns[5]
             if code == op.LINEAR:
@@ -387,13 +459,47 @@ def run(ops, times, last, indices, numbers, frames, positions, start, cache, mas
                         product(weights, factors, width, panels, x, stride, many, y, step)
             elif code == op.ATTEND:
                 for t in range(tokens):
-                    begin = columns[7] + 2 * channels * (positions[t] + time)
-                    tables[t] = numbers[begin : begin + 2 * channels].reshape(2, channels)
-                layer, now = columns[6], start + time
-                known, filled = layer if times > 1 else 0, now if time else 0
-                attention(frames, out, a, tables, cache[layer], now, filled, mask, keys[known], values[known])
+                    first = columns[7] + 2 * channels * (positions[t] + time)
+                    tables[t] = numbers[first : first + 2 * channels].reshape(2, channels)
+                layer, now = columns[6], start + time * tokens
+                known, copied = min(layer, len(keys) - 1), now if time > begin else filled
+                attention(frames, out, a, tables, cache[layer], now, copied, mask, keys[known], values[known])
+            elif code == op.BRANCH:
+                branch(frames, columns, time, start, mask, results)
             else:
                 for r in range(rows):
                     elementwise(code, frames[r], columns, numbers, indices)
                     if code == op.ARGMAX:
-                        results[time, r] = frames[r, out]
+                        results[time, 0, r] = frames[r, out]
+
+
+@numba.njit(types.Tuple((_I[::1], _I[::1], types.boolean[:, ::1]))(_F[:, :, ::1], _I, _I), cache=True)
+def best(results, top_k, nodes):
+    """Choose the nodes of EAGLE-2's tree: the most probable of all, at equal probabilities the first ones.
+
+    They form a tree, because a child is never more probable than its parent, which comes before it.
+
+    Args:
+        results: What `branch` found in all executions.
+        top_k: Number of children of a node.
+        nodes: Number of nodes to choose, at most.
+
+    Returns:
+        The n nodes' tokens (n,) and parents (n,), −1 for the root, and the mask (n, n) bool: entry [i, j] says whether
+        node j is node i or one of its ancestors.
+    """
+    levels, children = results.shape[0], results.shape[2]
+    found = np.empty((3, top_k + (levels - 1) * children), np.float32)
+    found[:, :top_k] = results[0, :3, :top_k]
+    for level in range(1, levels):
+        found[:, top_k + (level - 1) * children : top_k + level * children] = results[level, :3]
+    chosen = np.sort(np.argsort(-found[2], kind="mergesort")[:nodes])
+    index, tokens, parents = np.full(found.shape[1], -1), np.empty(len(chosen), _I), np.empty(len(chosen), _I)
+    seen = np.zeros((len(chosen), len(chosen)), np.bool_)
+    for i in range(len(chosen)):
+        tokens[i], parent = int(found[0, chosen[i]]), int(found[1, chosen[i]])
+        parents[i] = index[parent] if parent >= 0 else -1
+        if parent >= 0:
+            seen[i] = seen[index[parent]]
+        seen[i, i], index[chosen[i]] = True, i
+    return tokens, parents, seen

@@ -29,7 +29,7 @@ from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
 from kerv_cli.targets.attention import Cache
-from kerv_cli.targets.compact.recording import ARGMAX, COLUMNS, FLOAT, HALF, INT8, PANEL, Tape
+from kerv_cli.targets.compact.recording import ARGMAX, BRANCH, COLUMNS, FLOAT, HALF, INT8, PANEL, Tape
 
 _LOG = logging.getLogger("kerv")
 
@@ -137,6 +137,9 @@ def forget(module: torch.nn.Module) -> None:
         _MATRICES.pop(parameter, None)
 
 
+_WITHOUT_ATTENTION = Cache(1, 1, 1, 1, 1, torch.empty(0))
+
+
 class Program:
     """A compiled function of tensors.
 
@@ -149,7 +152,8 @@ class Program:
         Args:
             function: Takes float32 tensors and returns a tensor or a tuple of tensors.
             shapes: Shape of each input. Its first dimension is 1 and stands for any number of rows.
-            repeats: Whether `repeat` will be called. Then output i of an execution becomes input i of the next.
+            repeats: Whether `repeat` or `grow` will be called. Then output i of an execution becomes input i of the
+                next. There may be more outputs than inputs.
         """
         tape = Tape()
         with torch.no_grad():
@@ -157,7 +161,7 @@ class Program:
             found = function(*inputs)
         outputs = [tape.lined(x, x.shape[-1]) for x in (found if isinstance(found, tuple) else (found,))]
         if repeats:
-            for given, (result, _, _) in zip(inputs, outputs, strict=True):
+            for given, (result, _, _) in zip(inputs, outputs, strict=False):
                 tape.copied(result, given)
         self.size, self.cache = tape.arrange([*inputs, *(x for x, _, _ in outputs)]), tape.cache
         self.places = [(int(x.place.flatten()[0]), x.place.numel()) for x in inputs]
@@ -168,7 +172,7 @@ class Program:
         self.ops = np.array([[row.get(name, 0) for name in COLUMNS] for row in table], np.int64)
         self.indices = np.array(tape.indices, np.int64)
         self.numbers = np.concatenate([*tape.numbers, np.zeros(1, np.float32)])
-        found = np.flatnonzero(self.ops[:, 0] == ARGMAX)
+        found = np.flatnonzero(np.isin(self.ops[:, 0], (ARGMAX, BRANCH)))
         self.last = int(found[0]) + 1 if len(found) else len(self.ops)
         self.run = kernels().run
 
@@ -190,7 +194,7 @@ class Program:
         Returns:
             The outputs, (rows, …) each.
         """
-        frames, _ = self._execute(inputs, 1, positions, cache, mask)
+        frames = self._execute(inputs, positions, cache, mask)
         found = []
         for first, rows, stride, shape in self.results:
             block = frames[:, first : first + rows * stride].reshape(len(frames), rows, stride)[:, :, : shape[-1]]
@@ -209,24 +213,65 @@ class Program:
         Returns:
             (times, B) float32, the result of the ARGMAX operation in each execution.
         """
-        return self._execute(inputs, times, torch.tensor([cache.length]), cache, None)[1]
+        results = np.empty((times, 1, inputs[0].numel() // self.places[0][1]), np.float32)
+        self._execute(inputs, torch.tensor([cache.length]), cache, None, results)
+        return results[:, 0]
+
+    def grow(
+        self, levels: int, top_k: int, nodes: int, *inputs: Tensor, position: int, cache: Cache
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Draft EAGLE-2's dynamic tree in one call. Every execution of the program adds a level.
+
+        At each level, the `top_k` nodes with the highest cumulative log-probability get `top_k` children each. In the
+        end the most probable nodes of all are kept. At equal probabilities the first ones count.
+
+        Args:
+            levels: Maximum number of tokens on a path.
+            top_k: Number of nodes per level that get children, and number of children of each.
+            nodes: Maximum number of nodes of the tree.
+            inputs: Inputs of the program for the tree's root.
+            position: Rotary position of the tree's first level.
+            cache: Keys and values of earlier tokens. Those of drafted tokens are written after them, but `cache.length`
+                stays as it is.
+
+        Returns:
+            Tokens (n,), parents (n,), −1 for the root, and the mask (n, n) bool of each node's path, as in
+            `Draft.ancestors`.
+        """
+        results = np.empty((levels, 4, top_k * top_k), np.float32)
+        mask = torch.ones(top_k, cache.length + levels * top_k)
+        mask[:, : cache.length] = 0.0
+        rows = [x.expand(top_k, *x.shape[1:]) for x in inputs]
+        self._execute(rows, torch.full((top_k,), position), cache, mask, results)
+        found: tuple[np.ndarray, np.ndarray, np.ndarray] = kernels().best(results, top_k, nodes)
+        return found
 
     def _execute(
-        self, inputs: Sequence[Tensor], times: int, positions: Tensor | None, cache: Cache | None, mask: Tensor | None
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self,
+        inputs: Sequence[Tensor],
+        positions: Tensor | None,
+        cache: Cache | None,
+        mask: Tensor | None,
+        results: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Execute the program len(results) times, or once without results. Return the frames (rows, size)."""
         where = np.zeros(1, np.int64) if positions is None else positions.numpy()
         rows, tokens = inputs[0].numel() // self.places[0][1], len(where)
-        frames, results = np.empty((rows, self.size), np.float32), np.empty((times, rows), np.float32)
+        results = np.empty((1, 1, rows), np.float32) if results is None else results
+        times = len(results)
+        frames = np.empty((rows, self.size), np.float32)
         for (first, size), value in zip(self.places, inputs, strict=True):
             frames[:, first : first + size] = value.numpy().reshape(rows, size)
         if cache is None:
             layers, heads, channels = self.cache
-            start, buffer = 0, np.empty((max(1, layers), 2, rows // tokens, heads, tokens, channels), np.float32)
-        else:
-            start, buffer = cache.length, cache.buffer.numpy()
-        if start + tokens + times - 1 > buffer.shape[4]:
-            raise IndexError(f"{tokens + times - 1} tokens after {start} in a cache of {buffer.shape[4]}")
+            like = torch.empty(0)
+            cache = Cache(layers, rows // tokens, heads, tokens, channels, like) if layers else _WITHOUT_ATTENTION
+        start, buffer, stop = cache.length, cache.buffer.numpy(), cache.length + tokens * times
+        if stop > buffer.shape[4]:
+            raise IndexError(f"{tokens * times} tokens after {start} in a cache of {buffer.shape[4]}")
+        keys, values, filled = cache.copies(PANEL)
         seen = np.zeros((0, 1), np.float32) if mask is None else mask.numpy()
-        tables = self.ops, times, self.last, self.indices, self.numbers
-        self.run(*tables, frames, where, start, buffer, seen, results)
-        return frames, results
+        tables = self.ops, 0, times, self.last, self.indices, self.numbers
+        self.run(*tables, frames, where, start, buffer, keys, values, filled, seen, results)
+        cache.copied = stop
+        return frames

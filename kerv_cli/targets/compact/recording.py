@@ -22,7 +22,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-LINEAR, NORM, SILU, TANH, ADD, MULTIPLY, AFFINE, CLAMP, GATHER, EMBED, ARGMAX, ATTEND = range(12)
+LINEAR, NORM, SILU, TANH, ADD, MULTIPLY, AFFINE, CLAMP, GATHER, EMBED, ARGMAX, ATTEND, BRANCH = range(13)
 """Codes of the operations."""
 HALF, INT8, FLOAT = range(3)
 """Number formats in which the weights of a matrix can be stored: float16, int8 with a scale per output, float32."""
@@ -31,10 +31,11 @@ PANEL = 64
 COLUMNS = ["code", "out", "a", "b", "rows", "width", "stride", "first", "step", "weights", "factors", "panels", "kind"]
 """Columns of the table of operations, all int64. A column that an operation does not use is 0.
 
-code: The operation, `LINEAR` to `ATTEND`.
+code: The operation, `LINEAR` to `BRANCH`.
 out, a, b: Place of the first element of the result, of the first input and of the second input.
 rows, width: Number of rows of the input, and of elements per row.
-stride: Distance between two input rows in elements. For ATTEND the index of the layer in the cache.
+stride: Distance between two input rows in elements. For ATTEND the index of the layer in the cache; for BRANCH the size
+    of a hidden state.
 first: Index of the operation's first constant in `Tape.numbers`; for GATHER of its first index in `Tape.indices`.
 step: Distance between two result rows in elements.
 weights, factors: Memory addresses of a matrix's weights, and of its scales and biases.
@@ -114,6 +115,22 @@ class Recorded:
         """Return the index (1,) of the greatest of all elements. `dim` must be -1."""
         assert dim == -1
         return self.tape.emit(ARGMAX, (1,), [self], self.place.numel())
+
+    def branch(self, hidden: Recorded) -> tuple[Recorded, Recorded]:
+        """Grow a level of a draft tree. `Program.grow` explains what this operation of all rows computes.
+
+        Args:
+            hidden: (…, E) hidden state of a row's node. This value has the logits of the node's children.
+
+        Returns:
+            The token (1,) of the new node that the row stands for, and its parent's hidden state (…, E).
+        """
+        tape, size = self.tape, hidden.place.numel()
+        out = tape.emit(BRANCH, (1 + size,), [self], self.place.numel(), stride=size)
+        lined, _, _ = tape.lined(hidden, size)
+        tape.ops[-1]["b"] = int(lined.place.flatten()[0])
+        tape.ops[-1]["reads"].append(lined.place)
+        return out[:1], out[1:].view(hidden.shape)
 
     def attend(self, heads: int, cos: Tensor, sin: Tensor) -> Recorded:
         """Record the attention of the next layer. Of this value's 3 E columns, E are queries, E keys and E values.

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
 from kerv_cli.engine.transfer import upload
-from kerv_cli.targets.attention import Cache
+from kerv_cli.targets.attention import Cache, attention_mask
 from kerv_cli.targets.compact.features import (
     hand_features,
     mlp,
@@ -68,7 +68,7 @@ class Compiled(NamedTuple):
 
     Attributes:
         prompt: Program that encodes a prompt.
-        step: Program that decodes a token and can be repeated for the next ones.
+        step: Program from tokens to the tokens after them and the hidden states. It can be repeated.
     """
 
     prompt: Program
@@ -300,8 +300,9 @@ class CompactTarget(Packable):
         else:
             shapes += [(1, space.state)]
 
-        def step(token: Tensor) -> Tensor:
-            return self.head(self.trunk.recorded(self.embedding(token))).argmax(-1)
+        def step(token: Tensor) -> tuple[Tensor, Tensor]:
+            hidden = self.trunk.recorded(self.embedding(token))
+            return self.head(hidden).argmax(-1)[None], hidden
 
         return Compiled(Program(self.prompt, *shapes), Program(step, (1, 1), repeats=True))
 
@@ -335,6 +336,21 @@ class CompactTarget(Packable):
         tokens = self.packed.step.repeat(count, torch.tensor([[token]]), cache=cache)
         cache.length += count
         return [int(token) for token in tokens[:, 0]]
+
+    def predict(
+        self, tokens: Tensor, positions: Tensor, cache: Cache, seen: np.ndarray | Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Read T new tokens, and return the most probable token after each (T,) and their hidden states (1, T, E).
+
+        A compiled target needs one call for it. The other arguments are those of `Trunk.forward`.
+        """
+        if self.packed is None or cache.fixed:
+            hidden = self(self.embed(tokens[None]), positions, cache, seen)
+            return self.head(hidden[0]).argmax(-1), hidden
+        mask = attention_mask(seen, len(tokens), cache, self.head.weight)
+        found, hidden = self.packed.step(tokens, positions=positions, cache=cache, mask=mask)
+        cache.length += len(tokens)
+        return found[:, 0].long(), hidden.view(1, len(tokens), -1)
 
     def parallel_pass(self, prompt: Tensor, cache: Cache | None = None) -> Tensor:
         """Return the hidden states (B, N, E) of all N tokens of a chunk in one forward (docs/methods.md §6).
