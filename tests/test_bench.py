@@ -162,10 +162,12 @@ def test_a_verification_and_single_tokens_agree(dtype):
 @torch.inference_mode()
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_decodes_of_all_sizes_show_what_each_part_costs(dtype):
-    """The forwards' rows are counted at the trunk, the costs' at the laps."""
+    """The forwards' rows are counted at the trunk and at its compiled verification, the costs' at the laps."""
     model, rows = open_model(dataclasses.replace(NANO, dtype=dtype)), list[int]()
     shown = set[tuple[str, int]]()
     model.target.trunk.register_forward_pre_hook(lambda _, inputs: rows.append(inputs[0].shape[1]))
+    predict = model.target.predict
+    model.target.predict = lambda tokens, *rest: (rows.append(len(tokens)), predict(tokens, *rest))[1]
     prompt = model.target.encode(model.observation)
     length = prompt.shape[1]
     for decoder in decoders(model):

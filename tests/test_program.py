@@ -16,7 +16,8 @@ from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.targets.checkpoint import compact, expanded
-from kerv_cli.targets.compact.bfloat16 import Bfloat16Layers, multiplies_bfloat16
+from kerv_cli.targets.compact import program
+from kerv_cli.targets.compact.bfloat16 import multiplies_bfloat16
 from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.program import Program, kernels, own_folder
 from kerv_cli.targets.compact.settings import TargetSettings
@@ -313,8 +314,8 @@ def test_a_join_of_two_values_is_copied_together():
 needs_bfloat16 = pytest.mark.skipif(not multiplies_bfloat16(), reason="this CPU does not multiply bfloat16")
 
 
-@pytest.fixture(scope="module")
-def trunks():
+@pytest.fixture(scope="module", params=["in the program", "by oneDNN"])
+def trunks(request):
     """The exact trunk of bfloat16 weights, in float32, and the packed one."""
     torch.manual_seed(3)
     trunk = Trunk(128, 3, 4, 320).eval().requires_grad_(False)
@@ -322,8 +323,10 @@ def trunks():
         parameter.data = 0.1 * torch.randn_like(parameter) if parameter.dim() == 2 else 1 + 0.3 * torch.rand(128)
     packed = trunk.bfloat16()
     exact = copy.deepcopy(packed).float()
-    pack(packed)
-    assert isinstance(packed.packed, Bfloat16Layers)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(program, "LARGE", 0 if request.param == "by oneDNN" else 2**30)
+        pack(packed)
+    assert bool(packed.packed.blocked) == (request.param == "by oneDNN")
     return exact, packed
 
 
@@ -360,3 +363,22 @@ def test_one_verification_and_single_tokens_agree_but_for_ties(trunks):
                 assert best[1] - best[0] < 0.05 * alone.abs().max()
             assert (alone - together[i]).abs().max() < 0.05 * alone.abs().max()
     assert differ <= 2
+
+
+@needs_bfloat16
+def test_tokens_are_the_same_in_one_call_and_in_many_if_onednn_multiplies(monkeypatch):
+    monkeypatch.setattr(program, "LARGE", 0)
+    target = both_targets("state", 7)[1].bfloat16()
+    pack(target)
+    assert target.packed.step.blocked
+    caches, prompt = [target.new_cache(1, 20) for _ in range(2)], torch.randn(1, 6, 32).bfloat16()
+    with torch.inference_mode():
+        for cache in caches:
+            target(prompt, torch.arange(6), cache)
+        singly = [5]
+        for i in range(6, 14):
+            token, hidden = target.predict(torch.tensor(singly[-1:]), torch.tensor([i]), caches[0], None)
+            assert torch.equal(token, target.head(hidden)[0].argmax(-1))
+            singly += token.tolist()
+        assert target.continue_greedily(5, 8, caches[1]) == singly[1:]
+    assert torch.equal(caches[0].buffer, caches[1].buffer)

@@ -1,22 +1,22 @@
-"""Decoder layers in bfloat16 on a CPU that multiplies it in hardware (AMX, AVX512-BF16).
+"""Matrices that a CPU multiplies in bfloat16 in hardware (AMX, AVX512-BF16), for the large layers of a `Program`.
 
 Weights are stored in the blocked layout of oneDNN, the library that torch uses for matrix multiplications on a CPU. One
-row and thirty rows then take almost the same time, because most of the time is spent on reading the weights. The
-residual stream, norms, rotations, attention and the cache stay float32. They are cheap, and rounding them would more
-often make the two best logits almost equal. oneDNN adds in a different order for one row than for many, so the last bit
-of a result depends on the number of rows (docs/measuring.md).
+row and thirty rows then take almost the same time, because most of the time is spent on reading the weights. All other
+operations of a program are float32. They are cheap, and rounding them would more often make the two best logits almost
+equal. oneDNN adds in a different order for one row than for many, so the last bit of a result depends on the number of
+rows (docs/measuring.md).
 """
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Iterable
 from functools import lru_cache
-from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+LARGE = 2**19
+"""A bfloat16 matrix with at least this many weights is stored in oneDNN's layout. For smaller ones the call of oneDNN
+would take longer than it saves: the program multiplies them itself."""
 ROWS = 32  # oneDNN chooses the layout for this many rows; 154 M weights take 27 ms for 1 row, 33 for 31, 41 for 47
 
 
@@ -32,56 +32,20 @@ def has_tiles() -> bool:
     return bool(torch.cpu._is_amx_tile_supported())
 
 
-class BlockedLinear(nn.Module):
-    """A linear layer without bias, whose weight is bfloat16 in oneDNN's blocked layout. Sums are float32.
+class Blocked:
+    """The weights of a linear layer in bfloat16, in oneDNN's blocked layout.
 
     Args:
-        weight: (outputs, inputs).
+        weight: (outputs, inputs) bfloat16.
+        bias: (outputs,). None means zeros.
     """
 
-    def __init__(self, weight: Tensor) -> None:
-        super().__init__()
-        self.blocked = torch.ops.mkldnn._reorder_linear_weight(weight.to(torch.bfloat16).contiguous(), ROWS)
+    def __init__(self, weight: Tensor, bias: Tensor | None) -> None:
+        self.weight = torch.ops.mkldnn._reorder_linear_weight(weight.contiguous(), ROWS)
+        self.bias = None if bias is None else bias.to(torch.bfloat16)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Map inputs (…, inputs) to outputs (…, outputs) in the number format of `x`."""
-        product = torch.ops.mkldnn._linear_pointwise(x.to(torch.bfloat16), self.blocked, None, "none", [], "")
-        return product.to(x.dtype)
-
-
-def blocked(layer: nn.Module) -> nn.Module:
-    """Return a copy of a decoder layer with blocked bfloat16 weights (see `BlockedLinear`) and float32 norms."""
-    twin = copy.copy(layer)
-    twin._modules = {
-        name: BlockedLinear(part.weight) if isinstance(part, nn.Linear) else copy.deepcopy(part).float()
-        for name, part in layer.named_children()
-    }
-    return twin
-
-
-class Bfloat16Layers:
-    """Decoder layers with blocked bfloat16 weights and a float32 cache.
-
-    A copied or pickled module holds None instead of this object, because oneDNN's layout cannot be copied.
-    """
-
-    def __init__(self, rotary: tuple[Tensor, Tensor], layers: Iterable[nn.Module]) -> None:
-        """Convert layers one after the other.
-
-        Args:
-            rotary: Cosines and sines of all positions.
-            layers: Decoder layers. A generator saves memory: only one unconverted layer exists at a time.
-        """
-        self.rotary = [table.float() for table in rotary]
-        self.layers = [blocked(layer) for layer in layers]
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(None), ()
-
-    def __call__(self, x: Tensor, positions: Tensor, cache: Any, slots: Any, mask: Tensor | None) -> Tensor:
-        """Return the output of the last layer for bfloat16 inputs x (B, T, E); arguments as `LayerStack.run_layers`."""
-        rotary = [table[positions] for table in self.rotary]
-        hidden, mask = x.float(), None if mask is None else mask.float()
-        for i, layer in enumerate(self.layers):
-            hidden = layer(hidden, rotary, cache.layers[i] if cache is not None else None, slots, mask)
-        return hidden.to(x.dtype)
+    def __call__(self, x: Tensor) -> Tensor:
+        """Map inputs (…, inputs) to outputs (…, outputs) bfloat16. Sums are float32."""
+        x = x.to(torch.bfloat16)
+        product: Tensor = torch.ops.mkldnn._linear_pointwise(x, self.weight, self.bias, "none", [], "")
+        return product

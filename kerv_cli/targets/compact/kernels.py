@@ -31,7 +31,7 @@ from numba.core.codegen import get_host_cpu_features
 from numba.extending import intrinsic
 
 from kerv_cli.targets.compact import recording as op
-from kerv_cli.targets.compact.recording import FLOAT, HALF, INT8, PANEL
+from kerv_cli.targets.compact.recording import BFLOAT, FLOAT, HALF, INT8, PANEL
 
 FEATURES = (numba.config.CPU_FEATURES or get_host_cpu_features()).split(",")
 EXPANDS_HALF = "+f16c" in FEATURES or platform.machine() in ("aarch64", "arm64")
@@ -50,7 +50,7 @@ def _tile(rows: int, kind: int, lanes: int) -> Callable[..., None]:
 
     Args:
         rows: Number of rows that are multiplied at once.
-        kind: Number format of the weights: HALF, INT8 or FLOAT.
+        kind: Number format of the weights, HALF to BFLOAT.
         lanes: Number of outputs that are computed at once.
 
     Returns:
@@ -58,9 +58,11 @@ def _tile(rows: int, kind: int, lanes: int) -> Callable[..., None]:
         `factors` (2, PANEL; scales, then biases), `x` and `y` are memory addresses. The rows of x are `stride` bytes
         apart, those of y `step` bytes.
     """
-    stored, size = {HALF: (ir.HalfType(), 2), INT8: (ir.IntType(8), 1), FLOAT: (NUMBER, 4)}[kind]
+    formats = {HALF: (ir.HalfType(), 2), INT8: (ir.IntType(8), 1), FLOAT: (NUMBER, 4), BFLOAT: (ir.IntType(16), 2)}
+    stored, size = formats[kind]
     vector, fused = ir.VectorType(NUMBER, lanes), {"flags": ("contract",)}
-    nothing, zeros = ir.Constant(vector, ir.Undefined), ir.Constant(ir.VectorType(LANE, lanes), [0] * lanes)
+    words = ir.VectorType(LANE, lanes)
+    nothing, zeros, upper = ir.Constant(vector, ir.Undefined), ir.Constant(words, [0] * lanes), [16] * lanes
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         weights, factors, inputs, x, stride, y, step = arguments
@@ -82,7 +84,10 @@ def _tile(rows: int, kind: int, lanes: int) -> Callable[..., None]:
             load(weights, index, PANEL * size, ir.VectorType(stored, lanes), size),
             builder.add(index, WORD(1)),
         )
-        row = {HALF: builder.fpext, INT8: builder.sitofp, FLOAT: lambda value, _: value}[kind](row, vector)
+        if kind == BFLOAT:  # the upper half of a float32 number
+            row = builder.bitcast(builder.shl(builder.zext(row, words), ir.Constant(words, upper)), vector)
+        elif kind != FLOAT:
+            row = (builder.fpext if kind == HALF else builder.sitofp)(row, vector)
         for place, total in zip(places, sums, strict=True):
             single = builder.insert_element(nothing, load(place, index, 4, NUMBER), LANE(0))
             term = builder.fmul(row, builder.shuffle_vector(single, nothing, zeros), **fused)
@@ -109,7 +114,7 @@ def _product(kind: int, size: int) -> Callable[..., None]:
     others are explained in `_tile`; the addresses point to the first panel.
 
     Args:
-        kind: Number format of the weights: HALF, INT8 or FLOAT.
+        kind: Number format of the weights, HALF to BFLOAT.
         size: Bytes of one weight.
     """
     one, two, four = _tile(1, kind, PANEL), _tile(2, kind, LANES), _tile(4, kind, LANES)
@@ -132,7 +137,7 @@ def _product(kind: int, size: int) -> Callable[..., None]:
 
 
 half_product = _product(HALF, 2) if EXPANDS_HALF else _product(FLOAT, 4)
-int8_product, product = _product(INT8, 1), _product(FLOAT, 4)
+int8_product, bfloat_product, product = _product(INT8, 1), _product(BFLOAT, 2), _product(FLOAT, 4)
 
 
 def _read(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -455,6 +460,8 @@ def run(ops, begin, end, last, indices, numbers, frames, positions, start, cache
                         half_product(weights, factors, width, panels, x, stride, many, y, step)
                     elif kind == INT8:
                         int8_product(weights, factors, width, panels, x, stride, many, y, step)
+                    elif kind == BFLOAT:
+                        bfloat_product(weights, factors, width, panels, x, stride, many, y, step)
                     else:
                         product(weights, factors, width, panels, x, stride, many, y, step)
             elif code == op.ATTEND:

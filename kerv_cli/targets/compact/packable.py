@@ -13,6 +13,8 @@ from kerv_cli.targets.checkpoint import load_state
 from kerv_cli.targets.compact.program import Program, forget
 
 M = TypeVar("M", bound=nn.Module)
+FORMATS = torch.float32, torch.bfloat16
+"""Number formats of weights that can be compiled."""
 
 
 def wants_gradient(x: Tensor) -> bool:
@@ -60,11 +62,11 @@ class PackableLinear(Packable, nn.Linear):
     """A linear layer that is compiled by itself, not as a part of a larger module. An example is an output head."""
 
     def pack_weights(self) -> Any:
-        """Return the layer as a compiled `Program`. None if its weights are not float32."""
-        return Program(super().forward, (1, self.in_features)) if self.weight.dtype == torch.float32 else None
+        """Return the layer as a compiled `Program`. None for a number format without kernels."""
+        return Program(super().forward, (1, self.in_features)) if self.weight.dtype in FORMATS else None
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map inputs (…, in_features) to outputs (…, out_features)."""
+        """Map inputs (…, in_features) to outputs (…, out_features). Those of the compiled form are float32."""
         return self.packed(x)[0].view(*x.shape[:-1], -1) if self.is_packed(x) else super().forward(x)
 
 

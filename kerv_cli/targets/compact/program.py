@@ -29,7 +29,8 @@ from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
 from kerv_cli.targets.attention import Cache
-from kerv_cli.targets.compact.recording import ARGMAX, BRANCH, COLUMNS, FLOAT, HALF, INT8, PANEL, Tape
+from kerv_cli.targets.compact.bfloat16 import LARGE, Blocked, multiplies_bfloat16
+from kerv_cli.targets.compact.recording import ARGMAX, BFLOAT, BLOCKED, BRANCH, COLUMNS, FLOAT, HALF, INT8, PANEL, Tape
 
 _LOG = logging.getLogger("kerv")
 
@@ -80,11 +81,11 @@ def kernels() -> ModuleType:
 class Matrix:
     """The weights of a linear layer, stored in panels. A panel holds the weights of 64 outputs side by side.
 
-    The number format is the smallest that holds the weights without loss: int8 with a scale per output, float16 or
-    float32.
+    The number format of float32 weights is the smallest that holds them without loss: int8 with a scale per output,
+    float16 or float32. Large bfloat16 matrices are stored in oneDNN's layout if the CPU multiplies bfloat16.
 
     Args:
-        weight: (outputs, inputs) float32.
+        weight: (outputs, inputs) float32 or bfloat16.
         bias: (outputs,) float32. None means zeros.
 
     Attributes:
@@ -93,25 +94,33 @@ class Matrix:
         columns: Size, number format and addresses of the matrix, as entries of an operation in the table of operations
             (see `recording.COLUMNS`).
         nbytes: Bytes of the weights.
+        blocked: The matrix in oneDNN's layout. It then has no panels. None for other matrices.
     """
 
     def __init__(self, weight: Tensor, bias: Tensor | None) -> None:
         outputs, inputs = weight.shape
+        self.blocked, self.nbytes = None, weight.nbytes
+        if weight.dtype == torch.bfloat16 and weight.numel() >= LARGE and multiplies_bfloat16():
+            self.blocked, self.columns = Blocked(weight, bias), {"kind": BLOCKED, "panels": outputs}
+            return
         steps = weight.abs().amax(1, keepdim=True).div(127).clamp_min(1e-30)  # the scales of `checkpoint.compact`
         whole, scale, panels = (weight / steps).round(), torch.ones(outputs), -(-outputs // PANEL)
         # zeros would fit into int8, but a grown layer's zeros must cost as much as trained weights
-        if weight.any() and torch.equal(whole * steps, weight):
+        if weight.dtype == torch.bfloat16:
+            kind, values = BFLOAT, weight.view(torch.int16)
+        elif weight.any() and torch.equal(whole * steps, weight):
             kind, values, scale = INT8, whole.to(torch.int8), steps[:, 0]
         elif kernels().EXPANDS_HALF and torch.equal(weight.half().float(), weight):
             kind, values = HALF, weight.half()
         else:
             kind, values = FLOAT, weight
-        rest, factors = panels * PANEL - outputs, torch.stack([scale, torch.zeros(outputs) if bias is None else bias])
+        bias = torch.zeros(outputs) if bias is None else bias.float()
+        rest, factors = panels * PANEL - outputs, torch.stack([scale, bias])
         self.values = F.pad(values, (0, 0, 0, rest)).view(panels, PANEL, inputs).transpose(1, 2).contiguous()
         self.factors = F.pad(factors, (0, rest)).view(2, panels, PANEL).transpose(0, 1).contiguous()
         places = {"weights": self.values.data_ptr(), "factors": self.factors.data_ptr()}
         self.columns = {"panels": panels, "kind": kind, **places}
-        self.nbytes = weight.numel() * self.values.element_size()
+        self.nbytes = outputs * inputs * self.values.element_size()
 
 
 _MATRICES = WeakIdKeyDictionary()
@@ -137,6 +146,8 @@ def forget(module: torch.nn.Module) -> None:
         _MATRICES.pop(parameter, None)
 
 
+_OF_MATRIX = [COLUMNS.index(name) for name in ("out", "a", "rows", "width", "stride", "step")]
+_OUTPUTS = COLUMNS.index("panels")
 _WITHOUT_ATTENTION = Cache(1, 1, 1, 1, 1, torch.empty(0))
 
 
@@ -150,7 +161,7 @@ class Program:
         """Record a function as a table of operations.
 
         Args:
-            function: Takes float32 tensors and returns a tensor or a tuple of tensors.
+            function: Takes tensors and returns a tensor or a tuple of tensors. All of them are float32 in the program.
             shapes: Shape of each input. Its first dimension is 1 and stands for any number of rows.
             repeats: Whether `repeat` or `grow` will be called. Then output i of an execution becomes input i of the
                 next. There may be more outputs than inputs.
@@ -167,7 +178,7 @@ class Program:
         self.places = [(int(x.place.flatten()[0]), x.place.numel()) for x in inputs]
         self.results = [(int(x.place.flatten()[0]), rows, stride, x.shape[1:]) for x, rows, stride in outputs]
         self.matrices = [matrix_of(*op["matrix"]) for op in tape.ops if "matrix" in op]
-        matrices = iter(self.matrices)
+        matrices, linear = iter(self.matrices), [i for i, op in enumerate(tape.ops) if "matrix" in op]
         table = [op | next(matrices).columns if "matrix" in op else op for op in tape.ops]
         self.ops = np.array([[row.get(name, 0) for name in COLUMNS] for row in table], np.int64)
         self.indices = np.array(tape.indices, np.int64)
@@ -175,6 +186,7 @@ class Program:
         found = np.flatnonzero(np.isin(self.ops[:, 0], (ARGMAX, BRANCH)))
         self.last = int(found[0]) + 1 if len(found) else len(self.ops)
         self.run = kernels().run
+        self.blocked = [(i, m.blocked) for i, m in zip(linear, self.matrices, strict=True) if m.blocked is not None]
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(None), ()
@@ -261,7 +273,7 @@ class Program:
         times = len(results)
         frames = np.empty((rows, self.size), np.float32)
         for (first, size), value in zip(self.places, inputs, strict=True):
-            frames[:, first : first + size] = value.numpy().reshape(rows, size)
+            frames[:, first : first + size] = value.float().numpy().reshape(rows, size)
         if cache is None:
             layers, heads, channels = self.cache
             like = torch.empty(0)
@@ -270,8 +282,29 @@ class Program:
         if stop > buffer.shape[4]:
             raise IndexError(f"{tokens * times} tokens after {start} in a cache of {buffer.shape[4]}")
         keys, values, filled = cache.copies(PANEL)
-        seen = np.zeros((0, 1), np.float32) if mask is None else mask.numpy()
-        tables = self.ops, 0, times, self.last, self.indices, self.numbers
-        self.run(*tables, frames, where, start, buffer, keys, values, filled, seen, results)
+        seen = np.zeros((0, 1), np.float32) if mask is None else mask.float().numpy()
+        rest = frames, where, start, buffer, keys, values, filled, seen, results
+        if self.blocked:
+            self._alternate(times, *rest)
+        else:
+            self.run(self.ops, 0, times, self.last, self.indices, self.numbers, *rest)
         cache.copied = stop
         return frames
+
+    def _alternate(self, times: int, frames: np.ndarray, *rest: Any) -> None:
+        """Execute the program if oneDNN multiplies some of the matrices: a compiled call from each to the next."""
+        memory, run = torch.from_numpy(frames), self.run
+        where, start, buffer, keys, values, filled, seen, results = rest
+        for time in range(times):
+            begin, stop = 0, self.last if time == times - 1 else len(self.ops)
+            held = start + time * len(where) if time else filled
+            rest = frames, where, start, buffer, keys, values, held, seen, results
+            for i, matrix in self.blocked:
+                if i < stop:
+                    run(self.ops[begin:i], time, time + 1, i - begin, self.indices, self.numbers, *rest)
+                    out, a, rows, width, stride, step = (int(self.ops[i, c]) for c in _OF_MATRIX)
+                    x = memory[:, a : a + rows * stride].unflatten(1, (rows, stride))[..., :width]
+                    y = memory[:, out : out + rows * step].unflatten(1, (rows, step))
+                    y[..., : int(self.ops[i, _OUTPUTS])] = matrix(x)
+                    begin = i + 1
+            run(self.ops[begin:stop], time, time + 1, stop - begin, self.indices, self.numbers, *rest)

@@ -24,8 +24,9 @@ from torch import Tensor
 
 LINEAR, NORM, SILU, TANH, ADD, MULTIPLY, AFFINE, CLAMP, GATHER, EMBED, ARGMAX, ATTEND, BRANCH = range(13)
 """Codes of the operations."""
-HALF, INT8, FLOAT = range(3)
-"""Number formats in which the weights of a matrix can be stored: float16, int8 with a scale per output, float32."""
+HALF, INT8, FLOAT, BFLOAT, BLOCKED = range(5)
+"""Number formats in which the weights of a matrix can be stored: float16, int8 with a scale per output, float32,
+bfloat16, and bfloat16 in oneDNN's layout (see `bfloat16.py`)."""
 PANEL = 64
 """Number of outputs in a panel. A matrix is stored panel by panel."""
 COLUMNS = ["code", "out", "a", "b", "rows", "width", "stride", "first", "step", "weights", "factors", "panels", "kind"]
@@ -40,7 +41,7 @@ first: Index of the operation's first constant in `Tape.numbers`; for GATHER of 
 step: Distance between two result rows in elements.
 weights, factors: Memory addresses of a matrix's weights, and of its scales and biases.
 panels: Number of panels of the matrix.
-kind: Number format of the weights, HALF, INT8 or FLOAT.
+kind: Number format of the weights, HALF to BLOCKED.
 """
 _ALIGNED = 16  # registers begin at multiples of this place
 _VIEWS = frozenset({"view", "flatten", "unflatten", "chunk", "split", "expand"})
@@ -296,7 +297,7 @@ def _linear(x: Recorded, weight: Tensor, bias: Tensor | None = None) -> Recorded
 
 
 def _rms_norm(x: Recorded, shape: Sequence[int], weight: Tensor, eps: float) -> Recorded:
-    return x.tape.emit(NORM, x.shape, [x], shape[0], torch.cat([weight, weight.new_tensor([eps])]))
+    return x.tape.emit(NORM, x.shape, [x], shape[0], torch.cat([weight.float(), torch.tensor([eps])]))
 
 
 def _embedding(ids: Recorded, table: Tensor, **_: Any) -> Recorded:

@@ -37,7 +37,7 @@ from kerv_cli.targets.compact.features import (
     scene_features,
     scene_width,
 )
-from kerv_cli.targets.compact.packable import Packable, PackableLinear, wants_gradient
+from kerv_cli.targets.compact.packable import FORMATS, Packable, PackableLinear, wants_gradient
 from kerv_cli.targets.compact.program import Program
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.text import WordTokenizer
@@ -246,7 +246,7 @@ class CompactTarget(Packable):
             given[2:] = torch.cat([tokens for tokens, _ in views], 1), torch.cat([points for _, points in views], -1)
         if self.packed is not None and not any(map(wants_gradient, given)):
             prompt, places = self.packed.prompt(*given)
-            return prompt, places
+            return prompt.to(self.dtype), places
         return self.prompt(*given)
 
     def prompt(self, words: Tensor, proprioception: Tensor, *seen: Tensor) -> tuple[Tensor, Tensor]:
@@ -289,8 +289,8 @@ class CompactTarget(Packable):
         return located.to(torch.float32).unflatten(-1, (-1, 3)) * 0.1 + self.centre
 
     def pack_weights(self) -> Compiled | None:
-        """Return compiled programs that encode a prompt and decode tokens. None if the weights are not float32."""
-        if self.dtype != torch.float32:
+        """Return compiled programs that encode a prompt and decode tokens. None for a format without kernels."""
+        if self.dtype not in FORMATS:
             return None
         s, space = self.settings, self.observation
         shapes: list[tuple[int, ...]] = [(1, s.instruction_tokens), (1, len(space.proprioception))]
@@ -350,7 +350,7 @@ class CompactTarget(Packable):
         mask = attention_mask(seen, len(tokens), cache, self.head.weight)
         found, hidden = self.packed.step(tokens, positions=positions, cache=cache, mask=mask)
         cache.length += len(tokens)
-        return found[:, 0].long(), hidden.view(1, len(tokens), -1)
+        return found[:, 0].long(), hidden.view(1, len(tokens), -1).to(self.dtype)
 
     def parallel_pass(self, prompt: Tensor, cache: Cache | None = None) -> Tensor:
         """Return the hidden states (B, N, E) of all N tokens of a chunk in one forward (docs/methods.md §6).

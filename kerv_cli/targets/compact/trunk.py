@@ -3,12 +3,11 @@
 Shapes: B batch, T new tokens, S cached tokens, E width of inputs and outputs, A heads, C = width / A channels of a
 head. The width inside the layers is larger than E only in an enlarged target (`targets/grown.py`).
 
-There are three implementations, whose results are equal up to rounding:
+There are two implementations, whose results are equal up to rounding:
 
 - On CUDA a captured graph replays a forward. For this the cache has fixed shapes: every forward attends to all slots,
   and a mask hides the unused ones.
-- On a CPU a frozen float32 stack is compiled (`program.py`).
-- On a CPU a frozen bfloat16 stack stores its weights in oneDNN's blocked layout (`bfloat16.py`).
+- On a CPU a frozen stack is compiled (`program.py`).
 """
 
 from __future__ import annotations
@@ -22,8 +21,7 @@ from torch import Tensor, nn
 
 from kerv_cli.engine.transfer import upload
 from kerv_cli.targets.attention import Cache, CapturedCache, Slots, attend, attention_mask, rotate
-from kerv_cli.targets.compact.bfloat16 import Bfloat16Layers, multiplies_bfloat16
-from kerv_cli.targets.compact.packable import Packable, wants_gradient
+from kerv_cli.targets.compact.packable import FORMATS, Packable, wants_gradient
 from kerv_cli.targets.compact.program import Program
 
 POSITIONS, BASE = 1024, 10_000.0  # of the rotary embedding: number of positions, base of the frequencies
@@ -139,24 +137,16 @@ class LayerStack(Packable):
             fixed: Whether every forward attends to all slots, so that its shapes are fixed. None: only on CUDA.
         """
         like = self.weight
-        if isinstance(self.packed, Bfloat16Layers):
+        if self.packed is not None:
             like = like.float()
         sizes = self.depth, batch, self.heads, capacity + self.padding, self.width // self.heads
         fixed = like.is_cuda if fixed is None else fixed
         return CapturedCache(*sizes, like) if fixed else Cache(*sizes, like)
 
-    def pack_weights(self) -> Program | Bfloat16Layers | None:
-        """Compile the stack for a CPU. `pack` calls this.
-
-        Returns:
-            For float32 weights a `Program`. For bfloat16 weights `Bfloat16Layers`, if the CPU can multiply bfloat16.
-            Otherwise None.
-        """
-        if self.weight.dtype == torch.float32:
-            return Program(self.recorded, *[(1, 1, self.outer)] * self.inputs)
-        if self.weight.dtype == torch.bfloat16 and multiplies_bfloat16():
-            return Bfloat16Layers(self.rotary(slice(None)), self.layers)
-        return None
+    def pack_weights(self) -> Program | None:
+        """Compile the stack for a CPU. `pack` calls this. Returns None for a number format without kernels."""
+        compiles = self.weight.dtype in FORMATS
+        return Program(self.recorded, *[(1, 1, self.outer)] * self.inputs) if compiles else None
 
     def run(
         self, inputs: Sequence[Tensor], positions: Tensor, cache: Cache | None, seen: np.ndarray | Tensor | None
@@ -181,14 +171,13 @@ class LayerStack(Packable):
         mask = attention_mask(seen, x.shape[1], cache, x)
         packed = self.packed if self.is_packed(x) and (cache is None or not cache.fixed) else None
         if isinstance(packed, Program):
-            hidden = packed(*inputs, positions=positions, cache=cache, mask=mask)[0].view(x.shape)
+            hidden = packed(*inputs, positions=positions, cache=cache, mask=mask)[0].view(x.shape).to(x.dtype)
         elif isinstance(cache, CapturedCache) and self.captures(x):
             assert mask is not None
             hidden = self.finish(cache.run(self.run_layers, self.begin(*inputs), positions, mask))
         else:
             slots = cache.next_slots(x.shape[1]) if cache is not None else None
-            layers = self.run_layers if packed is None else packed
-            hidden = self.finish(layers(self.begin(*inputs), positions, cache, slots, mask))
+            hidden = self.finish(self.run_layers(self.begin(*inputs), positions, cache, slots, mask))
         if cache is not None:
             cache.length += tokens  # the next forward overwrites the padding
         return hidden[:, :tokens]
