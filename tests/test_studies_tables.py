@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import operator
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,10 +15,13 @@ import pandas as pd
 import pytest
 import sqlalchemy as sa
 from conftest import refused
+from hypothesis import given
+from hypothesis import strategies as st
 from rich.console import Console
 from studies_synthetic import part, points_of, settings_of, still_episode, study_of, swept, threshold_study
 
 from kerv_cli.engine.record import DecodeRecord, Round
+from kerv_cli.engine.tally import Tally
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab import database as tables
 from kerv_cli.lab.database import Database
@@ -26,11 +30,11 @@ from kerv_cli.lab.plan import Episode, Setting, Study
 from kerv_cli.lab.store import StudyStore, plan_study
 from kerv_cli.report.measures import MACRO, MICRO
 from kerv_cli.report.page import render
-from kerv_cli.report.plots import curves_figure, png, study_figures, with_lines
+from kerv_cli.report.plots import acceptance_figure, curves_figure, png, study_figures, with_lines
 from kerv_cli.report.report import Unpublishable, refusals, report
 from kerv_cli.report.statistics import PairedCounts, mean_of, paired_difference, speedup, wilson
 from kerv_cli.report.summary import SummaryTable, not_in_turn, of_runs, summary_frame
-from kerv_cli.report.tables import StudyData, load_study
+from kerv_cli.report.tables import StudyData, further_of, load_study
 
 PREFILL = Round("prefill", "none", 0, (), (1,), 0, 1, 0, ())
 
@@ -102,6 +106,52 @@ def row_of(table: pd.DataFrame, **wanted: str) -> dict[str, Any]:
         table = table[table[column] == value]
     (row,) = table.to_dict("records")
     return {str(name): value for name, value in row.items()}
+
+
+def test_acceptance_by_place_by_hand(data):
+    """Five drafts of which all three tokens were accepted; one rejected at its second token; one of a single token."""
+    found = further_of(data)["labels"]
+    assert "acceptance" not in found["ar"]
+    expected = {
+        "num_drafts": 7,  # the skipped draft was not verified
+        "num_draft_tokens": 7 * 4,
+        "num_accepted_tokens": 17,
+        "num_accepted_tokens_per_pos": [7, 5, 5],
+        "mean_acceptance_length": 1 + 17 / 7,
+        "draft_acceptance_rate": 17 / 28,
+        "per_position_acceptance_rate": [1, 5 / 7, 5 / 7],
+        "acceptance_histogram": [0, 2, 0, 5],
+        "num_reached_tokens_per_pos": [7, 6, 5],
+        "conditional_acceptance_rate_per_pos": [1, 5 / 6, 1],
+        "num_reached_tokens_per_dof": [0, 6, 6, 6],
+        "conditional_acceptance_rate_per_dof": [None, 1, 5 / 6, 1],
+    }
+    acceptance = found["kerv"]["acceptance"]
+    assert acceptance.keys() == expected.keys()
+    for name, value in expected.items():
+        assert acceptance[name] == pytest.approx(value), name
+    points = acceptance_figure(data.tallies, data.references).to_dict()["datasets"]
+    values = {(p["panel"], p["x"]): p["value"] for rows in points.values() for p in rows}
+    assert values["Accepted tokens, %, by position in the draft", 2] == pytest.approx(100 * 5 / 6)
+    assert values["Accepted tokens, %, by DoF", 3] == pytest.approx(100 * 5 / 6)
+    assert values["Drafts, %, by number of accepted tokens", 3] == pytest.approx(100 * 5 / 7)
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 15), st.integers(0, 6), st.booleans()), min_size=0, max_size=12),
+    st.integers(0, 12),
+)
+def test_tallies_of_parts_add_up_to_the_tally_of_the_whole(rounds, cut):
+    records = [
+        decode(0.1, [verify(start, range(accepted + rejected), accepted, accepted + 1)])
+        for start, accepted, rejected in rounds
+    ]
+    whole, dofs = Tally.of_records(records, 4).as_dict(), 4
+    parts = (Tally.of_records(part, dofs) for part in (records[:cut], records[cut:]))
+    assert operator.add(*parts).as_dict() == whole
+    assert sum(whole["acceptance_histogram"]) == whole["num_drafts"] == len(records)
+    assert sum(whole["num_accepted_tokens_per_pos"]) == whole["num_accepted_tokens"]
+    assert sum(whole["num_reached_tokens_per_pos"]) == sum(whole["num_reached_tokens_per_dof"])
 
 
 def test_one_task_by_hand(data):
@@ -294,6 +344,7 @@ def test_report_writes_the_same_bytes_again(results, written):
         "report/tables/threshold_per_task.csv",
         "report/tables/threshold.json",
         "report/plots/threshold.png",
+        "report/plots/threshold_acceptance.png",
         "studies/threshold/report.html",
     ]
     labels = json.loads((results / "report/tables/threshold.json").read_text())["labels"]
@@ -326,7 +377,7 @@ def test_a_page_shows_hostile_names_as_text(tmp_path, monkeypatch):
     monkeypatch.setattr("kerv_cli.report.page.library", lambda: "")
     page = render(store, load_study(store), 3.0)
     assert "<img" not in page
-    assert page.count("</script>") == page.count("<script") == 3
+    assert page.count("</script>") == page.count("<script") == 4
 
 
 def test_the_interval_of_a_ratio_takes_the_run_as_a_cluster_from_three_runs_on(tmp_path):

@@ -71,7 +71,7 @@ def report(
     if as_json:
         tables = {name: rows_of(table) for name, table in output.tables.items()}
         priced = {} if output.priced is None else {"priced": rows_of(output.priced)}
-        end_with_json({"files": output.files, "studies": tables, **priced})
+        end_with_json({"files": output.files, "studies": tables, "acceptance": output.acceptance, **priced})
     for name, table in output.tables.items():
         print_study(table, StudyStore(database, name), all_columns, "--all")
     print_prices(output.priced)

@@ -18,7 +18,7 @@ from kerv_cli.episodes.identity import NOT_DETERMINING, without
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.decide import verdict_of
 from kerv_cli.report.measures import MACRO, Row
-from kerv_cli.report.plots import about, latency_figure, library, study_figures
+from kerv_cli.report.plots import about, acceptance_figure, latency_figure, library, study_figures
 from kerv_cli.report.reprice import ASSUMES, repriced_summary
 from kerv_cli.report.summary import MAIN, NOTE, SPEEDS, of_runs, summary_frame
 from kerv_cli.report.tables import (
@@ -94,6 +94,7 @@ def study_parts(
         "suite": _suite(data.table),
         "charts": [figure.to_dict() for figure in figures.values()],
         "has_bounds": "_tradeoff" in figures,
+        "has_places": "_acceptance" in figures,
         "tasks": _by_task(data.per_task),
         "cell_link": None,  # the board gives a function: heading of the first column, row, column -> address
         "machines": None if priced is None else repriced_summary(priced),
@@ -111,7 +112,8 @@ def figures_of(data: StudyData, loss: float) -> dict[str, alt.ConcatChart]:
     `loss` is the largest acceptable loss of success, in points.
     """
     figures = study_figures(data.table, data.study.axis, loss)
-    return figures | ({"_latency": latency_figure(data.table)} if len(latency_table(data.table)) else {})
+    figures |= {"_latency": latency_figure(data.table)} if len(latency_table(data.table)) else {}
+    return figures | ({"_acceptance": acceptance_figure(data.tallies, data.references)} if data.tallies else {})
 
 
 def _suite(table: pd.DataFrame) -> pd.DataFrame:

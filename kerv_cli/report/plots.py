@@ -8,10 +8,12 @@ to the setting that was clicked.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import altair as alt
+import numpy as np
 import pandas as pd
 import vl_convert
 from PIL import Image
@@ -19,6 +21,7 @@ from PIL import Image
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import write_if_changed
+from kerv_cli.engine.tally import Tally
 from kerv_cli.report.measures import MICRO
 from kerv_cli.report.stressed import NONE, is_stressed
 from kerv_cli.report.summary import MAIN, summary_frame
@@ -198,6 +201,36 @@ def latency_figure(table: pd.DataFrame) -> alt.ConcatChart:
     panels = "delay compensation: " + rows["rollout.delay_compensation"]
     points = _points(rows.assign(line=rows["method"], panel=panels), SUCCESS)
     return lines_figure([points], "an autoregressive decode takes, ms", "success, %")
+
+
+def acceptance_figure(tallies: Mapping[str, Tally], references: Mapping[str, str]) -> alt.ConcatChart:
+    """Draw how many draft tokens were accepted, in three panels with a line per setting.
+
+    The first two show the share of accepted tokens among those whose predecessors were accepted, by position in the
+    draft and by DoF. The third shows the share of drafts by their number of accepted tokens.
+
+    Args:
+        tallies: Counts by the setting's label.
+        references: For each label, the label that it is compared with.
+    """
+    frames = []
+    for label, tally in tallies.items():
+        reached, accepted = tally.by_position
+        panels = {
+            "Accepted tokens, %, by position in the draft": (1, accepted, reached),
+            "Accepted tokens, %, by DoF": (1, tally.accepted, tally.reached),
+            "Drafts, %, by number of accepted tokens": (0, tally.lengths, np.full(len(tally.lengths), tally.drafts)),
+        }
+        for panel, (first, part, whole) in panels.items():
+            points = pd.DataFrame({"x": first + np.arange(len(part)), "part": part, "whole": whole}).query("whole > 0")
+            share = 100.0 * points["part"] / points["whole"]
+            is_baseline = references.get(label) == label
+            texts = {"setting": label, "place": points["x"], "tokens": points["part"], "of": points["whole"]}
+            fields: dict[str, Any] = {"setting": label, "line": label, "panel": panel, "is_baseline": is_baseline}
+            fields |= {"value": share, "low": share, "high": share}
+            fields |= {f"text {name}": text for name, text in texts.items()}
+            frames.append(points[["x"]].assign(**fields))
+    return lines_figure(frames, "position, DoF or number")
 
 
 def _best_step(log: pd.DataFrame) -> float:

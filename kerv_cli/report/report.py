@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -43,11 +44,13 @@ class Report:
     Attributes:
         files: Written files, in the order of writing.
         tables: The table of each study, by the study's name.
+        acceptance: How many draft tokens were accepted, by place (`Tally.as_dict`), by study and setting.
         priced: The study's speeds on other machines, from `repriced_table`. None if `on` was empty.
     """
 
     files: list[Path]
     tables: dict[str, pd.DataFrame]
+    acceptance: dict[str, dict[str, dict[str, Any]]]
     priced: pd.DataFrame | None = None
 
 
@@ -83,7 +86,7 @@ def report(
         given = f"on={','.join(on)}" if on else f"baseline={baseline}"
         raise UsageError(f"{given}: name the study with study=NAME")
     names = names_to_report(database, study)
-    profiles, output = open_profiles(database.results, on), Report([], {})
+    profiles, output = open_profiles(database.results, on), Report([], {}, {})
     for name in names:
         store = StudyStore(database, name)
         data = load_study(store)
@@ -91,6 +94,7 @@ def report(
         output.priced = repriced_table(data, store, profiles) if profiles else own_prices(data, store)
         output.files += write_study(store, data, loss, publish, output.priced)
         output.tables[name] = data.table
+        output.acceptance[name] = {label: tally.as_dict() for label, tally in data.tallies.items()}
     return output
 
 

@@ -16,9 +16,11 @@ from typing import Any
 import pandas as pd
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.engine.tally import Tally
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, flat, stress_of, without
 from kerv_cli.lab.plan import Episode, Setting, Study, seeds_text
 from kerv_cli.lab.store import StudyStore
+from kerv_cli.report.acceptance import tally_of
 from kerv_cli.report.matched import with_matched_speed
 from kerv_cli.report.measures import MACRO, MICRO, Row, columns_of, measure, paired, speedups
 from kerv_cli.report.statistics import NO_ESTIMATE, Estimate, over_runs
@@ -59,12 +61,14 @@ class StudyData:
             machine. Each run measured all episodes of the study, or all settings and tasks on seeds of its own. Empty
             if there are no such runs.
         same_pairs: Whether each run measured all episodes of the study.
+        store: The study in the database, to read its decodes. None: the decodes are unknown.
     """
 
     study: Study
     episodes: pd.DataFrame
     runs: tuple[pd.DataFrame, ...] = ()
     same_pairs: bool = False
+    store: StudyStore | None = None
 
     @functools.cached_property
     def settings(self) -> dict[str, Setting]:
@@ -134,6 +138,15 @@ class StudyData:
         return [paired(run, self.references) for run in self.runs]
 
     @functools.cached_property
+    def tallies(self) -> dict[str, Tally]:
+        """How many draft tokens were accepted, by place, for each setting that verified drafts. Reads all decodes."""
+        if self.store is None:
+            return {}
+        episodes = self.episodes.groupby("label")["episode"]
+        found = {label: tally_of(self.store, episodes.get_group(label).tolist()) for label in self.labels}
+        return {label: tally for label, tally in found.items() if tally is not None}
+
+    @functools.cached_property
     def table(self) -> pd.DataFrame:
         """Two rows per setting: one pools all tasks (micro), one averages over difficulty groups (macro)."""
         return pd.DataFrame(row for averaging in (MICRO, MACRO) for row in with_matched_speed(_rows(self, averaging)))
@@ -181,7 +194,7 @@ def load_study(store: StudyStore, wanted: Sequence[Episode] | None = None) -> St
     names = [name for name in _ONE_STATE if name in frame]  # imported episodes may lack some
     alike = [one for one in frames if all(set(one[name]) == set(frame[name]) for name in names)]
     runs = [_labelled(study, one) for one in alike] if len(alike) > 2 else []
-    return StudyData(study, _labelled(study, frame), tuple(runs), same_pairs)
+    return StudyData(study, _labelled(study, frame), tuple(runs), same_pairs, store)
 
 
 def _with_new_seeds(episodes: pd.DataFrame) -> list[pd.DataFrame]:
@@ -323,6 +336,7 @@ def further_of(data: StudyData) -> dict[str, Any]:
         - `identity`: hashes of weights and data
         - `provenance`: executor, machine, versions and the like
         - `measures`: for each averaging and each task, the measures that have no column in the CSV files
+        - `acceptance`: how many draft tokens were accepted, by place, over all tasks; only if drafts were verified
     """
     columns = list(data.table.columns)
     left_out = {*CSV_COLUMNS, "series", "unstressed"}
@@ -343,6 +357,8 @@ def further_of(data: StudyData) -> dict[str, Any]:
         key = row["averaging"] if row["averaging"] in (MICRO, MACRO) else row["task"]
         values = {name: _json(row[name]) for name in measures}
         labels.setdefault(row["label"], about)["measures"][key] = values
+    for label, tally in data.tallies.items():
+        labels[label]["acceptance"] = tally.as_dict()
     return {"study": data.study.name, "axis": data.study.axis, "labels": labels}
 
 

@@ -1,0 +1,105 @@
+"""Count how many draft tokens the target accepted, by their place (docs/methods.md §7).
+
+A token is *reached* if the target accepted all tokens before it in its draft.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from kerv_cli.engine.record import DecodeRecord
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Counts over the verifications of some decodes.
+
+    Attributes:
+        nodes: Number of verified draft tokens, those beside the accepted path included.
+        lengths: Entry k: number of verifications that accepted k draft tokens.
+        judged: Entry k: number of verifications whose judged path has k tokens: the accepted ones and, if the draft
+            was rejected after them, the rejected one.
+        reached: (D,) number of reached tokens of each DoF.
+        accepted: (D,) number of accepted tokens of each DoF.
+    """
+
+    nodes: int
+    lengths: np.ndarray
+    judged: np.ndarray
+    reached: np.ndarray
+    accepted: np.ndarray
+
+    @classmethod
+    def of(cls, start: np.ndarray, judged: np.ndarray, accepted: np.ndarray, nodes: np.ndarray, dofs: int) -> Tally:
+        """Count n verifications.
+
+        Args:
+            start: (n,) number of tokens committed before each.
+            judged: (n,) length of the judged path.
+            accepted: (n,) number of accepted draft tokens.
+            nodes: (n,) number of verified draft tokens.
+            dofs: Number of DoFs D.
+        """
+        place = np.arange(judged.sum()) - np.repeat(np.cumsum(judged) - judged, judged)
+        dof, taken = (np.repeat(start, judged) + place) % dofs, place < np.repeat(accepted, judged)
+        counts = (np.bincount(accepted), np.bincount(judged), np.bincount(dof, minlength=dofs))
+        return cls(int(nodes.sum()), *counts, np.bincount(dof[taken], minlength=dofs))
+
+    @classmethod
+    def of_records(cls, decodes: Iterable[DecodeRecord], dofs: int) -> Tally:
+        """Count the verifications of some decodes, of actions with `dofs` DoFs."""
+        rounds = [one for decode in decodes for one in decode.rounds if one.is_verification]
+        numbers = [(one.start, len(one.drafted), one.accepted, one.tree_size) for one in rounds]
+        start, judged, accepted, nodes = np.array(numbers, int).reshape(-1, 4).T
+        return cls.of(start, judged, accepted, nodes, dofs)
+
+    def __add__(self, other: Tally) -> Tally:
+        names = ("lengths", "judged", "reached", "accepted")
+        return Tally(self.nodes + other.nodes, *(_sum(getattr(self, name), getattr(other, name)) for name in names))
+
+    @property
+    def drafts(self) -> int:
+        """Number of verifications."""
+        return int(self.lengths.sum())
+
+    @property
+    def by_position(self) -> tuple[np.ndarray, np.ndarray]:
+        """Number of reached and of accepted tokens at each position in the draft, the first position first."""
+        reached, accepted = (counts[::-1].cumsum()[::-1][1:] for counts in (self.judged, self.lengths))
+        return reached, _sum(np.zeros(len(reached), int), accepted)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the measures for JSON, under vLLM's names where vLLM has one (docs/methods.md §7)."""
+        reached, accepted = self.by_position
+        drafts, tokens = self.drafts, int(accepted.sum())
+        return {
+            "num_drafts": drafts,
+            "num_draft_tokens": self.nodes,
+            "num_accepted_tokens": tokens,
+            "num_accepted_tokens_per_pos": accepted.tolist(),
+            "mean_acceptance_length": 1 + tokens / drafts if drafts else None,
+            "draft_acceptance_rate": tokens / self.nodes if self.nodes else None,
+            "per_position_acceptance_rate": (accepted / max(1, drafts)).tolist(),
+            "acceptance_histogram": self.lengths.tolist(),
+            "num_reached_tokens_per_pos": reached.tolist(),
+            "conditional_acceptance_rate_per_pos": rates(reached, accepted),
+            "num_reached_tokens_per_dof": self.reached.tolist(),
+            "conditional_acceptance_rate_per_dof": rates(self.reached, self.accepted),
+        }
+
+
+def rates(reached: np.ndarray, accepted: np.ndarray) -> list[float | None]:
+    """Return accepted ÷ reached of each place. None for a place that no draft reached."""
+    return [b / a if a else None for a, b in zip(reached.tolist(), accepted.tolist(), strict=True)]
+
+
+def _sum(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Add two arrays of counts. The shorter one continues with zeros."""
+    total = np.zeros(max(len(first), len(second)), int)
+    for counts in (first, second):
+        total[: len(counts)] += counts
+    return total
