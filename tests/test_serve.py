@@ -104,6 +104,18 @@ def test_a_client_gets_the_actions_of_the_policy(policy, policies):
         until(lambda: any("disconnected; 3 answers, p50" in line for line in log))
 
 
+def test_an_answer_says_how_much_was_accepted_so_far_under_vllms_names(policy, policies):
+    conversation = OpenPi(policy)
+    answers = [conversation.act(seen(seed))["spec_decode"] for seed in range(3)]
+    assert [one["num_drafts"] for one in answers] == sorted(one["num_drafts"] for one in answers)
+    last = answers[-1]
+    assert last["mean_acceptance_length"] == 1 + last["num_accepted_tokens"] / last["num_drafts"]
+    assert sum(last["acceptance_histogram"]) == last["num_drafts"] >= 3
+    assert len(last["conditional_acceptance_rate_per_dof"]) == 4
+    words = ["policy.target=nano-vision", f"results={policies}", "method=ar"]
+    assert "spec_decode" not in OpenPi(Policy(compose_settings("serve", words, ServeSettings))).act(seen(0))
+
+
 BOMB = {b"__ndarray__": True, b"data": b"", b"dtype": "<f8", b"shape": [2**40]}
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.tally import Tally
 from kerv_cli.serve.interface import Interface, Message, hand_of, keys_of, packed, text_of, unpacked
 from kerv_cli.serve.policy import Conversation, Log, Policy
 
@@ -62,6 +63,7 @@ class OpenPi(Conversation):
         last: (H, D) the H actions of the latest answer, for D DoFs, in environment units.
         last_hand: (3,) position of the end effector when that answer was computed, in metres.
         decodes: Number of answers so far.
+        tally: How many draft tokens were accepted in all answers so far.
     """
 
     seats, ping_s, idle_s = 1, 10.0, 120.0
@@ -70,6 +72,7 @@ class OpenPi(Conversation):
         super().__init__(policy, log)
         self.last, self.last_hand = np.zeros((0, 0)), np.zeros(3)
         self.decodes = 0
+        self.tally = Tally.of_records((), self.interface.actions.dofs)
 
     def greeting(self) -> bytes:
         """Return the first message to the client: what it must know about the policy, as `metadata` describes it."""
@@ -87,7 +90,7 @@ class OpenPi(Conversation):
         return packed(self.act(unpacked(frame)))
 
     def act(self, message: Message) -> dict[str, Any]:
-        """Return the values of the answer to a client's message: actions, times, and number of target forwards.
+        """Return the values of the answer to a client's message: actions, times, forwards and acceptance.
 
         Args:
             message: The observation. It may also have `executed`, how many of the last actions were executed, and
@@ -110,11 +113,13 @@ class OpenPi(Conversation):
         record = self.policy.decode(self.decoder, observation)
         self.last, self.last_hand = record.actions, hand
         self.decodes += 1
+        self.tally += Tally.of_records((record,), self.interface.actions.dofs)
         timing = {"infer_ms": 1000 * record.seconds}
         return {
             "actions": self.interface.converted(record.actions),
             "policy_timing": timing,
             "decode": {"forwards": record.forwards, "tokens": len(record.tokens), "mode": record.mode},
+            **({"spec_decode": self.tally.as_dict()} if self.tally.drafts else {}),
             "server_timing": timing | ({} if math.isnan(self.last_ms) else {"prev_total_ms": self.last_ms}),
         }
 
