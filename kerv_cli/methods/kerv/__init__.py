@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, choice, number
 from kerv_cli.base.registry import PREFILL, NoSettings, Part, add, parts
-from kerv_cli.engine.record import Measure
 
 if TYPE_CHECKING:
+    from kerv_cli.engine.record import Measure
     from kerv_cli.methods.context import Context
 
 _PREDICTION = "kerv_cli.methods.kerv.prediction:"
@@ -144,6 +144,8 @@ class KinematicThresholdSettings(RadiusRange):
     @property
     def measure(self) -> Measure:
         """How K is computed."""
+        from kerv_cli.engine.record import Measure
+
         return Measure(self.over == ACCEPTED, self.total)
 
 
