@@ -274,7 +274,7 @@ def test_a_failed_training_shows_its_curves_why_it_failed_and_what_to_type(addre
 def test_a_study_shows_numbers_on_hovering_and_differences_on_a_click(address, open_page):
     page = open_page(f"{address}/studies/radii")
     page.locator(".chart svg").first.wait_for()
-    page.locator(".chart svg path[aria-roledescription=point]").last.hover(force=True)
+    page.locator(".chart").first.locator("svg path[aria-roledescription=point]").last.hover(force=True)
     assert re.search(r"success\n\d", page.locator(".tip").inner_text())
     page.get_by_role("button", name="spec_vla r=9").click()
     assert "threshold.r" in page.locator("tr.detail").inner_text()
