@@ -7,7 +7,7 @@ constants here say by how much, and who measured it. This module needs no torch.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,7 +17,9 @@ from kerv_cli.targets.openvla.config import TOWERS, Language, Tower
 _HALF = 2.0  # bytes of a bfloat16 number
 _TREE_WIDTH = 8  # nodes per level of the drafter's tree
 _TRUNK, _CHAIN, _LEVEL = 21, 13, 31  # kernels outside the layers, counted: of a trunk, a drafted token, a tree's level
+_ENCODER = 20  # kernels of an encoder outside its blocks
 _ROWS = (1, 2, 4, 8, 16, 32, 64)
+SYSTEM = "system time"
 CHUNK = 64
 """Largest number of tokens per chunk that a computed profile prices."""
 
@@ -95,11 +97,26 @@ class Engine:
     system: float
     source: str
 
+    def times(self, needs: Needs, device: Device) -> dict[str, float]:
+        """Return the seconds of reading, arithmetic and launches, of which the longest counts, and of system time."""
+        kernels = needs.layers * self.layer + needs.blocks * self.block + needs.kernels
+        return {
+            "reading": needs.read / device.bandwidth / self.share,
+            "arithmetic": needs.flops / device.flops / self.share,
+            "launches": kernels * self.launch,
+            SYSTEM: self.system * needs.asks,
+        }
+
     def seconds(self, needs: Needs, device: Device) -> float:
         """Return the seconds of a phase on a device."""
-        kernels = needs.layers * self.layer + needs.blocks * self.block + needs.kernels
-        busy = max(device.floor(needs.read, needs.flops) / self.share, kernels * self.launch)
-        return busy + self.system * needs.asks
+        times = self.times(needs, device)
+        system = times.pop(SYSTEM)
+        return max(times.values()) + system
+
+    def bound(self, needs: Needs, device: Device) -> str:
+        """Return what takes most of the phase's time, a name of `times`."""
+        times = self.times(needs, device)
+        return max(times, key=times.__getitem__)
 
 
 SHARE = 0.69
@@ -158,7 +175,16 @@ class Sizes:
     drafter_padding: int = 0
 
     @classmethod
-    def of(cls, width: int, layers: int, feed_forward: int, vocabulary: int, weight: float, slot: float) -> Sizes:
+    def of(
+        cls,
+        width: int,
+        layers: int,
+        feed_forward: int,
+        vocabulary: int,
+        weight: float,
+        slot: float,
+        shared: float = 1.0,
+    ) -> Sizes:
         """Return the sizes of a Llama-style target, and of its drafter of one such layer.
 
         Args:
@@ -168,9 +194,11 @@ class Sizes:
             vocabulary: Number of tokens that the head knows.
             weight: Bytes of a weight.
             slot: Bytes of a number in the key/value cache.
+            shared: Heads of keys and values ÷ heads of queries.
         """
-        layer, head, channels = 4 * width**2 + 3 * width * feed_forward, width * vocabulary, layers * width
-        return cls(layers * layer, head, layer + 2 * width**2 + head, channels, 2 * channels, weight, slot)
+        keys, head, channels = round(shared * width), width * vocabulary, layers * width
+        layer = 2 * width**2 + 2 * width * keys + 3 * width * feed_forward
+        return cls(layers * layer, head, layer + 2 * width**2 + head, channels, 2 * layers * keys, weight, slot)
 
     @property
     def trunk_weights(self) -> int:
@@ -264,8 +292,13 @@ def _block(tower: Tower) -> int:
     return 4 * tower.width**2 + 2 * tower.width * tower.feed_forward
 
 
-def _encoder(towers: list[Tower], width: int) -> Needs:
-    """Return what OpenVLA's encoder needs: all blocks but the last of each tower, and the projector of three layers."""
+def encoder_of(towers: Sequence[Tower], width: int) -> Needs:
+    """Return what OpenVLA's encoder needs: all blocks but the last of each tower, and the projector of three layers.
+
+    Args:
+        towers: Its vision transformers.
+        width: Width of the language model.
+    """
     weights, flops, blocks = 0.0, 0.0, 0
     for tower in towers:
         tokens, depth = tower.patches + tower.prefix, tower.depth - 1
@@ -276,26 +309,52 @@ def _encoder(towers: list[Tower], width: int) -> Needs:
     channels = sum(tower.width for tower in towers)
     projector = channels * 4 * channels + 4 * channels * width + width**2
     flops += 2.0 * projector * towers[0].patches
-    return Needs(_HALF * (weights + projector), flops, blocks=blocks, kernels=20, asks=True)
+    return Needs(_HALF * (weights + projector), flops, blocks=blocks, kernels=_ENCODER, asks=True)
 
 
-def _openvla() -> Shape:
-    """Return the shape of OpenVLA-7B: two vision towers, a projector, and Llama-2 7B."""
-    llama, towers = Language(), list(TOWERS.values())
-    width, layers = llama.hidden_size, llama.num_hidden_layers
-    sizes = Sizes.of(width, layers, llama.intermediate_size, llama.vocab_size, _HALF, _HALF)
+def encoder_of_weights(weights: float, tokens: int) -> Needs:
+    """Return what an encoder of so many weights needs.
+
+    Args:
+        weights: Number of weights, each of which is used once per token. 0: there is no encoder.
+        tokens: Number of tokens that it makes.
+    """
+    blocks = 0 if not weights else 27 if weights > 200e6 else 12  # SigLIP So400m's and ViT-B's
+    return Needs(_HALF * weights, 2.0 * weights * tokens, blocks=blocks, kernels=_ENCODER * bool(weights), asks=True)
+
+
+def vla_shape(name: str, language: Language, prompt: int, encoder: Needs) -> Shape:
+    """Return the shape of a VLA in bfloat16, whose drafters and datastore are of the shipped ones' sizes.
+
+    Args:
+        name: Name of the model.
+        language: Shape of its language model.
+        prompt: P, number of prompt tokens.
+        encoder: What its vision encoder needs.
+    """
+    width, layers = language.hidden_size, language.num_hidden_layers
+    shared = language.key_value_heads / language.num_attention_heads
+    sizes = Sizes.of(width, layers, language.intermediate_size, language.vocab_size, _HALF, _HALF, shared)
     # The early drafter reads two pooled vectors, has two blocks of 384 units and spreads 32 features over 7 tokens. Its
     # kernels and the scout's are counted in the shipped drafters, the scout's other figures, too. A datastore has the
     # shipped one's 45,221 keys of 32 numbers.
     early = 2 * width * 384 + 6 * 384**2 + 384 * 7 * 32 + 32 * 256
     parts = {
-        "encode": _encoder(towers, width),
+        "encode": encoder,
         "early": Needs(_HALF * early, 2.0 * early, kernels=57),
         "scout": Needs(_HALF * 1.253e6, 30.2e6, kernels=121),
         "retrieval": Needs(_HALF * 45_221 * 32, 2.0 * 45_221 * 32, kernels=10),
     }
-    return Shape("openvla-7b", sizes, layers, towers[0].patches + 25, parts)
+    return Shape(name, sizes, layers, prompt, parts)
 
 
-SHAPES = {"openvla-7b": _openvla()}
+def openvla(name: str, language: Language, towers: Sequence[Tower]) -> Shape:
+    """Return the shape of an OpenVLA: vision towers, a projector, and a Llama. Its instruction has 25 tokens."""
+    encoder = encoder_of(towers, language.hidden_size)
+    return vla_shape(name, language, towers[0].patches + INSTRUCTION, encoder)
+
+
+INSTRUCTION = 25
+"""Number of prompt tokens beside an image's."""
+SHAPES = {"openvla-7b": openvla("openvla-7b", Language(), tuple(TOWERS.values()))}
 """Shapes by name. The prompt of OpenVLA-7B is 256 patches and an instruction of 25 tokens."""

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import choice, number, setting
-from kerv_cli.base.settings import RunSettings
-from kerv_cli.bench.physics import DEVICES, SHAPES, SHARE
+from kerv_cli.base.settings import CommandSettings, RunSettings
+from kerv_cli.bench.physics import CHUNK, DEVICES, SHAPES, SHARE
 
 PROJECTIONS = {name: [device.bandwidth / 1e9, device.flops / 1e12] for name, device in DEVICES.items()}
 
@@ -40,3 +40,33 @@ class BenchSettings(RunSettings):
         for name, figures in self.projections.items():
             if len(figures) != 2 or min(figures) <= 0:
                 raise UsageError(f"{prefix}projections.{name}={figures}: two numbers above 0, GB/s and TFLOP/s")
+
+
+@dataclass
+class EstimateSettings(CommandSettings):
+    """Settings of `kerv estimate`, which computes what speculation can give a policy. Nothing is run."""
+
+    weights: str = setting("", "weights of the policy, encoder included: 7B, 450M; the rest of its shape is assumed")
+    model: str = setting("", "instead: a Hugging Face config.json or its folder, a target of kerv, or openvla-7b")
+    tokens: int | None = number(
+        None, 0, CHUNK, help="N, tokens per chunk; default: the model's, else 7. 0: it has none"
+    )
+    actions: int = number(1, 1, 1000, help="control steps per chunk")
+    hz: float | None = number(None, above=0, help="control steps per second that the robot asks for")
+    prompt: int | None = number(None, 1, 100_000, help="prompt tokens, the image's included")
+    vision: str = setting("", "vision encoder: its weights (400M), or its time (8ms)")
+    device: list[str] = setting(["h100"], f"GPUs: {', '.join(DEVICES)}")
+    on: list[str] = setting([], "instead: profiles of 'kerv bench', as in 'kerv report on='")
+
+    def check_together(self, prefix: str) -> None:
+        """Check settings that depend on each other.
+
+        Args:
+            prefix: Start of the settings' names in error messages.
+
+        Raises:
+            UsageError: A device is unknown.
+        """
+        for name in self.device:
+            if name not in DEVICES:
+                raise UsageError(f"{prefix}device={name}: known are {', '.join(DEVICES)}", f"{prefix}device")

@@ -1,0 +1,204 @@
+"""Find the shape of a policy from a number of weights, a Hugging Face `config.json` or a target of kerv. No torch."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.files import read_mapping
+from kerv_cli.base.places import as_path
+from kerv_cli.bench.physics import INSTRUCTION, SHAPES, Shape, encoder_of, encoder_of_weights, openvla, vla_shape
+from kerv_cli.bench.settings import EstimateSettings
+from kerv_cli.targets.folders import find_target
+from kerv_cli.targets.openvla.config import TOWERS, Language, Tower, read_shape
+
+PUBLISHED = {
+    "SmolLM2-135M": (0.135e9, 30, 49_152),
+    "SmolLM2-360M": (0.362e9, 32, 49_152),
+    "TinyLlama-1.1B": (1.03e9, 22, 32_000),
+    "OpenLLaMA-3B": (3.32e9, 26, 32_000),
+    "Llama-2-7B": (6.61e9, 32, 32_000),
+    "Llama-2-13B": (12.9e9, 40, 32_000),
+    "Llama-2-70B": (68.7e9, 80, 32_000),
+}
+"""Published language models: weights of layers and head, number of layers, vocabulary. See `language_of`."""
+
+SMALL = 50e6
+"""Below so many weights a policy has a head of action tokens alone, and 8 layers, as kerv's own."""
+
+_PATCHES = TOWERS["vit_so400m_patch14_siglip_224"].patches
+_SHARE = 0.1  # of the weights are the vision encoder's, as in OpenVLA-7B
+_UNITS = {"": 1.0, "K": 1e3, "M": 1e6, "B": 1e9, "G": 1e9}
+_CONTINUOUS = ("act", "diffusion", "groot", "pi0", "pi05", "smolvla", "tdmpc", "vqbet", "xvla")
+
+
+@dataclass(frozen=True)
+class Described:
+    """A policy as far as its costs depend on it.
+
+    Attributes:
+        shape: Its shape. None if it emits no action tokens.
+        tokens: N, tokens of a chunk.
+        assumed: What was assumed, a phrase each.
+        encoder: Seconds of its vision encoder, if they were given.
+    """
+
+    shape: Shape | None
+    tokens: int
+    assumed: tuple[str, ...] = ()
+    encoder: float | None = None
+
+
+def described(settings: EstimateSettings) -> Described:
+    """Return the policy that the settings describe.
+
+    Raises:
+        UsageError: The policy is described twice or not at all, `weights` or `vision` is no number, or there is no such
+            model.
+        CheckpointError: The model's file is damaged.
+    """
+    if settings.tokens == 0:
+        return Described(None, 0)
+    if bool(settings.weights) == bool(settings.model):
+        raise UsageError("name the policy by one of weights=7B and model=PATH, or its costs by on=PROFILE")
+    policy = _of_weights(settings) if settings.weights else _of_model(settings)
+    if policy.shape is None:
+        return policy
+    shape, encoder = policy.shape, None
+    if settings.prompt is not None:
+        shape = replace(shape, prompt=settings.prompt)
+    if settings.vision.endswith("ms"):
+        encoder = number_of("vision", settings.vision.removesuffix("ms")) / 1e3
+    elif settings.vision and not settings.weights:
+        needs = encoder_of_weights(number_of("vision", settings.vision), _PATCHES)
+        shape = replace(shape, parts={**shape.parts, "encode": needs})
+    tokens = policy.tokens if settings.tokens is None else settings.tokens
+    return Described(shape, tokens, policy.assumed, encoder)
+
+
+def number_of(name: str, text: str) -> float:
+    """Return the number that a text such as `7B`, `450M` or `3.5e9` states.
+
+    Args:
+        name: Name of the setting, for the message.
+        text: The text.
+
+    Raises:
+        UsageError: It is no number, or below 0.
+    """
+    match = re.fullmatch(r"(\d+(?:\.\d*)?(?:[eE]\+?\d+)?)([KMBG]?)", text.strip(), re.IGNORECASE)
+    if match is None:
+        raise UsageError(f"{name}={text}: write a number such as 7B, 450M or 4600000", name)
+    return float(match[1]) * _UNITS[match[2].upper()]
+
+
+def language_of(weights: float) -> Language:
+    """Return a Llama whose layers and head have about so many weights.
+
+    The number of layers and the vocabulary lie between those of the published models that are next in size, on a
+    logarithmic scale. A layer's feed-forward part is 8/3 as wide as its hidden states, as Llama's. The width follows
+    from the number of weights.
+    """
+    sizes, layers, vocabularies = (np.array(column, float) for column in zip(*PUBLISHED.values(), strict=True))
+    at = math.log(weights)
+    depth = round(float(np.interp(at, np.log(sizes), layers))) if weights >= SMALL else 8
+    vocabulary = round(float(np.interp(at, np.log(sizes), vocabularies))) if weights >= SMALL else 256
+    # weights = depth · 12 · width² + vocabulary · width
+    width = round((math.sqrt(vocabulary**2 + 48 * depth * weights) - vocabulary) / (24 * depth))
+    return Language(vocabulary, max(width, 1), max(round(8 / 3 * width), 1), depth, 1)
+
+
+def _of_weights(settings: EstimateSettings) -> Described:
+    total = number_of("weights", settings.weights)
+    given = settings.vision and not settings.vision.endswith("ms")
+    vision = number_of("vision", settings.vision) if given else _SHARE * total
+    if total - vision < 9e4:
+        least = f"the encoder alone has {vision:.3g}" if given else "at least 100K are needed"
+        raise UsageError(f"weights={settings.weights}, vision={settings.vision or 'unknown'}: {least}", "weights")
+    language, prompt = language_of(total - vision), _PATCHES + INSTRUCTION
+    shape = vla_shape(f"{settings.weights} weights", language, prompt, encoder_of_weights(vision, _PATCHES))
+    assumed = [f"{language.num_hidden_layers} layers, {language.hidden_size} wide, {language.vocab_size} ids"]
+    assumed += [] if given or settings.vision else [f"{vision / 1e6:.3g} M of the weights are the vision encoder's"]
+    return Described(shape, 7, (*assumed, *_prompt(settings, prompt)))
+
+
+def _prompt(settings: EstimateSettings, prompt: int) -> list[str]:
+    return [f"a prompt of {prompt} tokens"] if settings.prompt is None else []
+
+
+def _of_model(settings: EstimateSettings) -> Described:
+    """Return the policy of `settings.model`: a shape's name, a `config.json`, its folder, or a target of kerv."""
+    name = settings.model
+    if name in SHAPES:
+        return Described(SHAPES[name], 7)
+    path = as_path(name)
+    file = path / "config.json" if path.is_dir() and not (path / "target.json").is_file() else path
+    if not file.is_file():
+        file = (path if (path / "target.json").is_file() else find_target(settings.results, name)) / "target.json"
+    value = read_mapping(file)
+    try:
+        return _of_target(value, file.parent) if file.name == "target.json" else _of_config(settings, value, file)
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"{file} does not describe a policy ({error}): give weights= instead") from error
+
+
+def _of_config(settings: EstimateSettings, config: Mapping[str, Any], file: Path) -> Described:
+    """Return the policy of a Hugging Face `config.json`."""
+    if config.get("model_type") == "openvla":
+        read = read_shape(file.parent)
+        return Described(openvla("openvla", read.language, read.towers), 7)
+    texts = [config, *(config[key] for key in ("text_config", "llm_config", "language_config") if key in config)]
+    text = next((one for one in reversed(texts) if "vocab_size" in one and "hidden_size" in one), None)
+    if text is None or config.get("type") in _CONTINUOUS:
+        return Described(None, 0)
+    heads = int(text.get("num_attention_heads", 1))
+    language = Language(
+        int(text["vocab_size"]),
+        int(text["hidden_size"]),
+        int(text.get("intermediate_size", 8 * text["hidden_size"] // 3)),
+        int(text.get("num_hidden_layers", 32)),
+        heads,
+        int(text.get("num_key_value_heads", heads)),
+    )
+    vision, assumed, prompt = config.get("vision_config") or {}, [], _PATCHES + INSTRUCTION
+    if {"hidden_size", "num_hidden_layers"} <= set(vision):
+        wide = int(vision["hidden_size"])
+        blocks, heads = int(vision["num_hidden_layers"]), int(vision.get("num_attention_heads", 1))
+        sides = int(vision.get("image_size", 224)), int(vision.get("patch_size", 14))
+        # one block more, because OpenVLA's towers do not use their last
+        tower = Tower(wide, blocks + 1, heads, int(vision.get("intermediate_size", 4 * wide)), 0, False, *sides)
+        encoder, prompt = encoder_of([tower], language.hidden_size), tower.patches + INSTRUCTION
+    else:
+        encoder = SHAPES["openvla-7b"].parts["encode"]
+        assumed = [] if settings.vision else ["the vision encoder of OpenVLA-7B"]
+    shape = vla_shape(file.parent.name, language, prompt, encoder)
+    return Described(shape, 7, (*assumed, *_prompt(settings, prompt)))
+
+
+def _of_target(target: Mapping[str, Any], folder: Path) -> Described:
+    """Return the policy of a target's folder."""
+    if target.get("family") == "openvla":
+        read = read_shape(Path(target["settings"]["checkpoint"]))
+        return Described(openvla(folder.name, read.language, read.towers), 7)
+    own = target.get("settings", {})
+    if not {"width", "layers", "feed_forward", "chunk"} <= set(own):
+        raise UsageError(f"model={folder}: the family '{target.get('family')}' states no width: give weights=", "model")
+    trunk = {**own, **own.get("grown", {})}
+    actions, size = target["actions"], int(own["image_size"]) if own.get("observation") != "state" else 0
+    tokens = int(own["chunk"]) * len(actions["names"])
+    views = len(target["cameras"]) if size else 0
+    prompt = own["grid"] ** 2 * views + own["instruction_tokens"] + own["scene_tokens"] + 1
+    width, wide, layers, heads = (int(trunk[key]) for key in ("width", "feed_forward", "layers", "heads"))
+    language = Language(int(actions["bins"]), width, wide, layers, heads)
+    stored = (folder / "model.safetensors").stat().st_size / 2 if (folder / "model.safetensors").is_file() else 0
+    small = own["layers"] * (4 * own["width"] ** 2 + 3 * own["width"] * own["feed_forward"])
+    encoder = encoder_of_weights(max(stored - small, 1e6 * views), max(own["grid"] ** 2 * views, 1))
+    name = folder.parent.name if folder.name == "target" else folder.name
+    return Described(vla_shape(name, language, trunk.get("prompt") or prompt, encoder), tokens)

@@ -1,0 +1,179 @@
+"""Compute what a decode costs on average, from a profile and from how often draft tokens are accepted.
+
+Nothing is run, and this module needs no torch. The costs are those of `engine.cost`: a decode is a prefill, then rounds
+of a draft and a verification.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from kerv_cli.base.registry import DRAFTING
+from kerv_cli.engine.cost import Profile
+
+_TOP = 8  # children of a node, and kept nodes of a level, in EAGLE-2's tree
+_STEPS = 20  # halvings of an interval until a search ends
+
+
+@dataclass(frozen=True)
+class Drafts:
+    """How a method drafts, and how much of it runs unverified.
+
+    Attributes:
+        depth: Largest number of tokens in a drafted chain, or of levels in a tree. 0: no drafter drafts.
+        nodes: Largest number of nodes of a drafted tree. 0: the drafter drafts chains.
+        source: Kind of cost of a draft that is made once per decode, such as `early`. Empty: there is none.
+        in_prefill: Whether the prefill verifies that draft.
+        retrieved: Share of the verified decodes in which `source` drafts, not the drafter.
+        skipped: Share of the decodes that execute the source's draft unverified.
+        encodes: Whether an unverified draft needs the target's encoder.
+    """
+
+    depth: int = 0
+    nodes: int = 0
+    source: str = ""
+    in_prefill: bool = False
+    retrieved: float = 0.0
+    skipped: float = 0.0
+    encodes: bool = True
+
+
+class Means(NamedTuple):
+    """Means of a verified decode, or of what is left of it.
+
+    Attributes:
+        seconds: Seconds.
+        forwards: Forwards of the target's trunk.
+        accepted: Accepted draft tokens.
+        verifications: Forwards that verify a draft.
+    """
+
+    seconds: float = 0.0
+    forwards: float = 0.0
+    accepted: float = 0.0
+    verifications: float = 0.0
+
+    def mixed(self, other: Means, share: float) -> Means:
+        """Return the means if `other` happens with the probability `share`."""
+        return Means(*((1 - share) * x + share * y for x, y in zip(self, other, strict=True)))
+
+    def plus(self, other: Means) -> Means:
+        """Return the means if `other` follows."""
+        return Means(*(x + y for x, y in zip(self, other, strict=True)))
+
+    @property
+    def accepted_each(self) -> float:
+        """Accepted draft tokens per verification. 0 if no draft was verified."""
+        return self.accepted / self.verifications if self.verifications else 0.0
+
+
+@dataclass(frozen=True)
+class Decodes:
+    """The decodes of a method at a profile's costs.
+
+    Attributes:
+        profile: Seconds of every kind of forward and draft.
+        tokens: N, number of tokens in a chunk.
+        drafts: How the method drafts.
+    """
+
+    profile: Profile
+    tokens: int
+    drafts: Drafts
+    _known: dict[tuple[str, int], float] = field(default_factory=dict, repr=False)
+
+    def seconds(self, acceptance: Sequence[float]) -> float:
+        """Return the mean seconds of a decode, verified or not; for the argument see `verified`."""
+        share = self.drafts.skipped
+        encoder = self._cost("encode", 1) * self.drafts.encodes
+        unverified = self._source + encoder if share else 0.0
+        seconds = self.verified(acceptance).seconds if share < 1 else 0.0
+        return (1 - share) * seconds + share * unverified
+
+    def speed(self, acceptance: Sequence[float]) -> float:
+        """Return how many times as fast as autoregressive decodes these are; for the argument see `verified`."""
+        return self.profile.decode(self.tokens) / self.seconds(acceptance)
+
+    def verified(self, acceptance: Sequence[float]) -> Means:
+        """Return the means of a decode that the target verifies.
+
+        Args:
+            acceptance: For a draft's first, second, … token, the probability that it is accepted if those before it
+                were. The last number holds for all further tokens.
+        """
+        size = (self.tokens - 1) * self.drafts.in_prefill
+        after = [Means()] * (self.tokens + 1)
+        for start in range(self.tokens - 1, 0, -1):
+            after[start] = self._round(start, acceptance, after)
+        first = Means(self._cost("encode", 1) + self._source)
+        prefill = self._forward("prefill", self.profile.prompt + size, size, 0, acceptance, after)
+        return first.plus(prefill)
+
+    def acceptance_for(self, forwards: float) -> float:
+        """Return the probability of acceptance with which a verified decode takes so many forwards of the trunk."""
+        return _least(lambda chance: self.verified([chance]).forwards <= forwards)
+
+    def break_even(self) -> Means | None:
+        """Return the means of a verified decode that takes as long as AR's. None if no acceptance is enough."""
+        limit = self.profile.decode(self.tokens)
+        if self.verified([1.0]).seconds > limit:
+            return None
+        return self.verified([_least(lambda chance: self.verified([chance]).seconds <= limit)])
+
+    def _cost(self, kind: str, rows: int) -> float:
+        """Return `Profile.seconds`, which a search asks for again and again."""
+        if (kind, rows) not in self._known:
+            self._known[kind, rows] = self.profile.seconds(kind, rows)
+        return self._known[kind, rows]
+
+    @property
+    def _source(self) -> float:
+        return self._cost(self.drafts.source, 1) if self.drafts.source else 0.0
+
+    def _round(self, start: int, acceptance: Sequence[float], after: Sequence[Means]) -> Means:
+        """Return the means of a decode from the round on that begins after `start` tokens."""
+        drafts, most = self.drafts, self.tokens - start - 1
+        if drafts.retrieved == 1:
+            return self._forward("verify", 1 + most, most, start, acceptance, after)
+        if not (depth := min(drafts.depth, most)):
+            return self._forward("verify", 1, 0, start, acceptance, after)
+        nodes = min(drafts.nodes, _TOP + (depth - 1) * _TOP**2) if drafts.nodes else depth
+        kind = "tree" if drafts.nodes and not self.profile.lacks(["tree"]) else DRAFTING
+        draft = Means(self._cost(kind, depth if kind == "tree" else nodes))
+        own = draft.plus(self._forward("verify", 1 + nodes, depth, start, acceptance, after))
+        if not drafts.retrieved:
+            return own
+        searched = self._forward("verify", 1 + most, most, start, acceptance, after)
+        return own.mixed(searched, drafts.retrieved)
+
+    def _forward(
+        self, kind: str, rows: int, depth: int, start: int, acceptance: Sequence[float], after: Sequence[Means]
+    ) -> Means:
+        """Return the means of a decode from a forward on that verifies paths of `depth` draft tokens."""
+        prompt, reached, feeds = self.profile.prompt * (start == 0), 1.0, self.drafts.depth > 0
+        seconds, forwards, taken, verifications = self._cost(kind, rows), 1.0, 0.0, float(depth > 0)
+        for accepted in range(depth + 1):
+            chance = acceptance[min(accepted, len(acceptance) - 1)] if accepted < depth else 0.0
+            ends, reached = reached * (1 - chance), reached * chance
+            stop = start + accepted + 1
+            fed = feeds and stop < self.tokens  # the drafter reads the target's states
+            feed = self._cost("feed", prompt + accepted + (start > 0)) if fed else 0.0
+            later = after[stop]
+            seconds += ends * (feed + later.seconds)
+            forwards += ends * later.forwards
+            taken += ends * (accepted + later.accepted)
+            verifications += ends * later.verifications
+        return Means(seconds, forwards, taken, verifications)
+
+
+def _least(enough: Callable[[float], bool]) -> float:
+    """Return the smallest probability that is enough, if every larger one is enough, too. 1 if none is."""
+    if enough(0.0):
+        return 0.0
+    low, high = 0.0, 1.0
+    for _ in range(_STEPS):
+        middle = (low + high) / 2
+        low, high = (low, middle) if enough(middle) else (middle, high)
+    return high

@@ -1,0 +1,301 @@
+"""What speculation can give a policy, from its size: against the cost model, and against what was measured."""
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from command import kerv, refusal, told
+
+from kerv_cli.bench.described import described, language_of
+from kerv_cli.bench.estimate import FAMILIES, Estimate, closest, computed
+from kerv_cli.bench.expected import Decodes, Drafts
+from kerv_cli.bench.physics import DEVICES, ENGINES, SHAPES, Sizes, priced
+from kerv_cli.bench.recorded import TABLES, recorded
+from kerv_cli.bench.settings import EstimateSettings
+from kerv_cli.engine.cost import Profile, prices, read_profile, work_of_record
+from kerv_cli.engine.record import DecodeRecord, Round
+
+ROOT = Path(__file__).resolve().parent.parent
+OPENVLA = priced(SHAPES["openvla-7b"], DEVICES["a100"], ENGINES["eager"])
+
+
+def answer(*words: str) -> dict:
+    document = json.loads(told("estimate", *words, "--json"))
+    assert document["applies"]
+    (machine,) = document["machines"]
+    return machine
+
+
+def family(machine: dict, method: str, engine: int = 0) -> dict:
+    return next(one for one in machine["engines"][engine]["families"] if one["method"] == method)
+
+
+# --- the price of a decode is the cost model's
+
+
+def decode(*rounds: Round, size: int = 7) -> DecodeRecord:
+    tokens = tuple(range(size))
+    return DecodeRecord(tokens, None, len(rounds), rounds, "ar", 0.0, {"vision": 1.0}, size=size)
+
+
+def taken(record: DecodeRecord) -> float:
+    return prices(work_of_record(record), OPENVLA)[0]
+
+
+FIRST = Round("prefill", committed=1)
+
+
+@pytest.mark.parametrize(
+    ("drafts", "chance", "record"),
+    [
+        (Drafts(), 0.0, decode(FIRST, *(Round("decode", start=n, committed=1) for n in range(1, 7)))),
+        (
+            Drafts(5),
+            1.0,
+            decode(FIRST, Round("verify", "drafter", 1, accepted=5, committed=6, tree_size=5)),
+        ),
+        (
+            Drafts(2),
+            1.0,
+            decode(FIRST, *(Round("verify", "drafter", n, accepted=2, committed=3, tree_size=2) for n in (1, 4))),
+        ),
+        (
+            Drafts(5, 49),
+            1.0,
+            decode(FIRST, Round("verify", "drafter", 1, accepted=5, committed=6, tree_size=49, levels=5)),
+        ),
+        (
+            Drafts(source="early", in_prefill=True),
+            1.0,
+            decode(Round("prefill", "early", 0, accepted=6, committed=7, tree_size=6)),
+        ),
+        (Drafts(source="early", skipped=1.0), 1.0, decode(Round("skip", "early", 0, committed=7, tree_size=7))),
+    ],
+)
+def test_a_decode_costs_what_the_cost_model_says_of_its_rounds(drafts, chance, record):
+    assert Decodes(OPENVLA, 7, drafts).seconds([chance]) == pytest.approx(taken(record))
+
+
+def test_a_mean_is_that_of_all_outcomes():
+    """Two places can be rejected: four outcomes, each with its own rounds."""
+    accept, total = 0.3, 0.0
+    last = Round("decode", start=3, committed=1)
+    both = Round("verify", "drafter", 1, accepted=2, committed=3, tree_size=2)
+    one = Round("verify", "drafter", 1, accepted=1, committed=2, tree_size=2)
+    none = Round("verify", "drafter", 1, accepted=0, committed=1, tree_size=2)
+    again, failed = (Round("verify", "drafter", 2, accepted=n, committed=n + 1, tree_size=1) for n in (1, 0))
+    total += accept**2 * taken(decode(FIRST, both, size=4))
+    total += accept * (1 - accept) * taken(decode(FIRST, one, last, size=4))
+    total += (1 - accept) * accept * taken(decode(FIRST, none, again, size=4))
+    total += (1 - accept) ** 2 * taken(decode(FIRST, none, failed, last, size=4))
+    decodes = Decodes(OPENVLA, 4, Drafts(2))
+    assert decodes.seconds([accept]) == pytest.approx(total)
+    forwards = decodes.verified([accept]).forwards
+    assert forwards == pytest.approx(accept**2 * 2 + 2 * accept * (1 - accept) * 3 + (1 - accept) ** 2 * 4)
+    assert decodes.acceptance_for(forwards) == pytest.approx(accept)
+    even = decodes.break_even()
+    assert even is not None
+    assert even.seconds == pytest.approx(OPENVLA.decode(4))
+
+
+# --- against what was measured
+
+
+def measured_profile(table: str) -> Profile:
+    """The stored profile. LIBERO's policy has no vision encoder: there AR's phases take what that table measured."""
+    profile = read_profile(ROOT / "results/bench/epyc-vla-150m-profile.json")
+    if table == "papers":
+        return profile
+    document = json.loads((ROOT / f"results/tables/{table}.json").read_text())
+    times = document["labels"]["ar"]["measures"]["micro over tasks"]
+    token = times["ms.verify"] / (TABLES[table] - 1) / 1e3 / profile.seconds("verify", 1)
+    scale = {
+        "encode": times["ms.vision"] / 1e3 / profile.seconds("encode", 1),
+        "prefill": times["ms.prefill"] / 1e3 / profile.seconds("prefill", profile.prompt),
+    }
+    phases = {
+        kind: (rows, tuple(scale.get(kind, token) * x for x in seconds))
+        for kind, (rows, seconds) in profile.phases.items()
+    }
+    return replace(profile, phases=phases)
+
+
+MISSES: dict[tuple[str, str], str] = {}
+"""Setting of a table -> why its estimate is not within 15 %. None is, today. `main` has no profile: those that ship are
+of a program whose tokens cost four times as much."""
+
+
+@pytest.mark.parametrize("table", ["papers", "papers_libero"])
+def test_every_method_of_a_published_table_is_estimated_within_15_per_cent(table):
+    profile, settings = measured_profile(table), recorded(table)
+    assert len(settings) > 9
+    off = {}
+    for one in settings:
+        decodes = Decodes(profile, one.tokens, one.drafts)
+        estimated = decodes.speed([decodes.acceptance_for(one.forwards)])
+        if not 0.85 <= estimated / one.speed <= 1.15:
+            off[table, one.label] = f"{estimated:.2f}, measured {one.speed:.2f}"
+    assert off.keys() == {place for place in MISSES if place[0] == table}, off
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_a_published_table_stands_for_the_families(table):
+    settings = recorded(table)
+    assert (settings[0].label, settings[0].forwards) == ("ar", TABLES[table])
+    found = {one.method: closest(settings, one) for one in FAMILIES}
+    assert all(shown for method, shown in found.items() if method != "scout_unverified")
+    shown = found["one_pass_streak"]
+    assert 0.5 < shown.drafts.skipped < 1
+    assert 1 <= shown.forwards < 2
+
+
+# --- the command
+
+
+def test_a_7b_on_every_device_in_a_second_without_torch():
+    words = ["estimate", "weights=7B", "tokens=7", "device=h100,a100,4090,orin", "--json"]
+    command = [sys.executable, "-X", "importtime", "-m", "kerv_cli", *words]
+    shown = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
+    assert not re.search(r"\| +(torch|pandas)$", shown.stderr, re.MULTILINE)
+    machines = json.loads(shown.stdout)["machines"]
+    assert [one["machine"] for one in machines] == [DEVICES[name].title for name in ("h100", "a100", "4090", "orin")]
+    for machine in machines:
+        tuned, eager = machine["engines"]
+        assert tuned["ms"] < eager["ms"]
+        for engine in machine["engines"]:
+            assert sum(part["ms"] for part in engine["parts"]) == pytest.approx(engine["ms"])
+            for one in engine["families"]:
+                for speed in (one["at_published_acceptance"], one["at_own_acceptance"]):
+                    assert speed is None or one["method"] == "heisd" or speed <= one["ceiling"] * 1.001, one
+    assert machines[0]["engines"][0]["parts"][2]["bound"] == "reading"
+    assert machines[0]["engines"][1]["parts"][2]["bound"] == "launches"
+
+
+def test_weights_alone_give_about_what_the_model_itself_gives():
+    """OpenVLA-7B's checkpoint has 7.54 billion weights."""
+    guessed, known = answer("weights=7.54B", "device=a100"), answer("model=openvla-7b", "device=a100")
+    for engine in (0, 1):
+        assert guessed["engines"][engine]["ms"] == pytest.approx(known["engines"][engine]["ms"], rel=0.1)
+        for one in known["engines"][engine]["families"][:5]:  # unverified drafts cost what one encoder or two towers do
+            assert family(guessed, one["method"], engine)["ceiling"] == pytest.approx(one["ceiling"], rel=0.1)
+    assert any("assumed" in line and "layers" in line for line in guessed["notes"])
+    assert not any("assumed" in line for line in known["notes"])
+
+
+@pytest.mark.parametrize("weights", [4.6e6, 135e6, 450e6, 3e9, 7e9, 70e9])
+def test_an_assumed_shape_has_the_weights_that_were_asked_for(weights):
+    language = language_of(weights)
+    sizes = Sizes.of(
+        language.hidden_size, language.num_hidden_layers, language.intermediate_size, language.vocab_size, 2, 2
+    )
+    assert sizes.trunk_weights == pytest.approx(weights, rel=0.02)
+
+
+def test_a_small_policy_and_a_shipped_one_are_answered():
+    assert answer("weights=450M", "vision=100M", "device=orin")["engines"][0]["parts"][0]["ms"] > 0
+    shipped = answer("model=mt10-vision")
+    assert shipped["tokens"] == 16
+    assert family(shipped, "spec_vla")["own_acceptance_from"].startswith("results/tables/main.csv")
+    assert "prefill, 31 tokens" in [part["part"] for part in shipped["engines"][0]["parts"]]
+
+
+def test_what_is_said_of_a_policy_counts():
+    known = answer("model=openvla-7b", "device=a100")
+    slow = answer("model=openvla-7b", "device=a100", "vision=150ms")
+    assert slow["engines"][0]["parts"][0]["ms"] == 150
+    assert family(slow, "one_pass")["ceiling"] < family(known, "one_pass")["ceiling"]
+    assert "a faster vision encoder" in slow["sentence"]
+    blind = answer("model=openvla-7b", "vision=0")
+    assert blind["engines"][0]["encoder_share"] == 0
+    assert answer("model=openvla-7b", "prompt=500")["engines"][0]["parts"][1]["part"] == "prefill, 500 tokens"
+    text = told("estimate", "weights=3B", "tokens=7", "hz=20", "device=4090")
+    assert "20 Hz leave 50 ms per decode" in text
+    assert re.search(r"At 7 tokens and [\d.]+ ms per action .* at most [\d.]+ .*what pays first is", text)
+    assert "leave 250 ms" in told("estimate", "weights=3B", "hz=20", "actions=5")
+
+
+@pytest.mark.parametrize("words", [("tokens=1",), ("tokens=64",), ("weights=1M",), ("weights=400B", "vision=8ms")])
+def test_extremes_are_answered(words):
+    words = words if any("weights" in word for word in words) else ("weights=7B", *words)
+    assert "what pays first is" in told("estimate", *words)
+
+
+def test_a_measured_profile_is_priced_as_it_is():
+    (machine,) = json.loads(told("estimate", "on=epyc-vla-150m", "tokens=4", "--json"))["machines"]
+    (engine,) = machine["engines"]
+    assert {part["bound"] for part in engine["parts"]} == {"measured"}
+    assert engine["ms"] == pytest.approx(
+        1e3 * read_profile(ROOT / "results/bench/epyc-vla-150m-profile.json").decode(4)
+    )
+    assert "chunks of 16 tokens" in refusal("estimate", "on=epyc-vla-150m", "tokens=17", code=2)
+
+
+def config(folder: Path, **fields: object) -> str:
+    folder.mkdir(exist_ok=True)
+    (folder / "config.json").write_text(json.dumps(fields))
+    return f"model={folder}"
+
+
+LLAMA = {
+    "vocab_size": 32064,
+    "hidden_size": 4096,
+    "intermediate_size": 11008,
+    "num_hidden_layers": 32,
+    "num_attention_heads": 32,
+}
+
+
+def test_a_config_of_hugging_face_gives_the_shape(tmp_path):
+    timm = ["vit_large_patch14_reg4_dinov2.lvd142m", "vit_so400m_patch14_siglip_224"]
+    text = {"model_type": "llama", "vocab_size": 32064}
+    openvla = config(tmp_path / "a", model_type="openvla", text_config=text, timm_model_ids=timm)
+    known = answer("model=openvla-7b")
+    assert answer(openvla)["engines"] == known["engines"]
+    assert answer(f"{openvla}/config.json")["engines"] == known["engines"]
+    plain = config(tmp_path / "b", model_type="prismatic", text_config=LLAMA)
+    assert answer(plain)["engines"][0]["ms"] == pytest.approx(known["engines"][0]["ms"], rel=0.01)
+    vision = {"hidden_size": 1152, "num_hidden_layers": 27, "image_size": 224, "patch_size": 14}
+    shared = {**LLAMA, "num_key_value_heads": 8}
+    small = answer(config(tmp_path / "c", text_config=shared, vision_config=vision))
+    assert small["engines"][0]["ms"] < known["engines"][0]["ms"]
+
+
+@pytest.mark.parametrize("fields", [{"type": "smolvla", "chunk_size": 50}, {"type": "pi0", "vocab_size": 1}, {}])
+def test_a_policy_without_action_tokens_is_told_what_applies(tmp_path, fields):
+    words = config(tmp_path / "flow", **fields)
+    for line in (told("estimate", words), told("estimate", "tokens=0"), told("estimate", "weights=3B", "tokens=0")):
+        assert len(line.splitlines()) == 1
+        assert "does not apply" in line
+        assert "rollout.clock=real" in line
+        assert "chunks" in line
+    assert json.loads(told("estimate", words, "--json"))["applies"] is False
+
+
+def test_wrong_words_are_refused(tmp_path):
+    assert "h100, a100, 4090" in refusal("estimate", "weights=7B", "device=h200", code=2)
+    assert "weights=7B" in refusal("estimate", code=2)
+    assert "one of" in refusal("estimate", "weights=7B", "model=openvla-7b", code=2)
+    for word in ("weights=many", "vision=ms", "vision=8B"):
+        words = [word] if word.startswith("weights") else ["weights=7B", word]
+        assert word.partition("=")[0] in refusal("estimate", *words, code=2)
+    assert "no target" in refusal("estimate", "model=nothing", f"results={tmp_path}", code=2)
+    assert "does not describe" in refusal("estimate", config(tmp_path / "x", vocab_size="many", hidden_size=8), code=1)
+    (tmp_path / "config.json").write_text("{")
+    assert "JSON" in refusal("estimate", f"model={tmp_path}", code=1)
+
+
+def test_the_help_names_the_settings():
+    shown = kerv("estimate", "--help").output
+    for word in ("weights", "tokens", "device", "vision"):
+        assert word in shown
+
+
+def test_an_estimate_of_a_shape_is_the_sum_of_its_parts():
+    policy = described(EstimateSettings(model="openvla-7b"))
+    for costs in computed(policy, DEVICES["h100"]):
+        one = Estimate(costs, 7)
+        assert sum(seconds for seconds, _ in one.parts.values()) == pytest.approx(one.seconds)
