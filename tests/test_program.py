@@ -15,6 +15,7 @@ from kerv_cli.engine.draft import HOST, Draft
 from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
+from kerv_cli.methods.early.drafter import choose
 from kerv_cli.targets.checkpoint import compact, expanded
 from kerv_cli.targets.compact import program
 from kerv_cli.targets.compact.bfloat16 import multiplies_bfloat16
@@ -237,6 +238,21 @@ def test_the_compiled_tree_is_the_tree(seed, depth, top_k, nodes, equal):
     assert compiled.tree == plain.tree
     assert np.array_equal(compiled.ancestors, plain.ancestors) or plain.ancestors is None
     assert torch.equal(compiled.positions(6, 1, HOST), plain.positions(6, 1, HOST))
+
+
+@settings(max_examples=30)
+@given(seed=st.integers(0, 10_000), radius=st.sampled_from([0, 1, 3, 9, 40]), rows=st.integers(1, 5), even=st.booleans())
+def test_the_compiled_choice_is_the_choice(seed, radius, rows, even):
+    """Of equal logits the first counts, for a strict token and at radius 0."""
+    generator = torch.Generator().manual_seed(seed)
+    logits = torch.randn(rows, 7, 255, generator=generator) * 4
+    logits = logits.round() if even and not radius else logits
+    strict = torch.rand(7, generator=generator) < 0.3
+    choice = Program(lambda logits, radius: logits.choose(radius, strict), (1, 7, 255), (1, 1))
+    found = choice(logits, torch.full((rows, 1), radius))[0]
+    tokens, odds = choose(logits, radius, strict)
+    assert torch.equal(found[:, :-1].long(), tokens)
+    assert torch.allclose(found[:, -1], odds, rtol=1e-3, atol=1e-12)
 
 
 def test_packed_weights_never_outlive_their_weights():

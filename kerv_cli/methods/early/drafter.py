@@ -28,8 +28,9 @@ from kerv_cli.engine.transfer import read
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.drafters import Decodes, Metrics, TrainableDrafter, Training
 from kerv_cli.methods.early import EarlySettings
-from kerv_cli.targets.compact.packable import Packable
+from kerv_cli.targets.compact.packable import FORMATS, Packable
 from kerv_cli.targets.compact.program import Program
+from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.losses import soft_labels, token_loss
 from kerv_cli.targets.observations import observations_of, prompts_of
 from kerv_cli.worlds.demos.files import DemoEpisode
@@ -80,8 +81,8 @@ class EarlyNetwork(Packable):
         self.head = nn.Linear(settings.rank, actions.tokens)
 
     def pack_weights(self) -> Program | None:
-        """Return the network as a compiled `Program`. None if the weights are not float32."""
-        return Program(self.logits, (1, len(self.mean))) if self.mean.dtype == torch.float32 else None
+        """Return the network as a compiled `Program`. None for a number format without kernels."""
+        return Program(self.logits, (1, len(self.mean))) if self.mean.dtype in FORMATS else None
 
     def standardise(self, features: Tensor) -> None:
         """Set the mean and the scale by which inputs are standardised, from the training features (n, F)."""
@@ -178,7 +179,21 @@ class EarlyProposer(ChainProposer):
 
     def __init__(self, early: EarlyNetwork, target: ReadableTarget) -> None:
         self.early, self.target = early, target
+        self.compiled = self.compile()
         self._drafted: tuple[Chunk, list[int], float] | None = None  # the last chunk, its draft, and the estimate
+
+    def compile(self) -> Program | None:
+        """Return a program from a radius (1, 1) and a prompt to the result of `row`. None if a part is not compiled."""
+        early, target = self.early, self.target
+
+        def row(radius: Tensor, prompt: Tensor) -> Tensor:
+            logits: Any = early.logits(target.pooled(prompt))
+            chosen: Tensor = logits.choose(radius, early.strict)
+            return chosen
+
+        if not (isinstance(target, CompactTarget) and isinstance(getattr(early, "packed", None), Program)):
+            return None
+        return Program(row, (1, 1), (1, target.max_prompt, target.width))
 
     def drafted(self, chunk: Chunk) -> tuple[list[int], float]:
         """Return the draft of the chunk's N tokens, and the estimated probability that all are accepted."""
@@ -191,8 +206,10 @@ class EarlyProposer(ChainProposer):
         """Draft the tokens of a chunk that are most likely to be accepted with this acceptance `radius`, in bins.
 
         Returns:
-            (N + 1,) float64: the N tokens, then the estimated probability that all of them are accepted.
+            (N + 1,): the N tokens, then the estimated probability that all of them are accepted.
         """
+        if self.compiled is not None:
+            return self.compiled(torch.tensor([[radius]]), chunk.prompt)[0][0]
         return self.early.draft(self.target.pooled(chunk.prompt), radius)[0]
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:

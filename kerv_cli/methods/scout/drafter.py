@@ -27,7 +27,7 @@ from kerv_cli.methods.drafters import Decodes, Metrics, Training
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyNetwork, EarlyProposer
 from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.targets.compact.features import hand_features, mlp, scene_features, scene_width
-from kerv_cli.targets.compact.packable import Packable, wants_gradient
+from kerv_cli.targets.compact.packable import FORMATS, Packable, wants_gradient
 from kerv_cli.targets.compact.program import Program
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.vision import VisionEncoder
@@ -122,11 +122,15 @@ class ScoutNetwork(Packable):
         return self.drafter.logits(features.to(self.drafter.head.weight.dtype)), places
 
     def pack_weights(self) -> Program | None:
-        """Return the network without its vision encoders as a compiled `Program`. None if weights are not float32."""
+        """Return the network without its vision encoders as a compiled `Program`. None for a format without kernels."""
+        return Program(self.network, *self.shapes) if self.cells.weight.dtype in FORMATS else None
+
+    @property
+    def shapes(self) -> list[tuple[int, ...]]:
+        """Shapes of the results of `views` for one observation."""
         s = self.settings
         of_view = (1, s.grid**2, s.cell_width), (1, 2 * s.keypoints)
-        shapes = [(1, len(self.observation.proprioception)), (1, s.word_width), *of_view * len(self.stems)]
-        return Program(self.network, *shapes) if self.cells.weight.dtype == torch.float32 else None
+        return [(1, len(self.observation.proprioception)), (1, s.word_width), *of_view * len(self.stems)]
 
 
 class ScoutProposer(EarlyProposer):
@@ -135,13 +139,26 @@ class ScoutProposer(EarlyProposer):
     name = "scout"
 
     def __init__(self, scout: ScoutNetwork, target: CompactTarget) -> None:
-        super().__init__(scout.drafter, target)
         self.scout, self.inputs = scout, target.inputs
+        super().__init__(scout.drafter, target)
+
+    def compile(self) -> Program | None:
+        """Return a program from a radius (1, 1) and views to the result of `row`. None if the scout is not compiled."""
+        scout = self.scout
+
+        def row(radius: Tensor, *views: Tensor) -> Tensor:
+            logits: Any = scout.network(*views)[0]
+            chosen: Tensor = logits.choose(radius, scout.drafter.strict)
+            return chosen
+
+        return Program(row, (1, 1), *scout.shapes) if scout.packed is not None else None
 
     @torch.inference_mode()
     def row(self, chunk: Chunk, radius: int) -> Tensor:
         """Draft a chunk from its observation; arguments and result as in `EarlyProposer.row`."""
         assert chunk.observation is not None
+        if self.compiled is not None:
+            return self.compiled(torch.tensor([[radius]]), *self.scout.views(self.inputs(chunk.observation)))[0][0]
         return self.early.chosen(self.scout(self.inputs(chunk.observation))[0], radius)[0]
 
 

@@ -291,6 +291,47 @@ def attention(frames, out, qkv, tables, cache, start, filled, mask, keys, values
 
 
 @compiled
+def sum_of_exponentials(x, most):
+    """Return the sum of e^(x − most)."""
+    total = _ZERO
+    for i in range(len(x)):
+        total += exponential(x[i] - most)
+    return total
+
+
+@compiled
+def choose(frame, columns, numbers):
+    """Choose the tokens of a chunk, and estimate the probability that all are accepted, see `early.drafter.choose`.
+
+    The arguments are those of `elementwise`. The constants are 1 for tokens that must equal the target's, else 0.
+    """
+    out, a, rows, width, stride, first = columns[1], columns[2], columns[4], columns[5], columns[6], columns[7]
+    radius, odds = int(frame[columns[3]]), _ONE
+    probability, below = np.empty(width, np.float32), np.zeros(width + 1, np.float32)
+    for r in range(rows):
+        logits, strict, total, best, most = frame[a + r * stride :], numbers[first + r] > 0, 0.0, 0, _LOWEST
+        highest = logits[:width].max()
+        factor = _ONE / sum_of_exponentials(logits[:width], highest)
+        for i in range(width):
+            probability[i] = exponential(logits[i] - highest) * factor
+        for i in range(width):
+            total += probability[i]
+            below[i + 1] = total
+        for i in range(width):
+            score = logits[i]
+            if radius and not strict:
+                near = below[min(i + radius + 1, width)] - below[max(i - radius, 0)]
+                nearer = below[min(i + radius // 3 + 1, width)] - below[max(i - radius // 3, 0)]
+                score = near + np.float32(0.1) * nearer + np.float32(0.05) * probability[i]
+            if score > most:
+                best, most = i, score
+        near = below[min(best + radius + 1, width)] - below[max(best - radius, 0)]
+        odds *= probability[best] if strict else near
+        frame[out + r] = best
+    frame[out + rows] = odds
+
+
+@compiled
 def elementwise(code, frame, columns, numbers, indices):
     """Execute one operation on one frame, the memory of a row. LINEAR and ATTEND are executed elsewhere.
 
@@ -333,6 +374,8 @@ def elementwise(code, frame, columns, numbers, indices):
             frame[to : to + wide] = numbers[begin : begin + wide]
     elif code == op.ARGMAX:
         y[0] = np.float32(np.argmax(x[:width]))
+    elif code == op.CHOOSE:
+        choose(frame, columns, numbers)
     elif code == op.NORM:
         gain, epsilon = numbers[first : first + width], numbers[first + width]
         for r in range(rows):
@@ -359,15 +402,6 @@ def ranked(values, best):
             for j in range(count - 1, place, -1):
                 held[j], best[j] = held[j - 1], best[j - 1]
             held[place], best[place] = value, i
-
-
-@compiled
-def sum_of_exponentials(x, most):
-    """Return the sum of e^(x − most)."""
-    total = _ZERO
-    for i in range(len(x)):
-        total += exponential(x[i] - most)
-    return total
 
 
 @numba.njit(error_model="numpy", fastmath=FAST - {"reassoc"})

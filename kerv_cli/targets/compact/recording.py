@@ -22,7 +22,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-LINEAR, NORM, SILU, TANH, ADD, MULTIPLY, AFFINE, CLAMP, GATHER, EMBED, ARGMAX, ATTEND, BRANCH = range(13)
+LINEAR, NORM, SILU, TANH, ADD, MULTIPLY, AFFINE, CLAMP, GATHER, EMBED, ARGMAX, ATTEND, BRANCH, CHOOSE = range(14)
 """Codes of the operations."""
 HALF, INT8, FLOAT, BFLOAT, BLOCKED = range(5)
 """Number formats in which the weights of a matrix can be stored: float16, int8 with a scale per output, float32,
@@ -32,7 +32,7 @@ PANEL = 64
 COLUMNS = ["code", "out", "a", "b", "rows", "width", "stride", "first", "step", "weights", "factors", "panels", "kind"]
 """Columns of the table of operations, all int64. A column that an operation does not use is 0.
 
-code: The operation, `LINEAR` to `BRANCH`.
+code: The operation, `LINEAR` to `CHOOSE`.
 out, a, b: Place of the first element of the result, of the first input and of the second input.
 rows, width: Number of rows of the input, and of elements per row.
 stride: Distance between two input rows in elements. For ATTEND the index of the layer in the cache; for BRANCH the size
@@ -126,12 +126,21 @@ class Recorded:
         Returns:
             The token (1,) of the new node that the row stands for, and its parent's hidden state (…, E).
         """
-        tape, size = self.tape, hidden.place.numel()
-        out = tape.emit(BRANCH, (1 + size,), [self], self.place.numel(), stride=size)
-        lined, _, _ = tape.lined(hidden, size)
-        tape.ops[-1]["b"] = int(lined.place.flatten()[0])
-        tape.ops[-1]["reads"].append(lined.place)
+        size = hidden.place.numel()
+        out = self.tape.emit(BRANCH, (1 + size,), [self, hidden], self.place.numel(), stride=size)
         return out[:1], out[1:].view(hidden.shape)
+
+    def choose(self, radius: Recorded, strict: Tensor) -> Recorded:
+        """Choose the tokens of a chunk from this value's logits (1, N, V), as `early.drafter.choose` does.
+
+        Args:
+            radius: (1, 1) acceptance radius, in bins.
+            strict: (N,) bool, tokens that must equal the target's.
+
+        Returns:
+            (1, N + 1): the N tokens, then the estimated probability that all of them are accepted.
+        """
+        return self.tape.emit(CHOOSE, (1, len(strict) + 1), [self, radius], self.shape[-1], strict)
 
     def attend(self, heads: int, cos: Tensor, sin: Tensor) -> Recorded:
         """Record the attention of the next layer. Of this value's 3 E columns, E are queries, E keys and E values.
@@ -188,8 +197,8 @@ class Tape:
         Args:
             code: What it computes, such as LINEAR.
             out: Value that receives the result, or the shape of a new register for it.
-            inputs: Up to two values that the operation reads.
-            width: Number of elements in each row of the inputs.
+            inputs: Up to two values that the operation reads. The second one counts as a single row.
+            width: Number of elements in each row of the first input.
             numbers: Constants that the operation reads, such as a norm's gain.
             **columns: Further entries of the operation, with the names in COLUMNS.
 
@@ -197,7 +206,7 @@ class Tape:
             The result.
         """
         out = out if isinstance(out, Recorded) else self.register(*out)
-        lined = [self.lined(x, width) for x in inputs]
+        lined = [self.lined(x, x.place.numel() if i else width) for i, x in enumerate(inputs)]
         first = [int(x.place.flatten()[0]) for x in (out, *(x for x, _, _ in lined))]
         shape = {"rows": lined[0][1], "width": width, "stride": lined[0][2], "first": self.placed(numbers)}
         places = dict(zip(("out", "a", "b"), first, strict=False))
