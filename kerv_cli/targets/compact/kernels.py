@@ -117,21 +117,32 @@ def _product(kind: int, size: int) -> Callable[..., None]:
         kind: Number format of the weights, HALF to BFLOAT.
         size: Bytes of one weight.
     """
-    one, two, four = _tile(1, kind, PANEL), _tile(2, kind, LANES), _tile(4, kind, LANES)
+    one, two, three, four, five, six = (_tile(n, kind, LANES if n > 1 else PANEL) for n in range(1, 7))
 
     @compiled
     def product(weights, factors, inputs, panels, x, stride, rows, y, step):
+        groups = (rows + 5) // 6  # as equal as can be: 8 rows are 4 and 4, not 6 and 2
         for panel in range(panels):
             w, f, to = weights + size * PANEL * inputs * panel, factors + 8 * PANEL * panel, y + 4 * PANEL * panel
-            for c in range(0, PANEL, LANES):
-                r, wide, narrow = 0, w + size * c, f + 4 * c
-                while r + 4 <= rows:
-                    four(wide, narrow, inputs, x + r * stride, stride, to + r * step + 4 * c, step)
-                    r += 4
-                if r + 2 <= rows:
-                    two(wide, narrow, inputs, x + r * stride, stride, to + r * step + 4 * c, step)
-            if rows % 2:
-                one(w, f, inputs, x + (rows - 1) * stride, stride, to + (rows - 1) * step, step)
+            if rows == 1:
+                one(w, f, inputs, x, stride, to, step)
+            else:
+                for c in range(0, PANEL, LANES):
+                    r, wide, narrow = 0, w + size * c, f + 4 * c
+                    for group in range(groups):
+                        at, place = x + r * stride, to + r * step + 4 * c
+                        many = (rows - r) // (groups - group)
+                        r += many
+                        if many == 6:
+                            six(wide, narrow, inputs, at, stride, place, step)
+                        elif many == 5:
+                            five(wide, narrow, inputs, at, stride, place, step)
+                        elif many == 4:
+                            four(wide, narrow, inputs, at, stride, place, step)
+                        elif many == 3:
+                            three(wide, narrow, inputs, at, stride, place, step)
+                        else:
+                            two(wide, narrow, inputs, at, stride, place, step)
 
     return product
 
