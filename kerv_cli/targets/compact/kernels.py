@@ -404,7 +404,9 @@ def ranked(values, best):
 
     There must be n values above minus infinity.
     """
-    held, count = np.full(len(best), np.float32(-np.inf)), len(best)
+    held, count = np.empty(len(best), np.float32), len(best)
+    for i in range(count):
+        held[i] = -np.inf
     for i in range(len(values)):
         value, place = values[i], count
         if value > held[count - 1]:
@@ -434,8 +436,9 @@ def branch(frames, columns, time, start, mask, results):
     """
     nodes, out, a, b = len(frames), columns[1], columns[2], columns[3]
     width, hidden, rows = columns[5], columns[6], nodes if time else 1
-    best, values, seen = np.empty(nodes, np.int64), np.empty(width, np.float32), mask.copy()
-    tokens, parents, scores, chosen = results[time]
+    best, values, seen = np.empty(nodes, np.int64), np.empty(width, np.float32), np.empty_like(mask)
+    slots = mask.shape[1]
+    copy(mask.ctypes.data, seen.ctypes.data, mask.size)
     for row in range(rows):
         logits, parent, score = frames[row, a : a + width], -1, _ZERO
         if time:
@@ -448,13 +451,14 @@ def branch(frames, columns, time, start, mask, results):
         ranked(values, best)
         for i in range(nodes):
             child = row * nodes + i
-            tokens[child], parents[child], scores[child] = best[i], parent, values[best[i]]
-    ranked(scores[: rows * nodes], best)
+            results[time, 0, child], results[time, 1, child] = best[i], parent
+            results[time, 2, child] = values[best[i]]
+    ranked(results[time, 2, : rows * nodes], best)
     for node in range(nodes):
         child, row = best[node], best[node] // nodes
-        chosen[node], frames[node, out] = child, tokens[child]
-        frames[node, out + 1 : out + 1 + hidden] = frames[row, b : b + hidden]
-        mask[node] = seen[row]
+        results[time, 3, node], frames[node, out] = child, results[time, 0, child]
+        copy(frames[row, b:].ctypes.data, frames[node, out + 1 :].ctypes.data, hidden)
+        copy(seen[row].ctypes.data, mask[node].ctypes.data, slots)
         mask[node, start + nodes * time + node] = _ZERO
 
 
@@ -525,7 +529,9 @@ def run(ops, begin, end, last, indices, numbers, frames, positions, start, cache
                         results[time, 0, r] = frames[r, out]
 
 
-@numba.njit(types.Tuple((_I[::1], _I[::1], types.boolean[:, ::1]))(_F[:, :, ::1], _I, _I), cache=True)
+@numba.njit(
+    types.Tuple((_I[::1], _I[::1], types.boolean[:, ::1]))(_F[:, :, ::1], _I, _I), error_model="numpy", cache=True
+)
 def best(results, top_k, nodes):
     """Choose the nodes of EAGLE-2's tree: the most probable of all, at equal probabilities the first ones.
 
@@ -540,18 +546,24 @@ def best(results, top_k, nodes):
         The n nodes' tokens (n,) and parents (n,), −1 for the root, and the mask (n, n) bool: entry [i, j] says whether
         node j is node i or one of its ancestors.
     """
-    levels, children = results.shape[0], results.shape[2]
-    found = np.empty((3, top_k + (levels - 1) * children), np.float32)
-    found[:, :top_k] = results[0, :3, :top_k]
-    for level in range(1, levels):
-        found[:, top_k + (level - 1) * children : top_k + level * children] = results[level, :3]
-    chosen = np.sort(np.argsort(-found[2], kind="mergesort")[:nodes])
-    index, tokens, parents = np.full(found.shape[1], -1), np.empty(len(chosen), _I), np.empty(len(chosen), _I)
-    seen = np.zeros((len(chosen), len(chosen)), np.bool_)
-    for i in range(len(chosen)):
-        tokens[i], parent = int(found[0, chosen[i]]), int(found[1, chosen[i]])
-        parents[i] = index[parent] if parent >= 0 else -1
-        if parent >= 0:
-            seen[i] = seen[index[parent]]
-        seen[i, i], index[chosen[i]] = True, i
+    children = results.shape[2]
+    count = top_k + (results.shape[0] - 1) * children
+    nodes = min(nodes, count)
+    chosen, index, scores = np.empty(nodes, np.int64), np.empty(count, np.int64), np.empty(count, np.float32)
+    tokens, parents, seen = np.empty(nodes, np.int64), np.empty(nodes, np.int64), np.empty((nodes, nodes), np.bool_)
+    for i in range(count):
+        level, child = (0, i) if i < top_k else ((i - top_k) // children + 1, (i - top_k) % children)
+        scores[i], index[i] = results[level, 2, child], -1
+    ranked(scores, chosen)
+    for i in chosen:
+        index[i] = 0
+    node = 0
+    for i in range(count):
+        if index[i] == 0:
+            level, child = (0, i) if i < top_k else ((i - top_k) // children + 1, (i - top_k) % children)
+            parent = index[int(results[level, 1, child])] if level else -1
+            tokens[node], parents[node], index[i] = int(results[level, 0, child]), parent, node
+            for j in range(nodes):
+                seen[node, j] = j == node or (parent >= 0 and seen[parent, j])
+            node += 1
     return tokens, parents, seen

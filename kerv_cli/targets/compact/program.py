@@ -146,8 +146,6 @@ def forget(module: torch.nn.Module) -> None:
         _MATRICES.pop(parameter, None)
 
 
-_OF_MATRIX = [COLUMNS.index(name) for name in ("out", "a", "rows", "width", "stride", "step")]
-_OUTPUTS = COLUMNS.index("panels")
 _WITHOUT_ATTENTION = Cache(1, 1, 1, 1, 1, torch.empty(0))
 
 
@@ -186,7 +184,11 @@ class Program:
         found = np.flatnonzero(np.isin(self.ops[:, 0], (ARGMAX, BRANCH)))
         self.last = int(found[0]) + 1 if len(found) else len(self.ops)
         self.run = kernels().run
-        self.blocked = [(i, m.blocked) for i, m in zip(linear, self.matrices, strict=True) if m.blocked is not None]
+        self.blocked = [
+            (i, m.blocked, [_columns_of(table[i], r) for r in range(table[i]["rows"])])
+            for i, m in zip(linear, self.matrices, strict=True)
+            if m.blocked is not None
+        ]
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(None), ()
@@ -299,12 +301,16 @@ class Program:
             begin, stop = 0, self.last if time == times - 1 else len(self.ops)
             held = start + time * len(where) if time else filled
             rest = frames, where, start, buffer, keys, values, held, seen, results
-            for i, matrix in self.blocked:
+            for i, matrix, rows in self.blocked:
                 if i < stop:
                     run(self.ops[begin:i], time, time + 1, i - begin, self.indices, self.numbers, *rest)
-                    out, a, rows, width, stride, step = (int(self.ops[i, c]) for c in _OF_MATRIX)
-                    x = memory[:, a : a + rows * stride].unflatten(1, (rows, stride))[..., :width]
-                    y = memory[:, out : out + rows * step].unflatten(1, (rows, step))
-                    y[..., : int(self.ops[i, _OUTPUTS])] = matrix(x)
+                    for given, result in rows:
+                        memory[:, result] = matrix(memory[:, given])
                     begin = i + 1
             run(self.ops[begin:stop], time, time + 1, stop - begin, self.indices, self.numbers, *rest)
+
+
+def _columns_of(op: dict[str, Any], row: int) -> tuple[slice, slice]:
+    """Return where a frame holds a row of a large matrix's input, and where its result goes."""
+    a, out = op["a"] + row * op["stride"], op["out"] + row * op["step"]
+    return slice(a, a + op["width"]), slice(out, out + op["panels"])
