@@ -53,7 +53,7 @@ def own_folder() -> Path:
 def kernels() -> ModuleType:
     """Return the module of compiled kernels.
 
-    The first process on a machine compiles them, and logs a warning that this takes ten seconds. Other processes wait
+    The first process on a machine compiles them, and logs a warning that this takes fifteen seconds. Other processes wait
     for it.
     """
     import numba
@@ -62,7 +62,7 @@ def kernels() -> ModuleType:
     class Told(event.Listener):
         def on_start(self, event: Any) -> None:
             if event.data["dispatcher"].py_func.__name__ == "run":
-                _LOG.warning("compiling for this CPU, once: about ten seconds …")
+                _LOG.warning("compiling for this CPU, once: about fifteen seconds …")
 
         def on_end(self, event: Any) -> None:
             pass
