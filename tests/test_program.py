@@ -241,7 +241,9 @@ def test_the_compiled_tree_is_the_tree(seed, depth, top_k, nodes, equal):
 
 
 @settings(max_examples=30)
-@given(seed=st.integers(0, 10_000), radius=st.sampled_from([0, 1, 3, 9, 40]), rows=st.integers(1, 5), even=st.booleans())
+@given(
+    seed=st.integers(0, 10_000), radius=st.sampled_from([0, 1, 3, 9, 40]), rows=st.integers(1, 5), even=st.booleans()
+)
 def test_the_compiled_choice_is_the_choice(seed, radius, rows, even):
     """Of equal logits the first counts, for a strict token and at radius 0."""
     generator = torch.Generator().manual_seed(seed)
