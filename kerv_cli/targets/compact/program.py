@@ -53,8 +53,8 @@ def own_folder() -> Path:
 def kernels() -> ModuleType:
     """Return the module of compiled kernels.
 
-    The first process on a machine compiles them, and logs a warning that this takes fifteen seconds. Other processes wait
-    for it.
+    The first process on a machine compiles them, and logs a warning that this takes fifteen seconds. Other processes
+    wait for it.
     """
     import numba
     from numba.core import event
