@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 from command import kerv, refusal, told
+from examples import trace_of_log
+from studies_synthetic import swept, threshold_study
 
 from kerv_cli.bench.described import described, language_of
 from kerv_cli.bench.estimate import FAMILIES, Estimate, closest, computed
@@ -18,6 +20,9 @@ from kerv_cli.bench.recorded import TABLES, recorded
 from kerv_cli.bench.settings import EstimateSettings
 from kerv_cli.engine.cost import Profile, prices, read_profile, work_of_record
 from kerv_cli.engine.record import DecodeRecord, Round
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.report.reprice import open_profiles, repriced_table
+from kerv_cli.report.tables import load_study
 
 ROOT = Path(__file__).resolve().parent.parent
 OPENVLA = priced(SHAPES["openvla-7b"], DEVICES["a100"], ENGINES["eager"])
@@ -299,3 +304,162 @@ def test_an_estimate_of_a_shape_is_the_sum_of_its_parts():
     for costs in computed(policy, DEVICES["h100"]):
         one = Estimate(costs, 7)
         assert sum(seconds for seconds, _ in one.parts.values()) == pytest.approx(one.seconds)
+
+
+# --- traces
+
+
+@pytest.fixture(scope="module")
+def swept_results(tmp_path_factory):
+    """A study of synthetic episodes, its trace, and what the report says of it on a computed profile."""
+    results = tmp_path_factory.mktemp("results")
+    swept(results, threshold_study(["reach-v3", "push-v3"], radii=(9,)))
+    words = (f"results={results}", "--json")
+    (trace,) = json.loads(told("runs", "export", "threshold", "--to", "trace", *words))["written"]
+    store = StudyStore(results, "threshold")
+    table = repriced_table(load_study(store), store, open_profiles(results, ["a100-openvla-7b-eager"]))
+    return Path(trace), table.set_index("label").to_dict("index")
+
+
+def priced_trace(trace: Path, *words: str) -> list[dict]:
+    rows: list[dict] = json.loads(told("estimate", f"trace={trace}", *words, "--json"))["rows"]
+    return rows
+
+
+def test_an_exported_trace_costs_what_the_report_says(swept_results):
+    trace, report = swept_results
+    rows = {row["setting"]: row for row in priced_trace(trace, "on=a100-openvla-7b-eager")}
+    assert rows.keys() == report.keys()
+    for label, row in rows.items():
+        assert row["ms_per_episode"] == pytest.approx(report[label]["time_per_episode_ms"])
+        faster = rows["ar"]["ms_per_episode"] / row["ms_per_episode"]
+        assert faster == pytest.approx(report[label]["episode_speedup"])
+        assert row["low"] <= row["speed"] <= row["high"]
+    assert rows["ar"]["speed"] == pytest.approx(1, rel=0.05), "the report adds recorded host seconds"
+
+
+def test_a_trace_is_priced_on_several_devices(swept_results):
+    trace, report = swept_results
+    rows = priced_trace(trace, "model=openvla-7b", "prompt=281", "device=a100,h100")
+    assert {(row["machine"], row["engine"]) for row in rows} == {
+        (DEVICES[name].title, engine) for name in ("a100", "h100") for engine in ENGINES
+    }
+    for row in rows:
+        if (row["machine"], row["engine"]) == (DEVICES["a100"].title, "eager"):
+            assert row["ms_per_episode"] == pytest.approx(report[row["setting"]]["time_per_episode_ms"], rel=1e-3)
+    assert "speed against AR" in told("estimate", f"trace={trace}", "weights=7B")
+
+
+def write_trace(path: Path, *lines: dict) -> Path:
+    path.write_text("\n".join(map(json.dumps, lines)), encoding="utf-8")
+    return path
+
+
+def chained(accepted: list[int], drafted: int, size: int, episode: int) -> dict:
+    """A decode in which every round drafts a chain, as far as tokens are left."""
+    start, rounds = 1, [{"committed": 1}]
+    for taken in accepted:
+        depth = min(drafted, size - start - 1)
+        if depth < 1:
+            rounds += [{"start": start}] * (start < size)
+            break
+        taken = min(taken, depth)
+        chain = list(range(-1, depth - 1))
+        rounds.append(
+            {"start": start, "proposer": "drafter", "parents": chain, "accepted": taken, "committed": taken + 1}
+        )
+        start += taken + 1
+    return {"episode": str(episode), "tokens": size, "rounds": rounds}
+
+
+def test_the_length_that_would_have_been_fastest_is_found(tmp_path):
+    """Two tokens are always accepted and a third never: chains of two, and the others cost what the model says."""
+    trace = write_trace(tmp_path / "t.jsonl", *(chained([2] * 10, 6, 10, episode) for episode in range(4)))
+    words = ("model=openvla-7b", "device=orin,h100", "choose=draft")
+    rows = priced_trace(trace, *words)
+    for row in rows:
+        assert (row["best"], row["sure"], len(row["speeds"])) == (2, 1, 7)
+        assert row["speeds"][0]["speed"] == pytest.approx(1)
+        assert row["speeds"][2]["low"] == pytest.approx(row["speeds"][2]["high"])
+    recorded_length = priced_trace(trace, *words[:1], "device=h100")[0]["speed"]
+    chosen = next(row for row in rows if "H100" in row["machine"])
+    assert chosen["speeds"][6]["speed"] == pytest.approx(recorded_length, rel=0.01)
+    assert chosen["speeds"][2]["speed"] > recorded_length
+    shown = told("estimate", f"trace={trace}", *words[::2])
+    assert "says nothing of longer chains" in shown
+    assert "assumed" in shown
+
+
+def test_an_interval_holds_what_differs_between_episodes(tmp_path):
+    lines = [chained([6 * (episode % 2)] * 16, 6, 16, episode) for episode in range(6)]
+    (row, _) = priced_trace(write_trace(tmp_path / "t.jsonl", *lines), "model=openvla-7b", "choose=draft")
+    speed = row["speeds"][6]
+    assert speed["low"] < speed["speed"] < speed["high"]
+    (one, _) = priced_trace(write_trace(tmp_path / "u.jsonl", *lines[:1]), "model=openvla-7b", "choose=draft")
+    assert one["speeds"][6]["low"] is None
+
+
+def test_a_tree_is_known_by_its_parents(tmp_path):
+    parents = [-1, -1, 0, 0, 1, 2]
+    of_parents = {"start": 1, "proposer": "drafter", "parents": parents, "accepted": 2, "committed": 3}
+    of_counts = {**of_parents, "parents": [], "nodes": 6, "levels": 3}
+    prices = []
+    for draft in (of_parents, of_counts, {**of_counts, "levels": 0}):
+        line = {"episode": "0", "tokens": 7, "rounds": [{}, draft, {"start": 4}, {"start": 5}, {"start": 6}]}
+        prices.append(priced_trace(write_trace(tmp_path / "t.jsonl", line), "model=openvla-7b")[0]["ms_per_decode"])
+    assert prices[0] == prices[1] != prices[2]
+
+
+def test_the_log_of_another_engine_becomes_a_trace(tmp_path):
+    log, trace = tmp_path / "log.jsonl", tmp_path / "trace.jsonl"
+    request = {"session_id": "kitchen 7", "method": "eagle3", "prompt_tokens": 281}
+    drafts = {"num_draft_tokens": [3, 1, 0], "num_accepted_tokens": [2, 1, 0]}
+    log.write_text(json.dumps({**request, **drafts}) + "\n")
+    trace_of_log.convert(log, trace)
+    (row, _) = priced_trace(trace, "model=openvla-7b", "device=a100")
+    assert (row["setting"], row["tokens"], row["episodes"]) == ("eagle3", 7, 1)
+    profile = priced(SHAPES["openvla-7b"], DEVICES["a100"], ENGINES["tuned"])
+    rounds = (
+        FIRST,
+        Round("verify", "drafter", 1, accepted=2, committed=3, tree_size=3),
+        Round("verify", "drafter", 4, accepted=1, committed=2, tree_size=1),
+        Round("decode", start=6, committed=1),
+    )
+    assert row["ms_per_decode"] == pytest.approx(1e3 * prices(work_of_record(decode(*rounds)), profile)[0])
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("{", "t.jsonl:2 is no JSON"),
+        ('{"tokens": 7}', "t.jsonl:2 is damaged: episode"),
+        ('{"episode": "0", "tokens": 7, "rounds": [{"accepted": 3, "parents": [-1]}]}', "accepted=3 of 1"),
+        ('{"episode": "0", "tokens": 7, "rounds": [{"parents": [0]}]}', "parents"),
+        ('{"episode": "0", "tokens": 7, "rounds": [{"start": -1}]}', "start=-1"),
+        ('{"episode": "0", "tokens": 7, "rounds": [{"mode": "fast"}]}', "mode=fast"),
+        ('{"episode": "0", "tokens": 7, "rounds": []}', "rounds"),
+    ],
+)
+def test_a_broken_trace_is_refused_by_its_line(tmp_path, line, says):
+    trace = tmp_path / "t.jsonl"
+    trace.write_text('{"episode": "0", "tokens": 7, "rounds": [{}]}\n' + line)
+    refused = refusal("estimate", f"trace={trace}", "model=openvla-7b", code=1)
+    assert says in refused
+    assert "t.jsonl:2" in refused
+
+
+def test_a_trace_that_cannot_be_answered_is_refused(tmp_path, swept_results):
+    trace = write_trace(tmp_path / "t.jsonl", {"episode": "0", "tokens": 100, "rounds": [{}]})
+    assert "64 tokens" in refusal("estimate", f"trace={trace}", "model=openvla-7b", code=2)
+    trace = write_trace(tmp_path / "t.jsonl", {"episode": "0", "tokens": 7, "rounds": [{}]})
+    assert "no drafted chain" in refusal("estimate", f"trace={trace}", "model=openvla-7b", "choose=draft", code=2)
+    assert "weights=7B" in refusal("estimate", f"trace={trace}", code=2)
+    assert "cannot be read" in refusal("estimate", f"trace={tmp_path / 'none'}", "weights=7B", code=1)
+    assert "needs trace=FILE" in refusal("estimate", "weights=7B", "choose=draft", code=2)
+
+
+def test_the_example_on_the_page_is_a_trace(tmp_path):
+    (line,) = re.findall(r"```json\n(.*?)\n```", (ROOT / "docs/trace.md").read_text(encoding="utf-8"))
+    trace = tmp_path / "t.jsonl"
+    trace.write_text(line, encoding="utf-8")
+    assert priced_trace(trace, "model=openvla-7b")[0]["speed"] > 1

@@ -16,6 +16,7 @@ from kerv_cli.base.files import read_mapping
 from kerv_cli.base.places import as_path
 from kerv_cli.bench.physics import INSTRUCTION, SHAPES, Shape, encoder_of, encoder_of_weights, openvla, vla_shape
 from kerv_cli.bench.settings import EstimateSettings
+from kerv_cli.targets.compact.settings import prompt_tokens
 from kerv_cli.targets.folders import find_target
 from kerv_cli.targets.openvla.config import TOWERS, Language, Tower, read_shape
 
@@ -194,11 +195,10 @@ def _of_target(target: Mapping[str, Any], folder: Path) -> Described:
     actions, size = target["actions"], int(own["image_size"]) if own.get("observation") != "state" else 0
     tokens = int(own["chunk"]) * len(actions["names"])
     views = len(target["cameras"]) if size else 0
-    prompt = own["grid"] ** 2 * views + own["instruction_tokens"] + own["scene_tokens"] + 1
     width, wide, layers, heads = (int(trunk[key]) for key in ("width", "feed_forward", "layers", "heads"))
     language = Language(int(actions["bins"]), width, wide, layers, heads)
     stored = (folder / "model.safetensors").stat().st_size / 2 if (folder / "model.safetensors").is_file() else 0
     small = own["layers"] * (4 * own["width"] ** 2 + 3 * own["width"] * own["feed_forward"])
     encoder = encoder_of_weights(max(stored - small, 1e6 * views), max(own["grid"] ** 2 * views, 1))
     name = folder.parent.name if folder.name == "target" else folder.name
-    return Described(vla_shape(name, language, trunk.get("prompt") or prompt, encoder), tokens)
+    return Described(vla_shape(name, language, prompt_tokens(target) or 1, encoder), tokens)

@@ -57,6 +57,8 @@ class EstimateSettings(CommandSettings):
     vision: str = setting("", "vision encoder: its weights (400M), or its time (8ms)")
     device: list[str] = setting(["h100"], f"GPUs: {', '.join(DEVICES)}")
     on: list[str] = setting([], "instead: profiles of 'kerv bench', as in 'kerv report on='")
+    trace: str = setting("", "price the decodes of this file, see docs/trace.md")
+    choose: str = choice("none", "none", "draft", help="draft: which length of drafted chains the trace's decodes want")
 
     def check_together(self, prefix: str) -> None:
         """Check settings that depend on each other.
@@ -65,8 +67,10 @@ class EstimateSettings(CommandSettings):
             prefix: Start of the settings' names in error messages.
 
         Raises:
-            UsageError: A device is unknown.
+            UsageError: A device is unknown, or there is nothing to choose from.
         """
+        if self.choose != "none" and not self.trace:
+            raise UsageError(f"{prefix}choose={self.choose} needs trace=FILE", f"{prefix}choose")
         for name in self.device:
             if name not in DEVICES:
                 raise UsageError(f"{prefix}device={name}: known are {', '.join(DEVICES)}", f"{prefix}device")

@@ -8,61 +8,63 @@ import typer
 
 from kerv_cli.bench.settings import EstimateSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, end_with_json, print_table
+from kerv_cli.cli.common import AsJson, end_with_json, print_rows, print_table
 
 if TYPE_CHECKING:
     from kerv_cli.bench.described import Described
-    from kerv_cli.bench.estimate import Estimate
+    from kerv_cli.bench.estimate import Costs, Estimate
 
 
 @command(
     "estimate",
     EstimateSettings,
-    keys="weights model tokens prompt vision actions hz device on results",
-    examples=("kerv estimate weights=7B tokens=7 device=h100", "kerv estimate on=epyc-mt10-vision tokens=16"),
+    keys="weights model tokens prompt vision actions hz device on trace choose results",
+    examples=("kerv estimate weights=7B tokens=7 device=h100", "kerv estimate trace=FILE on=PROFILE"),
     writes=False,
 )
 def estimate(settings: EstimateSettings, as_json: AsJson = False) -> None:
     """Say whether speculative decoding can help a policy: costs of an action, and speeds that methods can reach.
 
     weights=7B describes a policy by its size; model= reads a config.json or a target. A policy without action tokens
-    has tokens=0. on=PROFILE takes measured costs.
+    has tokens=0. on=PROFILE takes measured costs. trace=FILE prices recorded decodes; choose=draft says which length of
+    chains is the fastest for them.
     """
     from kerv_cli.bench.described import described
-    from kerv_cli.bench.estimate import NO_TOKENS
+    from kerv_cli.bench.estimate import NO_TOKENS, Estimate, check_tokens
 
+    if settings.trace:
+        _trace(settings, as_json)
+        return
     policy = None if settings.on and settings.tokens != 0 else described(settings)
     if policy and policy.shape is None:
         if as_json:
             end_with_json({"applies": False, "reason": NO_TOKENS})
         typer.echo(NO_TOKENS)
         return
-    found = _on_profiles(settings) if policy is None else _on_devices(settings, policy)
+    tokens = policy.tokens if policy else 7 if settings.tokens is None else settings.tokens
+    found = {}
+    for title, costs in _costs(settings, policy).items():
+        for one in costs:
+            check_tokens(one.engine, one.profile, tokens)
+        found[title] = [Estimate(one, tokens) for one in costs]
     if as_json:
         end_with_json({"applies": True, "machines": [_row(settings, policy, *one) for one in found.items()]})
     for title, estimates in found.items():
         _print(settings, policy, title, estimates)
 
 
-def _on_devices(settings: EstimateSettings, policy: Described) -> dict[str, list[Estimate]]:
-    """Return the estimates for each device with each engine, by the device's title."""
-    from kerv_cli.bench.estimate import Estimate, computed
+def _costs(settings: EstimateSettings, policy: Described | None) -> dict[str, list[Costs]]:
+    """Return the costs on each machine, with each engine or of a profile, by the machine's title."""
+    from kerv_cli.bench.estimate import Costs, computed
     from kerv_cli.bench.physics import DEVICES
 
-    devices = [DEVICES[name] for name in settings.device]
-    return {device.title: [Estimate(costs, policy.tokens) for costs in computed(policy, device)] for device in devices}
-
-
-def _on_profiles(settings: EstimateSettings) -> dict[str, list[Estimate]]:
-    """Return the estimate for each profile of `kerv bench`, by its title."""
-    from kerv_cli.bench.estimate import Costs, Estimate, check_tokens
+    if policy is not None:
+        devices = [DEVICES[name] for name in settings.device]
+        return {device.title: computed(policy, device) for device in devices}
     from kerv_cli.report.reprice import open_profiles
 
     profiles = open_profiles(settings.results, settings.on)
-    tokens = 7 if settings.tokens is None else settings.tokens
-    for one in profiles:
-        check_tokens(one.name, one.profile, tokens)
-    return {one.title: [Estimate(Costs(one.name, one.profile, {}), tokens)] for one in profiles}
+    return {one.title: [Costs(one.name, one.profile, {})] for one in profiles}
 
 
 def _row(settings: EstimateSettings, policy: Described | None, title: str, estimates: list[Estimate]) -> dict[str, Any]:
@@ -87,3 +89,26 @@ def _print(settings: EstimateSettings, policy: Described | None, title: str, est
     if settings.hz:
         typer.echo(rate(estimates, settings.hz, settings.actions))
     typer.echo(sentence(estimates))
+
+
+def _trace(settings: EstimateSettings, as_json: bool) -> None:
+    """Price a trace on each machine, or say which length of chains would have been the fastest there."""
+    from kerv_cli.base.places import as_path
+    from kerv_cli.bench.described import described
+    from kerv_cli.bench.traced import CANNOT, choose_length, price
+    from kerv_cli.engine.trace import read_trace
+
+    trace = read_trace(as_path(settings.trace))
+    settings.prompt = settings.prompt or next((one.prompt for one in trace if one.prompt), None)
+    answer = choose_length if settings.choose == "draft" else price
+    found = [
+        ({"machine": title, "engine": costs.engine}, one)
+        for title, several in _costs(settings, None if settings.on else described(settings)).items()
+        for costs in several
+        for one in answer(trace, costs)
+    ]
+    if as_json:
+        end_with_json({"rows": [{**machine, **one.document} for machine, one in found], "note": CANNOT})
+    print_rows([{**machine, **one.cells} for machine, one in found], settings.trace)
+    if settings.choose == "draft":
+        typer.echo(CANNOT)

@@ -35,7 +35,7 @@ RUNS = "NAME: runs (id, a unique part of it, or last) and results=DIR."
 FILTERS = "NAME: kind=, method=, task=, state=, since= and results=DIR narrow the list."
 
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask; names must be whole.")]
-To = Annotated[str, typer.Option("--to", help="csv, parquet or db.")]
+To = Annotated[str, typer.Option("--to", help="csv, parquet, db or trace.")]
 Folder = Annotated[Path | None, typer.Option("--dir", help="Folder to write to; default results/exports/FORMAT.")]
 
 
@@ -221,11 +221,11 @@ def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
     typer.echo(f"removed {what}")
 
 
-@_command_on_runs("export", "kerv runs export last", "kerv runs export main --to db")
+@_command_on_runs("export", "kerv runs export last", "kerv runs export main --to trace")
 def export(
     settings: CommandSettings, names: list[str], to: To = "csv", folder: Folder = None, as_json: AsJson = False
 ) -> None:
-    """Write the episodes of a run as CSV, Parquet or a database that 'kerv runs import' reads."""
+    """Write the episodes of a run as CSV, Parquet, a trace, or a database that 'kerv runs import' reads."""
     from kerv_cli.catalogue.entries import find_run
     from kerv_cli.lab.database import Database
     from kerv_cli.report.export import export as hand_over

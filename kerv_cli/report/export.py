@@ -1,21 +1,30 @@
-"""Export the episodes of a run as CSV, Parquet, or a database of their own."""
+"""Export the episodes of a run as CSV, Parquet, a database of their own, or a trace."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
-from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.files import atomic_path, write_text
+from kerv_cli.base.errors import KervError, UnknownName, UsageError
+from kerv_cli.base.files import atomic_path, read_mapping, write_text
 from kerv_cli.catalogue.entries import RunEntry, store_of
 from kerv_cli.catalogue.imports import export_database
+from kerv_cli.engine.cost import READ_PHASES
+from kerv_cli.engine.record import PARALLEL
 from kerv_cli.episodes.rows import DECODE_SCHEMA
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.store import StudyStore
+from kerv_cli.report.reprice import levels_of
 from kerv_cli.report.tables import csv_text
+from kerv_cli.targets.compact.settings import prompt_tokens
+from kerv_cli.targets.folders import find_target
 
-FORMATS = ("csv", "parquet", "db")
+FORMATS = ("csv", "parquet", "db", "trace")
+_TRACED = ("rounds", "similarity", *(f"seconds.{phase}" for phase in READ_PHASES))  # columns of a trace
 _AT_ONCE = 100  # episodes in memory at a time
 
 
@@ -40,6 +49,8 @@ def export(run: RunEntry, database: Database, to: str, folder: Path) -> list[Pat
         return [export_database(store, folder / run.id)]
     if to == "parquet":
         return _to_parquet(store, folder / run.id)
+    if to == "trace":
+        return [_to_trace(store, folder / f"{run.id}.jsonl")]
     path = folder / f"{run.id}.csv"
     write_text(path, csv_text(_episodes(store).drop(columns=["episode", "decode_seconds", "initial_state"])))
     return [path]
@@ -72,3 +83,61 @@ def _to_parquet(store: StudyStore, folder: Path) -> list[Path]:
             columns = [*episode_keys.columns, *(rows[name] for name in DECODE_SCHEMA.names)]
             writer.write_table(pa.table(columns, names=schema.names).cast(schema))
     return [episodes, decodes]
+
+
+def _to_trace(store: StudyStore, path: Path) -> Path:
+    """Write every decode of a study as a line of a trace (docs/trace.md)."""
+    frame, settings = _episodes(store), {one.label: one.settings for one in store.load().settings}
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        for label, part in frame.groupby("label", sort=False):
+            chosen, size = settings.get(str(label), {}), 0
+            for rows in _decodes(store, part, ["tokens"]):
+                size = max(size, *(len(row["tokens"]) for row in rows))
+            prompt, levels = _prompt(store, chosen), levels_of(chosen)
+            for rows in _decodes(store, part, _TRACED):
+                for row in rows:
+                    about = {"episode": row["episode"], "setting": label, "prompt": prompt, "tokens": size}
+                    file.write(json.dumps({**about, **_line(row, levels)}) + "\n")
+    return path
+
+
+def _decodes(store: StudyStore, episodes: pd.DataFrame, columns: Sequence[str]) -> Iterator[list[dict[str, Any]]]:
+    """Yield the decodes of some episodes at a time, with the episode's name in `episode`."""
+    for start in range(0, len(episodes), _AT_ONCE):
+        some = episodes.iloc[start : start + _AT_ONCE]
+        names = [f"{task}/{seed}/{repeat}" for task, seed, repeat in some[["task", "seed", "repeat"]].to_numpy()]
+        rows = store.decodes(list(some["episode"]), columns).to_pylist()
+        yield [{**row, "episode": names[row["episode"]]} for row in rows]
+
+
+def _prompt(store: StudyStore, settings: Mapping[str, Any]) -> int | None:
+    """Return the number of prompt tokens of a setting's policy. None if it is not known here."""
+    name = settings.get("policy", {}).get("target") or ""
+    try:
+        return prompt_tokens(read_mapping(find_target(str(store.database.results), name) / "target.json"))
+    except KervError:
+        return None
+
+
+def _line(row: Mapping[str, Any], levels: int) -> dict[str, Any]:
+    """Return a decode's line of a trace, without what its episode says.
+
+    Args:
+        row: Columns _TRACED of the decode.
+        levels: Levels of a drafted tree, for episodes from before rounds had levels.
+    """
+    seconds = {phase: row[f"seconds.{phase}"] for phase in READ_PHASES if row[f"seconds.{phase}"] is not None}
+    rounds = [
+        {
+            "mode": one["mode"] if one["mode"] in ("skip", PARALLEL) else "forward",
+            "proposer": one["proposer"],
+            "start": one["start"],
+            "nodes": one["tree_size"],
+            "levels": (levels if one.get("levels") is None else one["levels"]) if one["tree_size"] else 0,
+            "accepted": one["accepted"],
+            "committed": one["committed"],
+        }
+        for one in row["rounds"]
+    ]
+    searched, encoded = row["similarity"] is not None, bool(seconds.pop("vision", 1.0))
+    return {"encoded": encoded, "searched": searched, "seconds": seconds, "rounds": rounds}

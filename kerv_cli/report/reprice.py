@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -210,13 +210,17 @@ def _work_of_label(data: StudyData, label: str, store: StudyStore) -> _LabelWork
     size = int(np.bincount(decode, columns.pop("committed")).max())
     phases = {phase: np.nan_to_num(table[f"seconds.{phase}"].to_numpy()) for phase in READ_PHASES}
     looked_up = ~np.isnan(table["similarity"].to_numpy(zero_copy_only=False).astype(float))
-    # episodes from before rounds had levels: the settings say what was drafted
-    proposer = setting.settings.get("proposer", {})
-    drafted = int(proposer["depth"]) if proposer.get("shape") == "tree" else 0
+    drafted = levels_of(setting.settings)
     levels = columns.get("levels", np.full(len(decode), np.nan)).astype(float)
     columns["levels"] = np.where(np.isnan(levels), drafted, levels).astype(int)
     work = work_of(columns, counts, phases, looked_up, size)
     return _LabelWork(work, table["episode"].to_numpy(), size)
+
+
+def levels_of(settings: Mapping[str, Any]) -> int:
+    """Return the levels of the trees that a setting drafts, for episodes from before rounds had levels. 0: chains."""
+    proposer = settings.get("proposer", {})
+    return int(proposer["depth"]) if proposer.get("shape") == "tree" else 0
 
 
 def _check(named: NamedProfile, label: str, work: _LabelWork) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import choice, number, setting
@@ -41,3 +43,17 @@ class TargetSettings:
             raise UsageError(f"{prefix}width={self.width} must be a multiple of 2 x {prefix}heads={self.heads}")
         if self.observation == "vision" and self.image_size % (8 * self.grid):
             raise UsageError(f"{prefix}image_size={self.image_size} must be a multiple of 8 x {prefix}grid={self.grid}")
+
+
+def prompt_tokens(target: Mapping[str, Any]) -> int | None:
+    """Return P, the number of prompt tokens of a compact or grown target. None for other families.
+
+    Args:
+        target: Content of its `target.json`.
+    """
+    own = target.get("settings", {})
+    if not {"grid", "instruction_tokens", "scene_tokens"} <= set(own):
+        return None
+    views = len(target["cameras"]) if own.get("observation") != "state" else 0
+    prompt: int = own["grid"] ** 2 * views + own["instruction_tokens"] + own["scene_tokens"] + 1
+    return own.get("grown", {}).get("prompt") or prompt
