@@ -1,5 +1,6 @@
 """LeRobot datasets of version 3 are read and trained on; what was made for other actions is refused."""
 
+import contextlib
 import io
 import json
 import resource
@@ -26,8 +27,9 @@ from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.openvla.config import Bounds, action_space
 from kerv_cli.worlds import instruction_of, specs
+from kerv_cli.worlds.demos import lerobot
 from kerv_cli.worlds.demos.dataset import DemoDataset
-from kerv_cli.worlds.demos.files import encode_png
+from kerv_cli.worlds.demos.files import encode_png, memory_limit
 from kerv_cli.worlds.demos.lerobot import DATA, VIDEO
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.settings import CameraSettings
@@ -210,7 +212,7 @@ def test_a_folders_name_may_begin_with_a_digit_and_no_dof_need_be_strict(results
     assert DemoDataset.open(tmp_path / "artifacts/demos/2024_lift").manifest.actions.strict == ()
 
 
-@pytest.fixture
+@contextlib.contextmanager
 def two_gigabytes():
     """The process may take 2 GB more than it has."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
@@ -226,24 +228,68 @@ def long_action(rows: pa.Table) -> pa.Table:
     return rows.slice(0, 1).set_column(rows.column_names.index("action"), "action", zeros)
 
 
-def repeated_picture(rows: pa.Table) -> pa.Table:
+def pictures(rows: pa.Table, count: int, picture: bytes) -> pa.Table:
+    """`count` rows with the same picture."""
+    cells = pa.array([{"bytes": picture, "path": None}] * count)
+    rows = pa.concat_tables([rows.slice(0, 1)] * count)
+    return rows.set_column(rows.column_names.index("observation.images.front"), "observation.images.front", cells)
+
+
+def huge_picture(rows: pa.Table) -> pa.Table:
     """Every picture is the same 64 megapixels, a file of some kilobytes."""
     buffer = io.BytesIO()
     Image.new("1", (8_000, 8_000)).save(buffer, "PNG")
-    pictures = pa.array([{"bytes": buffer.getvalue(), "path": None}] * len(rows))
-    return rows.set_column(rows.column_names.index("observation.images.front"), "observation.images.front", pictures)
+    return pictures(rows, len(rows), buffer.getvalue())
 
 
-@pytest.mark.usefixtures("two_gigabytes")
+def flat_pictures(rows: pa.Table) -> pa.Table:
+    """A gigabyte of pixels."""
+    return pictures(rows, 330, encode_png(np.zeros((1000, 1000, 3), np.uint8)))
+
+
+def long_cells(rows: pa.Table) -> pa.Table:
+    """300 MB of cells. Their column's name has dots."""
+    return pictures(rows, 60, encode_png(np.zeros((8, 8, 3), np.uint8)) + bytes(5_000_000))
+
+
+def noise_pictures(rows: pa.Table) -> pa.Table:
+    """180 MB of cells, and as many bytes in the new dataset."""
+    noise = np.random.default_rng(0).integers(0, 256, (1000, 1000, 3), np.uint8)
+    return pictures(rows, 60, encode_png(noise))
+
+
+def understated(data: Path) -> None:
+    """Let the footer say that the cells of `long_cells` take a kilobyte."""
+    group = pq.ParquetFile(data).metadata.row_group(0)
+    column = next(group.column(i) for i in range(group.num_columns) if group.column(i).path_in_schema.endswith("bytes"))
+    true, content = varint(column.total_uncompressed_size), data.read_bytes()
+    head, tail = content.rsplit(true, 1)
+    data.write_bytes(head + varint(1000, len(true)) + tail)
+    assert pq.ParquetFile(data).metadata.row_group(0).column(0).total_uncompressed_size < 5000
+
+
+def varint(value: int, length: int = 0) -> bytes:
+    """A number as Thrift's compact protocol writes it, padded to a length."""
+    value, parts = 2 * value, []
+    while value or len(parts) < max(1, length):
+        value, part = divmod(value, 128)
+        parts.append(part | 128)
+    return bytes([*parts[:-1], parts[-1] & 127])
+
+
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "damage", "said"),
     [
-        (None, ("info.json", "at most 65536 numbers")),
-        (long_action, ("copy", "at most 65536 are read")),
-        (repeated_picture, ("file-000.parquet", "MiB in memory")),
+        (None, None, ("info.json", "at most 65536 numbers")),
+        (long_action, None, ("file-000.parquet", "at most 65536 are read")),
+        (huge_picture, None, ("file-000.parquet", "MiB in memory")),
+        (flat_pictures, None, ("file-000.parquet", "at most 128 MiB")),
+        (long_cells, None, ("file-000.parquet", "more than 128 MiB")),
+        (long_cells, understated, ("file-000.parquet", "MiB")),
+        (noise_pictures, None, ("file-000.parquet", "more than 128 MiB")),
     ],
 )
-def test_a_small_file_cannot_choose_how_much_memory_is_taken(results, tmp_path, change, said):
+def test_a_small_file_cannot_choose_how_much_memory_is_taken(results, tmp_path, change, damage, said):
     source = edited(results, tmp_path)
     info = json.loads((source / "meta/info.json").read_text())
     if change is None:
@@ -257,11 +303,50 @@ def test_a_small_file_cannot_choose_how_much_memory_is_taken(results, tmp_path, 
         pq.write_table(rows, data, compression="zstd")
         first = pq.read_table(episodes / "file-000.parquet").slice(0, 1).to_pylist()[0]
         pq.write_table(pa.Table.from_pylist([{**first, "length": len(rows)}]), episodes / "file-000.parquet")
-        assert data.stat().st_size < 10_000_000
+        if damage:
+            damage(data)
+        assert data.stat().st_size < 25_000_000
     begun = time.monotonic()
-    refused = refusal("demos", "import", f"source={source}", "name=small", f"results={tmp_path}", code=1)
+    with two_gigabytes():
+        refused = refusal("demos", "import", f"source={source}", "name=small", f"results={tmp_path}", code=1)
     assert all(word in refused for word in said)
     assert time.monotonic() - begun < 10
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").is_file(), reason="needs Linux")
+def test_memory_is_limited_while_a_file_of_any_origin_is_read():
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    with pytest.raises(MemoryError), memory_limit(2**28):
+        np.ones(2**30, np.uint8)
+    assert resource.getrlimit(resource.RLIMIT_AS) == before
+
+
+def test_a_small_file_of_very_many_episodes_is_refused(results, tmp_path):
+    source = edited(results, tmp_path)
+    data, episodes = source / DATA.format(chunk_index=0, file_index=0), source / "meta/episodes/chunk-000"
+    rows = pq.read_table(data).slice(0, 1)
+    number = rows.column_names.index("episode_index")
+    rows = pa.concat_tables([rows] * 600).set_column(number, "episode_index", pa.array(np.arange(600)))
+    pq.write_table(rows, data)
+    first = pq.read_table(episodes / "file-000.parquet").slice(0, 1).to_pylist()[0]
+    every = [{**first, "episode_index": i, "length": 1} for i in range(600)]
+    pq.write_table(pa.Table.from_pylist(every), episodes / "file-000.parquet")
+    words = ["demos", "import", f"source={source}", f"results={tmp_path}"]
+    assert "file-000.parquet holds 600 episodes, at most 500" in refusal(*words, "name=many", code=1)
+    kerv(*words, "name=few", "episodes=3")
+
+
+def test_what_a_file_may_take_grows_with_it_and_its_episodes_may_be_in_any_order(results, tmp_path, monkeypatch):
+    monkeypatch.setattr(lerobot, "ALLOWED", 0)
+    source = edited(results, tmp_path)
+    data = source / DATA.format(chunk_index=0, file_index=0)
+    pq.write_table(pq.read_table(data).sort_by([("episode_index", "descending")]), data)
+    kerv("demos", "import", f"source={source}", "name=order", f"results={tmp_path}")
+    before, after = both(results)[0], DemoDataset.open(tmp_path / "artifacts/demos/order")
+    for index in range(4):
+        ours, theirs = before.load(index), after.load(index)
+        assert ours.steps == theirs.steps
+        assert {tuple(step) for step in ours.states} == {tuple(step) for step in theirs.states}
 
 
 def test_a_truncated_table_is_refused(results, tmp_path):

@@ -5,6 +5,7 @@ An episode file is a safetensors file with lossless PNG images (docs/formats.md)
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -17,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from PIL import Image
@@ -25,7 +25,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import regular, write_bytes
+from kerv_cli.base.files import atomic_path, regular
 
 FORMAT = "1"
 """Version of the episode files' format."""
@@ -86,7 +86,7 @@ def save_episode(path: Path, episode: DemoEpisode) -> None:
     """
     pictures = [encode_png(frame) for frame in episode.frames]
     tensors = {
-        "png": np.frombuffer(b"".join(pictures), dtype=np.uint8),
+        "png": np.zeros(0, np.uint8),  # the pictures follow, without a copy of all of them
         "png_offsets": np.cumsum([0, *map(len, pictures)], dtype=np.int64),
         **{name: getattr(episode, attribute) for attribute, name in _ARRAYS.items()},
     }
@@ -102,16 +102,24 @@ def save_episode(path: Path, episode: DemoEpisode) -> None:
         **({"frame_width": str(width)} if width != height else {}),
     }
     # Not safetensors' save_file: on a full disk it raises its own type of error.
-    write_bytes(path, _with_sorted_metadata(save(tensors, metadata=metadata)))
+    head = _with_pictures(save(tensors, metadata=metadata), sum(map(len, pictures)))
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.writelines([head, *pictures])
 
 
-def _with_sorted_metadata(data: bytes) -> bytes:
-    """Return the bytes of a safetensors file with the keys of its metadata sorted.
+def _with_pictures(data: bytes, size: int) -> bytes:
+    """Return the bytes of a safetensors file up to its last tensor, `png`. Sort the keys of its metadata.
 
     safetensors writes the keys in random order. Without sorting, two recordings of the same episode would have
-    different hashes.
+    different hashes. It writes tensors of bytes last.
+
+    Args:
+        data: The file with an empty `png`.
+        size: Number of bytes of `png`.
     """
     header, start = header_of(data)
+    begin = len(data) - start
+    header["png"] |= {"shape": [size], "data_offsets": [begin, begin + size]}
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)  # arrays start at a multiple of eight
@@ -231,6 +239,22 @@ class EncodedFrames:
             return np.array(image)[:, : self.width]  # a copy, because torch warns if memory is read-only
 
 
+@dataclass(frozen=True)
+class StreamedFrames:
+    """Images that are decoded one after the other, while their episode is saved. They can be read once.
+
+    Attributes:
+        shape: Shape of the decoded images, (n, height, width, 3).
+        images: Yields them, (height, width, 3) uint8.
+    """
+
+    shape: tuple[int, int, int, int]
+    images: Iterator[NDArray[np.uint8]]
+
+    def __iter__(self) -> Iterator[NDArray[np.uint8]]:
+        return self.images
+
+
 def header_of(data: bytes) -> tuple[dict[str, Any], int]:
     """Return the header of a safetensors file, and the position at which its arrays begin.
 
@@ -249,71 +273,92 @@ def encode_png(frame: NDArray[np.uint8]) -> bytes:
 
 
 MOST_EXPANDED = 2**30
-"""Largest size of a table, or of an episode's images, in memory, in bytes."""
+"""Largest size of a table in memory, in bytes."""
 _BATCH = 1024  # rows
+_BATCH_BYTES = 2**26  # of text and bytes that the file stores once
 _LEAST_ROW = 64  # bytes: a row counts as at least this large
 _WIDTHS = {"BOOLEAN": 1, "INT32": 4, "FLOAT": 4, "INT64": 8, "DOUBLE": 8, "INT96": 12}
 
 
-def foreign_table(
-    source: Path | bytes, where: tuple[str, Any] | None = None, columns: Sequence[str] = (), most: int = 0
-) -> pa.Table:
-    """Read a table from a Parquet file of any origin. It is read part by part, so that its size can be limited.
+@contextlib.contextmanager
+def memory_limit(size: int) -> Iterator[None]:
+    """Let this process take at most `size` bytes of memory inside the `with` block, beyond what it has.
+
+    A file of any origin may need more than it states. Outside Linux this does nothing.
+
+    Raises:
+        MemoryError: Inside the block, if more is needed.
+    """
+    status = Path("/proc/self/statm")
+    if not status.is_file():
+        yield
+        return
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    most = int(status.read_text().split()[0]) * resource.getpagesize() + size
+    resource.setrlimit(resource.RLIMIT_AS, (most if soft < 0 else min(most, soft), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def foreign_table(source: Path | bytes, columns: Sequence[str] = (), most: int = 0) -> pa.Table:
+    """Read a table from a Parquet file of any origin, see `foreign_batches`."""
+    batches = list(foreign_batches(source, columns, most))
+    return pa.Table.from_batches(batches[1:], batches[0].schema)
+
+
+def foreign_batches(source: Path | bytes, columns: Sequence[str] = (), most: int = 0) -> Iterator[pa.RecordBatch]:
+    """Yield the rows of a Parquet file of any origin, part by part, so that their size can be limited.
 
     Args:
         source: The file's path or its bytes.
-        where: (column, value). Read only the rows that have this value in this column. None: all rows.
         columns: Names of the columns to read. Names that the file lacks are ignored. Empty: all columns.
-        most: Largest size of the table in memory, in bytes. 0: MOST_EXPANDED.
+        most: Largest size of all rows in memory, in bytes. 0: MOST_EXPANDED.
+
+    Yields:
+        First a batch without rows, then the rows.
 
     Raises:
         OSError: The file is missing or is no Parquet file.
         ValueError: The file is damaged, or takes more than `most` bytes in memory.
     """
-    batches, total, most = [], 0, most or MOST_EXPANDED
+    total, most = 0, most or MOST_EXPANDED
     name = "a table" if isinstance(source, bytes) else str(source)
     too_large = ValueError(f"{name} expands to more than {most // 2**20} MiB in memory: split it")
     with pq.ParquetFile(io.BytesIO(source) if isinstance(source, bytes) else regular(source)) as file:
         chosen = [column for column in file.schema_arrow.names if not columns or column in columns]
-        groups = [n for n in range(file.num_row_groups) if not where or _may_hold(file.metadata.row_group(n), *where)]
-        sizes = [_expanded(file.metadata, n, chosen) for n in groups]
-        if max(sizes, default=0) > most:
+        fields = [file.schema_arrow.field(column) for column in chosen]
+        yield pa.RecordBatch.from_pylist([], pa.schema(fields, file.schema_arrow.metadata))
+        sizes = [_expanded(file.metadata, n, chosen) for n in range(file.num_row_groups)]
+        if max((size for size, _ in sizes), default=0) > most:
             raise too_large
         # a cell of text can repeat: it is at most as large as its row group in the file
-        rows = min(_BATCH, most // max(sizes, default=1))
+        rows = max(1, min(_BATCH, min(most, _BATCH_BYTES) // max((text for _, text in sizes), default=1)))
         # not pyarrow's dataset scanner, which would expand whole row groups before the total can be checked
-        for batch in file.iter_batches(rows, groups, chosen, use_threads=False):
-            batches.append(batch.filter(pc.equal(batch[where[0]], where[1])) if where else batch)
-            total += batches[-1].nbytes
+        for batch in file.iter_batches(rows, None, chosen, use_threads=False):
+            total += batch.nbytes
             if total > most:
                 raise too_large
-        fields = [file.schema_arrow.field(column) for column in chosen]
-        return pa.Table.from_batches(batches, pa.schema(fields, file.schema_arrow.metadata))
+            yield batch
 
 
-def _expanded(metadata: pq.FileMetaData, group: int, columns: Sequence[str]) -> int:
-    """Return how many bytes some columns of a row group take in memory at most, as far as the file states it.
+def _expanded(metadata: pq.FileMetaData, group: int, columns: Sequence[str]) -> tuple[int, int]:
+    """Return how many bytes some columns of a row group take in memory, as far as the file states it.
 
-    Text and bytes that repeat count once, unless they are in lists.
+    Returns:
+        size: All columns, at most. Text and bytes that repeat count once, unless they are in lists.
+        text: Text and bytes alone, each counted once. At least 1.
     """
     chunks, rows = metadata.row_group(group), metadata.row_group(group).num_rows
-    total = _LEAST_ROW * rows
+    total, text = _LEAST_ROW * rows, 1
     for number in range(chunks.num_columns):
         chunk = chunks.column(number)
-        if chunk.path_in_schema.partition(".")[0] in columns:
+        if f"{chunk.path_in_schema}.".startswith(tuple(f"{name}." for name in columns)):  # names may have dots
             listed = max(1, chunk.total_uncompressed_size if chunk.num_values > rows else 1)
-            width = _WIDTHS.get(chunk.physical_type, metadata.schema.column(number).length or listed)
-            total += max(chunk.total_uncompressed_size, chunk.num_values * width)
-    return total
-
-
-def _may_hold(group: pq.RowGroupMetaData, column: str, value: Any) -> bool:
-    """Return whether a row group (a part of a Parquet file) can contain `value` in `column`.
-
-    The answer comes from the smallest and largest value that the file states. Without them it is True.
-    """
-    for number in range(group.num_columns):
-        chunk = group.column(number)
-        if chunk.path_in_schema == column and chunk.statistics is not None and chunk.statistics.has_min_max:
-            return bool(chunk.statistics.min <= value <= chunk.statistics.max)
-    return True
+            fixed = _WIDTHS.get(chunk.physical_type, max(0, metadata.schema.column(number).length))
+            text += 0 if fixed else chunk.total_uncompressed_size
+            total += max(chunk.total_uncompressed_size, chunk.num_values * (fixed or listed))
+    return total, text

@@ -7,10 +7,12 @@ state.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import itertools
 import math
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +21,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
 from kerv_cli.base.files import read_mapping, regular, write_folder, write_json
@@ -35,7 +37,14 @@ from kerv_cli.worlds.demos.dataset import (
     episode_path,
     totals,
 )
-from kerv_cli.worlds.demos.files import MOST_EXPANDED, DemoEpisode, foreign_table, save_episode
+from kerv_cli.worlds.demos.files import (
+    DemoEpisode,
+    StreamedFrames,
+    foreign_batches,
+    foreign_table,
+    memory_limit,
+    save_episode,
+)
 from kerv_cli.worlds.settings import DemosImportSettings
 from kerv_cli.worlds.spec import EnvironmentSpec
 
@@ -54,6 +63,24 @@ MOST_NUMBERS = 65_536
 """Largest size of an action or a state: numbers per control step."""
 MOST_NAMED = 2**26
 """Largest size of a table of episodes or tasks in memory, in bytes."""
+MOST_EPISODES = 2**18
+"""Largest number of episodes of a dataset."""
+ALLOWED = 2**27
+"""Bytes in memory that the rows, pictures or video frames of any file may take, however small it is."""
+ROWS_RATIO, PICTURES_RATIO, VIDEO_RATIO = 8, 64, 512
+"""Bytes of rows, pictures and video frames in memory per byte of their file, if that is more than ALLOWED."""
+EPISODE_BYTES, FEW_EPISODES = 1024, 500
+"""Least size of an episode in its file, in bytes, and the number of episodes of which any file may hold."""
+_MOST_REWINDS = 10  # of a data file whose episodes are not in order
+_MEMORY = 3 * 2**29  # bytes, beyond what the process has
+_DAMAGE = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    SyntaxError,
+    Image.DecompressionBombError,
+)  # PIL raises SyntaxError
 _TEMPLATE = re.compile(r"([^{}]|\{video_key\}|\{(chunk|file)_index(:0?\d{1,2}d)?\}){1,1000}")
 
 OPENVLA = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
@@ -116,12 +143,14 @@ class Source:
         camera_file = [f"videos/{keys[camera]}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
         columns = ["episode_index", "length", "data/chunk_index", "data/file_index", *camera_file]
         paths = sorted(folder.glob("meta/episodes/[!.]*/[!.]*.parquet"))
-        tables = [_table(path, columns=columns, most=MOST_NAMED) for path in paths]
+        tables = [_table(path, columns, MOST_NAMED) for path in paths]
+        if sum(map(len, tables)) > MOST_EPISODES:
+            raise CheckpointError(f"{paths[0].parent} names more than {MOST_EPISODES} episodes: split the dataset")
         rows = sorted((row for table in tables for row in table.to_pylist()), key=lambda row: row["episode_index"])
         if not rows:
             raise CheckpointError(f"{folder / 'meta/episodes'} is missing or names no episode: copy the dataset again")
         columns = ["task_index", "task", "__index_level_0__"]
-        names = _table(folder / TASKS, columns=columns, most=MOST_NAMED).to_pylist()
+        names = _table(folder / TASKS, columns, MOST_NAMED).to_pylist()
         tasks = {int(row["task_index"]): str(row.get("task", row.get("__index_level_0__"))) for row in names}
         return cls(folder, info, rows, tasks, camera, keys[camera])
 
@@ -168,39 +197,126 @@ class Source:
         indices = {f"{x}_index": int(episode[f"{columns}/{x}_index"]) for x in ("chunk", "file")}
         return _below(self.folder, form.format(video_key=self.key, **indices))
 
-    def table(self, episode: Row) -> pa.Table:
-        """Return the rows of one episode, in order.
+    def data_path(self, episode: Row) -> Path:
+        """Return the path of the data file of an episode, see `path`."""
+        return self.path(episode, "data", self.info.get("data_path") or DATA)
 
-        Args:
-            episode: The episode's row in meta/episodes.
-
-        Raises:
-            CheckpointError: Rows are missing, or the file is damaged.
-        """
-        path = self.path(episode, "data", self.info.get("data_path") or DATA)
-        columns = ["episode_index", "task_index", *VECTORS, self.key]
-        table = _table(path, ("episode_index", int(episode["episode_index"])), columns)
-        if len(table) != int(episode["length"]):
-            raise CheckpointError(f"{path} has {len(table)} rows of episode {episode['episode_index']}, not its length")
-        return table
-
-    def frames(self, episode: Row, table: pa.Table) -> np.ndarray:
+    def frames(self, episode: Row, table: pa.Table, limits: Limits) -> StreamedFrames:
         """Return the images (T, height, width, 3) uint8 of one episode.
 
         Args:
             episode: The episode's row in meta/episodes.
-            table: The episode's rows, from `table`.
+            table: The episode's rows.
+            limits: What the files of the dataset may take.
 
         Raises:
-            CheckpointError: A file is missing or damaged, or the images take more than MOST_EXPANDED bytes in memory.
+            CheckpointError: A file is missing or damaged, or its images take too much memory.
         """
         if self.info["features"][self.key]["dtype"] == "image":
-            path = self.path(episode, "data", self.info.get("data_path") or DATA)
-            pictures = (_picture(cell.as_py(), self.folder) for cell in table[self.key])
-            return _decoded(pictures, len(table), path)
-        path = self.path(episode, f"videos/{self.key}", self.info.get("video_path") or VIDEO)
-        start, rate = float(episode[f"videos/{self.key}/from_timestamp"]), float(self.info["fps"])
-        return _decoded(_video_frames(path, start, rate, len(table)), len(table), path)
+            path, cells = self.data_path(episode), table[self.key]
+            with _picture(cells[0].as_py(), self.folder, path) as first:
+                size = first.size
+            images, ratio = _pictures(cells, self.folder, path, size), PICTURES_RATIO
+        else:
+            path = self.path(episode, f"videos/{self.key}", self.info.get("video_path") or VIDEO)
+            size, ratio = _video_size(path), VIDEO_RATIO
+            start, rate = float(episode[f"videos/{self.key}/from_timestamp"]), float(self.info["fps"])
+            images = _video_frames(path, start, rate, len(table), size)
+        shape = (len(table), size[1], size[0], 3)
+        limits.take(path, math.prod(shape), ratio, f"the {len(table)} images of an episode")
+        return StreamedFrames(shape, images)
+
+
+class Limits:
+    """Counts what the images of each file take in memory, and refuses a file that takes too much for its size."""
+
+    def __init__(self) -> None:
+        self.taken: dict[Path, int] = {}
+
+    def take(self, path: Path, size: int, ratio: int, what: str) -> None:
+        """Count `size` bytes of a file.
+
+        Args:
+            path: The file.
+            size: Number of bytes in memory.
+            ratio: How many bytes in memory are allowed per byte of the file.
+            what: What takes them, for the error message.
+
+        Raises:
+            CheckpointError: The file takes more than that, and more than ALLOWED.
+        """
+        self.taken[path] = self.taken.get(path, 0) + size
+        most = allowed(path, ratio)
+        if self.taken[path] > most:
+            raise CheckpointError(
+                f"{path}: {what} take {size // 2**20} MiB in memory, with the episodes before "
+                f"{self.taken[path] // 2**20}; at most {most // 2**20} MiB are read from a file of this size"
+            )
+
+
+def _batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
+    """Yield the rows of a data file with `foreign_batches`, and name the file in every error."""
+    with _reading(path):
+        yield from foreign_batches(path, columns, allowed(path, ROWS_RATIO))
+
+
+def allowed(path: Path, ratio: int) -> int:
+    """Return how many bytes the contents of a file may take in memory, at `ratio` bytes per byte of the file."""
+    return max(ALLOWED, ratio * path.stat().st_size)
+
+
+class DataFile:
+    """The rows of a data file. They are read once, from the beginning to the end.
+
+    Args:
+        path: The file.
+        columns: Names of the columns to read.
+    """
+
+    def __init__(self, path: Path, columns: Sequence[str]) -> None:
+        self.path, self.columns = path, columns
+        self._rewinds = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        self._batches = _batches(self.path, self.columns)
+        self._rest = next(self._batches)
+
+    def rows(self, episode: int, length: int) -> pa.Table:
+        """Return the rows of one episode, in order.
+
+        Args:
+            episode: Number of the episode.
+            length: Its number of rows.
+
+        Raises:
+            CheckpointError: Rows are missing, or the file is damaged.
+        """
+        found = self._next_rows(episode)
+        if not found:  # they may come before the rows of the episode that was read last
+            self._rewinds += 1
+            if self._rewinds <= _MOST_REWINDS:
+                self._begin()
+                found = self._next_rows(episode)
+        count = sum(map(len, found))
+        if not count or count != length:
+            raise CheckpointError(f"{self.path} has {count} rows of episode {episode} in order, not its length")
+        return pa.Table.from_batches(found)
+
+    def _next_rows(self, episode: int) -> list[pa.RecordBatch]:
+        """Return the next rows in a row that belong to an episode. Empty: none is left."""
+        found: list[pa.RecordBatch] = []
+        for batch in itertools.chain([self._rest], self._batches):
+            is_mine = batch["episode_index"].to_numpy(zero_copy_only=False) == episode
+            first = 0 if found else int(is_mine.argmax()) if is_mine.any() else len(batch)
+            others = np.flatnonzero(~is_mine[first:])
+            stop = first + int(others[0]) if len(others) else len(batch)
+            if stop > first:
+                found.append(batch.slice(first, stop - first))
+            self._rest = batch.slice(stop)
+            if found and stop < len(batch):
+                break
+        return found
 
 
 def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProgress) -> DemoDataset:
@@ -222,7 +338,9 @@ def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProg
     path = as_path(settings.source)
     try:
         source = Source.open(path, settings.camera)
-        write_folder(folder, lambda new: _import(source, settings, new, progress))
+        largest = max(file.stat().st_size for file in {source.data_path(row) for row in source.episodes})
+        with memory_limit(_MEMORY + 4 * largest):
+            write_folder(folder, lambda new: _import(source, settings, new, progress))
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         why = " ".join(f"{type(error).__name__} {error}".split())[:120]
         raise CheckpointError(f"{path} is no dataset as LeRobot writes them, or damaged: {why}") from error
@@ -239,9 +357,14 @@ def _import(source: Source, settings: DemosImportSettings, folder: Path, progres
         check_recorded(environment)
     entries: dict[str, list[EpisodeEntry]] = {}
     limits: list[np.ndarray] = []
-    state = 0
-    for done, row in enumerate(chosen):
-        episode = _episode(source, row, names, settings.tail)
+    state, taken = 0, Limits()
+    paths = [source.data_path(row) for row in chosen]
+    _check_episodes(paths)
+    file: DataFile | None = None
+    for done, (path, row) in enumerate(sorted(zip(paths, chosen, strict=True), key=lambda pair: pair[0])):
+        if file is None or file.path != path:
+            file = DataFile(path, ["episode_index", "task_index", *VECTORS, source.key])
+        episode = _episode(source, row, file, names, settings.tail, taken)
         limits.append(np.stack([episode.executed.min(0), episode.executed.max(0)]))
         state = episode.states.shape[1]
         path = episode_path(folder, episode.task, episode.seed)
@@ -324,31 +447,56 @@ def _observation(source: Source, state: int, world: EnvironmentSpec) -> Observat
     )
 
 
-def _episode(source: Source, row: Row, names: Mapping[int, str], tail: int) -> DemoEpisode:
+def _check_episodes(paths: Sequence[Path]) -> None:
+    """Refuse data files that hold more episodes than fit into them.
+
+    Args:
+        paths: Path of the data file of each episode.
+
+    Raises:
+        CheckpointError: A file holds more than FEW_EPISODES episodes, and they have less than EPISODE_BYTES each.
+    """
+    for path, count in Counter(paths).items():
+        with _reading(path):
+            most = max(FEW_EPISODES, path.stat().st_size // EPISODE_BYTES)
+        if count > most:
+            raise CheckpointError(
+                f"{path} holds {count} episodes, at most {most} are read from a file of this size: give episodes=N"
+            )
+
+
+def _episode(
+    source: Source, row: Row, file: DataFile, names: Mapping[int, str], tail: int, taken: Limits
+) -> DemoEpisode:
     """Convert one episode.
 
     Args:
         source: The LeRobot dataset.
         row: The episode's row in meta/episodes.
+        file: The data file of the episode.
         names: The names of the tasks by `task_index`.
         tail: Number of copies of the last action to append to the labels.
+        taken: What the images of the earlier episodes took.
 
     Raises:
-        CheckpointError: Rows are missing, a file is damaged, or a number is not finite.
+        CheckpointError: Rows are missing, a file is damaged or too large, or a number is not finite.
     """
-    table = source.table(row)
     number = int(row["episode_index"])
-    columns = {name: _vectors(table, name) for name in VECTORS if name in table.column_names}
+    with _reading(file.path):
+        table = file.rows(number, int(row["length"]))
+        columns = {name: _vectors(table, name) for name in VECTORS if name in table.column_names}
+        task = names[int(table["task_index"][0].as_py())]
     if not all(np.isfinite(values).all() for values in columns.values()):
-        raise CheckpointError(f"episode {number} of {source.folder} holds numbers that are not finite")
+        raise CheckpointError(f"{file.path}: episode {number} holds numbers that are not finite")
     labels = columns[ACTION]
     states = columns.get(ENVIRONMENT, columns.get(STATE, np.zeros((len(table), 0), np.float32)))
+    frames: Any = source.frames(row, table, taken)  # `save_episode` reads them once
     return DemoEpisode(
-        task=names[int(table["task_index"][0].as_py())],
+        task=task,
         seed=number,
         perturbed=False,
         steps=len(table),
-        frames=source.frames(row, table),
+        frames=frames,
         frame_steps=np.arange(len(table), dtype=np.int64),
         states=states,
         labels=np.concatenate([labels, np.repeat(labels[-1:], tail, 0)]),
@@ -434,17 +582,30 @@ def _below(folder: Path, name: str) -> Path:
     return folder / name
 
 
-def _table(path: Path, where: tuple[str, Any] | None = None, columns: Sequence[str] = (), most: int = 0) -> pa.Table:
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Turn an error inside the `with` block into a CheckpointError that names the file that is read."""
+    try:
+        yield
+    except MemoryError as error:
+        raise CheckpointError(
+            f"{path} is damaged: it takes more than the {(_MEMORY + 4 * path.stat().st_size) // 2**20} MiB of memory "
+            "that a file of this size may take"
+        ) from error
+    except (*_DAMAGE, pa.ArrowException) as error:
+        name = "" if isinstance(error, OSError | ValueError) else f"{type(error).__name__} "
+        why = " ".join(str(error).replace(str(path), "it").split())[:120]
+        raise CheckpointError(f"{path} is missing or damaged: {name}{why}") from error
+
+
+def _table(path: Path, columns: Sequence[str], most: int) -> pa.Table:
     """Read a Parquet file with `foreign_table`, which explains the arguments.
 
     Raises:
         CheckpointError: The file is missing or damaged.
     """
-    try:
-        return foreign_table(path, where, columns, most)
-    except (OSError, ValueError) as error:
-        why = str(error).replace(str(path), "it")[:120]
-        raise CheckpointError(f"{path} is missing or damaged: {why}") from error
+    with _reading(path):
+        return foreign_table(path, columns, most)
 
 
 def _vectors(table: pa.Table, name: str) -> np.ndarray:
@@ -467,35 +628,69 @@ def _vectors(table: pa.Table, name: str) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def _decoded(images: Iterator[np.ndarray], count: int, path: Path) -> np.ndarray:
-    """Return `count` images as one array (count, height, width, 3) uint8.
+def _picture(cell: Row, folder: Path, path: Path) -> Image.Image:
+    """Open an image in a cell of a table, which holds the image's bytes or its path below `folder`.
+
+    Args:
+        cell: The cell.
+        folder: Folder of the dataset.
+        path: File of the table.
 
     Raises:
-        CheckpointError: They take more than MOST_EXPANDED bytes in memory.
+        CheckpointError: The image is missing or damaged.
     """
-    first = next(images)
-    if count * first.nbytes > MOST_EXPANDED:
-        raise CheckpointError(
-            f"{path}: the {count} images of an episode take {count * first.nbytes // 2**20} MiB in memory, at most "
-            f"{MOST_EXPANDED // 2**20} are read: make them smaller"
-        )
-    frames = np.empty((count, *first.shape), np.uint8)
-    for number, image in enumerate(itertools.chain([first], images)):
-        frames[number] = image
-    return frames
-
-
-def _picture(cell: Row, folder: Path) -> np.ndarray:
-    """Decode an image from a cell of a table, which holds the image's bytes or its path below `folder`."""
     data = cell.get("bytes")
+    place = path if data else _below(folder, str(cell.get("path")))
+    with _reading(place):
+        return Image.open(io.BytesIO(data) if data else regular(place))
+
+
+def _pictures(cells: pa.ChunkedArray, folder: Path, path: Path, size: tuple[int, int]) -> Iterator[np.ndarray]:
+    """Yield the decoded images (height, width, 3) uint8 of the cells of a table, see `_picture`.
+
+    Raises:
+        CheckpointError: An image is missing or damaged, or its (width, height) is not `size`.
+    """
+    for cell in cells:
+        with _picture(cell.as_py(), folder, path) as image, _reading(path):
+            _check_size(image.size, size)
+            yield np.asarray(image.convert("RGB"))
+
+
+def _check_size(found: tuple[int, int], size: tuple[int, int]) -> None:
+    """Raise a ValueError if the (width, height) of an image is not that of the first image of its episode."""
+    if found != size:
+        raise ValueError(f"an image has {found[0]} x {found[1]} pixels, the first of its episode {size[0]} x {size[1]}")
+
+
+@contextlib.contextmanager
+def _opened_video(path: Path) -> Iterator[Any]:
+    """Open a video for reading, and name it in every error.
+
+    Raises:
+        KervError: The package av is not installed.
+        CheckpointError: The video is missing or damaged.
+    """
     try:
-        with Image.open(io.BytesIO(data) if data else regular(_below(folder, str(cell.get("path"))))) as image:
-            return np.asarray(image.convert("RGB"))
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise CheckpointError(f"an image in {folder} cannot be read: {str(error)[:120]}") from error
+        import av
+    except ImportError as error:
+        raise KervError("datasets with videos need the package av: pip install 'kerv[lerobot]'") from error
+    with _reading(path):
+        try:
+            with av.open(str(regular(path))) as container:
+                yield container
+        except av.error.FFmpegError as error:
+            raise ValueError(str(error)) from error
 
 
-def _video_frames(path: Path, start: float, rate: float, count: int) -> Iterator[np.ndarray]:
+def _video_size(path: Path) -> tuple[int, int]:
+    """Return width and height of the images of a video; raises as `_opened_video`."""
+    with _opened_video(path) as container:
+        codec = container.streams.video[0].codec_context
+        return codec.width, codec.height
+
+
+def _video_frames(path: Path, start: float, rate: float, count: int, size: tuple[int, int]) -> Iterator[np.ndarray]:
     """Yield the frames of a video that are nearest to the times start, start + 1 / rate, ….
 
     Args:
@@ -503,27 +698,22 @@ def _video_frames(path: Path, start: float, rate: float, count: int) -> Iterator
         start: First time, in seconds.
         rate: Frames per second.
         count: Number of frames.
+        size: Their (width, height).
 
     Raises:
         KervError: The package av is not installed.
-        CheckpointError: The video is missing, damaged or too short.
+        CheckpointError: The video is missing, damaged or too short, or has frames of another size.
     """
-    try:
-        import av
-    except ImportError as error:
-        raise KervError("datasets with videos need the package av: pip install 'kerv[lerobot]'") from error
-    try:
-        with av.open(str(regular(path))) as container:
-            stream = container.streams.video[0]
-            if start > 0:
-                container.seek(int(start / float(stream.time_base)), stream=stream)
-            done, half = 0, 0.5 / rate
-            for frame in container.decode(stream):
-                while done < count and float(frame.time) >= start + done / rate - half:
-                    yield frame.to_ndarray(format="rgb24")
-                    done += 1
-                if done == count:
-                    return
-    except (av.error.FFmpegError, OSError) as error:
-        raise CheckpointError(f"{path} is missing or damaged: {str(error)[:120]}") from error
+    with _opened_video(path) as container:
+        stream = container.streams.video[0]
+        if start > 0:
+            container.seek(int(start / float(stream.time_base)), stream=stream)
+        done, half = 0, 0.5 / rate
+        for frame in container.decode(stream):
+            _check_size((frame.width, frame.height), size)
+            while done < count and float(frame.time) >= start + done / rate - half:
+                yield frame.to_ndarray(format="rgb24")
+                done += 1
+            if done == count:
+                return
     raise CheckpointError(f"{path} ends {count - done} frames before its episode does")
