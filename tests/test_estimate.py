@@ -463,3 +463,32 @@ def test_the_example_on_the_page_is_a_trace(tmp_path):
     trace = tmp_path / "t.jsonl"
     trace.write_text(line, encoding="utf-8")
     assert priced_trace(trace, "model=openvla-7b")[0]["speed"] > 1
+
+
+# --- the page
+
+
+def test_the_page_of_ones_own_policy_is_short_and_shows_the_example_as_it_is():
+    page = (ROOT / "docs/your-policy.md").read_text(encoding="utf-8")
+    assert len(page.split()) <= 600
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert len(code.splitlines()) <= 30
+    assert code in dedent_class((ROOT / "tests/examples/own_policy.py").read_text(encoding="utf-8"))
+    first_screen = (ROOT / "README.md").read_text(encoding="utf-8").partition("\n## ")[0]
+    assert "docs/your-policy.md" in first_screen
+    assert "kerv estimate" in first_screen
+
+
+def dedent_class(text: str) -> str:
+    return re.sub("^    ", "", text, flags=re.MULTILINE)
+
+
+def test_the_range_on_the_page_is_that_of_the_tables():
+    page = (ROOT / "docs/measuring.md").read_text(encoding="utf-8")
+    for table in ("papers", "papers_libero"):
+        ratios, profile = [], measured_profile(table)
+        for one in recorded(table):
+            decodes = Decodes(profile, one.tokens, one.drafts)
+            ratios.append(decodes.speed([decodes.acceptance_for(one.forwards)]) / one.speed)
+        (row,) = [line for line in page.splitlines() if line.startswith(f"| `{table}`, {len(ratios)} settings")]
+        assert f"{min(ratios):.2f} to {max(ratios):.2f}" in row

@@ -126,7 +126,9 @@ def test_everything_trains_on_recorded_observations_of_an_openvla(results):
 def test_a_recording_cannot_be_rolled_out(results):
     both(results)
     words = ["rollout", "task=BACK", "policy.target=rec", "method=ar", "episodes=1", "world.camera.size=56"]
-    assert "back is a recording: no episode can run in it" in refusal(*words, f"results={results}", code=2)
+    refused = refusal(*words, f"results={results}", code=2)
+    assert "back is a recording: no episode can run in it" in refused
+    assert "kerv serve policy.target=" in refused, "what can be done with it"
 
 
 def without_positions(results: Path, tmp_path: Path) -> Path:

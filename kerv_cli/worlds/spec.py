@@ -223,7 +223,10 @@ class EnvironmentSpec:
             UsageError: A package is missing or has a wrong version, or the environment is a recorded dataset.
         """
         if not self.world_class:
-            raise UsageError(f"{self.name} is a recording: no episode can run in it")
+            raise UsageError(
+                f"{self.name} is a recording: no episode can run in it. Serve a policy of its tasks with 'kerv serve "
+                "policy.target=NAME', or import it again with environment=NAME, the simulator that recorded it"
+            )
         if not self.installed:
             raise UsageError(f"{self.name} needs more packages: pip install 'kerv[{self.extra}]'")
         load(self.world_class).check_installed()
