@@ -91,6 +91,17 @@ def test_a_study_stays_in_the_database_that_was_named(tmp_path, monkeypatch):
     assert not list(results.glob("*.db"))
 
 
+def test_a_sweep_reports_from_the_database_that_was_named(mine, tmp_path):
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    path, results = mine["results"].parent / "both.yaml", tmp_path / "results"
+    path.write_text("settings: {ar: method=ar, hold: method=spec_vla proposer=hold}\n", encoding="utf-8")
+    made = kerv.sweep(path, **{**mine, "results": results, "store": f"sqlite:///{elsewhere}/other.db"})
+    assert "report.html" in {file.name for file in made.report()}
+    assert made.to_pandas()["episodes"].tolist() == [1, 1]
+    assert not list(results.glob("*.db"))
+
+
 def test_runs_are_listed_and_narrowed(run, study, mine):
     there = kerv.runs(mine["results"])
     assert {run.name, study.name} <= set(there["id"])

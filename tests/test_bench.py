@@ -3,8 +3,11 @@
 import dataclasses
 import importlib
 import json
+import re
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from command import kerv, refusal
@@ -232,6 +235,29 @@ def test_the_command_ends_with_one_document(tmp_path):
     (single,) = [p["seconds"] for p in document["phases"] if p["name"] == "one token"]
     assert read_profile(path).seconds("verify", 1) == single
     assert read_profile(path).tokens == 8
+
+
+@pytest.mark.usefixtures("quick")
+def test_the_commands_for_a_new_gpu_run_to_their_end(policies, tmp_path):
+    """They run as docs/measuring.md writes them, but for the device, the shapes and the study's settings."""
+    page = (Path(__file__).parents[1] / "docs/measuring.md").read_text(encoding="utf-8")
+    (block,) = [block for block in re.findall(r"```sh\n(.*?)```", page, re.DOTALL) if "runtime.device=cuda" in block]
+    study = tmp_path / "main.yaml"
+    study.write_text("settings: {ar: method=ar, hold: method=spec_vla proposer=hold}\n", encoding="utf-8")
+    own = {
+        "bench": ["repeats=3"],
+        "sweep": [f"policy.target={policies}/artifacts/target/nano-state", "record=0", "world.horizon=6"],
+        "report": [],
+    }
+    for line in block.splitlines():
+        small = line.split("#")[0].replace("openvla-7b", "nano").replace("bfloat16", "float32").replace("cuda", "cpu")
+        _, name, *words = small.replace("sweep study=main", f"sweep study={study}").split()
+        kerv(name, *words, *own.pop(name), f"results={tmp_path}")
+    assert not own
+    priced = pd.read_csv(tmp_path / "report/tables/main_on.csv")
+    assert set(priced["label"]) == {"ar", "hold"}
+    assert set(priced["on"]) == {"nano-float32"}
+    assert list(priced["episodes"]) == [4, 4]
 
 
 def test_a_model_that_does_not_fit_is_refused(tmp_path, monkeypatch):

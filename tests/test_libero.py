@@ -24,13 +24,16 @@ FIRST = SPEC.seeds.evaluation.start
 
 
 @pytest.mark.parametrize("plan", ["", "--plan"])
-@pytest.mark.parametrize("command", ["rollout policy=expert episodes=1", "demos episodes=1"])
+@pytest.mark.parametrize(
+    "command", ["rollout policy=expert episodes=1", "demos episodes=1", "sweep study={}/one.yaml policy=libero"]
+)
 def test_without_the_extra_a_command_says_what_to_install(command, plan, tmp_path, monkeypatch):
     def absent(name):
         raise PackageNotFoundError(name)
 
     monkeypatch.setattr(spec_module, "version", absent)
-    run = kerv(*command.split(), *plan.split(), "task=bowl-on-stove", f"results={tmp_path}", code=2)
+    (tmp_path / "one.yaml").write_text("settings: {ar: method=ar}\n")
+    run = kerv(*command.format(tmp_path).split(), *plan.split(), "task=bowl-on-stove", f"results={tmp_path}", code=2)
     assert "pip install 'kerv[libero]'" in run.output
 
 

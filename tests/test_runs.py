@@ -3,6 +3,7 @@ policy in this process, recordings left out."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import shutil
@@ -19,7 +20,7 @@ from studies_synthetic import swept, threshold_study
 
 from kerv_cli.catalogue.entries import find_runs, matching
 from kerv_cli.lab.database import EPISODES, RUNS, WANTED, Database
-from kerv_cli.lab.runs import INTERRUPTED
+from kerv_cli.lab.runs import INTERRUPTED, Run
 from kerv_cli.lab.study import EpisodeRunner
 
 FAST = ["policy=state", "policy.target=nano-state", "task=reach-v3", "world.horizon=8", "record=0"]
@@ -70,6 +71,26 @@ def test_runs_are_viewed_by_their_ids_and_last_is_the_newest_with_recordings(pol
     assert "no recordings in" in kerv("view", "target/nano-state", results, code=2).stderr
     assert "unknown run 'nobodys'" in kerv("view", "nobodys", results, code=2).stderr
     assert "nobodys/either does not exist" in kerv("view", "nobodys/either", results, code=2).stderr
+
+
+def test_a_finished_training_stays_finished_while_it_is_repeated_and_after_that_was_interrupted(copy):
+    def training() -> dict[str, Any]:
+        (run,) = [run for run in listed(copy) if run["id"] == "target/nano-state"]
+        return run
+
+    database, words = Database(copy), ("target", "nano-state", ["train", "target", "name=nano-state"])
+    before = training()
+    with Run(database, *words, total=20):
+        pass
+    with contextlib.suppress(KeyboardInterrupt), Run(database, *words, total=20):
+        during = training()
+        raise KeyboardInterrupt
+    after = training()
+    assert (during["started"], during["state"]) == (before["started"], "running, 0 of 20")
+    assert (after["started"], after["state"]) == (before["started"], "complete")
+    with contextlib.suppress(KeyboardInterrupt), Run(database, "target", "nano-state", ["train", "target", "train.steps=40"]):
+        raise KeyboardInterrupt
+    assert training()["state"] == "interrupted"
 
 
 def test_runs_are_listed_and_filtered(results):
