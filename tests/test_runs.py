@@ -88,7 +88,8 @@ def test_a_finished_training_stays_finished_while_it_is_repeated_and_after_that_
     after = training()
     assert (during["started"], during["state"]) == (before["started"], "running, 0 of 20")
     assert (after["started"], after["state"]) == (before["started"], "complete")
-    with contextlib.suppress(KeyboardInterrupt), Run(database, "target", "nano-state", ["train", "target", "train.steps=40"]):
+    longer = ("target", "nano-state", ["train", "target", "name=nano-state", "train.steps=40"])
+    with contextlib.suppress(KeyboardInterrupt), Run(database, *longer):
         raise KeyboardInterrupt
     assert training()["state"] == "interrupted"
 

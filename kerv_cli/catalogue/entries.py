@@ -113,8 +113,11 @@ class RunEntry:
 def find_runs(database: Database) -> list[RunEntry]:
     """Return all entries of a database and its results folder, newest first."""
     rows: dict[tuple[str, str], RunRow] = {}
+    finished = set()
     for row in run_rows(database):
         rows.setdefault((row.kind, row.name), row)
+        if row.status == COMPLETE:
+            finished.add((row.kind, row.name, row.command))
     runs = _studies(database, rows)
     folder, kinds = database.results / "artifacts", artifact_kinds()
     for place in (database.results / "studies", database.results / "rollouts", *(folder / kind for kind in kinds)):
@@ -125,10 +128,12 @@ def find_runs(database: Database) -> list[RunEntry]:
         if kind in _STUDIES:
             continue
         entry = made.get(f"{kind}/{name}")
-        if row.status != COMPLETE:
+        is_repeat = entry is not None and entry.state == COMPLETE and (kind, name, row.command) in finished
+        if row.status == RUNNING or (row.status != COMPLETE and not is_repeat):
             entry = entry or RunEntry(f"{kind}/{name}", kind, folder / kind / name, "", "", (kind,))
             state = f"{row.status}, {row.done} of {row.total}" if row.total else row.status
-            entry = replace(entry, started=row.started[:23], state=state, done=row.done, total=row.total)
+            started = entry.started if is_repeat else row.started[:23]
+            entry = replace(entry, started=started, state=state, done=row.done, total=row.total)
             entry = replace(entry, left=time_left(row), message=row.message)
         if entry is not None:
             made[entry.id] = replace(entry, command=row.command)
