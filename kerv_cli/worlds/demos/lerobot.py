@@ -67,7 +67,7 @@ MOST_EPISODES = 2**18
 """Largest number of episodes of a dataset."""
 ALLOWED = 2**27
 """Bytes in memory that the rows, pictures or video frames of any file may take, however small it is."""
-ROWS_RATIO, PICTURES_RATIO, VIDEO_RATIO = 8, 64, 512
+ROWS_RATIO, PICTURES_RATIO, VIDEO_RATIO = 8, 64, 2048
 """Bytes of rows, pictures and video frames in memory per byte of their file, if that is more than ALLOWED."""
 EPISODE_BYTES, FEW_EPISODES = 1024, 500
 """Least size of an episode in its file, in bytes, and the number of episodes of which any file may hold."""
