@@ -11,11 +11,12 @@ import pyarrow as pa
 import pytest
 from command import refusal, told
 from studies_synthetic import episode, still_episode, swept, threshold_study
+from test_board import client_of
 
 from kerv_cli.engine.cost import Profile, prices, work_of_record
 from kerv_cli.episodes.rows import decode_records
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.reprice import NamedProfile, open_profiles, repriced_summary, repriced_table
+from kerv_cli.report.reprice import NamedProfile, open_profiles, own_prices, repriced_summary, repriced_table
 from kerv_cli.report.tables import load_study
 
 PROFILE = Profile(
@@ -139,6 +140,28 @@ def test_a_report_prices_the_study_on_the_machines_that_the_study_names(tmp_path
     profile_file(tmp_path)
     assert "vla-150m, GPU: per episode" in report(tmp_path)
     assert set(pd.read_csv(tmp_path / "report/tables/threshold_on.csv")["on"]) == {"there"}
+
+
+def test_a_study_is_also_priced_by_the_profile_of_its_own_machine(tmp_path):
+    """The report, and the board's page of the study, show the estimate beside the measurement."""
+    study = dataclasses.replace(threshold_study(["reach-v3"], radii=(9,)), machines=("there", "nowhere"))
+    store, _ = swept(tmp_path, study)
+    data = load_study(store)
+    device = data.episodes["device_name"].iloc[0]
+    assert own_prices(data, store) is None
+    profile_file(tmp_path)
+    own = tmp_path / "bench/mt10-vision-float32.json"
+    for name, machines in (("another one", {"there"}), (device, {"there", "mt10-vision-float32"})):
+        profile_file(tmp_path, own.stem)
+        own.write_text(json.dumps({**json.loads(own.read_text()), "device_name": name}))
+        assert set(own_prices(data, store)["on"]) == machines
+    with client_of(tmp_path) as client:
+        page = client.get("/studies/threshold/tables").text
+    assert f"vla-150m, {device}: per episode" in page
+    assert f"measured, {device}: per episode" in page
+    assert "GPU: per episode" not in page, "the board prices no other machine, which would take time"
+    profile_file(tmp_path, own.stem, without="feed")
+    assert set(own_prices(data, store)["on"]) == {"there"}, "a profile that lacks a cost is left out"
 
 
 def test_a_report_compares_with_another_baseline(results):

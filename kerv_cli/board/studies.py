@@ -27,18 +27,23 @@ _SECONDS = 5.0
 
 
 @functools.lru_cache(maxsize=16)
-def _parts(database: Database, name: str, version: str) -> tuple[dict[str, Any], float]:
+def _parts(database: Database, name: str, version: str, is_running: bool) -> tuple[dict[str, Any], float]:
     """Return the values of a study's report, and the seconds to wait before the next refresh.
 
     Args:
         database: The database.
         name: Name of the study.
         version: `StudyStore.version` of the study. A study is read again only if its version has changed.
+        is_running: Whether it runs. If so, no cost model estimates its speeds, which would take time from it.
     """
     from kerv_cli.report.page import study_parts  # imports Altair, which takes a second
+    from kerv_cli.report.reprice import own_profiles, prices_on
+    from kerv_cli.report.tables import load_study
 
-    clock = time.thread_time()
-    parts = study_parts(StudyStore(database, name))
+    clock, store = time.thread_time(), StudyStore(database, name)
+    data = load_study(store)
+    priced = None if is_running else prices_on(data, store, own_profiles(data, store))
+    parts = study_parts(store, data, priced=priced)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return parts, max(_SECONDS, (time.thread_time() - clock) / (_SHARE * cores))
 
@@ -77,7 +82,7 @@ def show_tables(request: Request) -> Response:
     if request.query_params.get("known") == version:
         return Response(status_code=204)
     has_episodes = store.counts()[0] > 0
-    parts, seconds = _parts(database, name, version) if has_episodes else ({}, _SECONDS)
+    parts, seconds = _parts(database, name, version, is_running) if has_episodes else ({}, _SECONDS)
     hidden: dict[str, Any] = {"recordings": [], "files": []} | ({"missing": 0} if is_running else {})
     if len(parts.get("settings", ())) == 1:
         hidden["charts"] = []  # nothing to compare

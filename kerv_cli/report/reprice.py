@@ -7,6 +7,7 @@ from a profile: a file of `kerv bench` with the seconds that each operation of a
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -155,16 +156,33 @@ def _estimated(data: StudyData, works: Mapping[str, _LabelWork], profile: Profil
 
 
 def own_prices(data: StudyData, store: StudyStore) -> pd.DataFrame | None:
-    """Return `repriced_table` for the profiles that the study's file names (`machines`).
+    """Return `prices_on` the machines that the study's file names and, if it was benchmarked, on its own."""
+    return prices_on(data, store, dict.fromkeys((*data.study.machines, *own_profiles(data, store))))
 
-    None if it names none, or if the estimate fails, for example because a profile lacks a cost.
+
+def prices_on(data: StudyData, store: StudyStore, names: Iterable[str]) -> pd.DataFrame | None:
+    """Return `repriced_table` for profiles, as far as they are there and have all costs. None if none is left."""
+    tables = []
+    for name in names:
+        with suppress(UsageError):
+            tables.append(repriced_table(data, store, open_profiles(store.database.results, [name])))
+    return pd.concat(tables, ignore_index=True) if tables else None
+
+
+def own_profiles(data: StudyData, store: StudyStore) -> list[str]:
+    """Return the names of the profiles that `kerv bench` measured of the study's targets on the study's machines.
+
+    Their estimates, beside what was measured, show how far the cost model is from the truth.
     """
-    if not data.study.machines:
-        return None
-    try:
-        return repriced_table(data, store, open_profiles(store.database.results, data.study.machines))
-    except UsageError:
-        return None
+    devices, names = set(data.episodes["device_name"]), []
+    for one in data.settings.values():
+        policy, runtime = one.settings.get("policy", {}), one.settings.get("runtime", {})
+        target = str(policy.get("target")).rstrip("/").rsplit("/", 1)[-1]
+        name = f"{target}-{runtime.get('dtype')}"
+        with suppress(CheckpointError):
+            if read_profile(store.database.results / "bench" / f"{name}.json").about.get("device_name") in devices:
+                names.append(name)
+    return names
 
 
 def _speeds(values: Row, prefix: str) -> dict[str, float]:
