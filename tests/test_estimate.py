@@ -16,6 +16,7 @@ from kerv_cli.bench.described import described, language_of
 from kerv_cli.bench.estimate import FAMILIES, Estimate, closest, computed
 from kerv_cli.bench.expected import Decodes, Drafts
 from kerv_cli.bench.physics import DEVICES, ENGINES, SHAPES, Sizes, priced
+from kerv_cli.bench.projection import ANCHORS
 from kerv_cli.bench.recorded import TABLES, recorded
 from kerv_cli.bench.settings import EstimateSettings
 from kerv_cli.engine.cost import Profile, prices, read_profile, work_of_record
@@ -214,6 +215,9 @@ def test_what_is_said_of_a_policy_counts():
     assert slow["engines"][0]["parts"][0]["ms"] == 150
     assert family(slow, "one_pass")["ceiling"] < family(known, "one_pass")["ceiling"]
     assert "a faster vision encoder" in slow["sentence"]
+    int4 = answer("model=openvla-7b", "device=orin", "bits=4")
+    published = next(one for one in ANCHORS if one.device == "orin")
+    assert int4["engines"][0]["ms"] == pytest.approx(published.ours)
     blind = answer("model=openvla-7b", "vision=0")
     assert blind["engines"][0]["encoder_share"] == 0
     assert answer("model=openvla-7b", "prompt=500")["engines"][0]["parts"][1]["part"] == "prefill, 500 tokens"
@@ -408,6 +412,14 @@ def test_a_tree_is_known_by_its_parents(tmp_path):
         line = {"episode": "0", "tokens": 7, "rounds": [{}, draft, {"start": 4}, {"start": 5}, {"start": 6}]}
         prices.append(priced_trace(write_trace(tmp_path / "t.jsonl", line), "model=openvla-7b")[0]["ms_per_decode"])
     assert prices[0] == prices[1] != prices[2]
+
+
+def test_an_unverified_chunk_costs_its_encoder_and_its_draft(tmp_path):
+    skipped = {"mode": "skip", "proposer": "early", "accepted": 7, "committed": 7}
+    line = {"episode": "0", "tokens": 7, "rounds": [skipped]}
+    row = priced_trace(write_trace(tmp_path / "t.jsonl", line), "on=a100-openvla-7b-eager")[0]
+    shipped = read_profile(ROOT / "results/bench/a100-openvla-7b-eager-profile.json")
+    assert row["ms_per_decode"] == pytest.approx(1e3 * (shipped.seconds("encode", 1) + shipped.seconds("early", 1)))
 
 
 def test_the_log_of_another_engine_becomes_a_trace(tmp_path):

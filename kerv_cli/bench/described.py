@@ -72,7 +72,8 @@ def described(settings: EstimateSettings) -> Described:
     policy = _of_weights(settings) if settings.weights else _of_model(settings)
     if policy.shape is None:
         return policy
-    shape, encoder = policy.shape, None
+    sizes = replace(policy.shape.sizes, weight=settings.bits / 8)
+    shape, encoder = replace(policy.shape, sizes=sizes), None
     if settings.prompt is not None:
         shape = replace(shape, prompt=settings.prompt)
     if settings.vision.endswith("ms"):

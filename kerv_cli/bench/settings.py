@@ -55,6 +55,7 @@ class EstimateSettings(CommandSettings):
     hz: float | None = number(None, above=0, help="control steps per second that the robot asks for")
     prompt: int | None = number(None, 1, 100_000, help="prompt tokens, the image's included")
     vision: str = setting("", "vision encoder: its weights (400M), or its time (8ms)")
+    bits: int = number(16, 1, 32, help="bits of a weight of the language model; arithmetic stays in bfloat16")
     device: list[str] = setting(["h100"], f"GPUs: {', '.join(DEVICES)}")
     on: list[str] = setting([], "instead: profiles of 'kerv bench', as in 'kerv report on='")
     trace: str = setting("", "price the decodes of this file, see docs/trace.md")

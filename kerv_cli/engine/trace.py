@@ -55,7 +55,7 @@ class TracedRound:
                 raise CheckpointError(f"{name}={getattr(self, name)}: from 0 to {MOST}")
         if any(not -1 <= parent < node for node, parent in enumerate(self.parents)):
             raise CheckpointError(f"parents={self.parents}: each is the index of an earlier node, or -1")
-        if self.accepted > self.drafted:
+        if self.accepted > self.drafted and self.mode == MODES[0]:
             raise CheckpointError(f"accepted={self.accepted} of {self.drafted} draft tokens")
         if self.mode not in MODES:
             raise CheckpointError(f"mode={self.mode}: one of {', '.join(MODES)}")
