@@ -115,11 +115,14 @@ def test_the_command_ends_quietly_and_at_once(tmp_path, number):
         assert address.startswith(f"{HERE}:")
         with urllib.request.urlopen(address) as page:
             assert b"Runs" in page.read()
-        with unfinished(address) as waiting, unfinished(address):
-            waiting.sendall(b"/slow HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
-            assert process.stdout.readline() == "asked\n"
-            process.send_signal(number)
-            assert (process.wait(3), process.stderr.read()) == (0, "")
+        try:
+            with unfinished(address) as waiting, unfinished(address):
+                waiting.sendall(b"/slow HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+                assert process.stdout.readline() == "asked\n"
+                process.send_signal(number)
+                assert (process.wait(3), process.stderr.read()) == (0, "")
+        finally:
+            process.kill()
 
 
 def unfinished(address):

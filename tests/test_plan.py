@@ -261,8 +261,8 @@ def test_an_interrupted_rerun_goes_on(database):
     study = threshold_study(["reach-v3"])
     swept(database.results, study)
     with database.writing() as connection:  # not in the second in which the next one begins
-        connection.exec_driver_sql("UPDATE runs SET started = '2020'")
-        connection.exec_driver_sql("UPDATE blocks SET started = '2020'")
+        connection.exec_driver_sql("UPDATE runs SET started = '2020-01-01T00:00:00.000+00:00'")
+        connection.exec_driver_sql("UPDATE blocks SET started = '2020-01-01T00:00:00.000+00:00'")
     words = ["sweep", f"study={study.name}"]
     assert interrupted_since(database, "sweep", study.name, words) == ""
     with pytest.raises(KeyboardInterrupt):
