@@ -6,6 +6,7 @@ import json
 import math
 import re
 import shutil
+import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -34,6 +35,7 @@ from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.openvla.config import TOWERS, Bounds, Language, Shape, action_space, read_shape
 from kerv_cli.targets.openvla.inputs import as_in_libero, cropped, pixels_of
 from kerv_cli.targets.openvla.loading import is_unread, layout
+from kerv_cli.targets.openvla.reference import SAMPLES, Reference, parity
 from kerv_cli.targets.openvla.target import OpenVLATarget, import_checkpoint
 from kerv_cli.targets.settings import BuildTargetSettings
 
@@ -103,120 +105,13 @@ def test_the_layout_and_the_shape_are_those_of_the_published_checkpoint(tmp_path
 # --- equal to transformers' own models, composed as OpenVLA composes them
 
 
-def block_weights(state: dict[str, torch.Tensor], block: str, names: dict[str, str]) -> dict[str, torch.Tensor]:
-    """A vision block's weights under transformers' names. names: ours -> theirs; `qkv` is split."""
-    found = {}
-    for kind in ("weight", "bias"):
-        found |= {
-            f"{theirs}.{kind}": state[f"{block}.{ours}.{kind}"] for ours, theirs in names.items() if ours != "qkv"
-        }
-        split = zip("qkv", state[f"{block}.attn.qkv.{kind}"].chunk(3), strict=True)
-        found |= {f"{names['qkv']}.{part}_proj.{kind}": chunk for part, chunk in split}
-    return found
-
-
-class Composed:
-    """OpenVLA put together from transformers' Llama, Dinov2WithRegisters and Siglip."""
-
-    def __init__(self, folder: Path) -> None:
-        self.shape = read_shape(folder)
-        self.state = {k: v for path in sorted(folder.glob("*.safetensors")) for k, v in load_file(path).items()}
-        self.dino, self.siglip, self.llama = self._dino(), self._siglip(), self._llama()
-
-    def _part(self, prefix: str) -> dict[str, torch.Tensor]:
-        return {k.removeprefix(prefix): v for k, v in self.state.items() if k.startswith(prefix)}
-
-    def _vision(self, model: Any, weights: dict[str, torch.Tensor]) -> Any:
-        assert not model.load_state_dict(weights, strict=False).unexpected_keys
-        return model.eval()
-
-    def _dino(self) -> Any:
-        from transformers import Dinov2WithRegistersConfig, Dinov2WithRegistersModel
-
-        tower = self.shape.towers[0]
-        config = Dinov2WithRegistersConfig(
-            hidden_size=tower.width,
-            num_hidden_layers=tower.depth - 1,  # OpenVLA takes the last but one
-            num_attention_heads=tower.heads,
-            mlp_ratio=tower.feed_forward // tower.width,
-            num_register_tokens=tower.registers,
-            image_size=tower.image,
-            patch_size=tower.patch,
-        )
-        own = self._part("vision_backbone.featurizer.")
-        weights = {
-            "embeddings.cls_token": own["cls_token"],
-            "embeddings.mask_token": torch.zeros(1, tower.width),
-            "embeddings.register_tokens": own["reg_token"],
-            # timm adds positions to the patches alone: transformers' class token gets a position of zero
-            "embeddings.position_embeddings": torch.cat([torch.zeros(1, 1, tower.width), own["pos_embed"]], 1),
-            "embeddings.patch_embeddings.projection.weight": own["patch_embed.proj.weight"],
-            "embeddings.patch_embeddings.projection.bias": own["patch_embed.proj.bias"],
-        }
-        names = {name: name for name in ("norm1", "norm2", "mlp.fc1", "mlp.fc2")}
-        names |= {"attn.proj": "attention.o_proj", "qkv": "attention"}
-        for i in range(tower.depth - 1):
-            layer = block_weights(own, f"blocks.{i}", names)
-            layer |= {f"layer_scale{n}.lambda1": own[f"blocks.{i}.ls{n}.scale_factor"] for n in (1, 2)}
-            weights |= {f"encoder.layer.{i}.{k}": v for k, v in layer.items()}
-        return self._vision(Dinov2WithRegistersModel(config), weights)
-
-    def _siglip(self) -> Any:
-        from transformers import SiglipVisionConfig, SiglipVisionModel
-
-        tower = self.shape.towers[1]
-        config = SiglipVisionConfig(
-            hidden_size=tower.width,
-            intermediate_size=tower.feed_forward,
-            num_hidden_layers=tower.depth - 1,
-            num_attention_heads=tower.heads,
-            image_size=tower.image,
-            patch_size=tower.patch,
-            hidden_act="gelu",  # timm's; transformers' own default is its tanh approximation
-        )
-        own = self._part("vision_backbone.fused_featurizer.")
-        weights = {
-            "embeddings.patch_embedding.weight": own["patch_embed.proj.weight"],
-            "embeddings.patch_embedding.bias": own["patch_embed.proj.bias"],
-            "embeddings.position_embedding.weight": own["pos_embed"][0],
-        }
-        names = {"norm1": "layer_norm1", "norm2": "layer_norm2", "mlp.fc1": "mlp.fc1", "mlp.fc2": "mlp.fc2"}
-        names |= {"attn.proj": "self_attn.out_proj", "qkv": "self_attn"}
-        for i in range(tower.depth - 1):
-            layer = block_weights(own, f"blocks.{i}", names)
-            weights |= {f"encoder.layers.{i}.{k}": v for k, v in layer.items()}
-        return self._vision(SiglipVisionModel(config), weights)
-
-    def _llama(self) -> Any:
-        from transformers import LlamaConfig, LlamaForCausalLM
-
-        numbers = asdict(self.shape.language)
-        rope = {"rope_type": "default", "rope_theta": numbers.pop("rope_theta")}
-        model = LlamaForCausalLM(LlamaConfig(**numbers, rope_parameters=rope))
-        model.load_state_dict(self._part("language_model."))
-        return model.eval()
-
-    def patches(self, pixels: torch.Tensor) -> torch.Tensor:
-        """Patches of each tower before its final norm, through the projector."""
-        first = self.dino(pixels[:, :3], output_hidden_states=True).hidden_states[-1]
-        second = self.siglip(pixels[:, 3:], output_hidden_states=True).hidden_states[-1]
-        x = torch.cat([first[:, 1 + self.shape.towers[0].registers :], second], -1)
-        for number in (1, 2, 3):
-            layer = self._part(f"projector.fc{number}.")
-            x = torch.nn.functional.linear(x, layer["weight"], layer["bias"])
-            x = torch.nn.functional.gelu(x) if number < 3 else x
-        return x
-
-    @torch.inference_mode()
-    def generate(self, pixels: torch.Tensor, ids: list[int], count: int) -> tuple[list[int], torch.Tensor]:
-        """Greedy over *all* ids -> `count` ids and the logits before each (count, ids)."""
-        words = self.llama.model.embed_tokens(torch.tensor([ids]))
-        x, tokens, logits = torch.cat([words[:, :1], self.patches(pixels), words[:, 1:]], 1), [], []
-        for _ in range(count):
-            logits.append(self.llama(inputs_embeds=x).logits[0, -1])
-            tokens.append(int(logits[-1].argmax()))
-            x = torch.cat([x, self.llama.model.embed_tokens(torch.tensor([tokens[-1:]]))], 1)
-        return tokens, torch.stack(logits)
+def generated_by(reference: Reference, pixels: torch.Tensor, ids: list[int], count: int) -> tuple[list[int], Tensor]:
+    """Greedy over *all* ids -> `count` ids and the logits before each (count, ids)."""
+    tokens: list[int] = []
+    for _ in range(count):
+        logits = reference.logits(pixels, ids, tokens)
+        tokens.append(int(logits[-1].argmax()))
+    return tokens, logits
 
 
 def reference_pixels(image: np.ndarray, size: int) -> torch.Tensor:
@@ -245,14 +140,14 @@ def test_logits_and_actions_equal_transformers(checkpoint, target, tmp_path, key
         language = Language(704, 64, 96, 3, 4, key_value_heads, rms_norm_eps=1e-5, rope_theta=5000.0)
         checkpoint = write_checkpoint(tmp_path / "grouped", Shape(TINY.towers, language), seed=5)
         target = loaded(imported(checkpoint, tmp_path))
-    composed, worst = Composed(checkpoint), 0.0
+    reference, worst = Reference(checkpoint), 0.0
     for seed, words in enumerate(("pick up the cup", "Put the spoon on the towel", "open")):
         observation = shown(seed, words)
         record = Decoder(target).decode(observation)
         text = f"In: What action should the robot take to {words.lower()}?\nOut:"
         ids = [*target.prompter.tokenizer.encode(text).ids, target.prompter.boundary]
         assert target.prompter.ids(words) == ids
-        generated, logits = composed.generate(reference_pixels(observation.images["primary"], 56), ids, 7)
+        generated, logits = generated_by(reference, reference_pixels(observation.images["primary"], 56), ids, 7)
         with torch.inference_mode():
             prompt = target.encode(observation)
             x = torch.cat([prompt, target.embed(torch.tensor([record.tokens[:-1]]))], 1)
@@ -263,6 +158,36 @@ def test_logits_and_actions_equal_transformers(checkpoint, target, tmp_path, key
         assert [TINY.vocabulary - 1 - token for token in record.tokens] == generated
         np.testing.assert_allclose(record.actions[0], published_action(generated, TINY.vocabulary), atol=1e-6)
     assert worst < 1e-4
+
+
+def test_an_import_is_compared_with_transformers_on_request(checkpoint, tmp_path):
+    words = ("build", "target", f"checkpoint={checkpoint}", "prompt_tokens=120", f"results={tmp_path}", "--json")
+    figures = json.loads(kerv(*words, "check=true").stdout)
+    assert figures["tokens compared with transformers"] == 7 * len(SAMPLES)
+    assert figures["tokens that differ"] == 0
+    assert figures["largest difference of logits"] < 1e-4
+    half = json.loads(kerv(*words, "check=true", "runtime.dtype=bfloat16").stdout)
+    assert half["tokens that differ"] <= figures["tokens compared with transformers"] // 4
+    assert half["largest difference of logits"] > figures["largest difference of logits"]
+    assert "tokens that differ" not in json.loads(kerv(*words).stdout)
+
+
+def test_the_comparison_finds_a_forward_that_is_wrong(target, monkeypatch):
+    right = parity(target)
+    encode = target.encode
+    monkeypatch.setattr(target, "encode", lambda observation: encode(observation).flip(1))
+    wrong = parity(target)
+    assert (right["tokens that differ"], right["largest difference of logits"] < 1e-4) == (0, True)
+    assert wrong["tokens that differ"] > 0
+    assert wrong["largest difference of logits"] > 0.01
+
+
+def test_a_comparison_without_transformers_says_what_to_install(checkpoint, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    words = (f"checkpoint={checkpoint}", "prompt_tokens=120", f"results={tmp_path}", "check=true")
+    assert "pip install 'transformers" in refusal("build", "target", *words, code=2)
+    assert not (tmp_path / "artifacts/target/openvla/target.json").exists()
+    assert "check=true" in refusal("build", "target", "grow=60m", f"results={tmp_path}", "check=true", code=2)
 
 
 @given(value=st.floats(-1.2, 1.2) | st.sampled_from([-1.0, 1.0]))

@@ -27,13 +27,15 @@ from kerv_cli.base.files import write_json
 from kerv_cli.base.manifests import read
 from kerv_cli.base.places import artifact
 from kerv_cli.base.registry import find, load
+from kerv_cli.base.runtime import DTYPES, set_up
 from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.engine.transfer import upload
 from kerv_cli.targets.attention import Cache
-from kerv_cli.targets.checkpoint import FORMAT, TargetDescription, target_fields
+from kerv_cli.targets.checkpoint import FORMAT, TargetDescription, load_target, target_fields
 from kerv_cli.targets.openvla.config import action_space, read_shape, read_statistics
 from kerv_cli.targets.openvla.inputs import Prompter, pixels_of, read_normalisations
 from kerv_cli.targets.openvla.loading import check_finite, digest_of, load_model, open_checked, open_shards
+from kerv_cli.targets.openvla.reference import check_installed, parity
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.targets.settings import BuildTargetSettings
 
@@ -219,12 +221,15 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
         The target's folder, and numbers to print by name, such as the number of parameters.
 
     Raises:
-        UsageError: No checkpoint is named, or it has statistics of several data sets and none is chosen.
+        UsageError: No checkpoint is named, it has statistics of several data sets and none is chosen, or `check` is
+            set and transformers is not installed.
         UnknownName: The chosen statistics or the environment do not exist.
         CheckpointError: The checkpoint is incomplete, damaged, pickled, or of a different model.
     """
     if not settings.checkpoint:
         raise UsageError("checkpoint=DIR: name the folder of a Hugging Face OpenVLA checkpoint")
+    if settings.check:
+        check_installed()
     source = Path(settings.checkpoint).expanduser().resolve()
     shape = read_shape(source)
     spec = None if settings.environment is None else load(find("environment", settings.environment).build)
@@ -253,4 +258,11 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
     described = {"format": FORMAT, "kind": "target", "sha256": digest_of(hashes, chosen), **fields}
     write_json(folder / "target.json", described)
     sizes = {"prompt tokens": shape.patches + len(prompt), "action tokens": actions.tokens, "DoFs": actions.dofs}
-    return folder, {"parameters": parameters, **sizes}
+    return folder, {"parameters": parameters, **sizes, **(_parity(folder, settings) if settings.check else {})}
+
+
+def _parity(folder: Path, settings: BuildTargetSettings) -> dict[str, float]:
+    """Return how the target compares with transformers, by name (`reference.parity`)."""
+    device, _ = set_up(settings.runtime)
+    target: Any = load_target(folder, device, DTYPES[settings.runtime.dtype])[0]
+    return parity(target)
