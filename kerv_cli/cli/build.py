@@ -14,7 +14,7 @@ from kerv_cli.training.settings import BuildDatastoreSettings, BuildDrafterSetti
 @command(
     "build target",
     BuildTargetSettings,
-    keys="grow policy.target target checkpoint name statistics environment camera check results",
+    keys="grow policy.target target checkpoint name statistics environment check results",
     examples=(
         "kerv build target grow=150m policy.target=mt10-vision name=mt10-150m",
         "kerv build target checkpoint=models/libero name=libero statistics=libero_spatial crop=true",

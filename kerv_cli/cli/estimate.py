@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 @command(
     "estimate",
     EstimateSettings,
-    keys="weights model tokens prompt vision bits actions hz device on trace choose results",
+    keys="weights model tokens prompt vision hz device on trace choose",
     examples=("kerv estimate weights=7B tokens=7 device=h100", "kerv estimate trace=FILE on=PROFILE"),
     writes=False,
 )
