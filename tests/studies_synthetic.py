@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import signal
+import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pytest
 
 from kerv_cli.base.registry import find
 from kerv_cli.base.settings import RuntimeSettings
@@ -19,10 +22,11 @@ from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.events import OnEvent, Outcome
-from kerv_cli.lab.execute import Prepare, RunEpisode, execute
 from kerv_cli.lab.plan import Setting, Study, all_episodes, plain_settings
 from kerv_cli.lab.runs import Run
 from kerv_cli.lab.store import StudyStore, plan_study
+from kerv_cli.lab.study import run_blocks
+from kerv_cli.lab.work import Prepare, RunEpisode
 from kerv_cli.worlds import settled
 from kerv_cli.worlds.metaworld.spec import SPEC
 
@@ -112,9 +116,24 @@ def swept(
     command = ["sweep", f"study={study.name}"]
     planned = plan_study(Database(results), study, rerun, runtime=runtime, command=command)
     store = planned.store
-    with Run(store.database, study.kind, study.name, command, alone=False) as record:
-        store.save(study, planned.existing)
-        return store, execute(planned, prepare or episodes_of, record, on_event)
+    prepare = prepare or episodes_of
+    with Run(store.database, study.kind, study.name, command, alone=False) as record, pretending(prepare):
+        return store, run_blocks(planned, prepare, record, on_event)
+
+
+@contextlib.contextmanager
+def pretending(prepare: Prepare, **environment: str) -> Iterator[None]:
+    """Let `kerv work`, started in this `with` block, call a function of this module for every setting of a block."""
+    path = os.pathsep.join(one for one in sys.path if one)
+    environment |= {
+        "KERV_PLUGINS": "pretended_worker",
+        "PRETENDED": getattr(prepare, "__name__", ""),
+        "PYTHONPATH": path,
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in environment.items():
+            patch.setenv(name, value)
+        yield
 
 
 def generator(*parts: object) -> np.random.Generator:
@@ -217,6 +236,51 @@ def unhurried(setting: Setting, task: str) -> RunEpisode:
 
     def run(seed):
         time.sleep(0.1)
+        return episode(setting, task, seed)
+
+    return run
+
+
+def brisk(setting: Setting, task: str) -> RunEpisode:
+    """A hundredth of a second for each episode."""
+
+    def run(seed):
+        time.sleep(0.01)
+        return episode(setting, task, seed)
+
+    return run
+
+
+def mortal(setting: Setting, task: str) -> RunEpisode:
+    """Kills its process in the seventh episode that it begins."""
+
+    def run(seed):
+        _begun.append(seed)
+        if len(_begun) == 7:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return episode(setting, task, seed)
+
+    return run
+
+
+_begun: list[int] = []
+
+
+def stops(setting: Setting, task: str) -> RunEpisode:
+    """Stops its process in an episode, until somebody lets it go on."""
+
+    def run(seed):
+        if (setting.label, seed) == ("ar", 100_002):
+            os.kill(os.getpid(), signal.SIGSTOP)
+        return episode(setting, task, seed)
+
+    return run
+
+
+def killed_at_the_third(setting: Setting, task: str) -> RunEpisode:
+    def run(seed):
+        if (setting.label, seed) == ("ar", 100_002):
+            os.kill(os.getpid(), signal.SIGKILL)
         return episode(setting, task, seed)
 
     return run

@@ -1,29 +1,27 @@
-"""Running a study: resume, isolation of failures, processes that are killed, sweeps at once, executors."""
+"""Running a study: resume, isolation of failures, workers that are killed or stopped, sweeps at once, Slurm."""
 
-import contextlib
-import gc
 import importlib
 import os
 import re
 import signal
+import sqlite3
 import sys
+import threading
 import time
-import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import pytest
 import sqlalchemy as sa
-from command import told
+from command import refusal, told
 from conftest import python, raising, refused, until
 from studies_synthetic import (
     count_calls,
     episode,
+    episodes_of,
     misbehave,
     part,
     settings_of,
-    slow_elsewhere,
     study_of,
     swept,
     threshold_study,
@@ -31,16 +29,17 @@ from studies_synthetic import (
 )
 
 from kerv_cli.base.errors import KervError, StorageError, UsageError
-from kerv_cli.base.files import visible
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.cli.common import progress_bar
-from kerv_cli.cli.work import event_printer
-from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, WANTED, Database
-from kerv_cli.lab.events import BlockStarted, BlockWaits, EpisodeEnd, Event, SettingFailed
-from kerv_cli.lab.execute import RunEpisode
-from kerv_cli.lab.plan import Setting, Study, blocks_of
+from kerv_cli.cli.studies import event_printer
+from kerv_cli.lab.database import EPISODES, QUEUE, WANTED, Database, clock
+from kerv_cli.lab.events import EpisodeEnd, Event, SettingFailed
+from kerv_cli.lab.plan import Study, blocks_of
+from kerv_cli.lab.queue import ClaimLost, Queue, enqueue
 from kerv_cli.lab.store import StudyStore, plan_study
-from kerv_cli.lab.study import estimate
+from kerv_cli.lab.study import estimate, warnings_about
+from kerv_cli.lab.work import work
+from kerv_cli.lab.workers import LocalWorkers, gpus_in_turn
 from kerv_cli.report.tables import further_of, load_study
 
 STUDY = threshold_study(["reach-v3"])
@@ -49,12 +48,14 @@ TWO = threshold_study(["reach-v3", "push-v3"])
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    monkeypatch.setattr("kerv_cli.lab.execute._POLL_SECONDS", 0.02)
+    monkeypatch.setattr("kerv_cli.lab.work.POLL_SECONDS", 0.02)
+    monkeypatch.setattr("kerv_cli.lab.workers._POLL_SECONDS", 0.02)
 
 
-def claims(database: Database) -> int:
+def queued(database: Database) -> int:
+    """Return how many blocks wait or run."""
     with database.reading() as connection:
-        return len(connection.execute(sa.select(BLOCKS).where(BLOCKS.c.claim.is_not(None))).all())
+        return int(connection.scalar(sa.select(sa.func.count()).select_from(QUEUE)) or 0)
 
 
 def episodes(database: Database) -> int:
@@ -102,7 +103,7 @@ def test_each_episode_is_committed_when_it_ends(database):
     with pytest.raises(KeyboardInterrupt):
         swept(database.results, TWO, raising(KeyboardInterrupt(), "ar", [100_002]))
     assert store.counts()[0] in range(24, 28)  # two seeds of four settings, and some of the third
-    assert claims(database) == 0
+    assert queued(database) == 0
     there = store.counts()[0]
     _, outcome = swept(database.results, TWO)
     assert (len(outcome.reused), len(outcome.done)) == (there, 32 - there)
@@ -132,7 +133,7 @@ def test_an_error_of_kerv_is_told_in_its_own_words(database):
     assert {failure.reason for failure in outcome.failed} == {"no drafter fits this target: run `kerv train drafter`"}
     with pytest.raises(StorageError):
         swept(database.results, STUDY, raising(StorageError("cannot write x.rrd: the disk is full")))
-    assert claims(database) == 0
+    assert queued(database) == 0
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -144,7 +145,7 @@ def test_a_study_that_is_deleted_while_it_runs_says_so(tmp_path, workers):
     with pytest.raises(KervError, match="threshold was deleted"):
         swept(tmp_path, STUDY, unhurried, runtime=RuntimeSettings(workers=workers), on_event=remove)
     store, outcome = swept(tmp_path, STUDY)
-    assert (outcome.failed, store.counts(), claims(store.database)) == ([], (16, 16), 0)
+    assert (outcome.failed, store.counts(), queued(store.database)) == ([], (16, 16), 0)
 
 
 def test_a_sweep_goes_on_when_another_plans_fewer_episodes(database):
@@ -165,59 +166,194 @@ SWEEP = """
 import os
 import sys
 import studies_synthetic as s
-from kerv_cli.lab import execute
-execute._POLL_SECONDS = 0.02
-execute.code_hash()  # once, before the processes part
+from kerv_cli.lab import work, workers
+work.POLL_SECONDS = workers._POLL_SECONDS = 0.02
+work.code_hash(), work.stamp("cpu")  # once, before the processes part
 study = s.threshold_study(["reach-v3", "push-v3"], episodes=2, radii=(3,))
-workers, processes = int(sys.argv[3]), int(sys.argv[4])
+number, processes = int(sys.argv[3]), int(sys.argv[4])
 children = []
 while len(children) < processes - 1 and (not children or children[-1]):
     children.append(os.fork())
-s.swept(sys.argv[1], study, getattr(s, sys.argv[2]), runtime=s.RuntimeSettings(workers=workers))
+s.swept(sys.argv[1], study, getattr(s, sys.argv[2]), runtime=s.RuntimeSettings(workers=number))
 if all(children):
     assert [os.waitpid(child, 0)[1] for child in children] == [0] * len(children)
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_workers_of_a_killed_sweep_end_and_its_claims_are_taken_over(tmp_path):
+def test_workers_of_a_killed_sweep_end_and_its_claims_are_taken_over(tmp_path, monkeypatch):
+    monkeypatch.setattr("kerv_cli.lab.queue.LAPSE_SECONDS", 1.0)
     store = StudyStore(tmp_path, "threshold")
     with python(SWEEP, tmp_path, "slow_elsewhere", 2, 1) as process:  # the first task at once, the other in a minute
         until(lambda: store.counts()[0] == 6)
-        until(lambda: claims(store.database) == 1)
+        until(lambda: queued(store.database) == 1)
         children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
         assert children
         process.kill()
         process.wait()
-    until(lambda: not any(Path(f"/proc/{child}").exists() for child in children), 10.0)
-    assert (store.counts(), claims(store.database)) == ((6, 12), 1)
+    until(lambda: not any(Path(f"/proc/{child}").exists() for child in children), 5.0)
+    assert (store.counts(), queued(store.database)) == ((6, 12), 1)
     _, outcome = swept(tmp_path, threshold_study(["reach-v3", "push-v3"], episodes=2, radii=(3,)))
-    assert (len(outcome.reused), len(outcome.done), claims(store.database)) == (6, 6, 0)
+    assert (len(outcome.reused), len(outcome.done), queued(store.database)) == (6, 6, 0)
 
 
-FAR, SILENT = {"host": "far"}, {"heartbeat": 0.0}
-CHANGES = [(SILENT, True), (FAR, True), (FAR | SILENT, False), ({"status": "failed"}, False)]
+def waiting(database: Database, study: Study, run: str = "run") -> StudyStore:
+    """Plan a study and queue its blocks, which nobody runs yet."""
+    plan = plan_study(database, study)
+    enqueue(plan, run)
+    return plan.store
 
 
-@pytest.mark.parametrize(("change", "held"), CHANGES)
-def test_a_claim_lasts_as_long_as_its_run(database, change, held):
-    """On another machine as long as it was heard of. What it runs meanwhile is not run again."""
-    seen: list[bool] = []
+@pytest.mark.parametrize(("silent", "is_held"), [(25.0, True), (35.0, False)])
+def test_a_claim_lasts_as_long_as_its_heartbeat(database, silent, is_held, monkeypatch):
+    """By the database's clock: the clocks of two machines may differ by an hour."""
+    store = waiting(database, STUDY)
+    first, second = Queue(store), Queue(store)
+    claim = first.claim()
+    assert second.claim() is None
+    with database.writing() as connection:
+        connection.execute(sa.update(QUEUE).values(heartbeat=clock(connection) - silent))
+    monkeypatch.setattr("time.time", lambda: 3600.0)
+    assert (second.claim() is None) == is_held
+    if is_held:
+        first.begin(claim, claim.block.episodes[0])
+    else:
+        with pytest.raises(ClaimLost):
+            first.begin(claim, claim.block.episodes[0])
 
-    def claimed(event):
-        if isinstance(event, BlockStarted):
-            with database.writing() as connection:
-                connection.execute(sa.update(RUNS).values(**change))
-            with contextlib.suppress(InterruptedError):
-                swept(database.results, STUDY, on_event=noted)
 
-    def noted(event):
-        if isinstance(event, BlockWaits | BlockStarted):
-            seen.append(isinstance(event, BlockWaits))
-            raise InterruptedError
+def test_a_claim_that_has_lapsed_does_not_come_back(database):
+    """Another study has the same episodes. Its worker begins them when the first one falls silent."""
+    first = Queue(waiting(database, STUDY, "one"))
+    second = Queue(waiting(database, threshold_study(["reach-v3"], name="other"), "two"))
+    claim = first.claim()
+    assert claim is not None
+    assert second.claim() is None
+    with database.writing() as connection:
+        connection.execute(sa.update(QUEUE).where(QUEUE.c.run == "one").values(heartbeat=clock(connection) - 40.0))
+    assert second.claim() is not None
+    with pytest.raises(ClaimLost):
+        first.begin(claim, claim.block.episodes[0])
 
-    swept(database.results, STUDY, on_event=claimed)
-    assert seen == [held]
+
+def test_no_two_workers_run_an_episode_that_two_studies_share(database):
+    """Nor does one study's block wait for another's that shares nothing with it."""
+    one = waiting(database, STUDY, "one")
+    other = waiting(database, threshold_study(["reach-v3", "push-v3"], radii=(3,), name="other"), "other")
+    first, second = Queue(one), Queue(other)
+    assert first.claim() is not None
+    claim = second.claim()
+    assert claim is not None
+    assert claim.block.task == "push-v3"
+    assert Queue(other).claim() is None
+    with database.writing() as connection:
+        connection.execute(sa.update(QUEUE).where(QUEUE.c.run == "one").values(worker=None))
+    work(Queue(one), episodes_of)
+    again = Queue(other).claim()
+    assert again is not None
+    assert (len(again.existing), again.block.episodes) == (12, ())
+
+
+STOPS = """
+import sys
+import studies_synthetic as s
+from kerv_cli.lab import queue, work
+from kerv_cli.lab.store import StudyStore
+queue.LAPSE_SECONDS, queue.BEAT_SECONDS = 1.0, 0.1
+work.work(queue.Queue(StudyStore(sys.argv[1], "threshold")), s.stops)
+"""
+
+
+def test_a_worker_that_was_stopped_loses_its_block_and_writes_nothing_twice(database, monkeypatch):
+    monkeypatch.setattr("kerv_cli.lab.queue.LAPSE_SECONDS", 1.0)
+    store = waiting(database, STUDY)
+    with python(STOPS, database.results) as process:
+        os.waitid(os.P_PID, process.pid, os.WSTOPPED)
+        assert 0 < store.counts()[0] < 16
+        work(Queue(store), episodes_of)
+        assert (store.counts(), queued(database)) == ((16, 16), 0)
+        os.kill(process.pid, signal.SIGCONT)
+        assert process.wait(30) == 0
+    assert episodes(database) == 16
+
+
+CREW = """
+import os
+import sys
+import pandas  # once, before the processes part; so are the calls below
+import studies_synthetic as s
+from kerv_cli.lab import database, queue, work
+from kerv_cli.lab.store import StudyStore, plan_study
+from kerv_cli.lab.database import Database
+
+work.POLL_SECONDS = 0.01
+work.code_hash(), work.stamp("cpu")
+results, prepare = sys.argv[1], getattr(s, sys.argv[2])
+
+
+def parted(function, *arguments, **options):
+    child = os.fork()
+    if child:
+        return child
+    database._server.cache_clear()  # a connection belongs to one process
+    function(*arguments, **options)
+    os._exit(0)
+
+
+def begun(store):
+    return parted(lambda: work.work(queue.Queue(StudyStore(results, store.name)), prepare))
+
+
+def crew(store, number):
+    "Keep so many workers at work until every block has ended; return how many died."
+    workers, died = [begun(store) for _ in range(number)], 0
+    while workers:
+        child, status = os.wait()
+        workers.remove(child)
+        if status:
+            died += 1
+            assert queue.Queue(store).lapse(child)
+            workers.append(begun(store))
+    return died
+"""
+MATRIX = """
+for workers in (1, 2, 4):
+    for block in (1, 2, 5):
+        study = s.threshold_study(["reach-v3"], episodes=5, radii=(), name=f"s{workers}{block}", block=block)
+        for number, setting in enumerate(study.settings):  # no study shares an episode with another
+            setting.settings["seed"] = 100_000 + 100 * block + 10 * workers
+        episodes = s.all_episodes(study.settings, ["reach-v3"], block)
+        study = s.replace(study, episodes=episodes)
+        queue.enqueue(plan_study(Database(results), study), "run")
+        died = crew(StudyStore(results, study.name), workers)
+        print(study.name, died)
+"""
+
+
+def test_any_number_of_workers_run_each_episode_once_though_some_are_killed(database):
+    """Each is killed in the seventh episode that it begins. Blocks have 2, 4 and 10 episodes."""
+    with python(CREW + MATRIX, database.results, "mortal") as process:
+        assert process.wait(120) == 0
+    assert (episodes(database), queued(database), errors(database)) == (9 * 10, 0, [])
+    for workers in (1, 2, 4):
+        for block in (1, 2, 5):
+            assert StudyStore(database, f"s{workers}{block}").counts() == (10, 10)
+
+
+AT_ONCE = """
+study = s.threshold_study(["reach-v3", "push-v3"], episodes=4, radii=(3,), block=2)
+queue.enqueue(plan_study(Database(results), study), "earlier")
+store = StudyStore(results, study.name)
+children = [begun(store) for _ in range(3)] + [parted(s.swept, results, study, prepare) for _ in range(2)]
+assert [os.waitpid(child, 0)[1] for child in children] == [0] * 5
+"""
+
+
+def test_two_sweeps_and_three_workers_at_once_run_each_episode_once(database):
+    with python(CREW + AT_ONCE, database.results, "brisk") as process:
+        assert process.wait(60) == 0
+    assert (episodes(database), queued(database)) == (24, 0)
+    assert StudyStore(database, "threshold").counts() == (24, 24)
 
 
 def test_sweeps_at_once_run_each_episode_once(database):
@@ -225,7 +361,7 @@ def test_sweeps_at_once_run_each_episode_once(database):
         assert process.wait(60) == 0
     assert episodes(database) == 12
     assert StudyStore(database, "threshold").counts() == (12, 12)
-    assert claims(database) == 0
+    assert queued(database) == 0
 
 
 def test_a_sweep_that_begins_in_the_middle_of_another_runs_nothing_twice(database):
@@ -245,35 +381,11 @@ def test_a_sweep_that_begins_in_the_middle_of_another_runs_nothing_twice(databas
     assert (len(outcome.done), len(outcome.reused)) == (0, 16)
 
 
-@pytest.mark.parametrize("seconds", [0.3, 60.0])
-def test_episodes_whose_message_comes_late_are_waited_for(seconds, tmp_path, monkeypatch):
-    """A network folder shows files late. Episodes that are never heard of have failed."""
-
-    def shown(folder):
-        return [path for path in visible(folder) if time.time() - path.stat().st_mtime > seconds]
-
-    monkeypatch.setattr("kerv_cli.lab.execute.visible", shown)
-    monkeypatch.setattr("kerv_cli.lab.execute.LATE_SECONDS", min(10.0, 60.0 - seconds), raising=False)
-    store, outcome = swept(tmp_path, STUDY, runtime=RuntimeSettings(workers=2))
-    lost = [one for failure in outcome.failed for one in failure.episodes]
-    assert (len(outcome.done), len(lost)) == ((16, 0) if seconds < 1 else (0, 16))
-    assert store.counts() == (len(outcome.done), 16)
-
-
 def in_order() -> Study:
     """A setting whose result depends on the order of its episodes, beside one that is not so."""
     settings = settings_of("retrieval")
     settings.skip = part("skip", "similarity", up=0.25)
     return study_of({"ar": settings_of("ar"), "heisd": settings}, ["reach-v3"])
-
-
-def killed_at_the_third(setting: Setting, task: str) -> RunEpisode:
-    def run(seed):
-        if (setting.label, seed) == ("ar", 100_002):
-            os.kill(os.getpid(), signal.SIGKILL)
-        return episode(setting, task, seed)
-
-    return run
 
 
 KILLS_ITS_PROCESS_ONCE = """
@@ -302,35 +414,39 @@ settings: {short: world.horizon=30, long: world.horizon=60}
 
 
 def test_workers_run_each_episode_once_though_one_is_killed(tmp_path, monkeypatch):
-    """A worker lives on after its first block. The episode that was running is lost, and the same command runs it."""
+    """A worker that dies is replaced, and the episode that it ran is repeated."""
     importlib.import_module("examples.point_mass")
     (tmp_path / "killing.py").write_text(KILLS_ITS_PROCESS_ONCE)
     (tmp_path / "armed").touch()
     monkeypatch.setenv("KERV_PLUGINS", "killing")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *filter(None, sys.path)]))
-    monkeypatch.syspath_prepend(str(tmp_path))  # loky gives it to its workers
+    monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "points.yaml").write_text(POINTS)
     words = ("sweep", f"study={tmp_path / 'points.yaml'}", f"results={tmp_path / 'results'}")
-
-    def sweep(workers: int, code: int | None) -> tuple[int, int]:
-        counts = re.search(r"(\d+) run, (\d+) reused", told(*words, f"runtime.workers={workers}", code=code))
-        assert counts
-        return int(counts[1]), int(counts[2])
-
-    run, reused = sweep(2, None)
-    assert (run in (11, 12), reused) == (True, 0)
+    assert "12 run, 0 reused, 0 failed" in told(*words, "runtime.workers=2")
     assert not (tmp_path / "armed").exists()
-    assert sweep(1, 0) == (12 - run, run)
+    assert "0 run, 12 reused, 0 failed" in told(*words)
     assert episodes(Database(tmp_path / "results")) == 12
 
 
-def test_episodes_whose_order_counts_run_whole_again_when_their_process_dies(tmp_path):
-    store, outcome = swept(tmp_path, in_order(), killed_at_the_third, runtime=RuntimeSettings(workers=2))
-    assert [one.setting.label for failure in outcome.failed for one in failure.episodes] == ["ar", "ar"]
-    assert len(outcome.done) == 2 + 4
+IN_ORDER = """
+from test_execute import in_order
+study = in_order()
+queue.enqueue(plan_study(Database(results), study), "run")
+assert crew(StudyStore(results, study.name), 1) == 2
+"""
+
+
+def test_episodes_whose_order_counts_run_whole_again_when_their_process_dies(database):
+    """A setting in which two workers die fails in the block."""
+    with python(CREW + IN_ORDER, database.results, "killed_at_the_third") as process:
+        assert process.wait(60) == 0
+    store = StudyStore(database, "threshold")
+    assert store.counts() == (2 + 4, 8)
+    assert errors(database) == ["two workers died in this episode\n"] * 2
     frame = store.frame().query("label == 'heisd'")
     assert (len(frame), frame["block"].nunique()) == (4, 1)
-    assert {one.setting.label for one in plan_study(store.database, in_order()).missing} == {"ar"}
+    assert {one.setting.label for one in plan_study(database, in_order()).missing} == {"ar"}
 
 
 def test_estimates_say_what_they_rest_on(database):
@@ -371,98 +487,103 @@ def test_a_busy_machine_is_said_once_and_kept(load, lines, tmp_path, capsys, mon
     assert told == str(load / 2)
 
 
-def runtime(executor: str, **options: Any) -> RuntimeSettings:
-    return RuntimeSettings(workers=2, executor=executor, executor_options=options)
-
-
-@pytest.fixture
-def cluster(monkeypatch):
-    """Slurm jobs, as processes on this machine."""
-    pytest.importorskip("submitit")
-    # seconds that it waits for the result of a job that was killed
-    monkeypatch.setattr("submitit.core.core.Job._results_timeout_s", 1)
-    # workers import this folder's modules
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path for path in sys.path if path))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # submitit's: files left to the collector
-        yield runtime("slurm", cluster="local")
-        gc.collect()
-
-
-@pytest.mark.parametrize(
-    ("executor", "tasks", "killed", "threads"),
-    [
-        ("local", ["reach-v3", "push-v3"], "its worker process was killed by SIGKILL", 3.0),
-        ("slurm", ["reach-v3"], "its job", 1.0),  # Slurm itself would set the variable
-    ],
-)
-def test_only_the_guilty_settings_fail(executor, tasks, killed, threads, request, tmp_path):
-    """One setting kills its process, one raises what cannot be pickled; the rest of their blocks still takes turns."""
-    where = request.getfixturevalue("cluster") if executor == "slurm" else RuntimeSettings(workers=2)
-    study = threshold_study(tasks, episodes=2, radii=(1, 3, 5))
+def test_only_the_guilty_settings_fail(tmp_path):
+    """One setting kills its process, one raises; the rest of their blocks still takes turns."""
+    study = threshold_study(["reach-v3"], episodes=2, radii=(1, 3, 5), block=1)
     for setting in study.settings:
         setting.settings["runtime"]["threads"] = 3  # type: ignore[index]
-    store, outcome = swept(tmp_path, study, misbehave, runtime=where)
+    store, outcome = swept(tmp_path, study, misbehave, runtime=RuntimeSettings(workers=2))
     reasons = {failure.episodes[0].setting.label: failure.reason for failure in outcome.failed}
-    assert len(outcome.failed) == 2 * len(tasks)
-    assert killed in reasons["spec_vla r=1"]
+    assert reasons["spec_vla r=1"] == "two workers died in this episode"
     assert reasons["spec_vla r=5"].startswith("Odd: 1 and 2")
-    done = len(tasks) * (3 * 2 + 1)
+    assert sum(len(failure.episodes) for failure in outcome.failed) == 3
+    done = 3 * 2 + 1
     assert len(outcome.done) == done
     table = store.frame()
-    assert (set(table["executor"]), set(table["workers"])) == ({executor}, {2})
+    assert (set(table["executor"]), set(table["workers"])) == ({"local"}, {2})
     assert table["run"].nunique() == 1
-    assert set(table["wall_seconds"]) == {threads}  # OMP_NUM_THREADS
-    assert claims(store.database) == 0
-    assert not list(tmp_path.glob(".spool*"))
+    assert set(table["wall_seconds"]) == {3.0}  # OMP_NUM_THREADS
+    assert queued(store.database) == 0
     _, again = swept(tmp_path, study)
-    assert (len(again.reused), len(again.done)) == (done, 10 * len(tasks) - done)
+    assert (len(again.reused), len(again.done)) == (done, 10 - done)
 
 
-def test_an_interrupt_ends_a_clusters_work(cluster, tmp_path):
-    ended: list[Event] = []
-
-    def interrupt(event):
-        ended.extend([event] if isinstance(event, EpisodeEnd) else [])
-        if len(ended) == 16:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        swept(tmp_path, TWO, slow_elsewhere, runtime=cluster, on_event=interrupt)
-    store = StudyStore(tmp_path, "threshold")
-    assert (store.counts(), claims(store.database)) == ((16, 32), 0)
+def shell(tmp_path: Path, name: str, script: str) -> Path:
+    path = tmp_path / name
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o755)
+    return path
 
 
-WRONG = {
-    "did you mean slurm": RuntimeSettings(executor="slrum"),
-    "runtime.workers=0": RuntimeSettings(workers=0),
-    "minutes": runtime("slurm", minutes="long"),
-    "partition: unexpected": runtime("local", partition="x"),
-    "Slurm cannot be used": runtime("slurm"),
-    "pip install 'kerv[slurm]'": runtime("slurm", cluster="local"),
-}
+def test_workers_that_cannot_begin_end_the_sweep_in_one_line(tmp_path, monkeypatch):
+    """One that says why, and those that are killed again and again."""
+    for script, line in (("echo 'kerv: no such thing' >&2; exit 2", "no such thing"), ("kill -9 $$", "enough memory")):
+        monkeypatch.setattr(sys, "executable", str(shell(tmp_path, "python", script)))
+        with refused(line):
+            swept(tmp_path, TWO, runtime=RuntimeSettings(workers=2))
+        assert queued(Database(tmp_path)) == 0
 
 
-@pytest.mark.parametrize("message", WRONG)
-def test_a_wrong_executor_is_refused_in_one_line(message, tmp_path, monkeypatch):
-    settings = WRONG[message]
-    if "pip install" in message:
-        monkeypatch.setattr(importlib.util, "find_spec", lambda package: None)
-    elif settings.executor == "slurm":
-        pytest.importorskip("submitit")
-    monkeypatch.setenv("PATH", "")  # no srun, wherever the test runs
-    with refused(message, error=UsageError):
-        swept(tmp_path, STUDY, runtime=settings)
+@pytest.mark.parametrize(("visible", "device", "seen"), [
+    ("0,GPU-b", "cuda", {"0": 2, "GPU-b": 1}), ("4", "cuda", {"4": 3}), ("0,1", "cuda:1", {"0,1": 3}),
+    ("7", "cpu", {"7": 3}),
+])  # fmt: skip
+def test_each_local_worker_sees_one_gpu(visible, device, seen, tmp_path, monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    store = waiting(Database(tmp_path), STUDY)
+    script = f'echo "$CUDA_VISIBLE_DEVICES" > {tmp_path}/gpu$$; sleep 60'
+    monkeypatch.setattr(sys, "executable", str(shell(tmp_path, "python", script)))
+    with LocalWorkers(Queue(store), 3, 1, gpus_in_turn(device)):
+        until(lambda: sum(path.stat().st_size > 0 for path in tmp_path.glob("gpu*")) == 3)
+    found = [path.read_text().strip() for path in tmp_path.glob("gpu*")]
+    assert {one: found.count(one) for one in found} == seen
 
 
-def test_a_job_that_slurm_refuses_is_refused_in_one_line(tmp_path, monkeypatch):
-    pytest.importorskip("submitit")
-    for name, script in (
-        ("srun", ""),
-        ("sbatch", "echo 'error: Memory specification can not be satisfied' >&2; exit 1"),
-    ):
-        (tmp_path / name).write_text(f"#!/bin/sh\n{script}\n")
-        (tmp_path / name).chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
-    with refused("Memory specification can not be satisfied", "runtime.executor_options", error=UsageError):
-        swept(tmp_path / "results", STUDY, runtime=runtime("slurm", memory_gb=100_000))
+def test_a_plan_warns_of_workers_that_disturb_each_others_times(tmp_path, monkeypatch):
+    database = Database(tmp_path)
+
+    def warnings(workers: int, device: str = "cpu", batch: int = 1) -> list[str]:
+        settings = settings_of("ar")
+        settings.runtime.device, settings.rollout.batch = device, batch
+        runtime = RuntimeSettings(workers=workers)
+        return warnings_about(plan_study(database, study_of({"ar": settings}, ["reach-v3"]), runtime=runtime))
+
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
+    assert warnings(1) == warnings(2, "cuda") == warnings(2, batch=16) == []
+    assert "memory channel" in warnings(2)[0]
+    assert "3 workers measure times and share 2 GPUs" in warnings(3, "cuda")[0]
+
+
+def test_a_database_that_does_not_answer_is_asked_again_for_two_minutes(tmp_path, monkeypatch):
+    """Then the worker ends in one line. What it had finished is kept."""
+    monkeypatch.setattr("kerv_cli.lab.database.LOCK_SECONDS", 0)
+    store = waiting(Database(tmp_path), STUDY)
+    locks: list[sqlite3.Connection] = []
+
+    def lock(event: object) -> None:
+        """Lock the file after the fourth and the eighth episode."""
+        if isinstance(event, EpisodeEnd) and store.counts()[0] in (4, 8):
+            locks.append(sqlite3.connect(tmp_path / "kerv.db", check_same_thread=False))
+            locks[-1].execute("BEGIN IMMEDIATE")
+            if len(locks) > 1:
+                threading.Timer(0.5, locks[-1].close).start()
+
+    monkeypatch.setattr("kerv_cli.lab.queue.PATIENCE_SECONDS", 0.3)
+    with refused("locked", "finished episodes are kept", error=StorageError):
+        work(Queue(store), episodes_of, lock)
+    locks[-1].close()
+    assert store.counts() == (4, 16)
+    monkeypatch.setattr("kerv_cli.lab.queue.PATIENCE_SECONDS", 20.0)
+    with store.database.writing() as connection:  # the block could not be freed
+        connection.execute(sa.update(QUEUE).values(heartbeat=0.0))
+    work(Queue(store), episodes_of, lock)
+    assert (len(locks), store.counts(), episodes(store.database)) == (2, (16, 16), 16)
+
+
+@pytest.mark.parametrize(("override", "says"), [
+    ("runtime.executor=slrum", "did you mean slurm"), ("runtime.workers=0", "runtime.workers=0"),
+    ("runtime.executor_options.minutes=long", "minutes"), ("runtime.executor_options.partitoin=x", "partition"),
+    ("runtime.detach=true", "runtime.executor=slurm"),
+])  # fmt: skip
+def test_a_wrong_executor_is_refused_in_one_line(override, says, tmp_path):
+    assert says in refusal("sweep", "study=demo", override, f"results={tmp_path}", code=2)

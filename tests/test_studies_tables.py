@@ -25,9 +25,9 @@ from kerv_cli.engine.tally import Tally
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab import database as tables
 from kerv_cli.lab.database import Database
-from kerv_cli.lab.execute import RunEpisode
 from kerv_cli.lab.plan import Episode, Setting, Study
 from kerv_cli.lab.store import StudyStore, plan_study
+from kerv_cli.lab.work import RunEpisode
 from kerv_cli.report.measures import MACRO, MICRO
 from kerv_cli.report.page import render
 from kerv_cli.report.plots import acceptance_figure, curves_figure, png, study_figures, with_lines

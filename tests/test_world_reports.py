@@ -12,8 +12,8 @@ from kerv_cli.episodes.identity import stress_of
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings, SweepSettings, TimingSettings
 from kerv_cli.lab.database import Database
-from kerv_cli.lab.execute import RunEpisode
 from kerv_cli.lab.plan import Setting
+from kerv_cli.lab.work import RunEpisode
 from kerv_cli.report.decide import verdict_of
 from kerv_cli.report.plots import latency_figure, study_figures
 from kerv_cli.report.report import report

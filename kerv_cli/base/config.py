@@ -259,7 +259,7 @@ def _store_part(group: str, name: str, settings: type) -> None:
 
 
 def _open_mappings(node: Any) -> None:
-    """Let overrides add keys to the untyped mappings of a schema, such as `runtime.executor_options`."""
+    """Let overrides add keys to the untyped mappings of a schema, such as `policy.artifacts`."""
     from omegaconf import DictConfig, OmegaConf
 
     for child in (node[name] for name in node if not OmegaConf.is_missing(node, name)):

@@ -43,3 +43,19 @@ def begin_worker(parent: int) -> None:
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with(parent)
+
+
+def end_with_input() -> None:
+    """Make this process end when its standard input ends: a pipe that its parent holds, and never writes to.
+
+    It also ignores Ctrl-C, which its parent handles.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def watch() -> None:
+        with contextlib.suppress(OSError):
+            while os.read(0, 1024):
+                pass
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -40,7 +40,6 @@ MODULES = (
     "kerv_cli.methods.jacobi",
     "kerv_cli.methods.merged",
     "kerv_cli.methods.certified",
-    "kerv_cli.lab.executors",
 )
 """Modules that register kerv's own parts when they are imported. They import neither torch nor MuJoCo.
 
@@ -77,7 +76,7 @@ class Part:
 
     Args:
         kind: proposer, acceptance, threshold, rectifier, boundary, skip, datastore, artifact, target, environment,
-            stress, executor, column or command.
+            stress, column or command.
         name: The name by which it is chosen.
         build: The code that makes it, as `module:function` or `module:Class.method`. For the parts of a method,
             `methods/context.py` describes the arguments. Empty: choosing this name means having no such part.

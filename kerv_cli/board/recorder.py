@@ -94,10 +94,10 @@ def record_episode(setting: Setting, task: str, seeds: list[int], results: str, 
     Returns:
         The error in one line. Empty if all went well.
     """
-    from kerv_cli.catalogue.entries import checked
     from kerv_cli.episodes.runner import Runner
     from kerv_cli.episodes.settings import settings_from
-    from kerv_cli.lab.execute import failure_of
+    from kerv_cli.lab.study import checked
+    from kerv_cli.lab.work import failure_of
     from kerv_cli.report.viewing import save_recording
 
     try:

@@ -20,16 +20,15 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
+from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.files import read_mapping, read_text, sha256_of, storage_errors, sync, visible
 from kerv_cli.base.leftovers import clean, temporary_beside
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.registry import parts
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.episodes.identity import OBSERVATION
-from kerv_cli.episodes.settings import settings_from
 from kerv_cli.lab.database import EPISODES, SETTINGS, STUDIES, WANTED, Database
-from kerv_cli.lab.plan import ALL, Episode, Setting
+from kerv_cli.lab.plan import ALL, Episode
 from kerv_cli.lab.runs import COMPLETE, RUNNING, RunRow, forget, run_rows, time_left, unfinished
 from kerv_cli.lab.store import IMPORT, ROLLOUT, SWEEP, Plan, StudyStore, plan_study
 from kerv_cli.targets.folders import shipped_dir
@@ -429,6 +428,8 @@ def plan_of(run: RunEntry, database: Database) -> Plan:
         CheckpointError: The weights or data of the run have changed since.
         UsageError: A setting cannot run.
     """
+    from kerv_cli.lab.study import checked, new_name  # imports torch, which listing runs does not need
+
     results, study = str(database.results), store_of(run, database).load()
     new = {setting.label: checked(setting, study.tasks, results) for setting in study.settings}
     episodes = tuple(Episode(new[one.setting.label], one.task, one.seed, one.repeat) for one in study.episodes)
@@ -438,38 +439,9 @@ def plan_of(run: RunEntry, database: Database) -> Plan:
     if row is not None:
         name = row.name
     elif study.kind == ROLLOUT:
-        from kerv_cli.lab.study import new_name  # imports torch, which listing runs does not need
-
         name = new_name(database, study)
     else:
         names = (f"{run.id}-again{number if number > 1 else ''}" for number in itertools.count(1))
         name = next(one for one in names if not StudyStore(database, one).exists)
     study = dataclasses.replace(study, name=name)
     return plan_study(database, study, ALL, row.started if row else "", command=command)
-
-
-def checked(setting: Setting, tasks: list[str], results: str) -> Setting:
-    """Check that the weights and data that a stored setting uses are still the same.
-
-    Args:
-        setting: The stored setting.
-        tasks: Names of the tasks on which it will run.
-        results: The results folder in which it will run.
-
-    Returns:
-        The setting, changed to run in `results`.
-
-    Raises:
-        CheckpointError: Its weights or data have changed.
-    """
-    from kerv_cli.episodes.policy import check  # imports torch
-
-    stored = {**setting.settings, "results": results}
-    identity = check(settings_from({**stored, "task": tasks}))
-    for kind in setting.identity.keys() | identity.keys():
-        before, now = setting.identity.get(kind, "none"), identity.get(kind, "none")
-        if kind != OBSERVATION and before != now:
-            raise CheckpointError(
-                f"the {kind} of {setting.label} has changed from {before[:12]} to {now[:12]}: it cannot run again"
-            )
-    return dataclasses.replace(setting, settings=stored, identity=identity)

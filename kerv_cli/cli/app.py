@@ -18,7 +18,7 @@ from kerv_cli.cli.common import one_line_errors
 
 # importing a module registers its commands; this is the order in the help
 # isort: off
-from kerv_cli.cli import demos, train, prepare, build, calibrate, rollout, sweep, serve, report, runs  # noqa: F401
+from kerv_cli.cli import demos, train, prepare, build, calibrate, rollout, sweep, work, serve, report, runs  # noqa: F401
 from kerv_cli.cli import importing, board, compare, view, estimate, bench, doctor  # noqa: F401
 # isort: on
 

@@ -70,7 +70,7 @@ def success(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_
 
     Existing episodes are reused. Choose the number of episodes before you look at any result.
     """
-    from kerv_cli.cli.work import planned_study, print_settings, print_study_plan, run_study
+    from kerv_cli.cli.studies import planned_study, print_settings, print_study_plan, run_study
     from kerv_cli.episodes.resolve import resolve
     from kerv_cli.lab.runs import making
     from kerv_cli.report.certificate import candidate_rows, certify, folder_of, planned_certificate, write

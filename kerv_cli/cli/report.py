@@ -55,7 +55,7 @@ def report(
     as_json: AsJson = False,
 ) -> None:
     """Write CSV tables (per task and aggregated), plots and an HTML page about the studies."""
-    from kerv_cli.cli.work import print_prices, print_study, print_verdict
+    from kerv_cli.cli.studies import print_prices, print_study, print_verdict
     from kerv_cli.episodes.resolve import study_name
     from kerv_cli.lab.database import Database
     from kerv_cli.lab.store import StudyStore

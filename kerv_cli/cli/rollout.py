@@ -18,7 +18,7 @@ from kerv_cli.cli.common import (
     results_word,
     settings_yaml,
 )
-from kerv_cli.cli.work import planned_study, run_study
+from kerv_cli.cli.studies import planned_study, run_study
 from kerv_cli.episodes.settings import RolloutSettings
 
 if TYPE_CHECKING:

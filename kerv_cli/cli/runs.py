@@ -179,7 +179,7 @@ def rerun(
         made = f", which '{run.command_line}' makes" if run.command else ""
         raise UsageError(f"{run.id} is of the kind {run.kind}{made}: only sweeps and rollouts are repeated")
     from kerv_cli.catalogue.entries import plan_of, store_of
-    from kerv_cli.cli.work import run_study
+    from kerv_cli.cli.studies import run_study
     from kerv_cli.report.compare import same_tokens
 
     planned = plan_of(run, database)

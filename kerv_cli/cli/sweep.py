@@ -10,8 +10,8 @@ from kerv_cli.base.config import compose, expand, groups, split
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UsageError
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan, end_with_json, print_rows
-from kerv_cli.cli.work import (
+from kerv_cli.cli.common import AsJson, ShowPlan, end_with_json, end_with_plan, print_rows
+from kerv_cli.cli.studies import (
     planned_study,
     print_prices,
     print_settings,
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 @command(
     "sweep",
     SweepSettings,
-    keys="study task episodes policy rerun loss runtime.workers results",
+    keys="study task episodes policy rerun loss runtime.workers runtime.executor results",
     examples=("kerv sweep study=demo", "kerv sweep study=threshold task=[reach,push] episodes=5 --plan"),
     each="rollout",
 )
@@ -81,6 +81,10 @@ def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, planned: Plan, as_
     """Print the results of a sweep and end the command, with exit code 1 if episodes failed."""
     from kerv_cli.report.tables import load_study, rows_of
 
+    if outcome.detached:
+        missing = count(len(planned.to_run), "episode")
+        text = f"{missing} to run: {outcome.detached}; the same command follows them"
+        end_with_plan(text, as_json)
     store, there = planned.store, [*outcome.done, *outcome.reused]
     data = load_study(store, there) if there else None
     failed = [one for failure in outcome.failed for one in failure.episodes]

@@ -6,7 +6,7 @@ import typer
 
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan
-from kerv_cli.cli.work import run_training
+from kerv_cli.cli.studies import run_training
 from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
 
 

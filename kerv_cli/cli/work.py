@@ -1,276 +1,48 @@
-"""Run studies and trainings for the commands: plan them, show their progress, print the results."""
+"""`kerv work`: run blocks of a study that a sweep has planned. Any number of processes may do so at once."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
-
 import typer
 
-from kerv_cli.base.durations import about, count
-from kerv_cli.cli.common import (
-    console,
-    end_with_json,
-    end_with_plan,
-    print_figures,
-    print_rows,
-    print_table,
-    progress_bar,
-    results_word,
-    settings_yaml,
+from kerv_cli.base.durations import count
+from kerv_cli.base.errors import Interrupted, UsageError
+from kerv_cli.cli.command import command
+from kerv_cli.cli.studies import event_printer
+from kerv_cli.episodes.settings import WorkSettings
+
+
+@command(
+    "work",
+    WorkSettings,
+    keys="study results",
+    examples=("kerv work study=demo", "kerv work study=main store=postgresql://me@server/kerv"),
 )
+def work(settings: WorkSettings) -> None:
+    """Run blocks of a study that 'kerv sweep' has planned, until none is left; on any machine, as often as you like."""
+    from kerv_cli.base.processes import end_with_input
+    from kerv_cli.episodes.resolve import study_name
+    from kerv_cli.lab.database import Database
+    from kerv_cli.lab.events import EpisodeEnd, Event
+    from kerv_cli.lab.store import StudyStore
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pandas import DataFrame
-
-    from kerv_cli.episodes.resolve import ResolvedStudy
-    from kerv_cli.lab.events import Event, Outcome
-    from kerv_cli.lab.runs import Run
-    from kerv_cli.lab.store import Plan, StudyStore
-    from kerv_cli.training.run import TrainingRun
-
-SECONDS_PER_EPISODE = 1.0
-"""Guess that is used before anything was measured. MT10 takes 0.5 to 1.5 s per episode on one core."""
-BUSY = 1.2
-"""Load average per core above which a line says that other programs disturb the measured times."""
-
-
-def planned_study(resolved: ResolvedStudy, command: Sequence[str], is_rollout: bool = False) -> Plan:
-    """Plan a study or a rollout: find out which of its episodes must run. Print notes about it to standard error.
-
-    The notes give the number of episodes, the overrides that have no effect, the tasks that the policy was not trained
-    on, and whether an interrupted rollout is resumed.
-
-    Args:
-        resolved: The study with all its settings.
-        command: Command-line arguments after `kerv`, to be stored with the episodes.
-        is_rollout: Whether to plan a rollout.
-
-    Raises:
-        UsageError: The study cannot run with these settings.
-        CheckpointError: The policy or an artifact that a method needs is missing or damaged.
-    """
-    from kerv_cli.episodes.resolve import idle_overrides
-
-    settings, tasks = resolved.settings, resolved.tasks
-    for override, reason in idle_overrides(resolved, not is_rollout).items():
-        typer.echo(f"note: {override} has no effect: {reason}", err=True)
-    what = next(iter(settings)) if len(settings) == 1 else f"{len(settings)} settings"
-    whose = _few(list(dict.fromkeys(setting.policy.target for setting in settings.values())), "targets")
-    number = len(settings) * len(tasks) * resolved.first.episodes * resolved.study.repeats
-    # printed before torch and the simulator load
-    typer.echo(f"{what} of {whose} on {_few(tasks, 'tasks')}: {count(number, 'episode')}", err=True)
-    from kerv_cli.episodes.policy import unseen_tasks
-    from kerv_cli.lab.study import plan, plan_rollout
-    from kerv_cli.worlds import spec_of
-
-    planned = (plan_rollout if is_rollout else plan)(resolved, command)
-    for target, names in dict.fromkeys((s.policy.target, tuple(unseen_tasks(s, tasks))) for s in settings.values()):
-        if names:
-            typer.echo(f"kerv: warning: policy {target} was never trained on {', '.join(names)}", err=True)
-    for task in dict.fromkeys(one.task for one in planned.to_run):
-        spec_of(task).check_installed()
-    if is_rollout and planned.existing:
-        there, wanted = len(planned.existing), len(planned.study.episodes)
-        typer.echo(f"resuming {planned.store.name}: {there} of {wanted} episodes are there", err=True)
-    return planned
-
-
-def _few(names: Sequence[str], what: str) -> str:
-    """Return up to three names as a list, or the number of names as in `10 tasks`.
-
-    Args:
-        names: The names.
-        what: What they name, in plural.
-    """
-    return ", ".join(names) if len(names) < 4 else f"{len(names)} {what}"
-
-
-def print_settings(resolved: ResolvedStudy) -> None:
-    """Print a study and each of its settings as YAML. For the option --cfg."""
-    typer.echo(settings_yaml(resolved.study), nl=False)
-    for label, settings in resolved.settings.items():
-        typer.echo(f"--- # {label}\n{settings_yaml(settings)}", nl=False)
-
-
-def print_study_plan(planned: Plan, as_json: bool) -> None:
-    """Print which episodes would run, why, and how long that would take. For the option --plan."""
-    from kerv_cli.lab.study import estimate, plan_rows
-
-    rows, store, to_run, reused = plan_rows(planned), planned.store, planned.to_run, planned.existing
-    seconds, source = estimate(planned, SECONDS_PER_EPISODE)
-    if as_json:
-        end_with_json({"study": store.name, "folder": store.root, "settings": rows, "to run": len(to_run),
-                       "reused": len(reused), "seconds": seconds, "source": source})  # fmt: skip
-    print_rows(rows, f"study {store.name}, episodes")
-    typer.echo(f"{count(len(to_run), 'episode')} to run, {len(reused)} reused, {about(seconds, source)}")
-
-
-def run_study(planned: Plan) -> Outcome:
-    """Run the missing episodes of a plan and show the progress.
-
-    Raises:
-        Interrupted: The user pressed Ctrl-C.
-        KervError: The study could not run, see `study.run`.
-    """
-    from kerv_cli.lab.study import run
+    if not settings.study:
+        raise UsageError("of which study? name one, study=NAME: 'kerv runs list' shows them")
+    if settings.run:
+        end_with_input()
+    from kerv_cli.lab.study import work_on
     from kerv_cli.report.viewing import save_recording
 
-    with progress_bar("episodes") as show:
-        return run(planned, event_printer(show), save=save_recording)
-
-
-def event_printer(show: Callable[[int, int, str], None]) -> Callable[[Event], None]:
-    """Return a function that prints a line about each event of a running study and moves its progress bar.
-
-    If standard error is no terminal and more than 100 episodes run, no line is printed per episode.
-
-    Args:
-        show: Moves the bar, see `progress_bar`.
-    """
-    from kerv_cli.lab.events import BlockStarted, BlockWaits, SettingFailed, Started
-
-    total = ended = 0
-    title = "preparing"
+    ended = 0
+    show = event_printer(lambda done, total, text: None)
 
     def on_event(event: Event) -> None:
-        nonlocal total, ended, title
-        line = ""
-        if isinstance(event, Started):
-            if event.load > BUSY:
-                typer.echo(f"the load average is {event.load:g} per core: other programs slow these times", err=True)
-            total, ended = event.to_run, 0
-            line = f"{count(event.reused, 'episode')} there already" if event.reused else ""
-        elif isinstance(event, BlockStarted):
-            title = event.block.title
-        elif isinstance(event, BlockWaits):
-            line = f"{event.block.name}: another sweep computes it"
-        elif isinstance(event, SettingFailed):
-            ended += len(event.episodes)
-            one = event.episodes[0]
-            line = f"{one.setting.label} on {one.task}: failed: {event.reason}"
-        else:
-            ended += 1
-            one, result = event.episode, "run by another sweep"
-            if not event.elsewhere:
-                result = f"{'success' if event.success else 'failure'}, {event.seconds:.1f} s"
-            if event.elsewhere or total <= 100 or sys.stderr.isatty():
-                line = f"{ended}/{total} {one.setting.label} on {one.task}, seed {one.seed}: {result}"
-        if line:
-            typer.echo(line, err=True)
-        if total:
-            show(ended, total, title)
+        nonlocal ended
+        ended += isinstance(event, EpisodeEnd)
+        show(event)
 
-    return on_event
-
-
-def print_study(table: DataFrame, store: StudyStore, all_columns: bool = False, how: str = "") -> None:
-    """Print the table of a study and its note.
-
-    If times cannot be compared, because they were not measured in turn, print the command that measures them again.
-
-    Args:
-        table: Summary with one row per setting.
-        store: The study in the database.
-        all_columns: Print all columns, not only those that people need first.
-        how: What to type to see all columns. Empty: `kerv report study=NAME --all`.
-    """
-    from kerv_cli.report.summary import SummaryTable, not_in_turn
-    from kerv_cli.report.tables import values_of
-
-    where = results_word([f"results={store.database.results}"] if str(store.database.results) != "results" else [])
-    how = how or f"kerv report study={store.name}{where} --all"
-    console().print(SummaryTable(table, all_columns, how))
-    codes, commits = values_of(table, "code"), values_of(table, "git_commit")
-    if len(codes) > 1:
-        names = ", ".join(sorted(commit[:12] for commit in commits))
-        typer.echo(f"its episodes are of {len(codes)} states of the code, commits {names}")
-    apart = not_in_turn(table)
-    if apart:
-        mend = "" if store.kind == "import" else f"; '{store.sweep_command('rerun=timed')}' does that"
-        typer.echo(f"no speedup of {', '.join(apart)}: not measured in turn with the baseline{mend}")
-    note = store.load().note
-    if note:
-        typer.echo(f"\n{note}\n")
-
-
-def print_prices(priced: DataFrame | None) -> None:
-    """Print the speeds on other machines, from `reprice.repriced_table`. Nothing if there are none."""
-    from kerv_cli.report.reprice import ASSUMES, repriced_summary
-
-    if priced is not None:
-        summary = repriced_summary(priced)
-        summary = summary.filter(regex="setting|per episode")  # the page has the speeds per step
-        print_table(summary.columns, summary.itertuples(index=False), ASSUMES)
-
-
-def print_verdict(table: DataFrame, store: StudyStore, loss: float) -> None:
-    """Print the last lines about a study: the verdict, the page to open, the recording to watch, the board.
-
-    Args:
-        table: Summary with one row per setting.
-        store: The study in the database.
-        loss: Largest loss of success that is accepted, percentage points.
-    """
-    from kerv_cli.report.decide import verdict_of
-
-    typer.echo(f"verdict: {verdict_of(table, loss)[0]}")
-    typer.echo(f"page: {store.root / 'report.html'}")
-    typer.echo(
-        f"browse: kerv board{'' if store.database.results.name == 'results' else f' results={store.database.results}'}"
-    )
-    recordings = store.recordings
-    mend = "" if store.kind == "import" else "; the same sweep with record=1 rerun=all does that"
-    typer.echo(f"watch: {f'kerv view {recordings[0]}' if recordings else f'nothing is recorded{mend}'}")
-
-
-def run_training(run: TrainingRun, plan: bool, as_json: bool, loading: str, training: str) -> None:
-    """Run a training and show its progress, or print the plan.
-
-    Args:
-        run: The training.
-        plan: Print what would be trained, and end the command.
-        as_json: Print the result as JSON.
-        loading: Title of the progress bar while data are read.
-        training: Title of the progress bar during training.
-
-    Raises:
-        UsageError: Another process is training the same artifact.
-    """
-    from kerv_cli.lab.runs import making, time_as_before
-
-    if plan:
-        time = time_as_before(run.settings.results, run.artifact_kind, run.settings.train.steps)
-        end_with_plan(f"{run.plan()}, {time}", as_json)
-    with making(run.settings.results, run.artifact_kind, run.folder) as record:
-        metrics, plot = _train(run, record, loading, training)
-    if as_json:
-        end_with_json({"folder": run.folder, "best": metrics, "curves": plot})
-    print_figures("best checkpoint", metrics, run.folder)
-    typer.echo(f"curves in {run.folder / 'log.csv'} and {plot}")
-
-
-def _train(run: TrainingRun, record: Run, loading: str, training: str) -> tuple[dict[str, float], Path]:
-    from kerv_cli.training.loop import without_subnormals
-
-    with without_subnormals(), progress_bar(loading, record) as advance:
-        run.load(advance)
-    started = False
-    settings = run.settings
-
-    def on_step(step: int, now: dict[str, float]) -> None:
-        nonlocal started
-        if not started and step > 1:
-            typer.echo(f"resuming at step {step - 1}", err=True)
-        started = True
-        line = " ".join(f"{name} {value:.4g}" for name, value in list(now.items())[:6] if name != "step")
-        advance(step, settings.train.steps, line)
-
-    with without_subnormals(), progress_bar(training, record) as advance:
-        metrics = run.train(on_step)
-    from kerv_cli.report.plots import save_curves
-
-    return metrics, save_curves(run.folder)
+    store = StudyStore(Database(settings.results), study_name(settings.study))
+    try:
+        work_on(store, settings.run, on_event, save_recording)
+    except KeyboardInterrupt:
+        raise Interrupted(f"interrupted after {count(ended, 'episode')}: other workers go on") from None
+    typer.echo(f"{count(ended, 'episode')} run, no block of {store.name} is left")

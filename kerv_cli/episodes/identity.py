@@ -41,7 +41,7 @@ OBSERVATION = "observation"
 NOT_DETERMINING = frozenset(
     {"task", "episodes", "seed", "policy", "method", "results", "store", "record", "record_size"}
 )
-NOT_DETERMINING_RUNTIME = frozenset({"workers", "executor", "executor_options"})
+NOT_DETERMINING_RUNTIME = frozenset({"workers", "executor", "executor_options", "detach"})
 
 
 def hash_of(value: object) -> str:
@@ -276,7 +276,7 @@ class _Essential(ast.NodeTransformer):
 
 
 def _of_plugins() -> Iterator[tuple[str, Path]]:
-    kinds = set(registry.kinds()) - {"executor", "command"}
+    kinds = set(registry.kinds()) - {"command"}
     modules = {part.build.partition(":")[0] for kind in kinds for part in registry.parts(kind).values()}
     for name in sorted(module for module in modules if module and not module.startswith("kerv_cli.")):
         spec = importlib.util.find_spec(name)

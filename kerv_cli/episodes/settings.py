@@ -108,6 +108,14 @@ class SweepSettings(CommandSettings):
     loss: float = number(3.0, above=0, most=99.9, help="largest loss of success that the verdict accepts, points")
 
 
+@dataclass(kw_only=True)
+class WorkSettings(CommandSettings):
+    """Settings of `kerv work`, which runs blocks of a study that a sweep has planned."""
+
+    study: str = setting("", "name or file of the study")
+    run: str = setting("", "only blocks of the command with this id, whose process ends this one by closing its input")
+
+
 def settings_from(plain: Mapping[str, Any]) -> RolloutSettings:
     """Build a rollout's settings from nested dictionaries and lists, as they are stored."""
     return read_settings(RolloutSettings, plain)

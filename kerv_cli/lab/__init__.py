@@ -1,1 +1,1 @@
-"""Runs studies: plans which episodes to run, runs them through executors, and stores them in the database."""
+"""Runs studies: plans which episodes to run, lets workers run them, and stores them in the database."""

@@ -1,7 +1,7 @@
 """The database of a results folder: tables of runs, studies and episodes (docs/formats.md).
 
 By default it is SQLite in `<results>/kerv.db`. With `store=postgresql://USER@HOST/DB`, or the variable KERV_STORE, the
-same tables are on a server. Only the process that runs a command writes. Its workers send their episodes to it.
+same tables are on a server. Every process that runs episodes writes them itself.
 """
 
 from __future__ import annotations
@@ -28,12 +28,17 @@ FILE = "kerv.db"
 SCHEMA = 1
 """Version of the tables. A database with a larger version is refused.
 
-A new column in MEASURES needs no new version: it is added at the next write, and until then it reads as null.
+A new column in MEASURES, or the table QUEUE, needs no new version: it is added at the next write. Until then the
+column reads as null.
 """
 LOCK_SECONDS = 60
 """Longest time to wait for another process's transaction in a SQLite file, seconds."""
 
 _META = sa.MetaData()
+
+
+class Unanswered(StorageError):
+    """The server is away or too slow, or another process has locked the file. Trying again may help."""
 
 
 class Damaged(ValueError):
@@ -177,7 +182,6 @@ SETTINGS = _table(
 BLOCKS = _table(
     "blocks",  # one attempt to run a group of episodes in one process, with settings taking turns
     sa.Column("id", _Text, primary_key=True),
-    sa.Column("claim", sa.Text),  # JSON: the episodes that are running; null after the block has ended
     *_required(_Text, "run", "seeds", "started", "code"),  # code: hash of the source code
     *_required(_Object, "about"),  # machine, versions, commit, executor, workers
 )
@@ -207,7 +211,21 @@ WANTED = _table(
     sa.Column("repeat", sa.Integer, primary_key=True),
     *_required(_Integer, "position"),
     sa.Column("episode_id", sa.ForeignKey("episodes.id", ondelete="SET NULL"), index=True),
-    sa.Column("error", _Message),  # traceback, if the last attempt failed
+    sa.Column("error", _Message),  # if the last attempt failed: the error in one line, then its traceback
+)
+QUEUE = _table(
+    "queue",  # blocks that wait or run: a row is deleted when its block has ended
+    sa.Column("id", sa.Integer, primary_key=True),
+    _to("study_id", "studies.id", nullable=False),
+    *_required(_Text, "run"),  # id of the command that planned the block
+    *_required(_Integer, "position", "newest"),  # newest: largest episodes.id when the block was planned
+    *_required(_List, "episodes"),  # work, task, seed and repeat of each
+    *_required(_Object, "about"),  # executor, workers
+    sa.Column("worker", _Text, index=True),  # the process that has claimed the block; null: none
+    sa.Column("heartbeat", _Float),  # its newest sign of life, seconds since 1970 by the database's clock
+    sa.Column("running", _List),  # the episode that it runs
+    sa.Column("died", _List),  # the episode in which the worker before it died
+    sa.Index("queue_of_study", "study_id", "position"),
 )
 
 
@@ -246,7 +264,17 @@ class Database:
         self.shown = str(self.file or without_passwords(str(url)))
         self._url = parsed if self.file else parsed.set(drivername="postgresql+psycopg")
         self._engine: sa.Engine | None = None
-        self._is_complete = False  # whether the table of episodes is known to have all columns
+        self._is_complete = False  # whether all tables and columns are known to exist
+
+    @property
+    def store(self) -> str:
+        """The value of KERV_STORE with which other processes use this database, its password included.
+
+        Empty for the file in the results folder.
+        """
+        if self.file is not None and self.file.absolute() == (self.results / FILE).absolute():
+            return ""
+        return self._url.render_as_string(hide_password=False)
 
     @property
     def exists(self) -> bool:
@@ -283,6 +311,7 @@ class Database:
             engine = self._opened(create=True).execution_options(kerv_writes=True)
             with engine.begin() as connection:
                 if not self._is_complete:
+                    QUEUE.create(connection, checkfirst=True)
                     _add_measures(connection)
                 yield connection
             self._is_complete = True
@@ -338,7 +367,8 @@ class Database:
         if self.file is None:
             is_away = isinstance(error, sa.exc.OperationalError | sa.exc.InterfaceError)
             hint = "check that the server runs, or leave out store=" if is_away else "check the rights of its user"
-            return StorageError(f"store={self.shown} {'failed' if is_away else 'refused a statement'} ({why}): {hint}")
+            kind = Unanswered if is_away else StorageError
+            return kind(f"store={self.shown} {'failed' if is_away else 'refused a statement'} ({why}): {hint}")
         if "malformed" in why or "not a database" in why:
             return self._damaged(why)
         hint = ""
@@ -346,7 +376,14 @@ class Database:
             hint = ": put results= on a local disk, or use a server, store=postgresql://USER@HOST/DB"
         elif "unable to open" in why and _log(self.file):
             hint = f": copy {self.results} to where you can write, its newest rows are in {self.file.name}-wal"
-        return StorageError(f"cannot use {self.file}: {why}{hint}")
+        return (Unanswered if "lock" in why else StorageError)(f"cannot use {self.file}: {why}{hint}")
+
+
+def clock(connection: sa.Connection) -> sa.ColumnElement[float]:
+    """Return the SQL expression of the time by the database's own clock, seconds since 1970."""
+    if connection.dialect.name == "postgresql":
+        return sa.literal_column("CAST(EXTRACT(EPOCH FROM clock_timestamp()) AS double precision)", sa.Double)
+    return sa.literal_column("(julianday('now') - 2440587.5) * 86400.0", sa.Double)
 
 
 def file_url(results: Path) -> sa.URL:

@@ -1,4 +1,4 @@
-"""Events of a running study. `execute` sends them, and a progress display shows them."""
+"""Events of a running study. Workers and sweeps send them, and a progress display shows them."""
 
 from __future__ import annotations
 
@@ -26,16 +26,14 @@ class Started:
 
 @dataclass(frozen=True)
 class BlockStarted:
-    """A worker was given a block (episodes that one process runs)."""
+    """A worker has claimed a block (episodes that one process runs)."""
 
     block: Block
 
 
 @dataclass(frozen=True)
-class BlockWaits:
-    """Another sweep is running the same block of episodes. `execute` checks again later."""
-
-    block: Block
+class BlocksWait:
+    """Other processes run all blocks that are left. The worker waits, to take over those of a process that dies."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,7 @@ class EpisodeEnd:
         episode: The episode.
         success: Whether the task was solved.
         seconds: Wall time.
-        elsewhere: Whether another sweep has run it.
+        elsewhere: Whether another command has planned it.
     """
 
     episode: Episode
@@ -62,7 +60,7 @@ class SettingFailed:
     Attributes:
         reason: The error in one line.
         trace: The error's traceback.
-        error: The error itself if it is a KervError, else None, because other errors may not be picklable.
+        error: The error itself if it is a KervError that was raised in this process, else None.
         episodes: The episode that failed, and then the episodes that will not run because of it.
     """
 
@@ -74,20 +72,22 @@ class SettingFailed:
 
 @dataclass
 class Outcome:
-    """Result of `execute`. Each episode of the study is in exactly one of the three lists.
+    """Result of `study.run`. Each episode of the study is in exactly one of the three lists, unless it was detached.
 
     Attributes:
-        done: Episodes that this call ran.
-        reused: Episodes that were in the database already, or that another sweep ran.
+        done: Episodes that this command planned and that were run.
+        reused: Episodes that were in the database already, or that another command planned and ran.
         failed: Settings that failed, with their episodes.
         seconds: Wall time.
+        detached: Says which workers of a cluster run the missing episodes. Empty: none do.
     """
 
     done: list[Episode] = field(default_factory=list)
     reused: list[Episode] = field(default_factory=list)
     failed: list[SettingFailed] = field(default_factory=list)
     seconds: float = 0.0
+    detached: str = ""
 
 
-Event = Started | BlockStarted | BlockWaits | EpisodeEnd | SettingFailed
+Event = Started | BlockStarted | BlocksWait | EpisodeEnd | SettingFailed
 OnEvent = Callable[[Event], None]

@@ -166,9 +166,10 @@ class StudyStore:
             existing: Episodes that the database already has, with their rows.
         """
         with self.database.writing() as connection:
-            self._save(connection, study, existing or {})
+            self.save_in(connection, study, existing or {})
 
-    def _save(self, connection: sa.Connection, study: Study, existing: Mapping[Episode, StoredEpisode]) -> None:
+    def save_in(self, connection: sa.Connection, study: Study, existing: Mapping[Episode, StoredEpisode]) -> int:
+        """Do what `save` does, in a transaction of the caller. Return the study's row number."""
         about = {name: getattr(study, name) for name in ABOUT}
         row = connection.execute(sa.select(STUDIES).where(STUDIES.c.name == self.name)).first()
         if row is None:
@@ -206,6 +207,7 @@ class StudyStore:
         ]
         if rows:
             connection.execute(sa.insert(WANTED), rows)
+        return int(row.id)
 
     def counts(self) -> tuple[int, int]:
         """Return how many of the study's planned episodes have been run, and how many are planned in all."""
@@ -311,7 +313,7 @@ class StudyStore:
         from kerv_cli.episodes.rows import seconds_blob, table_blob
 
         with Run(self.database, study.kind, self.name, command) as record, self.database.writing() as connection:
-            self._save(connection, study, {})
+            self.save_in(connection, study, {})
             blocks = set(connection.scalars(sa.select(BLOCKS.c.id)))
             for one in episodes:
                 if one.block not in blocks:
@@ -356,7 +358,7 @@ class StudyStore:
             connection.execute(sa.delete(EPISODES).where(*unused))
             connection.execute(sa.delete(STUDIES).where(STUDIES.c.name == self.name))
             full = sa.select(EPISODES.c.block)
-            connection.execute(sa.delete(BLOCKS).where(BLOCKS.c.id.not_in(full), BLOCKS.c.claim.is_(None)))
+            connection.execute(sa.delete(BLOCKS).where(BLOCKS.c.id.not_in(full)))
 
 
 def _save_setting(connection: sa.Connection, study: int, position: int, setting: Setting) -> int:
@@ -475,7 +477,9 @@ def plan_study(
     return Plan(study, store, existing, missing, newest, runtime or RuntimeSettings(), tuple(command))
 
 
-def stored_episodes(database: Database, study: Study, newer_than: int = 0) -> dict[Key, list[StoredEpisode]]:
+def stored_episodes(
+    database: Database, study: Study, newer_than: int = 0, block: Block | None = None
+) -> dict[Key, list[StoredEpisode]]:
     """Return the stored episodes that a study may reuse, by `Episode.key`.
 
     Sweeps do not reuse episodes of rollouts: no other setting took turns with them, so their times cannot be compared.
@@ -484,15 +488,19 @@ def stored_episodes(database: Database, study: Study, newer_than: int = 0) -> di
         database: The database.
         study: The study.
         newer_than: Return only rows with a larger row number.
+        block: Return only rows of this block's settings, tasks and seeds. None: of all the study's settings.
     """
     stored: dict[Key, list[StoredEpisode]] = {}
     columns = (
         EPISODES.c.work, EPISODES.c.task, EPISODES.c.seed, EPISODES.c.repeat, EPISODES.c.id, BLOCKS.c.id,
         BLOCKS.c.started, BLOCKS.c.code, BLOCKS.c.seeds,
     )  # fmt: skip
-    works = {setting.work for setting in study.settings}
+    works = {setting.work for setting in (block or study).settings}
     query = sa.select(*columns).join(BLOCKS, EPISODES.c.block == BLOCKS.c.id)
     query = query.where(EPISODES.c.id > newer_than, EPISODES.c.work.in_(works))
+    if block is not None:
+        tasks = {one.task for one in block.episodes}
+        query = query.where(EPISODES.c.task.in_(tasks), EPISODES.c.seed.in_(block.seeds))
     if study.kind != ROLLOUT:
         query = query.outerjoin(RUNS, RUNS.c.id == BLOCKS.c.run)
         query = query.where(sa.func.coalesce(RUNS.c.kind, "") != ROLLOUT)

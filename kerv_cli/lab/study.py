@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import secrets
 from collections.abc import Callable, Iterator, Sequence
@@ -11,29 +12,36 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
-from kerv_cli.base.errors import Interrupted, KervError, StorageError
+from kerv_cli.base.durations import count
+from kerv_cli.base.errors import CheckpointError, Interrupted, KervError, StorageError, UsageError
 from kerv_cli.base.places import check_writable
 from kerv_cli.base.runtime import set_up
+from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.engine.record import EpisodeRecord
+from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.resolve import ResolvedStudy
 from kerv_cli.episodes.runner import Request, Runner, close_worlds, is_recorded, run_batch
 from kerv_cli.episodes.settings import settings_from
 from kerv_cli.lab.database import EPISODES, Database
 from kerv_cli.lab.events import Event, OnEvent, Outcome, SettingFailed
-from kerv_cli.lab.execute import execute
-from kerv_cli.lab.executors import check_executor
 from kerv_cli.lab.plan import ALL, Episode, Setting, Study, all_episodes, plain_settings, seeds_text
+from kerv_cli.lab.progress import Progress
+from kerv_cli.lab.queue import Queue, enqueue
 from kerv_cli.lab.runs import Run, interrupted_since, unfinished
+from kerv_cli.lab.slurm import Array
 from kerv_cli.lab.store import ABOUT, ROLLOUT, SWEEP, Plan, StudyStore, plan_study
+from kerv_cli.lab.work import Prepare, work
+from kerv_cli.lab.workers import LocalWorkers, follow, gpus_in_turn
 
+SLURM = "slurm"
 Save = Callable[[EpisodeRecord, Path, str], object]
 """Function that writes an episode to a .rrd file. The last argument is the setting's label."""
 
 
 @dataclass(frozen=True)
 class EpisodeRunner:
-    """Builds the decoder of a setting and runs its episodes. Picklable.
+    """Builds the decoder of a setting and runs its episodes.
 
     Attributes:
         rollouts: Folder for recordings, one .rrd file per recorded episode.
@@ -81,7 +89,7 @@ def study_of(resolved: ResolvedStudy, kind: str = SWEEP) -> Study:
     about = resolved.study
     identities = {label: check(one) for label, one in resolved.settings.items()}
     for one in resolved.settings.values():
-        one.runtime.device, _ = set_up(one.runtime)
+        one.runtime.device = _device_of(one.runtime)
     settings = [
         Setting(
             label,
@@ -99,6 +107,39 @@ def study_of(resolved: ResolvedStudy, kind: str = SWEEP) -> Study:
     return Study(about.name, tuple(settings), episodes, kind, **own)
 
 
+def _device_of(runtime: RuntimeSettings) -> str:
+    """Return the device on which episodes run. On a cluster it is that of the nodes: this machine may have no GPU."""
+    if runtime.executor != SLURM:
+        return set_up(runtime)[0]
+    on_node = "cuda" if runtime.executor_options.gpus else "cpu"
+    return on_node if runtime.device == "auto" else runtime.device
+
+
+def checked(setting: Setting, tasks: list[str], results: str) -> Setting:
+    """Check that the weights and data that a stored setting uses are still the same.
+
+    Args:
+        setting: The stored setting.
+        tasks: Names of the tasks on which it will run.
+        results: The results folder in which it will run.
+
+    Returns:
+        The setting, changed to run in `results`.
+
+    Raises:
+        CheckpointError: Its weights or data have changed.
+    """
+    stored = {**setting.settings, "results": results}
+    identity = check(settings_from({**stored, "task": tasks}))
+    for kind in setting.identity.keys() | identity.keys():
+        before, now = setting.identity.get(kind, "none"), identity.get(kind, "none")
+        if kind != OBSERVATION and before != now:
+            raise CheckpointError(
+                f"the {kind} of {setting.label} has changed from {before[:12]} to {now[:12]}: it cannot run again"
+            )
+    return replace(setting, settings=stored, identity=identity)
+
+
 def plan(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
     """Plan a sweep: return which episodes of a study are in the database, and which must run.
 
@@ -112,7 +153,8 @@ def plan(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
         StorageError: The results folder is not writable.
     """
     runtime, results, rerun = resolved.first.runtime, resolved.first.results, resolved.sweep.rerun
-    check_executor(runtime)
+    if runtime.detach and runtime.executor != SLURM:
+        raise UsageError("runtime.detach=true is for clusters: add runtime.executor=slurm")
     check_writable(results)
     study, database = study_of(resolved), Database(results)
     since = interrupted_since(database, SWEEP, study.name, command) if rerun == ALL else ""
@@ -163,17 +205,103 @@ def run(planned: Plan, on_event: OnEvent = lambda event: None, *, save: Save = l
             raise event.error or KervError(event.reason)
         on_event(event)
 
-    runner = EpisodeRunner(store.rollouts, save)
-    with Run(store.database, planned.study.kind, store.name, planned.command, alone=is_rollout) as record:
-        try:
-            store.save(planned.study, planned.existing)
-            return execute(planned, runner, record, forward)
-        except KeyboardInterrupt:
-            raise Interrupted(
-                f"interrupted: {_kept(store)} of {store.name} are kept: run the same command to resume"
-            ) from None
-        finally:
-            close_worlds()
+    prepare = EpisodeRunner(store.rollouts, save)
+    try:
+        with Run(store.database, planned.study.kind, store.name, planned.command, alone=is_rollout) as record:
+            try:
+                return run_blocks(planned, prepare, record, forward)
+            except KeyboardInterrupt:
+                raise Interrupted(
+                    f"interrupted: {_kept(store)} of {store.name} are kept: run the same command to resume"
+                ) from None
+            finally:
+                close_worlds()
+    except Detached as detached:
+        return Outcome(reused=list(planned.existing), detached=str(detached))
+
+
+class Detached(Interrupted):
+    """The workers of a cluster go on without this command. The message says which."""
+
+
+def run_blocks(planned: Plan, prepare: Prepare, record: Run, on_event: OnEvent) -> Outcome:
+    """Queue the blocks of a plan, and run them: in this process, in worker processes, or on a cluster.
+
+    However it ends, no process of this machine runs a block after that, and none of the plan's blocks stays queued.
+    Only a cluster's workers go on if this process is killed.
+
+    Args:
+        planned: The plan.
+        prepare: Builds a setting's decoder for a task. Used in this process only.
+        record: The database row of this command.
+        on_event: Called with each event, to show progress.
+    """
+    runtime, blocks = planned.runtime, planned.blocks()
+    queue, progress = Queue(planned.store, record.id), Progress(planned, record, on_event)
+    enqueue(planned, record.id)
+    threads = max((one.setting.settings["runtime"]["threads"] for one in planned.to_run), default=1)
+    try:
+        if blocks and runtime.executor == SLURM:
+            _follow_cluster(Array(queue, runtime, threads), progress)
+        elif blocks and runtime.workers > 1:
+            number = min(runtime.workers, len(blocks))
+            with LocalWorkers(queue, number, threads, gpus_in_turn(_device(planned))) as workers:
+                follow(queue, progress, workers.tend)
+        elif blocks:
+            work(queue, prepare, progress.see)
+        outcome = progress.end()
+    except BaseException as error:
+        if not isinstance(error, Detached):
+            with contextlib.suppress(StorageError):
+                queue.withdraw()
+        raise
+    return outcome
+
+
+def _follow_cluster(array: Array, progress: Progress) -> None:
+    """Follow the workers of a cluster until they have run all blocks. If that is interrupted, cancel them.
+
+    Raises:
+        Detached: The command was asked not to follow them.
+    """
+    if array.runtime.detach:
+        raise Detached(f"job {array.id} of Slurm runs them, its logs are in {array.logs}")
+    try:
+        follow(array.queue, progress, lambda: array.tend(progress))
+    except KeyboardInterrupt:
+        with contextlib.suppress(KervError):
+            array.cancel()
+        raise
+
+
+def _device(planned: Plan) -> str:
+    """Return the device of a plan's episodes. Empty if they need different ones."""
+    devices = {str(one.setting.settings["runtime"]["device"]) for one in planned.to_run}
+    return devices.pop() if len(devices) == 1 else ""
+
+
+def work_on(store: StudyStore, run_id: str, on_event: OnEvent, save: Save) -> None:
+    """Run blocks of a study that a sweep has planned, until none is left. For `kerv work`.
+
+    Args:
+        store: The study.
+        run_id: Only blocks of the command with this id. Empty: all.
+        on_event: Called with each event, to show progress.
+        save: Writes a recording.
+
+    Raises:
+        UsageError: The study is not in the database, or its device is not on this machine.
+        CheckpointError: Weights or data in this results folder are not those with which the study was planned.
+        StorageError: The disk is full or not writable, or the database does not answer.
+    """
+    study = store.load()
+    for setting in study.settings:
+        set_up(settings_from(setting.on(study.tasks[0])).runtime)
+        checked(setting, study.tasks, str(store.database.results))
+    try:
+        work(Queue(store, run_id), EpisodeRunner(store.rollouts, save), on_event)
+    finally:
+        close_worlds()
 
 
 def _kept(store: StudyStore) -> str:
@@ -226,3 +354,18 @@ def estimate(planned: Plan, guess: float) -> tuple[float, str]:
     seconds = sum(means.get(one.setting.work, mean) for one in planned.to_run)
     source = f"measured on {stored} stored episodes" if stored else f"a guess of {guess:g} s per episode"
     return seconds / max(1, min(planned.runtime.workers, len(planned.blocks()))), source
+
+
+def warnings_about(planned: Plan) -> list[str]:
+    """Return what disturbs the times of a plan's episodes, a sentence each: workers that share a GPU or a CPU."""
+    runtime = planned.runtime
+    if runtime.workers == 1 or runtime.executor == SLURM or all(block.batch > 1 for block in planned.blocks()):
+        return []
+    device, gpus = _device(planned), len(gpus_in_turn(_device(planned)))
+    if device == "cuda":
+        shared = f"share {count(gpus, 'GPU')}" if runtime.workers > gpus else ""
+    else:
+        shared = "share this machine's memory: each needs a core and a memory channel of its own"
+    if not shared:
+        return []
+    return [f"{runtime.workers} workers measure times and {shared} (docs/scale.md)"]

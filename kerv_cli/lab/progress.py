@@ -1,0 +1,109 @@
+"""What has become of the episodes that a command planned, whichever process runs them."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import sqlalchemy as sa
+
+from kerv_cli.base.errors import KervError
+from kerv_cli.lab import events
+from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, SETTINGS, STUDIES, WANTED
+from kerv_cli.lab.plan import Episode
+from kerv_cli.lab.runs import Run
+from kerv_cli.lab.store import ROLLOUT, Plan
+from kerv_cli.lab.work import load_per_core
+
+
+class Progress:
+    """Collects the outcome of a plan: from the events of a worker in this process, and from the database.
+
+    Args:
+        plan: The plan.
+        record: The database row of the command.
+        on_event: Called with each event, to show progress.
+    """
+
+    def __init__(self, plan: Plan, record: Run, on_event: events.OnEvent) -> None:
+        self.plan, self.record, self.on_event = plan, record, on_event
+        self.outcome = events.Outcome(reused=list(plan.existing))
+        self._missing = {one.key: one for one in plan.to_run}
+        self._newest, self._began = plan.newest, time.perf_counter()
+        record.beat(0, len(self._missing))
+        is_timed = any(block.batch == 1 for block in plan.blocks())
+        on_event(events.Started(len(self._missing), len(plan.existing), load_per_core() if is_timed else 0.0))
+
+    def see(self, event: events.Event) -> None:
+        """Take an event of a worker in this process."""
+        if isinstance(event, events.EpisodeEnd):
+            one = self._missing.pop(event.episode.key, None)
+            if one is None:
+                return
+            event = replace(event, episode=one)
+            (self.outcome.reused if event.elsewhere else self.outcome.done).append(one)
+            self.record.beat(len(self.outcome.done))
+        elif isinstance(event, events.SettingFailed):
+            known = (self._missing.pop(one.key, one) for one in event.episodes)
+            event = replace(event, episodes=tuple(known))
+            self.outcome.failed.append(event)
+        elif isinstance(event, events.BlockStarted):
+            self.look()
+        self.on_event(event)
+
+    def look(self) -> None:
+        """Read from the database which episodes other processes have run, and which have failed."""
+        for ended in self._ended():
+            self.see(ended)
+        for failure in self._failed():
+            self.see(failure)
+
+    def _ended(self) -> list[events.EpisodeEnd]:
+        columns = (EPISODES.c.work, EPISODES.c.task, EPISODES.c.seed, EPISODES.c.repeat)
+        facts = (EPISODES.c.id, EPISODES.c.success, EPISODES.c.wall_seconds, BLOCKS.c.run)
+        works = {work for work, *_ in self._missing}
+        query = sa.select(*columns, *facts).join(BLOCKS, EPISODES.c.block == BLOCKS.c.id)
+        query = query.where(EPISODES.c.id > self._newest, EPISODES.c.work.in_(works)).order_by(EPISODES.c.id)
+        if self.plan.study.kind != ROLLOUT:  # as in `stored_episodes`
+            query = query.outerjoin(RUNS, RUNS.c.id == BLOCKS.c.run)
+            query = query.where(sa.func.coalesce(RUNS.c.kind, "") != ROLLOUT)
+        with self.plan.store.database.reading() as connection:
+            rows = connection.execute(query).all()
+        self._newest = max((row.id for row in rows), default=self._newest)
+        known = [(self._missing.get(tuple(row[:4])), row) for row in rows]
+        return [
+            events.EpisodeEnd(one, bool(row.success), float(row.wall_seconds), row.run != self.record.id)
+            for one, row in known
+            if one is not None
+        ]
+
+    def _failed(self) -> list[events.SettingFailed]:
+        columns = (SETTINGS.c.work, WANTED.c.task, WANTED.c.seed, WANTED.c.repeat, WANTED.c.error)
+        query = sa.select(*columns).select_from(WANTED.join(SETTINGS).join(STUDIES)).order_by(WANTED.c.position)
+        query = query.where(STUDIES.c.name == self.plan.store.name, WANTED.c.error.is_not(None))
+        failed: dict[tuple[str, str, str], dict[Episode, None]] = {}
+        with self.plan.store.database.reading() as connection:
+            for work, task, seed, repeat, error in connection.execute(query):
+                one = self._missing.get((work, task, seed, repeat))
+                if one is not None:
+                    failed.setdefault((work, task, error), {})[one] = None
+        return [
+            events.SettingFailed(*error.partition("\n")[::2], episodes=tuple(episodes))
+            for (_, _, error), episodes in failed.items()
+        ]
+
+    def end(self) -> events.Outcome:
+        """Return the outcome, after all blocks have ended.
+
+        Raises:
+            KervError: The study was deleted.
+        """
+        self.look()
+        if self._missing:
+            if not self.plan.store.exists:
+                name = self.plan.store.name
+                raise KervError(f"study {name} was deleted while it ran: run the same command to start it again")
+            reason = "another command has planned the study anew, without it: run the same command again"
+            self.see(events.SettingFailed(reason, episodes=tuple(self._missing.values())))
+        self.outcome.seconds = time.perf_counter() - self._began
+        return self.outcome

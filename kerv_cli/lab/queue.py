@@ -1,0 +1,283 @@
+"""The queue: blocks of episodes that wait or run. Workers claim them, wherever they are.
+
+A claim lasts as long as the worker writes its heartbeat. The database's own clock decides, because the clocks of two
+machines may differ. Every change is one transaction, and a database has one writer at a time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import sqlalchemy as sa
+
+from kerv_cli.base.errors import KervError, StorageError
+from kerv_cli.lab.database import QUEUE, SETTINGS, STUDIES, Unanswered, clock
+from kerv_cli.lab.plan import Block, Episode, Setting, StoredEpisode, Study, split
+from kerv_cli.lab.runs import is_running
+from kerv_cli.lab.store import ROLLOUT, Plan, StudyStore, setting_of, stored_episodes
+
+T = TypeVar("T")
+
+BEAT_SECONDS = 5.0
+"""Seconds between two heartbeats of a claim."""
+LAPSE_SECONDS = 30.0
+"""A claim without a heartbeat for so long is free again."""
+PATIENCE_SECONDS = 120.0
+"""Time for which a worker tries to reach a database that does not answer."""
+_PAGE = 10  # rows of the queue that are read at once
+
+
+class ClaimLost(KervError):
+    """The block does not belong to this worker any more: it was silent for too long, or the study was deleted."""
+
+
+def worker_id(pid: int, more: str = "") -> str:
+    """Return the name of a process in the queue.
+
+    Args:
+        pid: Its process id.
+        more: Tells workers of one process apart. Without it, the result is the beginning of its workers' names.
+    """
+    return f"{socket.gethostname()}:{pid}:{more}"
+
+
+def patiently(action: Callable[[], T]) -> T:
+    """Do something with the database. While it does not answer, try again for PATIENCE_SECONDS.
+
+    Raises:
+        StorageError: It did not answer for that long, or trying again would not help, as when the disk is full.
+    """
+    deadline = time.monotonic() + PATIENCE_SECONDS
+    while True:
+        try:
+            return action()
+        except Unanswered as error:
+            if time.monotonic() > deadline:
+                raise StorageError(f"{error}; finished episodes are kept, the same command goes on") from error
+            time.sleep(min(1.0, PATIENCE_SECONDS / 10))
+
+
+def enqueue(plan: Plan, run: str) -> None:
+    """Write a plan's study and its blocks, in one transaction.
+
+    Blocks of the same tasks that an earlier command has planned are removed, unless that command or a worker still
+    runs them.
+
+    Args:
+        plan: The plan.
+        run: Id of the command that made it.
+    """
+    about = {"executor": plan.runtime.executor, "workers": plan.runtime.workers}
+    with plan.store.database.writing() as connection:
+        study = plan.store.save_in(connection, plan.study, plan.existing)
+        rows = connection.execute(sa.select(QUEUE).where(QUEUE.c.study_id == study, _is_free(connection))).all()
+        dead = {run for run in {row.run for row in rows} if not is_running(connection, run)}
+        tasks = set(plan.study.tasks)
+        gone = [row.id for row in rows if row.run in dead and {one[1] for one in row.episodes} <= tasks]
+        for number in gone:
+            connection.execute(sa.delete(QUEUE).where(QUEUE.c.id == number))
+        blocks = [
+            {"position": position, "episodes": [list(one.key) for one in block.episodes]}
+            for position, block in enumerate(plan.blocks())
+        ]
+        if blocks:
+            common = {"study_id": study, "run": run, "newest": plan.newest, "about": about}
+            connection.execute(sa.insert(QUEUE), [common | block for block in blocks])
+
+
+def _is_free(connection: sa.Connection) -> sa.ColumnElement[bool]:
+    return sa.or_(QUEUE.c.worker.is_(None), QUEUE.c.heartbeat < clock(connection) - LAPSE_SECONDS)
+
+
+@dataclass
+class Claim:
+    """A block that this worker runs.
+
+    Attributes:
+        id: Its row number in the queue.
+        run: Id of the command that planned it.
+        about: Executor and workers of that command.
+        block: The episodes to run.
+        existing: Episodes of the block that others have run since the plan was made, with their rows.
+        killer: The episode in which two workers have died. None: there is none.
+    """
+
+    id: int
+    run: str
+    about: dict[str, Any]
+    block: Block
+    existing: dict[Episode, StoredEpisode]
+    killer: Episode | None
+
+
+class Queue:
+    """The blocks of one study, as one worker sees them.
+
+    Args:
+        store: The study.
+        run: Only blocks that the command with this id has planned. Empty: all blocks of the study.
+    """
+
+    def __init__(self, store: StudyStore, run: str = "") -> None:
+        self.store, self.run, self.database = store, run, store.database
+        self.worker = worker_id(os.getpid(), secrets.token_hex(4))
+        self._claimed: int | None = None
+
+    def claim(self) -> Claim | None:
+        """Claim the first free block. Return None if none is free now.
+
+        A block is not free while another worker runs one of its episodes, for whichever study.
+        """
+        with self.database.writing() as connection:
+            row = next(self._free(connection), None)
+            if row is None:
+                return None
+            is_dead = row.worker not in (None, self.worker)  # the worker before
+            died = row.running if is_dead else row.died
+            values = {
+                "worker": self.worker,
+                "heartbeat": clock(connection),
+                "died": died,
+                "running": next(iter(row.episodes), None),
+            }
+            connection.execute(sa.update(QUEUE).where(QUEUE.c.id == row.id).values(**values))
+        self._claimed = row.id
+        killer = row.running if is_dead and row.running == row.died else None
+        return self._claim_of(row, killer)
+
+    def _free(self, connection: sa.Connection) -> Iterator[Any]:
+        """Yield the free rows that nobody else runs an episode of, in order."""
+        mine, kind = self._mine(), self.store.kind
+        others = sa.select(QUEUE.c.episodes).join(STUDIES, STUDIES.c.id == QUEUE.c.study_id)
+        others = others.where(QUEUE.c.worker.is_not(None), QUEUE.c.worker != self.worker, ~_is_free(connection))
+        # rollouts share no episodes with other studies
+        others = others.where(mine if kind == ROLLOUT else STUDIES.c.kind != ROLLOUT)
+        held = {tuple(one) for episodes in connection.scalars(others) for one in episodes}
+        query = sa.select(QUEUE).where(mine, self._is_open(connection)).order_by(QUEUE.c.position, QUEUE.c.id)
+        for first in range(0, 10**9, _PAGE):
+            rows = connection.execute(query.limit(_PAGE).offset(first)).all()
+            yield from (row for row in rows if held.isdisjoint(map(tuple, row.episodes)))
+            if len(rows) < _PAGE:
+                return
+
+    def _is_open(self, connection: sa.Connection) -> sa.ColumnElement[bool]:
+        # a row of this worker is one whose claim was committed, but the answer was lost
+        return sa.or_(_is_free(connection), QUEUE.c.worker == self.worker)
+
+    def _mine(self) -> sa.ColumnElement[bool]:
+        study = sa.select(STUDIES.c.id).where(STUDIES.c.name == self.store.name).scalar_subquery()
+        of_study: sa.ColumnElement[bool] = QUEUE.c.study_id == study
+        return sa.and_(of_study, QUEUE.c.run == self.run) if self.run else of_study
+
+    def _here(self, work: str, setting: Setting) -> Setting:
+        """Return a setting that reads weights and data from this process's results folder.
+
+        Raises:
+            KervError: This version of kerv computes other results than the one that planned.
+        """
+        if setting.work != work:
+            raise KervError(f"{setting.label} was planned by another version of kerv: type the sweep again")
+        return replace(setting, settings={**setting.settings, "results": str(self.database.results)})
+
+    def _claim_of(self, row: Any, killer: list[Any] | None) -> Claim:
+        works = {work for work, *_ in row.episodes}
+        chosen = sa.select(SETTINGS).where(SETTINGS.c.study_id == row.study_id, SETTINGS.c.work.in_(works))
+        with self.database.reading() as connection:
+            settings = {one.work: self._here(one.work, setting_of(one)) for one in connection.execute(chosen)}
+        # a setting is missing if another command has planned the study anew, without it
+        known = [Episode(settings[work], *rest) for work, *rest in row.episodes if work in settings]
+        study = Study(self.store.name, tuple(settings.values()), tuple(known), self.store.kind)
+        stored = stored_episodes(self.database, study, row.newest, Block(tuple(known))) if known else {}
+        existing, missing = split(study, stored)
+        killers = (one for one in missing if list(one.key) == killer)
+        return Claim(row.id, row.run, row.about, Block(tuple(missing)), existing, next(killers, None))
+
+    def hold(self, connection: sa.Connection, claim: Claim, running: Episode | None = None, **values: Any) -> None:
+        """Check, in a transaction, that a block still belongs to this worker, and write its heartbeat.
+
+        Args:
+            connection: The database, in a transaction.
+            claim: The block.
+            running: The episode that begins now. None: as before.
+            **values: Further columns to write.
+
+        Raises:
+            ClaimLost: The block does not belong to this worker any more.
+        """
+        values |= {"heartbeat": clock(connection)} | ({"running": list(running.key)} if running else {})
+        # once lapsed, it stays so: another worker may have claimed a block with the same episodes
+        mine = sa.and_(QUEUE.c.id == claim.id, QUEUE.c.worker == self.worker, ~_is_free(connection))
+        if not connection.execute(sa.update(QUEUE).where(mine).values(**values)).rowcount:
+            raise ClaimLost("the worker was silent for too long, or the study was deleted")
+
+    def begin(self, claim: Claim, one: Episode) -> None:
+        """Note that an episode, or the preparation of its setting, begins."""
+        with self.database.writing() as connection:
+            self.hold(connection, claim, one)
+
+    def end(self, claim: Claim) -> None:
+        """Remove a block that has ended."""
+        self._claimed = None
+        with self.database.writing() as connection:
+            connection.execute(sa.delete(QUEUE).where(QUEUE.c.id == claim.id, QUEUE.c.worker == self.worker))
+
+    @contextlib.contextmanager
+    def beating(self) -> Iterator[None]:
+        """Write the heartbeat of the claimed block until the end of the `with` block. Then free what is claimed."""
+        ended = threading.Event()
+
+        def beat() -> None:
+            while not ended.wait(BEAT_SECONDS):
+                with contextlib.suppress(KervError):  # the worker itself will meet the same error
+                    if self._claimed is not None:
+                        with self.database.writing() as connection:
+                            mine = sa.and_(QUEUE.c.id == self._claimed, QUEUE.c.worker == self.worker)
+                            beaten = sa.update(QUEUE).where(mine, ~_is_free(connection))
+                            connection.execute(beaten.values(heartbeat=clock(connection)))
+
+        thread = threading.Thread(target=beat, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+            if self._claimed is not None:
+                with contextlib.suppress(StorageError), self.database.writing() as connection:
+                    freed = sa.update(QUEUE).where(QUEUE.c.worker == self.worker)
+                    connection.execute(freed.values(worker=None, heartbeat=None, running=None))
+
+    def has_free(self) -> bool:
+        """Return whether nobody has claimed some block. A worker that only looks holds up nobody."""
+        with self.database.reading() as connection:
+            query = sa.select(QUEUE.c.id).where(self._mine(), self._is_open(connection)).limit(1)
+            return connection.scalar(query) is not None
+
+    def is_empty(self) -> bool:
+        """Return whether every block has ended."""
+        with self.database.reading() as connection:
+            return connection.scalar(sa.select(QUEUE.c.id).where(self._mine()).limit(1)) is None
+
+    def claimed(self) -> list[Any]:
+        """Return the rows of blocks that are running."""
+        with self.database.reading() as connection:
+            return list(connection.execute(sa.select(QUEUE).where(self._mine(), QUEUE.c.worker.is_not(None))).all())
+
+    def lapse(self, pid: int) -> bool:
+        """Let the claims of a process of this machine that has died lapse at once. Return whether it had any."""
+        with self.database.writing() as connection:
+            died = QUEUE.c.worker.startswith(worker_id(pid), autoescape=True)
+            return bool(connection.execute(sa.update(QUEUE).where(died).values(heartbeat=0.0)).rowcount)
+
+    def withdraw(self) -> None:
+        """Remove the blocks that nobody runs."""
+        with self.database.writing() as connection:
+            connection.execute(sa.delete(QUEUE).where(self._mine(), _is_free(connection)))

@@ -1,0 +1,251 @@
+"""A worker: claims a block of episodes, runs it, commits each episode when it ends, and claims the next.
+
+Within a block the settings take turns in one process, episode by episode. A worker that is killed loses at most the
+episodes that are running. Another worker runs the rest of its block. If two workers die in the same episode, its
+setting fails in this block.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import os
+import secrets
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import sqlalchemy as sa
+
+from kerv_cli.base.errors import KervError, StorageError
+from kerv_cli.engine.record import EpisodeRecord
+from kerv_cli.episodes.identity import ENGINE, code_hash
+from kerv_cli.episodes.rows import decodes_table, episode_row, seconds_blob, table_blob
+from kerv_cli.lab import events
+from kerv_cli.lab.database import BLOCKS, EPISODES, now
+from kerv_cli.lab.plan import Episode, Setting, seeds_text
+from kerv_cli.lab.queue import Claim, ClaimLost, Queue, patiently
+from kerv_cli.lab.store import insert_episode
+from kerv_cli.targets.provenance import stamp
+
+POLL_SECONDS = 1.0
+"""Seconds between two looks at the queue while other processes run all blocks that are left."""
+
+RunEpisode = Callable[[int], EpisodeRecord]
+"""Function that runs the episode with a given seed."""
+
+Prepare = Callable[[Setting, str], RunEpisode]
+"""Function that builds and warms up a setting's decoder for a task. Its method `together` runs batches."""
+
+
+def load_per_core() -> float:
+    """Return the load average of this machine per core."""
+    return round(os.getloadavg()[0] / (os.cpu_count() or 1), 2)
+
+
+def work(queue: Queue, prepare: Prepare, on_event: events.OnEvent = lambda event: None) -> None:
+    """Run the blocks of a queue until none is left.
+
+    If a setting fails, it is reported and the other settings go on. While other workers run all blocks that are left,
+    wait, to take over those of a worker that dies.
+
+    Args:
+        queue: The blocks.
+        prepare: Builds a setting's decoder for a task.
+        on_event: Called with each event, to show progress.
+
+    Raises:
+        StorageError: The disk is full or not writable, or the database did not answer for two minutes.
+        KervError: The blocks were planned by another version of kerv.
+    """
+    load, is_waiting = load_per_core(), False
+    with queue.beating():
+        while True:
+            claim = patiently(queue.claim) if patiently(queue.has_free) else None
+            if claim is not None:
+                is_waiting = False
+                _Attempt(queue, claim, prepare, on_event, load).run()
+            elif patiently(queue.is_empty):
+                return
+            else:
+                if not is_waiting:
+                    on_event(events.BlocksWait())
+                is_waiting = True
+                time.sleep(POLL_SECONDS)
+
+
+def failure_of(error: BaseException) -> events.SettingFailed:
+    """Describe an error in one line. For errors that are not KervErrors, add the type, file and line."""
+    trace = "".join(traceback.format_exception(error))
+    text = " ".join(str(error).split())
+    if isinstance(error, KervError):
+        return events.SettingFailed(text, trace, error)
+    frames = traceback.extract_tb(error.__traceback__)
+    line = f" ({os.path.basename(frames[-1].filename)}:{frames[-1].lineno})" if frames else ""
+    return events.SettingFailed(f"{type(error).__name__}: {text[:200]}{line}", trace)
+
+
+@dataclass(eq=False)
+class _Attempt:
+    """A block that this process runs.
+
+    Attributes:
+        queue: Where it comes from.
+        claim: The block.
+        prepare: Builds a setting's decoder for a task.
+        on_event: Called with each event.
+        load: Load average per core when the worker began.
+        id: Id of its row in the table of blocks, which is written with the first episode.
+        started: When it began (ISO 8601).
+        left: Episodes that have neither ended nor failed.
+        failed: Episodes that have failed.
+        has_row: Whether its row is written.
+    """
+
+    queue: Queue
+    claim: Claim
+    prepare: Prepare
+    on_event: events.OnEvent
+    load: float
+    id: str = ""
+    started: str = field(default_factory=now)
+    left: list[Episode] = field(default_factory=list)
+    failed: list[Episode] = field(default_factory=list)
+    has_row: bool = False
+
+    def run(self) -> None:
+        """Run the block. Episodes that others have run meanwhile are linked to the study instead."""
+        self.id = f"{self.claim.run}-{secrets.token_hex(4)}"
+        self.left = list(self.claim.block.episodes)
+        try:
+            patiently(self._link_existing)
+            if self.claim.killer is not None:
+                self._fail(self.claim.killer, events.SettingFailed("two workers died in this episode"))
+            if self.left:
+                self.on_event(events.BlockStarted(self.claim.block))
+                if self.claim.block.batch > 1:
+                    self._run_batch()
+                else:
+                    self._take_turns()
+        except ClaimLost:
+            return
+        patiently(functools.partial(self.queue.end, self.claim))
+
+    def _link_existing(self) -> None:
+        if not self.claim.existing:
+            return
+        with self.queue.database.writing() as connection:
+            self.queue.hold(connection, self.claim)
+            for one, row in self.claim.existing.items():
+                connection.execute(self.queue.store.update_of(one).values(episode_id=row.id, error=None))
+
+    def _take_turns(self) -> None:
+        runners: dict[str, RunEpisode] = {}
+        for setting in self.claim.block.settings:
+            first = next((one for one in self.left if one.setting.work == setting.work), None)
+            if first is not None:
+                runner = self._try(first, functools.partial(self.prepare, setting, first.task))
+                if runner is not None:
+                    runners[setting.work] = runner
+        turns = [one for one in self.claim.block.turns() if one in self.left]
+        for order, one in enumerate(turns):
+            if one in self.left:
+                started = datetime.now(UTC)
+                record = self._try(one, functools.partial(runners[one.setting.work], one.seed))
+                if record is not None:
+                    self._end(one, record, order, started)
+
+    def _try(self, one: Episode, function: Callable[[], Any]) -> Any:
+        """Call a function for episode `one`. If it raises, its setting has failed: return None."""
+        patiently(functools.partial(self.queue.begin, self.claim, one))
+        try:
+            return function()
+        except Exception as error:  # noqa: BLE001 - the other settings go on
+            self._fail(one, failure_of(error))
+        return None
+
+    def _run_batch(self) -> None:
+        together = self.prepare.together  # type: ignore[attr-defined]
+        order = itertools.count()
+        patiently(functools.partial(self.queue.begin, self.claim, self.left[0]))
+        try:
+            for one, result in together(list(self.left)):
+                if isinstance(result, Exception):
+                    self._fail(one, failure_of(result))
+                elif one in self.left:
+                    started = datetime.now(UTC) - timedelta(seconds=result.wall_seconds)
+                    self._end(one, result, next(order), started)
+        except KervError as error:
+            if isinstance(error, ClaimLost | StorageError):
+                raise
+            self._fail_all(error)
+        except Exception as error:  # noqa: BLE001 - the other blocks go on
+            self._fail_all(error)
+
+    def _fail_all(self, error: Exception) -> None:
+        while self.left:
+            self._fail(self.left[0], failure_of(error))
+
+    def _end(self, one: Episode, record: EpisodeRecord, order: int, started: datetime) -> None:
+        """Commit an episode that has ended."""
+        row = episode_row(record) | {
+            "order": order,
+            "started": started.isoformat(timespec="milliseconds"),
+            "decode_seconds": seconds_blob(decode.seconds for decode in record.decodes),
+        }
+        decodes = table_blob(decodes_table(record))
+        patiently(functools.partial(self._write, one, row, decodes))
+        self.left.remove(one)
+        self.has_row = True
+        self.on_event(events.EpisodeEnd(one, bool(row["success"]), float(row["wall_seconds"])))
+
+    def _write(self, one: Episode, row: dict[str, Any], decodes: bytes) -> None:
+        """Write an episode and its decodes, and link the episode to the study, in one transaction."""
+        work, task, seed, repeat = one.key
+        key = {"work": work, "task": task, "seed": seed, "repeat": repeat, "block": self.id}
+        with self.queue.database.writing() as connection:
+            rest = [other for other in self.left if other is not one]
+            self.queue.hold(connection, self.claim, rest[0] if rest and self.claim.block.batch > 1 else None)
+            same = sa.select(EPISODES.c.id).where(*(EPISODES.c[name] == value for name, value in key.items()))
+            number = connection.scalar(same)  # there if it was committed, but the answer was lost
+            if number is None:
+                if not self.has_row:
+                    self._write_row(connection, str(one.setting.settings["runtime"]["device"]))
+                number = insert_episode(connection, key | row, decodes)
+            connection.execute(self.queue.store.update_of(one).values(episode_id=number, error=None))
+
+    def _write_row(self, connection: sa.Connection, device: str) -> None:
+        block = self.claim.block
+        about = stamp(device) | {"engine": ENGINE, "load": self.load} | self.claim.about
+        values = {"run": self.claim.run, "seeds": seeds_text(block.seeds), "started": self.started, "about": about}
+        connection.execute(sa.insert(BLOCKS).values(id=self.id, code=code_hash(), **values))
+
+    def _fail(self, one: Episode, failure: events.SettingFailed) -> None:
+        """Note that a setting failed on a task. Its remaining episodes in the block will not run.
+
+        Raises:
+            StorageError: This was the failure. Then no other setting can be stored either.
+            ClaimLost: The block does not belong to this worker any more.
+        """
+        if isinstance(failure.error, StorageError | ClaimLost):
+            raise failure.error
+        same = [other for other in self.left if (other.setting.work, other.task) == (one.setting.work, one.task)]
+        if not same:
+            return
+        same.sort(key=lambda other: other is not one)
+        self.failed += same
+        patiently(functools.partial(self._write_failure, same, failure))
+        self.left = [other for other in self.left if other not in same]
+        failure = replace(failure, episodes=tuple(same))
+        self.on_event(failure)
+
+    def _write_failure(self, failed: list[Episode], failure: events.SettingFailed) -> None:
+        rest = [list(one.key) for one in self.claim.block.episodes if one not in self.failed]
+        with self.queue.database.writing() as connection:
+            self.queue.hold(connection, self.claim, episodes=rest)
+            for one in failed:
+                error = f"{failure.reason}\n{failure.trace}"
+                connection.execute(self.queue.store.update_of(one).values(error=error))

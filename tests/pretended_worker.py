@@ -1,0 +1,16 @@
+"""Plugin of worker processes in tests: `kerv work` runs episodes of studies_synthetic, and little time passes.
+
+Variables: PRETENDED is the name of the function that runs the episodes; LAPSE the seconds after which a claim lapses.
+"""
+
+import os
+
+import studies_synthetic
+
+from kerv_cli.lab import queue, study, work
+
+study.EpisodeRunner = lambda *_: getattr(studies_synthetic, os.environ["PRETENDED"])
+study.checked = lambda *_: None  # the weights are pretended, too
+work.POLL_SECONDS = 0.05
+queue.LAPSE_SECONDS = float(os.environ.get("LAPSE", "30"))
+queue.BEAT_SECONDS = min(queue.BEAT_SECONDS, queue.LAPSE_SECONDS / 6)

@@ -1,0 +1,165 @@
+"""Workers on a real Slurm: one node on the loopback, in a temporary folder."""
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import tempfile
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+from conftest import python, refused, until
+from studies_synthetic import swept, threshold_study, unhurried
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.settings import RuntimeSettings, SlurmOptions
+from kerv_cli.lab.database import EPISODES, QUEUE
+from kerv_cli.lab.events import EpisodeEnd
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.study import Detached
+
+STUDY = threshold_study(["reach-v3", "push-v3"], episodes=6, radii=(3,), block=2)
+CONFIGURATION = """
+ClusterName=kerv
+SlurmctldHost={host}(127.0.0.1)
+SlurmctldPort={ports[0]}
+SlurmdPort={ports[1]}
+SlurmUser={user}
+SlurmdUser={user}
+AuthType=auth/munge
+AuthInfo=socket={folder}/munge/socket,cred_expire=5
+CredType=cred/munge
+StateSaveLocation={folder}/state
+SlurmdSpoolDir={folder}/spool
+SlurmctldPidFile={folder}/slurmctld.pid
+SlurmdPidFile={folder}/slurmd.pid
+SlurmctldLogFile={folder}/slurmctld.log
+SlurmdLogFile={folder}/slurmd.log
+ProctrackType=proctrack/linuxproc
+TaskPlugin=task/none
+SelectType=select/cons_tres
+SelectTypeParameters=CR_Core
+ReturnToService=2
+SchedulerParameters=sched_interval=1,batch_sched_delay=0
+KillWait=5
+MpiDefault=none
+NodeName={host} NodeAddr=127.0.0.1 CPUs=2 RealMemory=4000 State=UNKNOWN
+PartitionName=main Nodes={host} Default=YES MaxTime=INFINITE State=UP
+"""
+
+
+@pytest.fixture(scope="module")
+def slurm():
+    """Start a Slurm of one node, and let this process use it."""
+    if not all(shutil.which(name, path="/usr/sbin:/usr/bin") for name in ("munged", "slurmctld", "slurmd", "sbatch")):
+        pytest.skip("no Slurm here: apt-get install slurmctld slurmd slurm-client munge")
+    with tempfile.TemporaryDirectory(prefix="kerv-slurm-") as name, pytest.MonkeyPatch.context() as patch:
+        folder, host = Path(name), socket.gethostname().partition(".")[0]
+        for part in ("state", "spool", "munge"):
+            (folder / part).mkdir(mode=0o700)
+        (folder / "munge/key").write_bytes(os.urandom(1024))
+        (folder / "munge/key").chmod(0o600)
+        with socket.socket() as one, socket.socket() as other:
+            one.bind(("127.0.0.1", 0))
+            other.bind(("127.0.0.1", 0))
+            ports = one.getsockname()[1], other.getsockname()[1]
+        user = subprocess.check_output(["id", "-un"], text=True).strip()
+        text = CONFIGURATION.format(host=host, ports=ports, user=user, folder=folder)
+        (folder / "slurm.conf").write_text(text)
+        patch.setenv("SLURM_CONF", str(folder / "slurm.conf"))
+        patch.setenv("PATH", "/usr/sbin", prepend=os.pathsep)
+        files = {"key-file": "key", "socket": "socket", "pid-file": "pid", "log-file": "log", "seed-file": "seed"}
+        run("munged", "--force", *(f"--{option}={folder}/munge/{file}" for option, file in files.items()))
+        try:
+            run("slurmctld", "-f", str(folder / "slurm.conf"))
+            run("slurmd", "-f", str(folder / "slurm.conf"))
+            until(lambda: run("sinfo", "-h", "-o", "%T").strip() == "idle", 30)
+            yield
+            run("scancel", "--state=RUNNING", f"--user={user}")
+            run("scancel", "--state=PENDING", f"--user={user}")
+            until(lambda: not jobs(), 30)
+        finally:
+            for file in ("slurmd.pid", "slurmctld.pid", "munge/pid"):
+                if (folder / file).exists():
+                    os.kill(int((folder / file).read_text()), signal.SIGTERM)
+            until(lambda: not list(folder.glob("*.pid")), 30)
+
+
+def run(*words: str) -> str:
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    return done.stdout if done.returncode == 0 else ""
+
+
+def jobs() -> list[str]:
+    """Return the jobs that wait or run, as 12_0."""
+    return run("squeue", "--noheader", "--array", "--format=%i").split()
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch, slurm):
+    monkeypatch.setattr("kerv_cli.lab.slurm._LOOK_SECONDS", 0.5)
+    monkeypatch.setenv("LAPSE", "2")
+
+
+def runtime(**options: object) -> RuntimeSettings:
+    asked = {"minutes": 5, "memory_gb": 1, **options}
+    return RuntimeSettings(workers=2, executor="slurm", executor_options=SlurmOptions(**asked))
+
+
+SWEEP = """
+import sys
+import studies_synthetic as s
+import test_slurm as t
+s.swept(sys.argv[1], t.STUDY, s.unhurried, runtime=t.runtime())
+"""
+
+
+def test_a_study_survives_its_sweep_a_cancelled_worker_and_a_preempted_one(tmp_path):
+    store, struck = StudyStore(tmp_path, "threshold"), []
+    with python(SWEEP, tmp_path) as process:
+        until(lambda: store.counts()[0] >= 2, 120)
+        process.kill()
+
+    def strike(event: object) -> None:
+        if isinstance(event, EpisodeEnd) and not struck and len(jobs()) == 2:
+            struck.extend(jobs())
+            run("scancel", struck[0])
+            run("scontrol", "requeue", struck[1])
+
+    _, outcome = swept(tmp_path, STUDY, unhurried, runtime=runtime(), on_event=strike)
+    assert (len(struck), outcome.failed, store.counts()) == (2, [], (36, 36))
+    with store.database.reading() as connection:
+        assert connection.scalar(sa.select(sa.func.count()).select_from(EPISODES)) == 36
+        assert connection.scalar(sa.select(sa.func.count()).select_from(QUEUE)) == 0
+    assert {path.name.partition("_")[0] for path in (store.root / "jobs").iterdir()} == {struck[0].partition("_")[0]}
+    assert set(store.frame()["executor"]) == {"slurm"}
+
+
+def test_workers_are_left_alone_on_request_and_cancelled_by_an_interrupt(tmp_path):
+    asleep = runtime(setup=["sleep 60"])
+    asleep.detach = True
+    earlier = jobs()  # one of another study may still wait to be started again, and end at once
+    with pytest.raises(Detached, match=r"job \d+ of Slurm"):
+        swept(tmp_path, STUDY, runtime=asleep)
+    begun = set(jobs()) - set(earlier)
+    assert len(begun) == 2
+    asleep.detach = False
+    signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.setitimer(signal.ITIMER_REAL, 1.0)
+    with pytest.raises(KeyboardInterrupt):
+        swept(tmp_path, STUDY, runtime=asleep)
+    until(lambda: not set(jobs()) & begun, 30)
+    with StudyStore(tmp_path, "threshold").database.reading() as connection:
+        assert connection.scalar(sa.select(sa.func.count()).select_from(QUEUE)) == 0
+
+
+def test_what_slurm_refuses_is_one_line(tmp_path, monkeypatch):
+    with refused("Memory specification", "runtime.executor_options", error=UsageError):
+        swept(tmp_path, STUDY, runtime=runtime(memory_gb=100_000))
+    with refused("job", "has ended without an episode", "no such thing"):
+        swept(tmp_path, STUDY, runtime=runtime(setup=["echo no such thing; exit 3"]))
+    monkeypatch.setenv("PATH", "")
+    with refused("Slurm cannot be used from here", error=UsageError):
+        swept(tmp_path, STUDY, runtime=runtime())
