@@ -1,6 +1,5 @@
 """Running a study: resume, isolation of failures, workers that are killed or stopped, sweeps at once, Slurm."""
 
-import importlib
 import os
 import re
 import signal
@@ -29,6 +28,7 @@ from studies_synthetic import (
 )
 
 from kerv_cli.base.errors import KervError, StorageError, UsageError
+from kerv_cli.base.registry import _PARTS, Part, parts
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.cli.common import progress_bar
 from kerv_cli.cli.studies import event_printer
@@ -415,7 +415,8 @@ settings: {short: world.horizon=30, long: world.horizon=60}
 
 def test_workers_run_each_episode_once_though_one_is_killed(tmp_path, monkeypatch):
     """A worker that dies is replaced, and the episode that it ran is repeated."""
-    importlib.import_module("examples.point_mass")
+    part = Part("environment", "point-mass", "examples.point_mass:SPEC")
+    monkeypatch.setitem(_PARTS, "environment", {**parts("environment"), part.name: part})
     (tmp_path / "killing.py").write_text(KILLS_ITS_PROCESS_ONCE)
     (tmp_path / "armed").touch()
     monkeypatch.setenv("KERV_PLUGINS", "killing")
