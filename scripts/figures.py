@@ -73,7 +73,10 @@ def _is_baseline(row: Row) -> bool:
 
 
 def _ratio(row: Row, name: str) -> str:
-    return "1" if _is_baseline(row) else _interval(row, name, ".2f")
+    """A ratio; its interval only if it covers at least three runs, or if decodes were priced instead of timed."""
+    if _is_baseline(row):
+        return "1"
+    return _interval(row, name, ".2f") if int(row.get("runs", 3)) > 2 else _number(row, name, ".2f")
 
 
 def _own(text: Callable[[Row], str]) -> Callable[[Row], str]:
@@ -114,6 +117,9 @@ COLUMNS: dict[str, tuple[str, Callable[[Row], str]]] = {
     "AL": ("AL", lambda row: _number(row, "AL", ".1f")),
     "steps": ("control steps to success", lambda row: _number(row, "steps_to_success", ".0f")),
     "forwards": ("forwards per step", lambda row: _number(row, "forwards_per_step", ".2f")),
+    "compensated": ("decodes compensated", lambda row: _number(row, "compensation_rate", ".0f", 100, " %")),
+    "retrieved": ("decodes retrieved", lambda row: _number(row, "retrieval_share", ".0f", 100, " %")),
+    "skipped": ("decodes skipped", lambda row: _number(row, "skip_rate", ".0f", 100, " %")),
     "unverified": ("unverified", lambda row: _number(row, "unverified_share", ".0f", 100, " %")),
     "felt": ("a decode takes, ms", lambda row: _number(row, "felt_latency_ms", ".0f")),
     "held": ("steps on a held action", lambda row: _number(row, "held_share", ".0f", 100, " %")),

@@ -1,6 +1,7 @@
 """What speculation can give a policy, from its size: against the cost model, and against what was measured."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -113,7 +114,8 @@ def test_a_mean_is_that_of_all_outcomes():
 
 def measured_profile(table: str) -> Profile:
     """The stored profile. LIBERO's policy has no vision encoder: there AR's phases take what that table measured."""
-    profile = read_profile(ROOT / "results/bench/epyc-vla-150m-profile.json")
+    name = "epyc-mt10-150m" if table == "papers" else "epyc-vla-150m"
+    profile = read_profile(ROOT / f"results/bench/{name}-profile.json")
     if table == "papers":
         return profile
     document = json.loads((ROOT / f"results/tables/{table}.json").read_text())
@@ -130,9 +132,11 @@ def measured_profile(table: str) -> Profile:
     return replace(profile, phases=phases)
 
 
-MISSES: dict[tuple[str, str], str] = {}
-"""Setting of a table -> why its estimate is not within 15 %. None is, today. `main` has no profile: those that ship are
-of a program whose tokens cost four times as much."""
+LONE = "the profile charges AR 27 ms per token, a lone forward; in one call AR's tokens took 22.5"
+_OFF = ("kerv", "kerv literal", "heisd", "heisd_code", "one_pass", "one_pass_streak")
+MISSES = dict.fromkeys([("papers", label) for label in _OFF], LONE)
+"""Setting of a table -> why its estimate is not within 15 %. `main` has no profile: those that ship are of a program
+whose tokens cost four times as much."""
 
 
 @pytest.mark.parametrize("table", ["papers", "papers_libero"])
@@ -153,7 +157,8 @@ def test_a_published_table_stands_for_the_families(table):
     settings = recorded(table)
     assert (settings[0].label, settings[0].forwards) == ("ar", TABLES[table])
     found = {one.method: closest(settings, one) for one in FAMILIES}
-    assert all(shown for method, shown in found.items() if method != "scout_unverified")
+    absent = {"scout_unverified"} | ({"spec_vla_tuned"} if table == "papers" else set())  # no rows of the studies
+    assert all(shown for method, shown in found.items() if method not in absent)
     shown = found["one_pass_streak"]
     assert 0.5 < shown.drafts.skipped < 1
     assert 1 <= shown.forwards < 2
@@ -165,7 +170,8 @@ def test_a_published_table_stands_for_the_families(table):
 def test_a_7b_on_every_device_in_a_second_without_torch():
     words = ["estimate", "weights=7B", "tokens=7", "device=h100,a100,4090,orin", "--json"]
     command = [sys.executable, "-X", "importtime", "-m", "kerv_cli", *words]
-    shown = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
+    environment = {**os.environ, "KERV_PLUGINS": ""}  # a plugin may load torch
+    shown = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT, env=environment)
     assert not re.search(r"\| +(torch|pandas)$", shown.stderr, re.MULTILINE)
     machines = json.loads(shown.stdout)["machines"]
     assert [one["machine"] for one in machines] == [DEVICES[name].title for name in ("h100", "a100", "4090", "orin")]
