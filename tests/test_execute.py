@@ -430,6 +430,12 @@ def test_workers_run_each_episode_once_though_one_is_killed(tmp_path, monkeypatc
     assert episodes(Database(tmp_path / "results")) == 12
 
 
+def test_a_worker_counts_its_episodes_without_a_total(capsys):
+    one = STUDY.episodes[0]
+    event_printer(lambda *_: None)(EpisodeEnd(one, True, 0.5))
+    assert capsys.readouterr().err == f"1 {one.setting.label} on {one.task}, seed {one.seed}: success, 0.5 s\n"
+
+
 IN_ORDER = """
 from test_execute import in_order
 study = in_order()

@@ -160,7 +160,8 @@ def event_printer(show: Callable[[int, int, str], None]) -> Callable[[Event], No
             if not event.elsewhere:
                 result = f"{'success' if event.success else 'failure'}, {event.seconds:.1f} s"
             if event.elsewhere or total <= 100 or sys.stderr.isatty():
-                line = f"{ended}/{total} {one.setting.label} on {one.task}, seed {one.seed}: {result}"
+                of_all = f"/{total}" if total else ""  # a worker does not know how many the study has
+                line = f"{ended}{of_all} {one.setting.label} on {one.task}, seed {one.seed}: {result}"
         if line:
             typer.echo(line, err=True)
         if total:
