@@ -32,7 +32,7 @@ PUBLISHED = {
 """Published language models: weights of layers and head, number of layers, vocabulary. See `language_of`."""
 
 SMALL = 50e6
-"""Below so many weights a policy has a head of action tokens alone, and 8 layers, as kerv's own."""
+"""A policy with fewer weights is taken to have 8 layers and a head of action tokens alone, like kerv's own."""
 
 _PATCHES = TOWERS["vit_so400m_patch14_siglip_224"].patches
 _SHARE = 0.1  # of the weights are the vision encoder's, as in OpenVLA-7B
@@ -102,10 +102,10 @@ def number_of(name: str, text: str) -> float:
 
 
 def language_of(weights: float) -> Language:
-    """Return a Llama whose layers and head have about so many weights.
+    """Return a Llama whose layers and head have about this many weights.
 
-    The number of layers and the vocabulary lie between those of the published models that are next in size, on a
-    logarithmic scale. A layer's feed-forward part is 8/3 as wide as its hidden states, as Llama's. The width follows
+    The number of layers and the vocabulary are interpolated between the two published models next in size, on a
+    logarithmic scale. A layer's feed-forward part is 8/3 as wide as its hidden states, as in Llama. The width follows
     from the number of weights.
     """
     sizes, layers, vocabularies = (np.array(column, float) for column in zip(*PUBLISHED.values(), strict=True))
