@@ -23,7 +23,7 @@ from kerv_cli.methods.eagle.drafter import EagleDrafter
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyDrafter
 from kerv_cli.methods.heisd.datastore import Datastore
-from kerv_cli.methods.settings import PolicySettings, with_artifacts
+from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets import checkpoint
 from kerv_cli.training.calibration import CalibrationRun
 from kerv_cli.training.datastore import DatastoreBuild
@@ -143,13 +143,6 @@ def test_an_artifact_can_be_named(results):
     assert Artifacts(str(results), by_path).check(["drafter"]) == files.check(["drafter"])
     with pytest.raises(UnknownName, match="did you mean drafter"):
         files.check(["draftr"])
-
-
-def test_names_of_artifacts_in_stored_settings_of_0_1_0_are_kept():
-    older = {"kind": "model", "target": "mine", "drafter": "a", "early": None, "others": {"follow": "b"}}
-    policy = {"kind": "model", "target": "mine", "artifacts": {"drafter": "a", "follow": "b"}}
-    assert with_artifacts({"policy": older, "seed": 1}) == {"policy": policy, "seed": 1}
-    assert with_artifacts({"policy": policy}) == {"policy": policy}
 
 
 # --- one rule for every artifact that names a source

@@ -24,7 +24,7 @@ from conftest import python, refused, until
 from studies_synthetic import episode, settings_of, still_episode, study_of, swept, threshold_study
 
 from kerv_cli.base.errors import CheckpointError, StorageError, UsageError
-from kerv_cli.catalogue.imports import import_results
+from kerv_cli.catalogue.imports import import_databases
 from kerv_cli.episodes.rows import decodes_table, episode_row
 from kerv_cli.lab import database as module
 from kerv_cli.lab.command import STORE, noted
@@ -157,7 +157,7 @@ def test_a_measure_that_an_older_kerv_did_not_store_is_missing_until_it_is_measu
     store = StudyStore(tmp_path / "old", "threshold")
     assert load_study(store).table["near_contact_failure"].isna().all()
     new = Database(tmp_path / "new")
-    import_results(new, [tmp_path / "old"])
+    import_databases(new, [tmp_path / "old/kerv.db"])
     assert StudyStore(new, "threshold").frame()["closest_approach"].isna().all()
     swept(tmp_path / "old", study_of({"ar": settings_of("ar")}, ["push-v3"], "later"))
     assert StudyStore(tmp_path / "old", "later").frame()["closest_approach"].notna().all()

@@ -28,6 +28,7 @@ from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.episodes.identity import ENGINE, OBSERVATION, flat
 from kerv_cli.episodes.rows import DECODE_SCHEMA, EPISODE_SCHEMA, INT, decodes_table, episode_row
 from kerv_cli.episodes.settings import RolloutSettings, settings_from
+from kerv_cli.lab.database import Database
 from kerv_cli.lab.plan import Episode, Setting, Study
 from kerv_cli.lab.store import IMPORT, ImportedEpisode, StudyStore
 
@@ -102,12 +103,12 @@ class Evaluation:
 
 
 def import_evaluations(
-    results: Path, paths: Sequence[Path], name: str, labels: Sequence[str], baseline: str, words: Sequence[str]
+    database: Database, paths: Sequence[Path], name: str, labels: Sequence[str], baseline: str, words: Sequence[str]
 ) -> tuple[str, list[str]]:
     """Import evaluations into the database as one study.
 
     Args:
-        results: The results folder.
+        database: The database to write to.
         paths: One path per setting: a vla-eval recording, or a folder that contains some.
         name: Name of the study. Empty: made from the benchmarks' names.
         labels: A label for each path. Empty: the servers' names.
@@ -127,7 +128,7 @@ def import_evaluations(
     evaluations = [(label, one) for label, of_path in by_label.items() for one in of_path]
     benchmarks = list(dict.fromkeys(one.benchmark for _, one in evaluations))
     name = name or re.sub(r"\W+", "_", "-".join(benchmarks))[:80].strip("_") or "imported"
-    store = StudyStore(results, name)
+    store = StudyStore(database, name)
     if store.exists and store.kind != IMPORT:
         raise UsageError(f"study '{name}' exists and was not imported: choose another with name=")
     baseline = baseline or ("ar" if "ar" in by_label else next(iter(by_label)))
@@ -143,11 +144,11 @@ def import_evaluations(
     title = f"{HARNESS}: {', '.join(benchmarks)}"
     study = Study(name, tuple(settings.values()), tuple(episodes), IMPORT, title, baseline, note="; ".join(notes))
     existing = (
-        _imported(results, episode, one, recorded)
+        _imported(database.results, episode, one, recorded)
         for episode, (one, recorded) in episodes.items()
         if recorded is not None
     )
-    StudyStore(results, name, IMPORT).add(study, existing, words)
+    StudyStore(database, name, IMPORT).add(study, existing, words)
     return name, notes
 
 

@@ -8,7 +8,7 @@ import typer
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import setting
-from kerv_cli.base.places import as_path, results_dir
+from kerv_cli.base.places import as_path
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, console, end_with_json
@@ -26,14 +26,14 @@ class ImportSettings(CommandSettings):
 @command(
     "runs import",
     ImportSettings,
-    names="NAME: a results folder of kerv 0.1.0, a kerv.db, vla-eval's recording-….sqlite, or folders that hold one.",
+    names="NAME: a kerv.db, vla-eval's recording-….sqlite, or folders that hold one.",
     keys="name baseline labels results",
     examples=("kerv runs import ar/recording-1.sqlite kerv/recording-2.sqlite", "kerv runs import old-results"),
 )
 def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False) -> None:
     """Import the runs of another results folder, or evaluations of vla-eval as a study."""
     from kerv_cli.catalogue.evaluations import import_evaluations
-    from kerv_cli.catalogue.imports import import_results, is_results
+    from kerv_cli.catalogue.imports import database_in, import_databases
     from kerv_cli.lab.database import Database
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.summary import SummaryTable
@@ -42,20 +42,20 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
     if not names:
         raise UsageError("name what to import: kerv runs import old-results, or kerv runs import recording-ID.sqlite")
     paths = [as_path(name) for name in names]
-    results = results_dir(settings.results)
-    folders = [path for path in paths if is_results(path)]
-    if folders:
-        if len(folders) < len(paths):
+    files = [file for file in map(database_in, paths) if file]
+    database = Database(settings.results)
+    if files:
+        if len(files) < len(paths):
             raise UsageError("import results folders and evaluations one after the other")
-        studies, notes = import_results(Database(results), folders, settings.name)
+        studies, notes = import_databases(database, files, settings.name)
         if as_json:
             end_with_json({"studies": studies, "notes": notes})
         for line in [*notes, f"imported {', '.join(studies) or 'nothing'}: kerv runs list"]:
             typer.echo(line)
         return
     words = ["runs", "import", *names]
-    name, notes = import_evaluations(results, paths, settings.name, settings.labels, settings.baseline, words)
-    table = load_study(StudyStore(results, name)).table
+    name, notes = import_evaluations(database, paths, settings.name, settings.labels, settings.baseline, words)
+    table = load_study(StudyStore(database, name)).table
     if as_json:
         end_with_json({"study": name, "notes": notes, "settings": rows_of(table)})
     for line in notes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,19 +26,6 @@ class PolicySettings:
     kind: str = choice(MODEL, MODEL, EXPERT, help="expert: the environment's scripted policy, without decoding")
     target: str = setting("mt10-vision", "name of the policy's weights, or a path")
     artifacts: dict[str, str | None] = setting(_unnamed, "artifacts.KIND=NAME; null: the one beside the target")
-
-
-def with_artifacts(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert stored settings of version 0.1.0: move the names of artifacts into the mapping `policy.artifacts`.
-
-    Settings in the current format are returned unchanged.
-    """
-    policy = settings.get("policy")
-    if not isinstance(policy, Mapping) or "artifacts" in policy:
-        return dict(settings)
-    named = {kind: policy.get(kind) for kind in parts("artifact")} | dict(policy.get("others", {}))
-    kept = {key: value for key, value in policy.items() if key not in (*named, "others")}
-    return {**settings, "policy": {**kept, "artifacts": {kind: name for kind, name in named.items() if name}}}
 
 
 # help text of a setting that several commands have
