@@ -22,7 +22,7 @@ from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.catalogue.entries import RunEntry, find_run, find_runs, matching, store_of
 from kerv_cli.episodes.resolve import resolve, resolve_rollout, study_name
 from kerv_cli.lab.command import chosen_store
-from kerv_cli.lab.database import Database
+from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import ROLLOUT, StudyStore
 from kerv_cli.lab.study import plan, plan_rollout, run
 from kerv_cli.report.measures import MICRO, Row
@@ -110,7 +110,7 @@ def rollout(*overrides: str, grid: bool = False, **settings: object) -> Study:
     """
     with chosen_store(as_overrides(*overrides, **settings)) as typed:
         resolved = resolve_rollout(typed, grid)
-        planned = plan_rollout(resolved, ["rollout", *(["-m"] if grid else []), *typed])
+        planned = plan_rollout(resolved, opened(resolved.first.results), ["rollout", *(["-m"] if grid else []), *typed])
         run(planned, save=save_recording)
     return Study(planned.store)
 
@@ -133,7 +133,7 @@ def sweep(study: str | Path, *overrides: str, **settings: object) -> Study:
     """
     with chosen_store(as_overrides(f"study={study}", *overrides, **settings)) as typed:
         resolved = resolve(typed)
-        planned = plan(resolved, ["sweep", *typed])
+        planned = plan(resolved, opened(resolved.first.results), ["sweep", *typed])
         failed = run(planned, save=save_recording).failed
     if failed:
         one, lost = failed[0].episodes[0], sum(len(failure.episodes) for failure in failed)
@@ -154,7 +154,7 @@ def load_study(name: str, results: str | Path = "results", store: str = "") -> S
         UsageError: Nothing matches the name, several things match, or the match is no sweep or rollout.
     """
     with chosen_store([f"store={store}"] if store else []):
-        database = Database(results)
+        database = opened(results)
     return Study(store_of(find_run(database, study_name(name)), database))
 
 
@@ -171,7 +171,7 @@ def runs(results: str | Path = "results", store: str = "", **filters: str) -> pd
         UsageError: There is no such filter or kind.
     """
     with chosen_store([f"store={store}"] if store else []):
-        there = matching(find_runs(Database(results)), filters)
+        there = matching(find_runs(opened(results)), filters)
     return pd.DataFrame([asdict(run) for run in there], columns=[column.name for column in fields(RunEntry)])
 
 

@@ -24,7 +24,7 @@ import pytest
 from kerv_cli.base import registry
 from kerv_cli.base.errors import KervError
 from kerv_cli.lab.command import STORE
-from kerv_cli.lab.database import Database
+from kerv_cli.lab.database import opened
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background, commands inherit to ignore it
@@ -170,7 +170,7 @@ def served(results: Path) -> Iterator[str]:
     """The address of a board of a results folder, which runs in a thread."""
     from kerv_cli.board.app import web_server
 
-    server = web_server(results, port=0)
+    server = web_server(opened(results), port=0)
     thread = threading.Thread(target=server.run)
     thread.start()
     try:
@@ -253,14 +253,14 @@ def database(request, tmp_path, monkeypatch):
     """The empty database of the results folder `tmp_path`: in its file, or on a server."""
     monkeypatch.delenv(STORE, raising=False)
     if request.param == "sqlite":
-        yield Database(tmp_path)
+        yield opened(tmp_path)
         return
     psycopg = pytest.importorskip("psycopg")
     server, name = request.getfixturevalue("postgresql"), f"kerv_{secrets.token_hex(4)}"
     monkeypatch.setenv(STORE, f"{server}/{name}")
     with psycopg.connect(f"{server}/postgres", autocommit=True) as connection:
         connection.execute(f"CREATE DATABASE {name}")
-        made = Database(tmp_path)
+        made = opened(tmp_path)
         yield made
         made.close()
         connection.execute(f"DROP DATABASE {name} WITH (FORCE)")

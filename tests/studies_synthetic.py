@@ -20,7 +20,7 @@ from kerv_cli.base.registry import find
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
 from kerv_cli.episodes.settings import RolloutSettings
-from kerv_cli.lab.database import Database
+from kerv_cli.lab.database import opened
 from kerv_cli.lab.events import OnEvent, Outcome
 from kerv_cli.lab.plan import Setting, Study, all_episodes, plain_settings
 from kerv_cli.lab.runs import Run
@@ -114,7 +114,7 @@ def swept(
 ) -> tuple[StudyStore, Outcome]:
     """Runs what the database of a results folder lacks of a study."""
     command = ["sweep", f"study={study.name}"]
-    planned = plan_study(Database(results), study, rerun, runtime=runtime, command=command)
+    planned = plan_study(opened(results), study, rerun, runtime=runtime, command=command)
     store = planned.store
     prepare = prepare or episodes_of
     with Run(store.database, study.kind, study.name, command, alone=False) as record, pretending(prepare):

@@ -21,7 +21,7 @@ from kerv_cli.base.errors import KervError
 from kerv_cli.board import app, studies
 from kerv_cli.board.app import make_app
 from kerv_cli.episodes.rows import episode_row, seconds_blob
-from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, SETTINGS, WANTED, Database, now
+from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, SETTINGS, WANTED, now, opened
 from kerv_cli.lab.runs import Run
 from kerv_cli.lab.store import StudyStore
 
@@ -30,7 +30,7 @@ TASKS = ["drawer-open-v3", "reach-v3"]
 
 
 def client_of(results):
-    return TestClient(make_app(results), base_url=HERE)
+    return TestClient(make_app(opened(opened(results))), base_url=HERE)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def folder(tmp_path_factory):
     results = tmp_path_factory.mktemp("board")
     swept(results, threshold_study(TASKS, 4, name="radii"))
     swept(results, threshold_study(TASKS, 2, (3,), name="few"))
-    with pytest.raises(KervError), Run(Database(results), "target", "mine", ["train", "target", "name=mine"], 600):
+    with pytest.raises(KervError), Run(opened(results), "target", "mine", ["train", "target", "name=mine"], 600):
         raise KervError("the disk is full")
     training = results / "artifacts" / "target" / "mine"
     training.mkdir(parents=True)
@@ -64,7 +64,7 @@ def test_paths_outside_the_results_folder_are_refused(tmp_path):
     results, outside = tmp_path / "results", tmp_path / "secret"
     outside.mkdir()
     (outside / "target.json").write_text('{"provenance": {"command": "kerv treasure"}}')
-    with pytest.raises(KervError), Run(Database(results), "target", str(outside), ["train", "target"]):
+    with pytest.raises(KervError), Run(opened(results), "target", str(outside), ["train", "target"]):
         raise KervError("no")
     client = client_of(results)
     assert f"target/{outside}" in client.get("/").text
@@ -81,7 +81,7 @@ def test_hostile_names_are_text(tmp_path):
     changed = tuple(settings.get(one.label, one) for one in study.settings)
     episodes = tuple(replace(one, setting=settings.get(one.setting.label, one.setting)) for one in study.episodes)
     swept(tmp_path, replace(study, settings=changed, episodes=episodes))
-    with pytest.raises(KervError), Run(Database(tmp_path), "target", bad, ["train", bad]):
+    with pytest.raises(KervError), Run(opened(tmp_path), "target", bad, ["train", bad]):
         raise KervError(bad)
     client = client_of(tmp_path)
     for path in ("/", f"/?text={bad}&sort={bad}&kind={bad}", "/studies/plain/tables", f"/artifacts/target/{bad}",
@@ -175,7 +175,7 @@ def test_pages_are_quick_with_ten_thousand_episodes_and_two_hundred_runs(tmp_pat
     study = threshold_study(["reach-v3", "drawer-open-v3"], 500, tuple(range(1, 9)), name="large")
     rows = [episode_row(episode(study.settings[3], "reach-v3", seed)) for seed in range(20)]
     values = {"started": now(), "block": "b", "decode_seconds": seconds_blob([0.01] * 20)}
-    store = StudyStore(tmp_path, "large")
+    store = StudyStore(opened(tmp_path), "large")
     store.save(study)
     with Run(store.database, "sweep", "large", ["sweep"]):
         pass
@@ -292,7 +292,7 @@ def test_a_running_sweep_is_watched_until_it_ends(tmp_path, open_page, monkeypat
         page = open_page(address)
         assert "Nothing here yet" in page.locator("main").inner_text()
         sweep.start()
-        while not StudyStore(tmp_path, "live").counts()[0]:
+        while not StudyStore(opened(tmp_path), "live").counts()[0]:
             time.sleep(0.05)
         page.reload()
         page.locator(".pill", has_text=re.compile(r"running, \d+ of 24")).wait_for()

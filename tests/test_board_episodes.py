@@ -33,7 +33,7 @@ from kerv_cli.engine.record import Delay
 from kerv_cli.episodes.rows import decode_records, decodes_table
 from kerv_cli.episodes.runner import Runner, close_worlds
 from kerv_cli.episodes.settings import settings_from
-from kerv_cli.lab.database import WANTED, Database
+from kerv_cli.lab.database import WANTED, Database, opened
 from kerv_cli.lab.store import studies
 from kerv_cli.report.viewing.token_outcomes import outcomes_of, tokens_hash
 
@@ -52,12 +52,12 @@ def rolled(policies, tmp_path_factory):
     (results / "artifacts").symlink_to(policies / "artifacts")
     kerv("rollout", "-m", *ROLLOUT.split(), f"results={results}")
     close_worlds()
-    return Database(results)
+    return opened(results)
 
 
 @pytest.fixture
 def client(tmp_path):
-    with TestClient(make_app(tmp_path), base_url=HERE) as client:
+    with TestClient(make_app(opened(opened(tmp_path))), base_url=HERE) as client:
         yield client
 
 
@@ -136,7 +136,7 @@ def test_a_recording_that_is_a_link_out_of_the_results_folder_is_refused(tmp_pat
     secret.write_text("secret")
     store.rollouts.mkdir(parents=True)
     (store.rollouts / found.episode.recording).symlink_to(secret)
-    with TestClient(make_app(results), base_url=HERE) as client:
+    with TestClient(make_app(opened(opened(results))), base_url=HERE) as client:
         assert client.get(f"/episodes/{found.id}/recording.rrd").status_code == 404
 
 
@@ -159,7 +159,7 @@ def test_decodes_that_are_read_back_are_those_that_were_written(rolled):
 
 def test_the_command_on_the_page_repeats_the_episode(rolled):
     numbers = rows_of_wanted(rolled)
-    with TestClient(make_app(rolled.results), base_url=HERE) as client:
+    with TestClient(make_app(opened(opened(rolled.results))), base_url=HERE) as client:
         text = client.get(f"/episodes/{numbers[1]}").text
     command = html.unescape(text.partition('<code id="command">')[2].partition("</code>")[0])
     kerv(*shlex.split(command)[1:], "record=0")
@@ -186,7 +186,7 @@ def test_an_imported_episode_has_a_page_and_no_film(tmp_path, client):
         file.execute("INSERT INTO eval_metadata VALUES ('1', ?)", (json.dumps({"benchmark": "LIBERO"}),))
         file.execute("INSERT INTO episode_results VALUES ('1', 'bowl', 0, '{\"success\": false}', 9, 1.0, 'a', '')")
     kerv("runs", "import", str(recording), "name=libero", f"results={tmp_path}")
-    (number,) = rows_of_wanted(Database(tmp_path))
+    (number,) = rows_of_wanted(opened(tmp_path))
     text = client.get(f"/episodes/{number}").text
     assert text.count("another program ran it") == 2
     assert client.post(f"/episodes/{number}/record").status_code == 409

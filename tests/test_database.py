@@ -28,7 +28,7 @@ from kerv_cli.catalogue.imports import import_databases
 from kerv_cli.episodes.rows import decodes_table, episode_row
 from kerv_cli.lab import database as module
 from kerv_cli.lab.command import STORE, noted
-from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, FILE, RUNS, STUDIES, WANTED, Database
+from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, FILE, RUNS, STUDIES, WANTED, Database, opened
 from kerv_cli.lab.runs import Run, making, pulse, run_rows, time_left
 from kerv_cli.lab.store import StudyStore, studies
 from kerv_cli.report.tables import load_study
@@ -44,8 +44,8 @@ def count(database: Database, table: sa.Table) -> int:
 
 BEGUN = """
 import os, signal, sys
-from test_database import STUDIES, Database, begun
-database = Database(sys.argv[1])
+from test_database import STUDIES, begun, opened
+database = opened(sys.argv[1])
 """
 
 
@@ -74,7 +74,7 @@ def damageable(tmp_path_factory):
 
 def test_reading_creates_nothing(database, tmp_path):
     assert studies(database) == run_rows(database) == []
-    assert StudyStore(tmp_path, "threshold").counts() == (0, 0)
+    assert StudyStore(opened(tmp_path), "threshold").counts() == (0, 0)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -154,13 +154,13 @@ def test_a_measure_that_an_older_kerv_did_not_store_is_missing_until_it_is_measu
     swept(tmp_path / "old", STUDY)
     with contextlib.closing(sqlite3.connect(tmp_path / "old" / FILE)) as file:
         file.execute("ALTER TABLE episodes DROP COLUMN closest_approach")
-    store = StudyStore(tmp_path / "old", "threshold")
+    store = StudyStore(opened(tmp_path / "old"), "threshold")
     assert load_study(store).table["near_contact_failure"].isna().all()
-    new = Database(tmp_path / "new")
+    new = opened(tmp_path / "new")
     import_databases(new, [tmp_path / "old/kerv.db"])
     assert StudyStore(new, "threshold").frame()["closest_approach"].isna().all()
     swept(tmp_path / "old", study_of({"ar": settings_of("ar")}, ["push-v3"], "later"))
-    assert StudyStore(tmp_path / "old", "later").frame()["closest_approach"].notna().all()
+    assert StudyStore(opened(tmp_path / "old"), "later").frame()["closest_approach"].notna().all()
     assert store.frame()["closest_approach"].isna().all()
 
 
@@ -168,9 +168,9 @@ def test_newer_tables_are_refused(database, monkeypatch):
     begun(database, "a")
     monkeypatch.setattr(module, "SCHEMA", 0)
     with refused("newer kerv", error=CheckpointError):
-        studies(Database(database.results))
+        studies(opened(database.results))
     with pytest.raises(CheckpointError):
-        begun(Database(database.results), "b")
+        begun(opened(database.results), "b")
 
 
 @pytest.mark.parametrize("harm", ["no database", "cut", "changed", "empty", "a folder"])
@@ -187,11 +187,11 @@ def test_a_damaged_file_is_one_line(tmp_path, harm):
             "changed": content[:4096] + bytes(len(content) - 4096),
         }[harm])  # fmt: skip
     if harm == "empty":  # as a process leaves it that is killed before its first commit
-        assert studies(Database(tmp_path)) == []
+        assert studies(opened(tmp_path)) == []
         return
     remedy = () if harm == "a folder" else ("is damaged", "restore a copy of it, or move it aside")
     with refused(str(path), *remedy):
-        StudyStore(tmp_path, "threshold").frame()
+        StudyStore(opened(tmp_path), "threshold").frame()
     result = kerv("runs", "list", f"results={tmp_path}", code=None)
     assert result.exit_code in (0, 1)
     assert "Traceback" not in result.output
@@ -250,7 +250,7 @@ def test_a_statement_that_takes_too_long_ends(database, monkeypatch):
 
 @pytest.mark.parametrize("version", ["'x'", "''", "-1", "0", "'1.5'", "x'31'", "'٣'", "99999999999999999999"])
 def test_an_odd_schema_version_is_one_line(tmp_path, version):
-    begun(Database(tmp_path), "a")
+    begun(opened(tmp_path), "a")
     change(tmp_path, f"UPDATE kerv SET value = {version}")
     assert str(tmp_path / FILE) in refusal("runs", "list", f"results={tmp_path}", code=1)
 
@@ -260,10 +260,10 @@ ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELEC
 
 @pytest.mark.parametrize("table", ["kerv", "studies", "episodes"])
 def test_a_view_in_place_of_a_table_is_refused(tmp_path, table):
-    begun(Database(tmp_path), "a")
+    begun(opened(tmp_path), "a")
     change(tmp_path, f"DROP TABLE {table}", f"CREATE VIEW {table} (key, value) AS {ENDLESS}")
     with refused("is damaged", f"{table} is a view", error=CheckpointError):
-        studies(Database(tmp_path))
+        studies(opened(tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -292,10 +292,10 @@ def test_a_folder_that_cannot_be_written_to_can_be_read(tmp_path, monkeypatch):
     swept(tmp_path, STUDY)
     before = set(tmp_path.iterdir())
     monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)
-    assert len(StudyStore(tmp_path, "threshold").frame()) == 16
+    assert len(StudyStore(opened(tmp_path), "threshold").frame()) == 16
     assert set(tmp_path.iterdir()) == before
     with refused("cannot use", "readonly", error=StorageError):
-        begun(Database(tmp_path), "b")
+        begun(opened(tmp_path), "b")
 
 
 def as_reader(look: Callable[[], Any]) -> Any:
@@ -329,7 +329,7 @@ def test_a_reader_of_another_user_sees_all_rows_of_a_running_sweep_and_creates_n
         with contextlib.closing(sqlite3.connect(Path(folder, FILE))) as sweep:
             sweep.execute("SELECT * FROM runs").fetchall()
             for name in names:
-                begun(Database(folder), name)
+                begun(opened(folder), name)
             before = {path.name for path in Path(folder).iterdir()}
             os.chmod(folder, 0o555)
             assert Path(folder, f"{FILE}-wal").stat().st_size > 0
@@ -347,7 +347,7 @@ def test_a_log_that_cannot_be_read_is_not_left_out(tmp_path, monkeypatch):
         with contextlib.closing(sqlite3.connect(tmp_path / FILE)) as sweep:
             sweep.execute("PRAGMA journal_mode=WAL")
             sweep.execute("SELECT * FROM sqlite_schema").fetchall()
-            begun(Database(tmp_path), "a")
+            begun(opened(tmp_path), "a")
             for name in (FILE, f"{FILE}-wal"):  # without the third file, which says where the log's rows are
                 shutil.copy(tmp_path / name, folder)
         os.chmod(folder, 0o555)
@@ -357,29 +357,29 @@ def test_a_log_that_cannot_be_read_is_not_left_out(tmp_path, monkeypatch):
 
 
 def test_a_reader_without_locks_notices_a_change(tmp_path, monkeypatch):
-    begun(Database(tmp_path), "a")
+    begun(opened(tmp_path), "a")
     monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)
-    with refused("was written while it was read"), Database(tmp_path).reading():
+    with refused("was written while it was read"), opened(tmp_path).reading():
         change(tmp_path, "DELETE FROM studies")
 
 
 @pytest.mark.parametrize("name", ["a?b", "a%20b", "a#b", "mode=ro"])
 def test_a_results_folder_may_have_any_name(tmp_path, monkeypatch, name):
     monkeypatch.delenv(STORE, raising=False)
-    begun(Database(tmp_path / name), "a")
+    begun(opened(tmp_path / name), "a")
     assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")] == [name, f"{name}/{FILE}"]
     monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)
-    assert [one.name for one in studies(Database(tmp_path / name))] == ["a"]
+    assert [one.name for one in studies(opened(tmp_path / name))] == ["a"]
 
 
 def test_a_locked_file_says_what_else_to_use(tmp_path, monkeypatch):
-    begun(Database(tmp_path), "a")
+    begun(opened(tmp_path), "a")
     monkeypatch.setattr(module, "LOCK_SECONDS", 0)
     other = sqlite3.connect(tmp_path / FILE)
     other.execute("BEGIN IMMEDIATE")
     with refused("locked", "local disk", "store=postgresql", error=StorageError):
-        begun(Database(tmp_path), "b")
-    assert len(studies(Database(tmp_path))) == 1  # readers go on
+        begun(opened(tmp_path), "b")
+    assert len(studies(opened(tmp_path))) == 1  # readers go on
     other.close()
 
 
@@ -401,7 +401,7 @@ def test_a_full_disk_keeps_what_was_committed(tmp_path):
             swept(tmp_path, study, filling)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    store = StudyStore(tmp_path, "threshold")
+    store = StudyStore(opened(tmp_path), "threshold")
     assert store.counts() == (8, 40)
     assert len(store.frame()) == 8
     swept(tmp_path, study)  # in this process, whose claim could not be released
@@ -410,10 +410,10 @@ def test_a_full_disk_keeps_what_was_committed(tmp_path):
 
 def test_a_study_that_is_not_there_names_what_to_run(database, tmp_path):
     with refused("no study 'threshold'", "run `kerv sweep study=threshold`", error=UsageError):
-        StudyStore(tmp_path, "threshold").load()
+        StudyStore(opened(tmp_path), "threshold").load()
     for name in ("../up", "a/b", "", ".hidden"):
         with pytest.raises(UsageError, match="study name"):
-            StudyStore(tmp_path, name)
+            StudyStore(opened(tmp_path), name)
 
 
 def test_a_removed_study_leaves_nothing_but_what_others_want(database):
@@ -492,10 +492,11 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from kerv_cli.lab.command import noted
+from kerv_cli.lab.database import opened
 from kerv_cli.lab.runs import making
 results = Path(sys.argv[1])
 words = ["demos", "name=mine", "episodes=7", f"results={results}"]
-with noted(words), making(results, "demos", results / "artifacts/demos/mine") as record:
+with noted(words), making(opened(results), "demos", results / "artifacts/demos/mine") as record:
     record.beat(3, 7)
     print("begun", flush=True)
     sys.stdin.read()
@@ -519,7 +520,7 @@ def test_a_name_in_use_is_refused_and_a_killed_command_is_listed_with_how_to_go_
         assert "is running" in told("runs", "rm", "demos/mine", "--yes", f"results={tmp_path}", code=2)
         process.kill()
     words = ["demos", "name=mine", "episodes=8"]
-    with pytest.raises(UsageError), noted(words), making(tmp_path, "demos", place):
+    with pytest.raises(UsageError), noted(words), making(opened(tmp_path), "demos", place):
         raise UsageError("these are others")
     (row,) = listed(tmp_path)
     assert (row["id"], row["state"], row["command"][:2]) == ("demos/mine", "interrupted, 3 of 7", ["kerv", "demos"])
@@ -540,9 +541,9 @@ def test_a_command_whose_input_cannot_be_read_leaves_no_row(tmp_path):
     assert listed(tmp_path) == []
     folder = tmp_path / "artifacts/target/mine"
     folder.mkdir(parents=True)
-    with pytest.raises(CheckpointError), making(tmp_path, "target", folder):
+    with pytest.raises(CheckpointError), making(opened(tmp_path), "target", folder):
         raise CheckpointError("resume.pt is damaged")
-    assert [row.status for row in run_rows(Database(tmp_path))] == ["failed"]
+    assert [row.status for row in run_rows(opened(tmp_path))] == ["failed"]
 
 
 def test_a_store_is_used_by_one_command_and_no_password_is_kept(tmp_path, monkeypatch):
@@ -552,8 +553,11 @@ def test_a_store_is_used_by_one_command_and_no_password_is_kept(tmp_path, monkey
     (tmp_path / "artifacts/target/openvla").mkdir(parents=True)  # without a folder the command would leave no row
     told("build", "target", f"checkpoint={tmp_path}", f"store={url}", where, code=1)
     assert [row.status for row in run_rows(other)] == ["failed"]
-    assert run_rows(Database(tmp_path)) == []
-    assert STORE not in os.environ
+    assert run_rows(opened(tmp_path)) == []
+    monkeypatch.setenv(STORE, url)
+    assert len(run_rows(opened(tmp_path))) == 1
+    assert run_rows(Database(tmp_path)) == []  # only the command itself reads the variable
+    monkeypatch.delenv(STORE)
     store = "store=postgresql://me:secret@127.0.0.1:1/kerv"
     assert "store: postgresql://me@127.0.0.1:1/kerv" in told("build", "target", store, "--cfg")
     query = "store=postgresql://me@127.0.0.1:1/kerv?password=secret&connect_timeout=3&sslpassword=secret"

@@ -22,6 +22,7 @@ from kerv_cli.bench.recorded import TABLES, recorded
 from kerv_cli.bench.settings import EstimateSettings
 from kerv_cli.engine.cost import Profile, prices, read_profile, work_of_record
 from kerv_cli.engine.record import DecodeRecord, Round
+from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.reprice import open_profiles, repriced_table
 from kerv_cli.report.tables import load_study
@@ -326,7 +327,7 @@ def swept_results(tmp_path_factory):
     swept(results, threshold_study(["reach-v3", "push-v3"], radii=(9,)))
     words = (f"results={results}", "--json")
     (trace,) = json.loads(told("runs", "export", "threshold", "--to", "trace", *words))["written"]
-    store = StudyStore(results, "threshold")
+    store = StudyStore(opened(results), "threshold")
     table = repriced_table(load_study(store), store, open_profiles(results, ["a100-openvla-7b-eager"]))
     return Path(trace), table.set_index("label").to_dict("index")
 

@@ -32,7 +32,7 @@ from kerv_cli.base.registry import _PARTS, Part, parts
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.cli.common import progress_bar
 from kerv_cli.cli.studies import event_printer
-from kerv_cli.lab.database import EPISODES, QUEUE, WANTED, Database, clock
+from kerv_cli.lab.database import EPISODES, QUEUE, WANTED, Database, clock, opened
 from kerv_cli.lab.events import EpisodeEnd, Event, SettingFailed
 from kerv_cli.lab.plan import Study, blocks_of
 from kerv_cli.lab.queue import ClaimLost, Queue, enqueue
@@ -96,7 +96,7 @@ def test_each_episode_is_committed_when_it_ends(database):
 
     def on_event(event):
         if isinstance(event, EpisodeEnd):
-            told.append(StudyStore(Database(database.results), "threshold").counts())
+            told.append(StudyStore(opened(database.results), "threshold").counts())
 
     store, _ = swept(database.results, STUDY, on_event=on_event)
     assert told == [(number, 16) for number in range(1, 17)]
@@ -140,7 +140,7 @@ def test_an_error_of_kerv_is_told_in_its_own_words(database):
 def test_a_study_that_is_deleted_while_it_runs_says_so(tmp_path, workers):
     def remove(event):
         if isinstance(event, EpisodeEnd):
-            StudyStore(tmp_path, "threshold").remove()
+            StudyStore(opened(tmp_path), "threshold").remove()
 
     with pytest.raises(KervError, match="threshold was deleted"):
         swept(tmp_path, STUDY, unhurried, runtime=RuntimeSettings(workers=workers), on_event=remove)
@@ -183,7 +183,7 @@ if all(children):
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_workers_of_a_killed_sweep_end_and_its_claims_are_taken_over(tmp_path, monkeypatch):
     monkeypatch.setattr("kerv_cli.lab.queue.LAPSE_SECONDS", 1.0)
-    store = StudyStore(tmp_path, "threshold")
+    store = StudyStore(opened(tmp_path), "threshold")
     with python(SWEEP, tmp_path, "slow_elsewhere", 2, 1) as process:  # the first task at once, the other in a minute
         until(lambda: store.counts()[0] == 6)
         until(lambda: queued(store.database) == 1)
@@ -258,9 +258,10 @@ STOPS = """
 import sys
 import studies_synthetic as s
 from kerv_cli.lab import queue, work
+from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import StudyStore
 queue.LAPSE_SECONDS, queue.BEAT_SECONDS = 1.0, 0.1
-work.work(queue.Queue(StudyStore(sys.argv[1], "threshold")), s.stops)
+work.work(queue.Queue(StudyStore(opened(sys.argv[1]), "threshold")), s.stops)
 """
 
 
@@ -284,7 +285,7 @@ import pandas  # once, before the processes part; so are the calls below
 import studies_synthetic as s
 from kerv_cli.lab import database, queue, work
 from kerv_cli.lab.store import StudyStore, plan_study
-from kerv_cli.lab.database import Database
+from kerv_cli.lab.database import Database, opened
 
 work.POLL_SECONDS = 0.01
 work.code_hash(), work.stamp("cpu")
@@ -301,7 +302,7 @@ def parted(function, *arguments, **options):
 
 
 def begun(store):
-    return parted(lambda: work.work(queue.Queue(StudyStore(results, store.name)), prepare))
+    return parted(lambda: work.work(queue.Queue(StudyStore(opened(results), store.name)), prepare))
 
 
 def crew(store, number):
@@ -324,8 +325,8 @@ for workers in (1, 2, 4):
             setting.settings["seed"] = 100_000 + 100 * block + 10 * workers
         episodes = s.all_episodes(study.settings, ["reach-v3"], block)
         study = s.replace(study, episodes=episodes)
-        queue.enqueue(plan_study(Database(results), study), "run")
-        died = crew(StudyStore(results, study.name), workers)
+        queue.enqueue(plan_study(opened(results), study), "run")
+        died = crew(StudyStore(opened(results), study.name), workers)
         print(study.name, died)
 """
 
@@ -342,8 +343,8 @@ def test_any_number_of_workers_run_each_episode_once_though_some_are_killed(data
 
 AT_ONCE = """
 study = s.threshold_study(["reach-v3", "push-v3"], episodes=4, radii=(3,), block=2)
-queue.enqueue(plan_study(Database(results), study), "earlier")
-store = StudyStore(results, study.name)
+queue.enqueue(plan_study(opened(results), study), "earlier")
+store = StudyStore(opened(results), study.name)
 children = [begun(store) for _ in range(3)] + [parted(s.swept, results, study, prepare) for _ in range(2)]
 assert [os.waitpid(child, 0)[1] for child in children] == [0] * 5
 """
@@ -427,7 +428,7 @@ def test_workers_run_each_episode_once_though_one_is_killed(tmp_path, monkeypatc
     assert "12 run, 0 reused, 0 failed" in told(*words, "runtime.workers=2")
     assert not (tmp_path / "armed").exists()
     assert "0 run, 12 reused, 0 failed" in told(*words)
-    assert episodes(Database(tmp_path / "results")) == 12
+    assert episodes(opened(tmp_path / "results")) == 12
 
 
 def test_a_worker_counts_its_episodes_without_a_total(capsys):
@@ -439,8 +440,8 @@ def test_a_worker_counts_its_episodes_without_a_total(capsys):
 IN_ORDER = """
 from test_execute import in_order
 study = in_order()
-queue.enqueue(plan_study(Database(results), study), "run")
-assert crew(StudyStore(results, study.name), 1) == 2
+queue.enqueue(plan_study(opened(results), study), "run")
+assert crew(StudyStore(opened(results), study.name), 1) == 2
 """
 
 
@@ -528,7 +529,7 @@ def test_workers_that_cannot_begin_end_the_sweep_in_one_line(tmp_path, monkeypat
         monkeypatch.setattr(sys, "executable", str(shell(tmp_path, "python", script)))
         with refused(line):
             swept(tmp_path, TWO, runtime=RuntimeSettings(workers=2))
-        assert queued(Database(tmp_path)) == 0
+        assert queued(opened(tmp_path)) == 0
 
 
 @pytest.mark.parametrize(("visible", "device", "seen"), [
@@ -537,7 +538,7 @@ def test_workers_that_cannot_begin_end_the_sweep_in_one_line(tmp_path, monkeypat
 ])  # fmt: skip
 def test_each_local_worker_sees_one_gpu(visible, device, seen, tmp_path, monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-    store = waiting(Database(tmp_path), STUDY)
+    store = waiting(opened(tmp_path), STUDY)
     script = f'echo "$CUDA_VISIBLE_DEVICES" > {tmp_path}/gpu$$; sleep 60'
     monkeypatch.setattr(sys, "executable", str(shell(tmp_path, "python", script)))
     with LocalWorkers(Queue(store), 3, 1, gpus_in_turn(device)):
@@ -547,7 +548,7 @@ def test_each_local_worker_sees_one_gpu(visible, device, seen, tmp_path, monkeyp
 
 
 def test_a_plan_warns_of_workers_that_disturb_each_others_times(tmp_path, monkeypatch):
-    database = Database(tmp_path)
+    database = opened(tmp_path)
 
     def warnings(workers: int, device: str = "cpu", batch: int = 1) -> list[str]:
         settings = settings_of("ar")
@@ -564,7 +565,7 @@ def test_a_plan_warns_of_workers_that_disturb_each_others_times(tmp_path, monkey
 def test_a_database_that_does_not_answer_is_asked_again_for_two_minutes(tmp_path, monkeypatch):
     """Then the worker ends in one line. What it had finished is kept."""
     monkeypatch.setattr("kerv_cli.lab.database.LOCK_SECONDS", 0)
-    store = waiting(Database(tmp_path), STUDY)
+    store = waiting(opened(tmp_path), STUDY)
     locks: list[sqlite3.Connection] = []
 
     def lock(event: object) -> None:

@@ -15,6 +15,7 @@ from command import kerv
 from studies_synthetic import swept, threshold_study
 
 from kerv_cli.catalogue.imports import connect_foreign
+from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.tables import load_study
 from kerv_cli.worlds.demos import files
@@ -45,7 +46,10 @@ def test_an_exported_database_is_the_study_elsewhere(made, tmp_path):
     assert (run["id"], run["state"]) == ("threshold", "complete")
     told = answer("runs", "import", f"{tmp_path}/out/threshold/kerv.db", "name=copy", f"results={tmp_path}/new")
     assert told == {"studies": ["copy"], "notes": []}
-    before, after = (load_study(StudyStore(*at)) for at in ((made, "threshold"), (tmp_path / "new", "copy")))
+    before, after = (
+        load_study(StudyStore(opened(folder), name))
+        for folder, name in ((made, "threshold"), (tmp_path / "new", "copy"))
+    )
     pd.testing.assert_frame_equal(before.per_task.drop(columns="study"), after.per_task.drop(columns="study"))
     with sqlite3.connect(tmp_path / "out/threshold/kerv.db") as file:
         file.execute("UPDATE kerv SET value = '99'")
@@ -56,7 +60,7 @@ def test_an_exported_database_is_the_study_elsewhere(made, tmp_path):
 def test_episodes_and_decodes_as_parquet(made, tmp_path):
     answer("runs", "export", "threshold", "--to", "parquet", "--dir", str(tmp_path), f"results={made}")
     episodes, decodes = (pd.read_parquet(tmp_path / f"threshold/{name}.parquet") for name in ("episodes", "decodes"))
-    assert len(episodes) == len(StudyStore(made, "threshold").frame()) == 32
+    assert len(episodes) == len(StudyStore(opened(made), "threshold").frame()) == 32
     counted = decodes.groupby(["label", "task", "seed", "repeat"]).size()
     assert counted.to_dict() == episodes.set_index(["label", "task", "seed", "repeat"])["decodes"].to_dict()
 

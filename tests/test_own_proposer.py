@@ -22,7 +22,7 @@ from kerv_cli.engine.chunk import ActionHistory, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.settings import RolloutSettings, settings_from
-from kerv_cli.lab.database import Database
+from kerv_cli.lab.database import opened
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.kerv.prediction import Hold, PredictionProposer
@@ -81,7 +81,7 @@ def test_it_is_trained_from_the_command_line_and_drafts_in_every_place(results):
     few = ("demos=few", "drafter.share=0.5", "train.steps=6", "train.batch=8", "train.validate_every=3", "train.lr=0.1")
     assert "table of" in run("train", "drafter", "drafter=follow", *few, "--plan")
     assert "score" in run("train", "drafter", "drafter=follow", *few)
-    (entry,) = matching(find_runs(Database(results)), {"kind": "follow"})
+    (entry,) = matching(find_runs(opened(results)), {"kind": "follow"})
     assert (entry.id, entry.state, entry.is_training) == ("follow/learnt", "complete", True)
     assert "target" in entry.made_from
     described = json.loads((results / "artifacts/follow/learnt/follow.json").read_text())

@@ -20,7 +20,7 @@ from kerv_cli.base import files
 from kerv_cli.base.config import conf_dir
 from kerv_cli.base.files import read_yaml_lines
 from kerv_cli.episodes.resolve import resolve, resolve_rollout
-from kerv_cli.lab.database import RUNS, Database
+from kerv_cli.lab.database import RUNS, opened
 from kerv_cli.lab.runs import run_rows
 from kerv_cli.report.plots import read_log
 from kerv_cli.targets import folders
@@ -121,12 +121,12 @@ def test_a_plan_takes_its_time_from_the_most_similar_command_on_this_machine(res
     for name, steps, minutes in (("short", 2, 1), ("long", 100, 5)):
         told(*train, f"name={name}", "train.steps=2")
         times = {"started": "2026-01-01T00:00:00+00:00", "finished": f"2026-01-01T00:0{minutes}:00+00:00"}
-        with Database(results).writing() as connection:
+        with opened(results).writing() as connection:
             connection.execute(sa.update(RUNS).where(RUNS.c.name == name).values(total=steps, **times))
     assert "about 115 s (at the speed of target/short)" in told(*train, "name=new", "train.steps=4", "--plan")
     assert "about 3 min (at the speed of target/long)" in told(*train, "name=new", "train.steps=60", "--plan")
     assert "time unknown" in told(*train, "name=new", "train.batch=8", "--plan")
-    with Database(results).writing() as connection:
+    with opened(results).writing() as connection:
         connection.execute(sa.update(RUNS).values(host="another"))
     assert "time unknown" in told(*train, "name=new", "--plan")
     assert "early: time unknown" in told("prepare", MINE, "--plan")
@@ -190,7 +190,7 @@ def test_an_artifact_has_a_row_and_is_shown_with_the_settings_that_it_was_made_w
         told(*words)
         assert sorted(json.loads(told("runs", "show", name, "--json"))["command"]) == sorted(["kerv", *words])
     assert "made by   kerv train target target=nano " in told("runs", "show", "target/new")
-    rows = {f"{row.kind}/{row.name}": row for row in run_rows(Database(results))}
+    rows = {f"{row.kind}/{row.name}": row for row in run_rows(opened(results))}
     assert {name: row.status for name, row in rows.items()} == dict.fromkeys(made, "complete")
     assert (rows["target/new"].done, rows["target/new"].total) == (2, 2)
     assert read_log(results / "artifacts/target/new")["step"].tolist() == [1, 2]

@@ -15,6 +15,7 @@ from test_board import client_of
 
 from kerv_cli.engine.cost import Profile, prices, work_of_record
 from kerv_cli.episodes.rows import decode_records
+from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.reprice import NamedProfile, open_profiles, own_prices, repriced_summary, repriced_table
 from kerv_cli.report.tables import load_study
@@ -43,7 +44,7 @@ def results(tmp_path_factory):
 
 @pytest.fixture
 def data(results):
-    return load_study(StudyStore(results, "threshold"))
+    return load_study(StudyStore(opened(results), "threshold"))
 
 
 def profile_file(results: Path, name: str = "there", without: str = "", **changes: Any) -> None:
@@ -56,7 +57,9 @@ def profile_file(results: Path, name: str = "there", without: str = "", **change
 
 def test_an_episode_costs_its_decodes_at_the_profiles_costs(results, data):
     """Ratios of means over episodes and over times per step, of the very records of the sweep."""
-    table = repriced_table(data, StudyStore(results, "threshold"), [NamedProfile("there", PROFILE)]).set_index("label")
+    table = repriced_table(data, StudyStore(opened(results), "threshold"), [NamedProfile("there", PROFILE)]).set_index(
+        "label"
+    )
     seconds: dict[str, list[float]] = {}
     steps: dict[str, list[int]] = {}
     for one in data.study.episodes:
@@ -79,7 +82,7 @@ def test_an_episode_costs_its_decodes_at_the_profiles_costs(results, data):
 
 
 def test_decodes_from_before_rounds_had_levels_cost_what_their_settings_say(results, data, monkeypatch):
-    store = StudyStore(results, "threshold")
+    store = StudyStore(opened(results), "threshold")
     profiles = [NamedProfile("there", PROFILE)]
     whole, decodes = repriced_table(data, store, profiles), store.decodes
 
@@ -118,11 +121,11 @@ def test_a_table_shows_how_a_row_depends_on_the_encoder(results, data):
     about = {**ABOUT, "projected": True, "engine": "eager", "encoder_floor": 0.001, "encoder_system": 0.006}
     named = NamedProfile("there", dataclasses.replace(PROFILE, about=about))
     assert named.title == "vla-150m, GPU, eager, projected"
-    table = repriced_table(data, StudyStore(results, "threshold"), [named])
+    table = repriced_table(data, StudyStore(opened(results), "threshold"), [named])
     rows = table.set_index("label")
     for column, seconds in (("encoder_floor", 0.007), ("encoder_twice", 0.008), ("encoder_8ms", 0.014)):
         other = dataclasses.replace(PROFILE, phases={**PROFILE.phases, "encode": ((1,), (seconds,))})
-        priced = repriced_table(data, StudyStore(results, "threshold"), [NamedProfile("other", other)])
+        priced = repriced_table(data, StudyStore(opened(results), "threshold"), [NamedProfile("other", other)])
         assert list(rows[column]) == pytest.approx(list(priced["episode_speedup"]))
         assert "encoder_floor" not in priced, "a measured encoder has one cost"
     fast, slow = rows.loc["spec_vla r=9", ["encoder_floor", "encoder_8ms"]]

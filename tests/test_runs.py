@@ -19,7 +19,7 @@ from command import kerv
 from studies_synthetic import swept, threshold_study
 
 from kerv_cli.catalogue.entries import find_runs, matching
-from kerv_cli.lab.database import EPISODES, RUNS, WANTED, Database
+from kerv_cli.lab.database import EPISODES, RUNS, WANTED, opened
 from kerv_cli.lab.runs import INTERRUPTED, Run
 from kerv_cli.lab.study import EpisodeRunner
 
@@ -78,7 +78,7 @@ def test_a_finished_training_stays_finished_while_it_is_repeated_and_after_that_
         (run,) = [run for run in listed(copy) if run["id"] == "target/nano-state"]
         return run
 
-    database, words = Database(copy), ("target", "nano-state", ["train", "target", "name=nano-state"])
+    database, words = opened(copy), ("target", "nano-state", ["train", "target", "name=nano-state"])
     before = training()
     with Run(database, *words, total=20):
         pass
@@ -106,7 +106,7 @@ def test_runs_are_listed_and_filtered(results):
     assert listed(results, "kind=target")[0]["id"] == "target/nano-state"
     assert listed(results, "task=push") == []
     assert "did you mean method" in kerv("runs", "list", "methd=ar", f"results={results}", code=2).stderr
-    assert matching(find_runs(Database(results)), {"since": "2999"}) == []
+    assert matching(find_runs(opened(results)), {"since": "2999"}) == []
 
 
 def test_a_run_is_shown_and_a_wrong_name_refused(results):
@@ -150,7 +150,7 @@ def test_a_rerun_repeats_the_tokens_in_a_folder_of_its_own(copy):
     shown = works("runs", "compare", single, told["run"], f"results={copy}")
     assert "not timed in turn" in shown  # they ran one after the other, perhaps on a machine in another state
     assert "speed, per step" not in shown
-    with Database(copy).writing() as connection:  # as a kill leaves it
+    with opened(copy).writing() as connection:  # as a kill leaves it
         connection.execute(sa.update(RUNS).where(RUNS.c.name == told["run"]).values(status=INTERRUPTED))
         last = sa.select(sa.func.max(EPISODES.c.id)).scalar_subquery()
         connection.execute(sa.update(WANTED).where(WANTED.c.episode_id == last).values(episode_id=None))
@@ -220,7 +220,7 @@ def test_a_method_composed_on_the_command_line_is_called_what_it_is(words, label
 
 
 def test_episodes_are_exported_as_csv(results, tmp_path):
-    grid = next(run for run in find_runs(Database(results)) if "spec_vla" in run.methods)
+    grid = next(run for run in find_runs(opened(results)) if "spec_vla" in run.methods)
     (path,) = works("runs", "export", grid.id, "--dir", str(tmp_path), f"results={results}").split()
     table = pd.read_csv(path)
     assert list(table["label"]) == ["spec_vla r=5", "spec_vla r=5", "spec_vla r=9", "spec_vla r=9"]
@@ -235,7 +235,7 @@ KILLED = """
 import os, sys
 from pathlib import Path
 from kerv_cli.catalogue.entries import find_run, remove
-from kerv_cli.lab.database import Database
+from kerv_cli.lab.database import opened
 
 left = int(sys.argv[3])
 
@@ -246,7 +246,7 @@ def kill_at(event, arguments):
         if left < 0:
             os.kill(os.getpid(), 9)
 
-database = Database(sys.argv[1])
+database = opened(sys.argv[1])
 run = find_run(database, sys.argv[2])
 sys.addaudithook(kill_at)
 remove(run, database)

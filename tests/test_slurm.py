@@ -15,7 +15,7 @@ from studies_synthetic import swept, threshold_study, unhurried
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.settings import RuntimeSettings, SlurmOptions
-from kerv_cli.lab.database import EPISODES, QUEUE
+from kerv_cli.lab.database import EPISODES, QUEUE, opened
 from kerv_cli.lab.events import EpisodeEnd
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.lab.study import Detached
@@ -117,7 +117,7 @@ s.swept(sys.argv[1], t.STUDY, s.unhurried, runtime=t.runtime())
 
 
 def test_a_study_survives_its_sweep_a_cancelled_worker_and_a_preempted_one(tmp_path):
-    store, struck = StudyStore(tmp_path, "threshold"), []
+    store, struck = StudyStore(opened(tmp_path), "threshold"), []
     with python(SWEEP, tmp_path) as process:
         until(lambda: store.counts()[0] >= 2, 120)
         process.kill()
@@ -151,7 +151,7 @@ def test_workers_are_left_alone_on_request_and_cancelled_by_an_interrupt(tmp_pat
     with pytest.raises(KeyboardInterrupt):
         swept(tmp_path, STUDY, runtime=asleep)
     until(lambda: not set(jobs()) & begun, 30)
-    with StudyStore(tmp_path, "threshold").database.reading() as connection:
+    with StudyStore(opened(tmp_path), "threshold").database.reading() as connection:
         assert connection.scalar(sa.select(sa.func.count()).select_from(QUEUE)) == 0
 
 

@@ -24,7 +24,7 @@ from kerv_cli.engine.record import DecodeRecord, Round
 from kerv_cli.engine.tally import Tally
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab import database as tables
-from kerv_cli.lab.database import Database
+from kerv_cli.lab.database import opened
 from kerv_cli.lab.plan import Episode, Setting, Study
 from kerv_cli.lab.store import StudyStore, plan_study
 from kerv_cli.lab.work import RunEpisode
@@ -327,14 +327,14 @@ def results(tmp_path_factory):
     folder = tmp_path_factory.mktemp("results")
     study = threshold_study(["reach-v3", "push-v3", "door-open-v3"], episodes=3)
     swept(folder, replace(study, episodes=study.episodes[:-3]))
-    StudyStore(folder, "threshold").save(study, plan_study(Database(folder), study).existing)
+    StudyStore(opened(folder), "threshold").save(study, plan_study(opened(folder), study).existing)
     return folder
 
 
 @pytest.fixture(scope="module")
 def written(results):
     """The files of its report."""
-    return report(Database(results)).files
+    return report(opened(results)).files
 
 
 def test_report_writes_the_same_bytes_again(results, written):
@@ -354,7 +354,7 @@ def test_report_writes_the_same_bytes_again(results, written):
     before = {path: path.read_bytes() for path in written}
     for path in written:
         path.unlink()
-    again = report(Database(results), "threshold").files
+    again = report(opened(results), "threshold").files
     assert again == written
     assert {path: path.read_bytes() for path in again} == {path: before[path] for path in again}
     assert all(content.startswith(b"\x89PNG") for path, content in before.items() if path.suffix == ".png")
@@ -464,9 +464,9 @@ def commit(monkeypatch):
 
 def test_one_run_of_one_commit_is_published_where_it_is_committed(tmp_path):
     swept(tmp_path, STUDY)
-    draft = report(Database(tmp_path), "threshold")
+    draft = report(opened(tmp_path), "threshold")
     assert not (tmp_path / "tables").exists()
-    published = report(Database(tmp_path), "threshold", publish=True)
+    published = report(opened(tmp_path), "threshold", publish=True)
     table = tmp_path / "tables" / "threshold.csv"
     assert table in published.files
     assert table.read_bytes() == (tmp_path / "report" / "tables" / "threshold.csv").read_bytes()
@@ -476,9 +476,9 @@ def test_one_run_of_one_commit_is_published_where_it_is_committed(tmp_path):
 def test_what_is_missing_or_not_committed_is_refused(tmp_path, commit):
     commit(f"{COMMIT}+changes")
     swept(tmp_path, replace(STUDY, episodes=STUDY.episodes[:-1]))
-    StudyStore(tmp_path, "threshold").save(STUDY, plan_study(Database(tmp_path), STUDY).existing)
+    StudyStore(opened(tmp_path), "threshold").save(STUDY, plan_study(opened(tmp_path), STUDY).existing)
     with refused("1 of its episodes are missing", "not committed", error=Unpublishable):
-        report(Database(tmp_path), "threshold", publish=True)
+        report(opened(tmp_path), "threshold", publish=True)
     assert not (tmp_path / "tables").exists()
 
 

@@ -11,7 +11,7 @@ from kerv_cli.engine.record import Delay
 from kerv_cli.episodes.identity import stress_of
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings, SweepSettings, TimingSettings
-from kerv_cli.lab.database import Database
+from kerv_cli.lab.database import opened
 from kerv_cli.lab.plan import Setting
 from kerv_cli.lab.work import RunEpisode
 from kerv_cli.report.decide import verdict_of
@@ -97,7 +97,7 @@ def test_sums_count_every_stressed_world_once(stressed_table):
 
 
 def test_the_report_writes_the_sums(stressed):
-    written = {path.name for path in report(Database(stressed[0]), "stress").files}
+    written = {path.name for path in report(opened(stressed[0]), "stress").files}
     assert {"stress_summed.csv", "stress.png"} <= written
 
 
@@ -200,5 +200,5 @@ def test_the_figure_has_a_panel_per_compensation_and_a_line_per_method(delayed):
 
 
 def test_a_report_has_the_table_and_the_figure(delayed):
-    names = {path.name for path in report(Database(delayed[0]), "latency").files}
+    names = {path.name for path in report(opened(delayed[0]), "latency").files}
     assert {"latency.csv", "latency_latency.csv", "latency_latency.png", "report.html"} <= names

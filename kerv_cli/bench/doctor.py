@@ -146,10 +146,10 @@ def _disk(settings: DoctorSettings) -> str:
 
 def _database(settings: DoctorSettings) -> str:
     """Return which database is used, as text. Raises KervError if it does not answer."""
-    from kerv_cli.lab.database import Database
+    from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import run_rows
 
-    database = Database(settings.results)
+    database = opened(settings.results)
     rows = len(run_rows(database))
     what = "PostgreSQL" if database.file is None else "SQLite"
     says = f"{rows} commands in it" if database.exists else "made by the first command that needs it"

@@ -8,7 +8,6 @@ import socket
 import threading
 import webbrowser
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -74,8 +73,8 @@ class Impatient(H11Protocol):
             self.loop.call_later(PATIENCE, self._check, self.cycle)
 
 
-def make_app(results: str | Path) -> Starlette:
-    """Return the web app that shows a results folder.
+def make_app(database: Database) -> Starlette:
+    """Return the web app that shows a database and its results folder.
 
     Pages find the database in `request.app.state.database`.
     """
@@ -86,7 +85,7 @@ def make_app(results: str | Path) -> Starlette:
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=_HOSTS), Middleware(SameOrigin)],
         exception_handlers=dict.fromkeys((KervError, HTTPException, Exception), _failed),
     )
-    app.state.database = Database(results)
+    app.state.database = database
     return app
 
 
@@ -98,21 +97,21 @@ async def _failed(request: Request, error: Exception) -> Response:
     return render(request, "error.html", 404 if isinstance(error, UsageError) else 500, reason=reason)
 
 
-def web_server(results: str | Path, **options: Any) -> uvicorn.Server:
+def web_server(database: Database, **options: Any) -> uvicorn.Server:
     """Return the server of the web app.
 
     Args:
-        results: The results folder.
+        database: The database to show.
         **options: More options of uvicorn.
     """
-    return uvicorn.Server(uvicorn.Config(make_app(results), http=Impatient, log_level="critical", **options))
+    return uvicorn.Server(uvicorn.Config(make_app(database), http=Impatient, log_level="critical", **options))
 
 
-def serve(results: str | Path, port: int, opened: Callable[[str], None], browser: bool) -> None:
+def serve(database: Database, port: int, opened: Callable[[str], None], browser: bool) -> None:
     """Serve the web app until Ctrl-C.
 
     Args:
-        results: The results folder.
+        database: The database to show.
         port: Port to listen on; 0: a free one.
         opened: Called with the address as soon as the port is open.
         browser: Whether to open the address in the browser.
@@ -120,7 +119,7 @@ def serve(results: str | Path, port: int, opened: Callable[[str], None], browser
     Raises:
         UsageError: The port is taken.
     """
-    server = web_server(results)
+    server = web_server(database)
     with socket.socket() as listening:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

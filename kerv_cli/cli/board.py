@@ -30,10 +30,11 @@ class BoardSettings(CommandSettings):
 def board(settings: BoardSettings) -> None:
     """Look at runs, studies, trainings and episodes in the browser, until Ctrl-C; only this machine can."""
     from kerv_cli.board.app import serve
+    from kerv_cli.lab.database import opened
     from kerv_cli.report.viewing.viewer import has_display
 
     serve(
-        settings.results,
+        opened(settings.results),
         settings.port,
         lambda address: typer.echo(f"{address}  (Ctrl-C ends it)"),
         settings.open and has_display(),

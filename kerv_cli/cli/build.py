@@ -29,9 +29,10 @@ def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
     importers = {name: part for name, part in parts("target").items() if "importer" in part.traits}
     if find("target", settings.family, "target family").name not in importers:
         raise UsageError(f"family={settings.family}: only {', '.join(importers)} is imported, others are trained")
+    from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import making
 
-    with making(settings.results, "target", artifact(settings.results, "target", settings.name)):
+    with making(opened(settings.results), "target", artifact(settings.results, "target", settings.name)):
         folder, figures = load(importers[settings.family].traits["importer"])(settings)
     print_figures("target", figures, folder, as_json)
 
@@ -47,12 +48,13 @@ def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
 )
 def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
     """Import a drafter in the public EAGLE or Spec-VLA layout for a target."""
+    from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import making
     from kerv_cli.methods.artifacts import Artifacts
     from kerv_cli.methods.eagle.drafter import import_drafter
 
     folder = Artifacts(settings.results, settings.policy).new("drafter")
-    with making(settings.results, "drafter", folder):
+    with making(opened(settings.results), "drafter", folder):
         folder, figures = import_drafter(settings)
     print_figures("drafter", figures, folder, as_json)
 
@@ -68,14 +70,15 @@ def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
 )
 def datastore(settings: BuildDatastoreSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Store the demonstrations' action chunks with the target's features as search keys, for drafts by retrieval."""
+    from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import making, time_as_before
     from kerv_cli.training.datastore import DatastoreBuild
 
     run = DatastoreBuild(settings)
     if plan:
-        end_with_plan(f"{run.plan()}, {time_as_before(settings.results, 'datastore')}", as_json)
+        end_with_plan(f"{run.plan()}, {time_as_before(opened(settings.results), 'datastore')}", as_json)
     with (
-        making(settings.results, "datastore", run.folder) as made,
+        making(opened(settings.results), "datastore", run.folder) as made,
         progress_bar("encoding demonstrations", made) as advance,
     ):
         store = run.build(advance)

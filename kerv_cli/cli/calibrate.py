@@ -36,12 +36,13 @@ def calibrate(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
     from kerv_cli.training.calibration import CalibrationRun
 
     run = CalibrationRun(settings)
+    from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import making, time_as_before
 
     if plan:
-        end_with_plan(f"{run.plan()}, {time_as_before(settings.results, 'calibration')}")
+        end_with_plan(f"{run.plan()}, {time_as_before(opened(settings.results), 'calibration')}")
 
-    with making(settings.results, "calibration", run.path.parent) as record:
+    with making(opened(settings.results), "calibration", run.path.parent) as record:
         calibration = run.run(lambda title: progress_bar(title, record))
     from kerv_cli.report.calibration import tables
 
@@ -72,6 +73,7 @@ def success(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_
     """
     from kerv_cli.cli.studies import planned_study, print_settings, print_study_plan, run_study
     from kerv_cli.episodes.resolve import resolve
+    from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import making
     from kerv_cli.report.certificate import candidate_rows, certify, folder_of, planned_certificate, write
 
@@ -93,7 +95,7 @@ def success(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_
     if plan:
         print_study_plan(planned, as_json)
         return
-    with making(settings.results, "certificate", folder):
+    with making(opened(settings.results), "certificate", folder):
         if run_study(planned).failed:
             raise typer.Exit(1)
         certificate = certify(certificate, planned.store, planned.study.episodes, resolved.study.baseline)

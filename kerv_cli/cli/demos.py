@@ -24,6 +24,7 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
 
     With policy=NAME a policy acts instead, and the expert labels the states that it reaches (DAgger).
     """
+    from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import making, time_as_before
     from kerv_cli.training.dagger import recording_of
     from kerv_cli.training.demonstrations import name_of
@@ -34,10 +35,10 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
     folder = artifact(settings.results, "demos", settings.name or name_of(settings.task))
     if plan:
         what = f"{count(len(config.tasks), 'task')} x {count(settings.episodes, 'episode')}"
-        time = time_as_before(settings.results, "demos", len(config.tasks) * settings.episodes)
+        time = time_as_before(opened(settings.results), "demos", len(config.tasks) * settings.episodes)
         end_with_plan(f"{what} -> {folder}, {time}")
     try:
-        with making(settings.results, "demos", folder) as made, progress_bar("demonstrations", made) as advance:
+        with making(opened(settings.results), "demos", folder) as made, progress_bar("demonstrations", made) as advance:
             manifest = record(config, folder, advance, actor)
     except KeyboardInterrupt:
         raise Interrupted(
@@ -58,13 +59,14 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
 )
 def import_demos(settings: DemosImportSettings) -> None:
     """Read a LeRobot dataset as demonstrations."""
+    from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import making
     from kerv_cli.worlds.demos.lerobot import import_lerobot
 
     if not settings.source:
         raise UsageError("source=DIR: name the folder of a LeRobot dataset")
     folder = artifact(settings.results, "demos", settings.name or Path(settings.source).name)
-    with making(settings.results, "demos", folder) as made, progress_bar("import", made) as advance:
+    with making(opened(settings.results), "demos", folder) as made, progress_bar("import", made) as advance:
         manifest = import_lerobot(settings, folder, advance).manifest
     rows = ((name, len(row.episodes), f"{row.mean_steps:.0f}") for name, row in manifest.tasks.items())
     title = f"demonstrations in {folder}" + ("" if settings.environment else f", suite {manifest.environment.upper()}")

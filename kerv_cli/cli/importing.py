@@ -34,7 +34,7 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
     """Import the runs of another results folder, or evaluations of vla-eval as a study."""
     from kerv_cli.catalogue.evaluations import import_evaluations
     from kerv_cli.catalogue.imports import database_in, import_databases
-    from kerv_cli.lab.database import Database
+    from kerv_cli.lab.database import opened
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.summary import SummaryTable
     from kerv_cli.report.tables import load_study, rows_of
@@ -43,7 +43,7 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
         raise UsageError("name what to import: kerv runs import old-results, or kerv runs import recording-ID.sqlite")
     paths = [as_path(name) for name in names]
     files = [file for file in map(database_in, paths) if file]
-    database = Database(settings.results)
+    database = opened(settings.results)
     if files:
         if len(files) < len(paths):
             raise UsageError("import results folders and evaluations one after the other")

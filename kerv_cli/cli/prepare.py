@@ -29,7 +29,7 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
 
     Existing artifacts are skipped. The same command continues after an interruption.
     """
-    from kerv_cli.lab.database import Database
+    from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import time_of
     from kerv_cli.training.preparation import THERE, Step
     from kerv_cli.training.preparation import plan as planned
@@ -44,7 +44,7 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
     steps, name = planned(settings), settings.policy.target
     print_table(("what", "state", "command"), [(s.kind, s.state, f"kerv {line(s)}") for s in steps], name)
     if plan:
-        database = Database(settings.results)
+        database = opened(settings.results)
         for step in steps:
             if step.state != THERE:
                 typer.echo(f"{step.kind}: {time_of(database, step.kind, shlex.split(line(step)), step.steps)}")

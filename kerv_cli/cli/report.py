@@ -57,7 +57,7 @@ def report(
     """Write CSV tables (per task and aggregated), plots and an HTML page about the studies."""
     from kerv_cli.cli.studies import print_prices, print_study, print_verdict
     from kerv_cli.episodes.resolve import study_name
-    from kerv_cli.lab.database import Database
+    from kerv_cli.lab.database import opened
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.report import report as write_report
     from kerv_cli.report.tables import rows_of
@@ -66,7 +66,7 @@ def report(
     if choose:
         _print_choice(settings, as_json)
         return
-    database = Database(settings.results)
+    database = opened(settings.results)
     output = write_report(database, settings.only, publish, settings.on, settings.loss, settings.baseline)
     if as_json:
         tables = {name: rows_of(table) for name, table in output.tables.items()}
@@ -83,14 +83,14 @@ def report(
 
 def _print_choice(settings: ReportSettings, as_json: bool) -> None:
     """Print which setting to use in the chosen study, or in each study with results."""
-    from kerv_cli.lab.database import Database
+    from kerv_cli.lab.database import opened
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.decide import choices
     from kerv_cli.report.report import names_to_report
     from kerv_cli.report.tables import load_study
     from kerv_cli.report.verdict import sentence, short_sentence
 
-    database, answers = Database(settings.results), {}
+    database, answers = opened(settings.results), {}
     for name in names_to_report(database, settings.only):
         data = load_study(StudyStore(database, name))
         groups = choices(data.table, data.per_task, settings.loss)

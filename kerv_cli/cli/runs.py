@@ -73,10 +73,10 @@ def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a r
 def list_(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """List the runs of a results folder, the newest first."""
     from kerv_cli.catalogue.entries import find_runs, matching
-    from kerv_cli.lab.database import Database
+    from kerv_cli.lab.database import opened
 
     filters = dict(word.partition("=")[::2] for word in names)
-    runs = matching(find_runs(Database(settings.results)), filters)
+    runs = matching(find_runs(opened(settings.results)), filters)
     if as_json:
         end_with_json([_entry_row(run) for run in runs])
     if not runs:
@@ -108,12 +108,12 @@ def _entry_row(run: RunEntry) -> dict[str, object]:
 def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Show one run, ID or ID:SETTING: its command, its results, the artifacts it was made from, its folder."""
     from kerv_cli.catalogue.entries import disk_bytes, find_runs, parents, store_of
-    from kerv_cli.lab.database import Database
+    from kerv_cli.lab.database import opened
     from kerv_cli.report.compare import compared_runs
     from kerv_cli.report.summary import SummaryTable
     from kerv_cli.report.tables import load_study, rows_of
 
-    database, (name,) = Database(settings.results), _run_names(names)
+    database, (name,) = opened(settings.results), _run_names(names)
     chosen = compared_runs(database, name)
     run = chosen[0].run
     table = load_study(store_of(run, database)).table if run.has_episodes and run.episodes else None
@@ -138,11 +138,11 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
 @_command_on_runs("compare", "kerv runs compare main:ar main:kerv", "kerv runs compare main last")
 def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Compare two runs, ID or ID:SETTING: differences in settings, and in results with confidence intervals."""
-    from kerv_cli.lab.database import Database
+    from kerv_cli.lab.database import opened
     from kerv_cli.report import compare as comparing
 
     runs = _run_names(names, 2, 2, "two runs, ID or ID:SETTING")
-    comparisons = [comparing.compare(a, b) for a, b in comparing.pairs_to_compare(Database(settings.results), *runs)]
+    comparisons = [comparing.compare(a, b) for a, b in comparing.pairs_to_compare(opened(settings.results), *runs)]
     if as_json:
         end_with_json(comparisons)
     for comparison in comparisons:
@@ -171,9 +171,9 @@ def rerun(
 ) -> None:
     """Repeat a sweep or rollout under a new name, and say whether the tokens are the same."""
     from kerv_cli.catalogue.entries import find_run
-    from kerv_cli.lab.database import Database
+    from kerv_cli.lab.database import opened
 
-    database, (name,) = Database(settings.results), _run_names(names)
+    database, (name,) = opened(settings.results), _run_names(names)
     run = find_run(database, name)
     if run.kind not in ("sweep", "rollout"):
         made = f", which '{run.command_line}' makes" if run.command else ""
@@ -201,9 +201,9 @@ def rerun(
 def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
     """Remove runs and everything in their folders, after asking for confirmation."""
     from kerv_cli.catalogue.entries import check_removable, disk_bytes, find_run, remove
-    from kerv_cli.lab.database import Database
+    from kerv_cli.lab.database import opened
 
-    database = Database(settings.results)
+    database = opened(settings.results)
     runs = [find_run(database, name, exact=yes) for name in _run_names(names, 1, 1000)]
     for run in runs:
         check_removable(run)
@@ -227,11 +227,11 @@ def export(
 ) -> None:
     """Write the episodes of a run as CSV, Parquet, a trace, or a database that 'kerv runs import' reads."""
     from kerv_cli.catalogue.entries import find_run
-    from kerv_cli.lab.database import Database
+    from kerv_cli.lab.database import opened
     from kerv_cli.report.export import export as hand_over
 
     (name,) = _run_names(names)
-    database = Database(settings.results)
+    database = opened(settings.results)
     folder = folder or database.results / "exports" / to
     written = hand_over(find_run(database, name), database, to, folder)
     if as_json:

@@ -64,10 +64,11 @@ def planned_study(resolved: ResolvedStudy, command: Sequence[str], is_rollout: b
     # printed before torch and the simulator load
     typer.echo(f"{what} of {whose} on {_few(tasks, 'tasks')}: {count(number, 'episode')}", err=True)
     from kerv_cli.episodes.policy import unseen_tasks
+    from kerv_cli.lab.database import opened
     from kerv_cli.lab.study import plan, plan_rollout
     from kerv_cli.worlds import spec_of
 
-    planned = (plan_rollout if is_rollout else plan)(resolved, command)
+    planned = (plan_rollout if is_rollout else plan)(resolved, opened(resolved.first.results), command)
     for target, names in dict.fromkeys((s.policy.target, tuple(unseen_tasks(s, tasks))) for s in settings.values()):
         if names:
             typer.echo(f"kerv: warning: policy {target} was never trained on {', '.join(names)}", err=True)
@@ -243,12 +244,13 @@ def run_training(run: TrainingRun, plan: bool, as_json: bool, loading: str, trai
     Raises:
         UsageError: Another process is training the same artifact.
     """
+    from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import making, time_as_before
 
     if plan:
-        time = time_as_before(run.settings.results, run.artifact_kind, run.settings.train.steps)
+        time = time_as_before(opened(run.settings.results), run.artifact_kind, run.settings.train.steps)
         end_with_plan(f"{run.plan()}, {time}", as_json)
-    with making(run.settings.results, run.artifact_kind, run.folder) as record:
+    with making(opened(run.settings.results), run.artifact_kind, run.folder) as record:
         metrics, plot = _train(run, record, loading, training)
     if as_json:
         end_with_json({"folder": run.folder, "best": metrics, "curves": plot})

@@ -41,10 +41,10 @@ def _place(results: str, name: str) -> Path:
     if path.exists() or path.suffix == ".rrd":
         return path
     from kerv_cli.catalogue.entries import LAST, find_run, find_runs
-    from kerv_cli.lab.database import Database
+    from kerv_cli.lab.database import opened
     from kerv_cli.report.viewing.viewer import recordings_below
 
-    database = Database(results)
+    database = opened(results)
     if name == LAST:
         folders = (run.folder for run in find_runs(database) if run.has_episodes)
         return next((folder for folder in folders if any(recordings_below(folder))), Path(results))

@@ -21,7 +21,7 @@ def work(settings: WorkSettings) -> None:
     """Run blocks of a study that 'kerv sweep' has planned, until none is left; on any machine, as often as you like."""
     from kerv_cli.base.processes import end_with_input
     from kerv_cli.episodes.resolve import study_name
-    from kerv_cli.lab.database import Database
+    from kerv_cli.lab.database import opened
     from kerv_cli.lab.events import EpisodeEnd, Event
     from kerv_cli.lab.store import StudyStore
 
@@ -40,7 +40,7 @@ def work(settings: WorkSettings) -> None:
         ended += isinstance(event, EpisodeEnd)
         show(event)
 
-    store = StudyStore(Database(settings.results), study_name(settings.study))
+    store = StudyStore(opened(settings.results), study_name(settings.study))
     try:
         work_on(store, settings.run, on_event, save_recording)
     except KeyboardInterrupt:

@@ -6,16 +6,23 @@ import contextlib
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from contextvars import ContextVar
 from urllib.parse import unquote
 
 STORE = "KERV_STORE"
 """Environment variable with the URL of the database. If empty, it is a SQLite file in the results folder."""
-_words: list[str] = []
+_words: ContextVar[tuple[str, ...]] = ContextVar("words", default=())
+_store: ContextVar[str] = ContextVar("store", default="")
 
 
 def current_command() -> list[str]:
     """Return this process's command-line arguments, without `kerv` itself."""
-    return list(_words)
+    return list(_words.get())
+
+
+def current_store() -> str:
+    """Return the URL of the database that this command uses. Empty: the SQLite file in the results folder."""
+    return _store.get() or os.environ.get(STORE, "")
 
 
 @contextlib.contextmanager
@@ -25,12 +32,11 @@ def noted(words: Sequence[str]) -> Iterator[None]:
     At the end the arguments from before the block are remembered again, because `kerv prepare` runs other commands
     inside its own.
     """
-    before = current_command()
-    _words[:] = words
+    before = _words.set(tuple(words))
     try:
         yield
     finally:
-        _words[:] = before
+        _words.reset(before)
 
 
 def without_passwords(url: str) -> str:
@@ -42,26 +48,23 @@ def without_passwords(url: str) -> str:
 
 @contextlib.contextmanager
 def chosen_store(overrides: Iterable[str]) -> Iterator[list[str]]:
-    """Use the database named by the override `store=URL`, in this process and its workers, for the `with` block.
+    """Use the database named by the override `store=URL` for the `with` block.
 
     Args:
-        overrides: Overrides of a command. The environment variable KERV_STORE is set to the value of `store=`. Without
-            it the variable stays as it is.
+        overrides: Overrides of a command. Without `store=`, the database stays the one from before the block.
 
     Yields:
         The same overrides, but without the URL's password, so that it is never stored. The URL is quoted if Hydra needs
         that.
     """
-    overrides, before = list(overrides), os.environ.get(STORE)
+    overrides, chosen = list(overrides), _store.get()
     for number, override in enumerate(overrides):
         if override.startswith("store="):
-            os.environ[STORE] = url = override.removeprefix("store=").strip("'\"")
+            chosen = url = override.removeprefix("store=").strip("'\"")
             url = without_passwords(url)
             overrides[number] = f"store={url}" if re.fullmatch(r"[\w:/@.%+-]*", url) else f"store='{url}'"
+    before = _store.set(chosen)
     try:
         yield overrides
     finally:
-        if before is None:
-            os.environ.pop(STORE, None)
-        else:
-            os.environ[STORE] = before
+        _store.reset(before)

@@ -22,7 +22,7 @@ from kerv_cli.base.errors import CheckpointError, KervError, StorageError, Usage
 from kerv_cli.base.files import storage_errors
 from kerv_cli.base.places import results_dir
 from kerv_cli.episodes.rows import EPISODE_SCHEMA, FLAG, FLOAT, INT
-from kerv_cli.lab.command import STORE, without_passwords
+from kerv_cli.lab.command import current_store, without_passwords
 
 FILE = "kerv.db"
 SCHEMA = 1
@@ -241,7 +241,7 @@ class Database:
 
     Args:
         results: The results folder.
-        url: URL of the database. Empty: the variable KERV_STORE, or else the SQLite file in the results folder.
+        url: URL of the database. Empty: the SQLite file in the results folder.
 
     Raises:
         UsageError: The URL cannot be used.
@@ -251,7 +251,7 @@ class Database:
 
     def __init__(self, results: str | Path, url: str | sa.URL = "") -> None:
         self.results = results_dir(str(results))
-        url = url or os.environ.get(STORE) or file_url(self.results)
+        url = url or file_url(self.results)
         try:
             parsed = sa.make_url(url)
         except (sa.exc.ArgumentError, ValueError) as error:
@@ -377,6 +377,15 @@ class Database:
         elif "unable to open" in why and _log(self.file):
             hint = f": copy {self.results} to where you can write, its newest rows are in {self.file.name}-wal"
         return (Unanswered if "lock" in why else StorageError)(f"cannot use {self.file}: {why}{hint}")
+
+
+def opened(results: str | Path) -> Database:
+    """Return the database of a results folder that the running command uses.
+
+    It is the one that `store=` names, or else the variable KERV_STORE, or else the SQLite file in the folder. A command
+    calls this once and hands the database down.
+    """
+    return Database(results, current_store())
 
 
 def clock(connection: sa.Connection) -> sa.ColumnElement[float]:

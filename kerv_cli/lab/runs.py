@@ -24,7 +24,6 @@ import sqlalchemy as sa
 from kerv_cli.base.durations import about, left
 from kerv_cli.base.errors import CheckpointError, Interrupted, KervError, StorageError, UsageError
 from kerv_cli.base.leftovers import is_alive
-from kerv_cli.base.places import results_dir
 from kerv_cli.lab.command import current_command
 from kerv_cli.lab.database import EPISODES, RUNS, STUDIES, Database, now
 from kerv_cli.targets.provenance import git_commit
@@ -135,9 +134,9 @@ def time_of(database: Database, kind: str, command: Sequence[str], units: int = 
     return about(scaled, f"at the speed of {kind}/{row.name}")
 
 
-def time_as_before(results: str, kind: str, units: int = 0) -> str:
+def time_as_before(database: Database, kind: str, units: int = 0) -> str:
     """Say how long the command that was typed will take, see `time_of`."""
-    return time_of(Database(results), kind, current_command(), units)
+    return time_of(database, kind, current_command(), units)
 
 
 _SIZES = ("name", "task", "demos", "episodes", "seed", "train.steps", "results", "store", "policy.target")
@@ -276,31 +275,31 @@ class Run:
         return study is None and not (self.database.results / "artifacts" / self.kind / self.name).exists()
 
 
-def name_in(results: str | Path, kind: str, folder: Path) -> str:
+def _name_in(database: Database, kind: str, folder: Path) -> str:
     """Return the name under which the database stores an artifact (weights or data).
 
     It is the folder's name, or the whole path for a folder outside `<results>/artifacts/<kind>`.
     """
-    return folder.name if folder.parent == results_dir(str(results)) / "artifacts" / kind else str(folder.absolute())
+    return folder.name if folder.parent == database.results / "artifacts" / kind else str(folder.absolute())
 
 
-def making(results: str | Path, kind: str, folder: Path) -> Run:
+def making(database: Database, kind: str, folder: Path) -> Run:
     """Return the run (see `Run`) of a command that makes an artifact (weights or data).
 
     Args:
-        results: The results folder.
+        database: The database.
         kind: Kind of the artifact.
         folder: Folder of the artifact.
     """
-    return Run(Database(results), kind, name_in(results, kind, folder))
+    return Run(database, kind, _name_in(database, kind, folder))
 
 
-def command_to_go_on(results: str | Path, kind: str, folder: Path) -> tuple[str, ...]:
+def command_to_go_on(database: Database, kind: str, folder: Path) -> tuple[str, ...]:
     """Return the arguments after `kerv` that resume the making of an artifact (weights or data).
 
     Empty if the artifact is complete, or if the database has no row for it.
     """
-    rows = run_rows(Database(results), kind, name_in(results, kind, folder))
+    rows = run_rows(database, kind, _name_in(database, kind, folder))
     return rows[0].command if rows and rows[0].status != COMPLETE else ()
 
 

@@ -82,7 +82,7 @@ class StudyStore:
     """One study in the database, and its folder with recordings and the report.
 
     Args:
-        results: The results folder, or its database.
+        database: The database.
         name: Name of the study.
         kind: sweep, rollout or import. Empty: as stored in the database, or sweep if the study is not stored.
 
@@ -90,9 +90,8 @@ class StudyStore:
         UsageError: The name is not a plain folder name.
     """
 
-    def __init__(self, results: Path | str | Database, name: str, kind: str = "") -> None:
-        self.database = results if isinstance(results, Database) else Database(results)
-        self.name = check_name(name, "study name")
+    def __init__(self, database: Database, name: str, kind: str = "") -> None:
+        self.database, self.name = database, check_name(name, "study name")
         self._kind = kind
 
     @property

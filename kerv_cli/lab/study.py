@@ -140,11 +140,12 @@ def checked(setting: Setting, tasks: list[str], results: str) -> Setting:
     return replace(setting, settings=stored, identity=identity)
 
 
-def plan(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
+def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str]) -> Plan:
     """Plan a sweep: return which episodes of a study are in the database, and which must run.
 
     Args:
         resolved: The study with all its settings.
+        database: The database.
         command: Command-line arguments (without `kerv`) that resume this sweep.
 
     Raises:
@@ -152,24 +153,25 @@ def plan(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
         CheckpointError: A setting's weights or data cannot be read.
         StorageError: The results folder is not writable.
     """
-    runtime, results, rerun = resolved.first.runtime, resolved.first.results, resolved.sweep.rerun
+    runtime, rerun = resolved.first.runtime, resolved.sweep.rerun
     if runtime.detach and runtime.executor != SLURM:
         raise UsageError("runtime.detach=true is for clusters: add runtime.executor=slurm")
-    check_writable(results)
-    study, database = study_of(resolved), Database(results)
+    check_writable(str(database.results))
+    study = study_of(resolved)
     since = interrupted_since(database, SWEEP, study.name, command) if rerun == ALL else ""
     return plan_study(database, study, rerun, since, runtime, command)
 
 
-def plan_rollout(resolved: ResolvedStudy, command: Sequence[str]) -> Plan:
+def plan_rollout(resolved: ResolvedStudy, database: Database, command: Sequence[str]) -> Plan:
     """Plan a rollout. If the same command was interrupted before, plan the rest of its newest rollout instead.
 
     Args:
         resolved: The rollout with all its settings.
+        database: The database.
         command: Command-line arguments (without `kerv`) of the rollout.
     """
-    check_writable(resolved.first.results)
-    study, database = study_of(resolved, ROLLOUT), Database(resolved.first.results)
+    check_writable(str(database.results))
+    study = study_of(resolved, ROLLOUT)
     runtime = replace(resolved.first.runtime, workers=1, executor="local")
     if row := unfinished(database, ROLLOUT, command):
         rest = plan_study(database, replace(study, name=row.name), ALL, row.started, runtime, command)

@@ -12,6 +12,7 @@ from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.places import artifact_or_path, results_dir
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.episodes.settings import DEFAULT_TASKS
+from kerv_cli.lab.database import opened
 from kerv_cli.lab.runs import command_to_go_on
 from kerv_cli.targets.checkpoint import TargetDescription, described
 from kerv_cli.targets.folders import find_target
@@ -48,7 +49,7 @@ def open_demos(results: str, names: str, tasks: Sequence[str] = (), episodes: in
         try:
             datasets.append(DemoDataset.open(folder))
         except CheckpointError as error:
-            command = command_to_go_on(results, "demos", folder)
+            command = command_to_go_on(opened(results), "demos", folder)
             if command and not (folder / "manifest.json").exists():
                 line = shlex.join(["kerv", *command])
                 raise CheckpointError(f"the demonstrations in {folder} are unfinished: run '{line}'") from error

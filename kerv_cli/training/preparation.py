@@ -12,6 +12,7 @@ from kerv_cli.base.registry import find, parts
 from kerv_cli.catalogue.entries import state_of
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings
+from kerv_cli.lab.database import opened
 from kerv_cli.lab.runs import command_to_go_on
 from kerv_cli.methods.artifacts import Artifacts, kind_of, removal
 from kerv_cli.methods.compose import Method
@@ -132,6 +133,6 @@ def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
     if not files.is_complete(described, kinds):
         return MISSING
     state = state_of(path, kind) if isinstance(files, TrainableDrafter) else THERE
-    if state == "complete" and command_to_go_on(artifacts.results, kind, path):
+    if state == "complete" and command_to_go_on(opened(artifacts.results), kind, path):
         return "unfinished"  # e.g. the disk was full before the last files were written
     return THERE if state == "complete" else state
