@@ -33,11 +33,12 @@ from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.cli.common import progress_bar
 from kerv_cli.cli.studies import event_printer
 from kerv_cli.lab.database import EPISODES, QUEUE, WANTED, Database, clock, opened
-from kerv_cli.lab.events import EpisodeEnd, Event, SettingFailed
+from kerv_cli.lab.events import BlockStarted, EpisodeEnd, Event, Preparing, SettingFailed, Started
 from kerv_cli.lab.plan import Study, blocks_of
+from kerv_cli.lab.progress import TimeLeft
 from kerv_cli.lab.queue import ClaimLost, Queue, enqueue
 from kerv_cli.lab.store import StudyStore, plan_study
-from kerv_cli.lab.study import estimate, warnings_about
+from kerv_cli.lab.study import warnings_about
 from kerv_cli.lab.work import work
 from kerv_cli.lab.workers import LocalWorkers, gpus_in_turn
 from kerv_cli.report.tables import further_of, load_study
@@ -459,15 +460,19 @@ def test_episodes_whose_order_counts_run_whole_again_when_their_process_dies(dat
 
 def test_estimates_say_what_they_rest_on(database):
     def planned(workers):
-        return plan_study(database, TWO, runtime=RuntimeSettings(workers=workers))
+        return TimeLeft(plan_study(database, TWO, runtime=RuntimeSettings(workers=workers)), 10.0)
 
-    seconds, source = estimate(planned(1), 10.0)
-    assert (seconds, "guess" in source) == (32 * 10.0, True)
+    left = planned(1)
+    assert (left.seconds, "guess" in left.source) == (32 * 10.0, True)
+    one, other = (next(one for one in TWO.episodes if one.setting is setting) for setting in TWO.settings[:2])
+    left.see(EpisodeEnd(one, True, 2.0))
+    assert left.seconds == 31 * 2.0, "an episode that ended corrects the guess"
+    left.see(EpisodeEnd(other, True, 8.0))
+    assert left.seconds == 7 * 2.0 + 7 * 8.0 + 16 * 5.0, "each setting has its own mean"
     store, _ = swept(database.results, threshold_study(["reach-v3"], radii=()))
     wall = store.frame().groupby("label")["wall_seconds"].mean()
-    seconds, source = estimate(planned(2), 10.0)
-    assert seconds == pytest.approx((4 * wall.sum() + 16 * wall.mean()) / 2)
-    assert source == "measured on 8 stored episodes"
+    assert planned(2).seconds == pytest.approx((4 * wall.sum() + 16 * wall.mean()) / 2)
+    assert planned(2).source == "measured on 8 stored episodes"
 
 
 def test_progress_without_a_terminal_is_plain_lines(tmp_path, capsys):
@@ -482,6 +487,28 @@ def test_progress_without_a_terminal_is_plain_lines(tmp_path, capsys):
     assert re.fullmatch(r"12/12 .* on reach-v3, seed 100003: (success|failure), \d\.\d s", lines[-2])
     assert re.fullmatch(r"episodes 12/12, reach-v3 100001-100003: 4 settings in turn", lines[-1])
     assert "\x1b" not in written
+
+
+def test_progress_begins_before_the_first_episode(tmp_path, capsys):
+    study = threshold_study(["reach-v3"], episodes=26)
+    planned = plan_study(Database(tmp_path), study)
+    (block, *_), setting = planned.blocks(), study.settings[0]
+    with progress_bar("episodes", has_estimate=True) as show:
+        on_event = event_printer(show, TimeLeft(planned, 60.0))
+        for event in (Started(104, 0), BlockStarted(block), Preparing(setting, 1, 4)):
+            on_event(event)
+        for one in study.episodes:
+            on_event(EpisodeEnd(one, True, 2.0))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:3] == [
+        "104 to run, about 104 min (a guess of 60 s per episode)",
+        "episodes 0/104, about 104 min left, starting",
+        "preparing ar, 1 of 4",
+    ]
+    each = [line for line in lines if ", seed 1" in line]
+    assert each[0].startswith("1/104 ")
+    assert len(each) == 100, "a line per episode, though the study has more than 100"
+    assert any(re.fullmatch(r"episodes 52/104, about 104 s left, .* in turn", line) for line in lines)
 
 
 @pytest.mark.parametrize(("load", "lines"), [(2.0, 0), (3.0, 1)])

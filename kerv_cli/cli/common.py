@@ -166,7 +166,7 @@ def _refuse(message: str, code: int, error: BaseException | None) -> None:
 
 
 @contextmanager
-def progress_bar(title: str, record: Run | None = None) -> Iterator[Callable[..., None]]:
+def progress_bar(title: str, record: Run | None = None, has_estimate: bool = False) -> Iterator[Callable[..., None]]:
     """Show a progress bar while the block runs. Lines that are printed meanwhile appear above it.
 
     Without a terminal, print a line after each tenth of the work instead.
@@ -174,6 +174,7 @@ def progress_bar(title: str, record: Run | None = None) -> Iterator[Callable[...
     Args:
         title: Text before the bar.
         record: The command's row in the database, which also gets the progress. None: no row.
+        has_estimate: Whether the text says how much time is left. Otherwise the bar does.
 
     Yields:
         `advance(done, total, text="")`. Call it to move the bar and to change the text after it.
@@ -194,7 +195,8 @@ def progress_bar(title: str, record: Run | None = None) -> Iterator[Callable[...
             latest = tenths
             typer.echo(", ".join(filter(None, (f"{title} {done}/{total}", text))), err=True)
 
-    timed = (bars.BarColumn(), bars.MofNCompleteColumn(), bars.TimeElapsedColumn(), bars.TimeRemainingColumn())
+    timed = [bars.BarColumn(), bars.MofNCompleteColumn(), bars.TimeElapsedColumn()]
+    timed += [] if has_estimate else [bars.TimeRemainingColumn()]
     name, text = (bars.TextColumn(f"{{task.{one}}}", markup=False) for one in ("description", "fields[text]"))
     shown: Any = {"console": console(stderr=True), "transient": True, "disable": not on_terminal}
     with bars.Progress(name, *timed, text, **shown) as bar:

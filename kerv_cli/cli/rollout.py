@@ -18,7 +18,7 @@ from kerv_cli.cli.common import (
     results_word,
     settings_yaml,
 )
-from kerv_cli.cli.studies import planned_study, run_study
+from kerv_cli.cli.studies import SECONDS_PER_EPISODE, planned_study, run_study
 from kerv_cli.episodes.settings import RolloutSettings
 
 if TYPE_CHECKING:
@@ -53,11 +53,10 @@ def rollout(
     if plan:
         names = ", ".join(f"{label}{stress_text(asdict(settings))}" for label, settings in resolved.settings.items())
         total, tasks = len(planned.study.episodes), resolved.tasks
+        seconds = SECONDS_PER_EPISODE * total
         if as_json:
-            end_with_json(
-                {"settings": list(resolved.settings), "tasks": tasks, "episodes": total, "seconds": 3 * total}
-            )
-        typer.echo(f"{names}: {count(len(tasks), 'task')}, {count(total, 'episode')}, {about(3 * total)}")
+            end_with_json({"settings": list(resolved.settings), "tasks": tasks, "episodes": total, "seconds": seconds})
+        typer.echo(f"{names}: {count(len(tasks), 'task')}, {count(total, 'episode')}, {about(seconds)}")
         return
     run_study(planned)
     _print_rollout(planned.store, as_json, results_word(overrides))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.base.durations import about, count
+from kerv_cli.base.durations import about, count, duration
 from kerv_cli.cli.common import (
     console,
     end_with_json,
@@ -28,12 +28,13 @@ if TYPE_CHECKING:
 
     from kerv_cli.episodes.resolve import ResolvedStudy
     from kerv_cli.lab.events import Event, Outcome
+    from kerv_cli.lab.progress import TimeLeft
     from kerv_cli.lab.runs import Run
     from kerv_cli.lab.store import Plan, StudyStore
     from kerv_cli.training.run import TrainingRun
 
-SECONDS_PER_EPISODE = 1.0
-"""Guess that is used before anything was measured. MT10 takes 0.5 to 1.5 s per episode on one core."""
+SECONDS_PER_EPISODE = 3.0
+"""Guess for commands without a study's file, before anything was measured."""
 BUSY = 1.2
 """Load average per core above which a line says that other programs disturb the measured times."""
 
@@ -97,58 +98,81 @@ def print_settings(resolved: ResolvedStudy) -> None:
         typer.echo(f"--- # {label}\n{settings_yaml(settings)}", nl=False)
 
 
-def print_study_plan(planned: Plan, as_json: bool) -> None:
-    """Print which episodes would run, why, and how long that would take. For the option --plan."""
-    from kerv_cli.lab.study import estimate, plan_rows, warnings_about
+def print_study_plan(planned: Plan, as_json: bool, guess: float = SECONDS_PER_EPISODE) -> None:
+    """Print which episodes would run, why, and how long that would take. For the option --plan.
+
+    Args:
+        planned: The plan.
+        as_json: Print it as JSON.
+        guess: Seconds per episode if none was measured.
+    """
+    from kerv_cli.lab.progress import TimeLeft
+    from kerv_cli.lab.study import plan_rows, warnings_about
 
     rows, store, to_run, reused = plan_rows(planned), planned.store, planned.to_run, planned.existing
-    seconds, source = estimate(planned, SECONDS_PER_EPISODE)
+    left = TimeLeft(planned, guess)
     if as_json:
         end_with_json({"study": store.name, "folder": store.root, "settings": rows, "to run": len(to_run),
-                       "reused": len(reused), "seconds": seconds, "source": source})  # fmt: skip
+                       "reused": len(reused), "seconds": left.seconds, "source": left.source})  # fmt: skip
     print_rows(rows, f"study {store.name}, episodes")
     for warning in warnings_about(planned):
         typer.echo(f"kerv: warning: {warning}", err=True)
-    typer.echo(f"{count(len(to_run), 'episode')} to run, {len(reused)} reused, {about(seconds, source)}")
+    typer.echo(f"{count(len(to_run), 'episode')} to run, {len(reused)} reused, {about(left.seconds, left.source)}")
 
 
-def run_study(planned: Plan) -> Outcome:
-    """Run the missing episodes of a plan and show the progress.
+def run_study(planned: Plan, guess: float = SECONDS_PER_EPISODE) -> Outcome:
+    """Run the missing episodes of a plan and show the progress, with the time left.
+
+    Args:
+        planned: The plan.
+        guess: Seconds per episode while none is measured.
 
     Raises:
         Interrupted: The user pressed Ctrl-C.
         KervError: The study could not run, see `study.run`.
     """
+    from kerv_cli.lab.progress import TimeLeft
     from kerv_cli.lab.study import run
     from kerv_cli.report.viewing import save_recording
 
-    with progress_bar("episodes") as show:
-        return run(planned, event_printer(show), save=save_recording)
+    with progress_bar("episodes", has_estimate=True) as show:
+        return run(planned, event_printer(show, TimeLeft(planned, guess)), save=save_recording)
 
 
-def event_printer(show: Callable[[int, int, str], None]) -> Callable[[Event], None]:
+def event_printer(show: Callable[[int, int, str], None], left: TimeLeft | None = None) -> Callable[[Event], None]:
     """Return a function that prints a line about each event of a running study and moves its progress bar.
 
-    If standard error is no terminal and more than 100 episodes run, no line is printed per episode.
+    If standard error is no terminal, only the first 100 episodes get a line each.
 
     Args:
         show: Moves the bar, see `progress_bar`.
+        left: Estimates the time left. None: it is not shown.
     """
-    from kerv_cli.lab.events import BlockStarted, BlocksWait, SettingFailed, Started
+    from kerv_cli.lab.events import BlockStarted, BlocksWait, Preparing, SettingFailed, Started
 
     total = ended = 0
-    title = "preparing"
+    title = "starting"
+    on_terminal = sys.stderr.isatty()
 
     def on_event(event: Event) -> None:
         nonlocal total, ended, title
         line = ""
+        if left is not None:
+            left.see(event)
         if isinstance(event, Started):
             if event.load > BUSY:
                 typer.echo(f"the load average is {event.load:g} per core: other programs slow these times", err=True)
             total, ended = event.to_run, 0
             line = f"{count(event.reused, 'episode')} there already" if event.reused else ""
+            if left is not None and total:
+                line = ", ".join(filter(None, (line, f"{total} to run", about(left.seconds, left.source))))
         elif isinstance(event, BlockStarted):
             title = event.block.title
+        elif isinstance(event, Preparing):
+            preparing = f"preparing {event.setting.label}, {event.number} of {event.of}"
+            if total:
+                show(ended, total, preparing)
+            line = "" if ended or on_terminal else preparing
         elif isinstance(event, BlocksWait):
             line = "other processes run all blocks that are left: waiting for them"
         elif isinstance(event, SettingFailed):
@@ -160,13 +184,13 @@ def event_printer(show: Callable[[int, int, str], None]) -> Callable[[Event], No
             one, result = event.episode, "run by another sweep"
             if not event.elsewhere:
                 result = f"{'success' if event.success else 'failure'}, {event.seconds:.1f} s"
-            if event.elsewhere or total <= 100 or sys.stderr.isatty():
+            if event.elsewhere or ended <= 100 or on_terminal:
                 of_all = f"/{total}" if total else ""  # a worker does not know how many the study has
                 line = f"{ended}{of_all} {one.setting.label} on {one.task}, seed {one.seed}: {result}"
         if line:
             typer.echo(line, err=True)
-        if total:
-            show(ended, total, title)
+        if total and not isinstance(event, Preparing):
+            show(ended, total, title if left is None else f"about {duration(left.seconds)} left, {title}")
 
     return on_event
 

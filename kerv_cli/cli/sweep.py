@@ -55,9 +55,9 @@ def sweep(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_js
         return
     planned = planned_study(resolved, ["sweep", *overrides])
     if plan:
-        print_study_plan(planned, as_json)
+        print_study_plan(planned, as_json, resolved.study.seconds)
         return
-    _print_outcome(run_study(planned), resolved, planned, as_json)
+    _print_outcome(run_study(planned, resolved.study.seconds), resolved, planned, as_json)
 
 
 def _list_studies(as_json: bool) -> None:

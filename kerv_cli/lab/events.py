@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from kerv_cli.base.errors import KervError
-from kerv_cli.lab.plan import Block, Episode
+from kerv_cli.lab.plan import Block, Episode, Setting
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,21 @@ class BlockStarted:
     """A worker has claimed a block (episodes that one process runs)."""
 
     block: Block
+
+
+@dataclass(frozen=True)
+class Preparing:
+    """A worker builds the decoder of a setting, before the first episode of its block.
+
+    Attributes:
+        setting: The setting.
+        number: Its place among the block's settings, from 1.
+        of: Number of settings in the block.
+    """
+
+    setting: Setting
+    number: int
+    of: int
 
 
 @dataclass(frozen=True)
@@ -89,5 +104,5 @@ class Outcome:
     detached: str = ""
 
 
-Event = Started | BlockStarted | BlocksWait | EpisodeEnd | SettingFailed
+Event = Started | BlockStarted | Preparing | BlocksWait | EpisodeEnd | SettingFailed
 OnEvent = Callable[[Event], None]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter, defaultdict
 from dataclasses import replace
 
 import sqlalchemy as sa
@@ -107,3 +108,43 @@ class Progress:
             self.see(events.SettingFailed(reason, episodes=tuple(self._missing.values())))
         self.outcome.seconds = time.perf_counter() - self._began
         return self.outcome
+
+
+class TimeLeft:
+    """Estimates how long the missing episodes of a plan take, and corrects that with each episode that ends.
+
+    An episode is expected to take as long as those of its setting took on average, or all others if its setting has
+    none. The workers share the total equally.
+
+    Args:
+        plan: The plan.
+        guess: Seconds per episode while nothing is measured.
+    """
+
+    def __init__(self, plan: Plan, guess: float) -> None:
+        self.workers = max(1, min(plan.runtime.workers, len(plan.blocks())))
+        self._waiting = Counter(one.setting.work for one in plan.to_run)
+        self._guess, works = guess, {setting.work for setting in plan.study.settings}
+        query = sa.select(EPISODES.c.work, sa.func.avg(EPISODES.c.wall_seconds), sa.func.count(EPISODES.c.wall_seconds))
+        with plan.store.database.reading() as connection:
+            rows = connection.execute(query.where(EPISODES.c.work.in_(works)).group_by(EPISODES.c.work)).all()
+        self._stored = {work: float(mean) for work, mean, _ in rows if mean is not None}
+        self._measured: defaultdict[str, list[float]] = defaultdict(list)
+        stored = sum(number for *_, number in rows)
+        self.source = f"measured on {stored} stored episodes" if stored else f"a guess of {guess:g} s per episode"
+
+    def see(self, event: events.Event) -> None:
+        """Take an event of the run: an episode that ended, or those that will not run."""
+        if isinstance(event, events.EpisodeEnd):
+            self._waiting[event.episode.setting.work] -= 1
+            if event.seconds:
+                self._measured[event.episode.setting.work].append(event.seconds)
+        elif isinstance(event, events.SettingFailed):
+            self._waiting.subtract(one.setting.work for one in event.episodes)
+
+    @property
+    def seconds(self) -> float:
+        """Seconds that the episodes still take that have neither ended nor failed."""
+        means = self._stored | {work: sum(seconds) / len(seconds) for work, seconds in self._measured.items()}
+        mean = sum(means.values()) / len(means) if means else self._guess
+        return sum(number * means.get(work, mean) for work, number in self._waiting.items()) / self.workers

@@ -10,8 +10,6 @@ from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-import sqlalchemy as sa
-
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError, Interrupted, KervError, StorageError, UsageError
 from kerv_cli.base.places import check_writable
@@ -23,7 +21,7 @@ from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.resolve import ResolvedStudy
 from kerv_cli.episodes.runner import Request, Runner, close_worlds, is_recorded, run_batch
 from kerv_cli.episodes.settings import settings_from
-from kerv_cli.lab.database import EPISODES, Database
+from kerv_cli.lab.database import Database
 from kerv_cli.lab.events import Event, OnEvent, Outcome, SettingFailed
 from kerv_cli.lab.plan import ALL, Episode, Setting, Study, all_episodes, plain_settings, seeds_text
 from kerv_cli.lab.progress import Progress
@@ -332,30 +330,6 @@ def plan_rows(planned: Plan) -> list[dict[str, object]]:
             }
         )
     return rows
-
-
-def estimate(planned: Plan, guess: float) -> tuple[float, str]:
-    """Estimate how long the missing episodes will take.
-
-    An episode is expected to take as long as the setting's stored episodes took on average, or all stored episodes if
-    the setting has none. The workers share the total equally.
-
-    Args:
-        planned: The plan.
-        guess: Seconds per episode if nothing is stored.
-
-    Returns:
-        The seconds, and a text that says what the estimate is based on.
-    """
-    columns = EPISODES.c.work, sa.func.avg(EPISODES.c.wall_seconds), sa.func.count()
-    query = sa.select(*columns).where(EPISODES.c.work.in_([setting.work for setting in planned.study.settings]))
-    with planned.store.database.reading() as connection:
-        rows = connection.execute(query.group_by(EPISODES.c.work)).all()
-    means, stored = {row[0]: float(row[1]) for row in rows if row[1] is not None}, sum(row[2] for row in rows)
-    mean = sum(means.values()) / len(means) if means else guess
-    seconds = sum(means.get(one.setting.work, mean) for one in planned.to_run)
-    source = f"measured on {stored} stored episodes" if stored else f"a guess of {guess:g} s per episode"
-    return seconds / max(1, min(planned.runtime.workers, len(planned.blocks()))), source
 
 
 def warnings_about(planned: Plan) -> list[str]:

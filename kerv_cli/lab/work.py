@@ -144,9 +144,11 @@ class _Attempt:
 
     def _take_turns(self) -> None:
         runners: dict[str, RunEpisode] = {}
-        for setting in self.claim.block.settings:
+        settings = self.claim.block.settings
+        for number, setting in enumerate(settings, 1):
             first = next((one for one in self.left if one.setting.work == setting.work), None)
             if first is not None:
+                self.on_event(events.Preparing(setting, number, len(settings)))
                 runner = self._try(first, functools.partial(self.prepare, setting, first.task))
                 if runner is not None:
                     runners[setting.work] = runner
