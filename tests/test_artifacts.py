@@ -1,6 +1,5 @@
 """A policy's files: found, checked, and each loaded and hashed once per process, however many settings share them."""
 
-import contextlib
 import hashlib
 import json
 import os
@@ -18,6 +17,7 @@ from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.episodes.policy import check, decoder_for
 from kerv_cli.episodes.settings import RolloutSettings
+from kerv_cli.lab.database import Database
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.eagle.drafter import EagleDrafter
 from kerv_cli.methods.early import EarlySettings
@@ -25,8 +25,8 @@ from kerv_cli.methods.early.drafter import EarlyDrafter
 from kerv_cli.methods.heisd.datastore import Datastore
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets import checkpoint
-from kerv_cli.training.calibration import CalibrationRun
-from kerv_cli.training.datastore import DatastoreBuild
+from kerv_cli.training.calibration import calibrate
+from kerv_cli.training.datastore import build_datastore
 from kerv_cli.training.settings import BuildDatastoreSettings, CalibrateSettings
 
 STUDY = (
@@ -50,10 +50,10 @@ def whole(policies, tmp_path_factory):
     shutil.copytree(policies, results)
     write_dataset(results / "artifacts/demos/few")
     policy = PolicySettings(target="nano-state")
-    DatastoreBuild(BuildDatastoreSettings(policy=policy, demos="few", task=list(TASKS), results=str(results))).build()
+    built = BuildDatastoreSettings(policy=policy, demos="few", task=list(TASKS), results=str(results))
+    build_datastore(built, Database(results))
     words = ["task=reach,drawer-close", "demos=few", "decodes=4", "policy.target=nano-state"]
-    run = CalibrationRun(compose("calibrate", [*words, f"results={results}"], CalibrateSettings))
-    run.run(lambda text: contextlib.nullcontext(lambda done, total: None))
+    calibrate(compose("calibrate", [*words, f"results={results}"], CalibrateSettings), Database(results))
     target, described = checkpoint.load_target(results / "artifacts/target/nano-state")
     drafter = EarlyDrafter().network(EarlySettings(width=16, layers=1), target)
     own = {"settings": asdict(drafter.settings)}
@@ -127,7 +127,7 @@ def test_a_changed_file_is_another_artifact(results):
     assert files.load("datastore") is store
     policy = PolicySettings(target="nano-state")
     built = BuildDatastoreSettings(policy=policy, demos="few", task=list(TASKS), results=str(results), episodes=1)
-    DatastoreBuild(built).build()
+    build_datastore(built, Database(results))
     after = check(asked)
     assert {kind for kind in before if before[kind] != after[kind]} == {"datastore"}
     again = Artifacts(asked.results, asked.policy).load("datastore")

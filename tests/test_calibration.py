@@ -5,7 +5,6 @@ import dataclasses
 import json
 import shutil
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -28,6 +27,7 @@ from kerv_cli.base.files import read_json, sha256_of, write_json
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
 from kerv_cli.engine.record import Measure, Round
+from kerv_cli.lab.database import Database
 from kerv_cli.methods.artifacts import MadeFor
 from kerv_cli.methods.calibration import (
     NEVER,
@@ -47,17 +47,18 @@ from kerv_cli.targets.checkpoint import TargetDescription, read_target
 from kerv_cli.targets.folders import find_target
 from kerv_cli.training.calibration import (
     LEAST,
-    CalibrationRun,
     Matches,
+    calibrate,
     choose_episodes,
     episode_windows,
     fit_noise,
     lowest_level,
     match,
+    reference_level,
     skip_section,
     task_levels,
 )
-from kerv_cli.training.datastore import DatastoreBuild
+from kerv_cli.training.datastore import build_datastore
 from kerv_cli.training.settings import BuildDatastoreSettings, CalibrateSettings
 from kerv_cli.worlds.demos.dataset import FORMAT, DemoDataset, dataset_hash, episode_path
 from kerv_cli.worlds.demos.files import DemoEpisode, save_episode
@@ -132,18 +133,14 @@ def with_datastore(results, tmp_path_factory):
     """The same with a datastore of the state policy."""
     folder = Path(shutil.copytree(results, tmp_path_factory.mktemp("skipping") / "results"))
     policy = PolicySettings(target="nano-state")
-    DatastoreBuild(BuildDatastoreSettings(policy=policy, demos="few", task=list(TASKS), results=str(folder))).build()
+    built = BuildDatastoreSettings(policy=policy, demos="few", task=list(TASKS), results=str(folder))
+    build_datastore(built, Database(folder))
     return folder
 
 
 @pytest.fixture
 def own(with_datastore, tmp_path):
     return Path(shutil.copytree(with_datastore, tmp_path / "results"))
-
-
-def quiet(title: str) -> AbstractContextManager[Callable[[int, int], object]]:
-    """A stage of a calibration that shows nothing."""
-    return nullcontext(lambda done, total: None)
 
 
 def words(results: Path, *overrides: str) -> list[str]:
@@ -153,15 +150,8 @@ def words(results: Path, *overrides: str) -> list[str]:
     return [f"{key}={value}" for key, value in {**usual, **given}.items()]
 
 
-def run_of(results: Path, *overrides: str) -> CalibrationRun:
-    return CalibrationRun(compose("calibrate", words(results, *overrides), CalibrateSettings))
-
-
-def calibrated(results: Path, *overrides: str) -> tuple[CalibrationRun, Calibration]:
-    """A whole run, without the pre-sampled variability."""
-    run = run_of(results, *overrides)
-    run.presample = lambda stage: {}  # type: ignore[method-assign]
-    return run, run.run(quiet)
+def calibrated(results: Path, *overrides: str) -> tuple[Path, Calibration, list[str]]:
+    return calibrate(compose("calibrate", words(results, *overrides), CalibrateSettings), Database(results))
 
 
 def test_windows_hold_the_normalised_labels_before_and_after_each_moment():
@@ -215,37 +205,38 @@ def test_variability_is_the_mean_difference_of_the_judged_tokens():
     assert play(1, (0, 0, 254, 7), (0, 4, 0, 0)) == pytest.approx((5 + 0 + 4 + 7) / 6)
 
 
+def test_a_reference_level_is_the_median_of_the_decodes_and_divides():
+    def level(*drafts: Round) -> Variability:
+        decodes: Any = [SimpleNamespace(rounds=[draft]) for draft in drafts]
+        return reference_level(decodes, SPACE, 4)
+
+    def off_by(bins: int) -> Round:
+        """Two draft tokens: one accepted and off by these bins, one rejected and off by 30."""
+        return Round("verify", "x", 0, (100 + bins, 130), (100, 100, 7), 1, 2, 2, ())
+
+    row = level(off_by(1), off_by(50), off_by(3))
+    assert row.k_s == row.levels["mean of compared"] == pytest.approx(33 / 2 * BIN)
+    found = [row.levels[name] for name in ("sum of compared", "mean of accepted", "sum of accepted")]
+    assert found == pytest.approx([33 * BIN, 3 * BIN, 3 * BIN])
+    assert level(off_by(0), off_by(0)).levels["sum of accepted"] == BIN
+    assert level(Round("verify", "x", 0, (9,), (9,), 1, 1, 1, ())).k_s == BIN / 12  # one token off by one bin
+
+
 @pytest.mark.parametrize("target", ["nano-state", "nano-vision"])
 def test_a_run_writes_what_the_next_session_reads(results, target):
-    run = run_of(results, "decodes=4", f"policy.target={target}")
-    assert "12 demonstrations of 2 tasks; 4 decodes per task" in run.plan()
-    made = run.run(quiet)
+    plan = told("calibrate", *words(results, "decodes=4", f"policy.target={target}"), "--plan")
+    assert "12 demonstrations of 2 tasks; 4 decodes per task" in plan
+    path, made, notes = calibrated(results, "decodes=4", f"policy.target={target}")
     assert {row.decodes for row in made.variability.values()} == {4}
-
-    def decodes_off_by(*bins: int) -> Any:
-        """Decodes of two draft tokens: one accepted and off by these bins, one rejected and off by 30."""
-        drafts = [Round("verify", "x", 0, (100 + b, 130), (100, 100, 7), 1, 2, 2, ()) for b in bins]
-        return lambda decoder, index, decodes: [SimpleNamespace(rounds=[draft]) for draft in drafts]
-
-    run.episode_decodes = decodes_off_by(1, 50, 3)  # type: ignore[method-assign]
-    for row in run.presample(quiet).values():
-        assert row.k_s == row.levels["mean of compared"] == pytest.approx(33 / 2 * BIN)
-        found = [row.levels[name] for name in ("sum of compared", "mean of accepted", "sum of accepted")]
-        assert found == pytest.approx([33 * BIN, 3 * BIN, 3 * BIN])
     assert made.k_s("reach-v3", Measure(total=True)) == made.variability["reach-v3"].levels["sum of compared"]
-    run.episode_decodes = decodes_off_by(0, 0)  # type: ignore[method-assign]
-    assert {row.levels["sum of accepted"] for row in run.presample(quiet).values()} == {BIN}
-    zero = [SimpleNamespace(rounds=[Round("verify", "x", 0, (9,), (9,), 1, 1, 1, ())])]
-    run.episode_decodes = lambda decoder, index, decodes: zero  # type: ignore[method-assign,assignment,return-value]
-    assert {row.k_s for row in run.presample(quiet).values()} == {BIN / 12}  # it can divide: one token off by one bin
     folder = find_target(str(results), target)
-    assert run.path == results / f"artifacts/calibration/{target}/calibration.json"
-    loaded = CalibrationArtifact().checked(run.path, read_target(folder))
+    assert path == results / f"artifacts/calibration/{target}/calibration.json"
+    loaded = CalibrationArtifact().checked(path, read_target(folder))
     assert loaded == made
-    assert loaded.demos.sha256 == run.dataset.sha256
+    assert loaded.demos.sha256 == DemoDataset.open(results / "artifacts/demos/few").sha256
     assert loaded.boundary.episodes == 12
     assert loaded.skip is None
-    assert [line.split(":")[0] for line in run.notes] == ["no skip levels"]
+    assert [line.split(":")[0] for line in notes] == ["no skip levels"]
     for kind, predictor_class in PREDICTORS.items():
         predictor = predictor_class(SPACE.is_strict, loaded.noise.get(kind), window=loaded.window)
         np.testing.assert_allclose(predictor.predict(np.full((10, 4), 0.25), 4), 0.25)
@@ -253,16 +244,15 @@ def test_a_run_writes_what_the_next_session_reads(results, target):
 
 def test_a_calibration_is_completed_and_keeps_its_numbers(own):
     """As one of an earlier version: one measure of K, no quantiles of F, filters that know no gripper."""
-    run = run_of(own, "decodes=4")
-    made = run.run(quiet)
+    path, made, _ = calibrated(own, "decodes=4")
     ranges = {"15": replace(made.ranges(15), radius_high=7.0, points=())}
     unfitted = {kind: replace(noise, q=(7.0, *noise.q[1:3], 0.0)) for kind, noise in made.noise.items()}
     rows = {task: Variability(0.7, 5) for task in made.variability}
     old = replace(made, noise=unfitted, variability=rows, boundary=replace(made.boundary, windows=ranges))
-    write_json(run.path, dataclasses.asdict(old))
+    write_json(path, dataclasses.asdict(old))
     with refused("sum of accepted tokens", "kerv calibrate complete=true", error=CheckpointError):
         old.k_s("reach-v3", Measure(True, True))
-    completed = run_of(own, "decodes=4", "complete=true").run(quiet)
+    _, completed, _ = calibrated(own, "decodes=4", "complete=true")
     assert completed.skip == old.skip
     for kind, noise in completed.noise.items():
         assert noise.q == (7.0, *made.noise[kind].q[1:])
@@ -272,7 +262,7 @@ def test_a_calibration_is_completed_and_keeps_its_numbers(own):
     assert replace(completed.ranges(15), points=()) == ranges["15"]
     assert completed.ranges(15).limit(0.25, 0.5) > 0
     assert completed.ranges(30) == made.ranges(30)
-    assert CalibrationArtifact().checked(run.path, read_target(find_target(str(own), "nano-state"))) == completed
+    assert CalibrationArtifact().checked(path, read_target(find_target(str(own), "nano-state"))) == completed
 
 
 def calibration() -> Calibration:
@@ -328,7 +318,7 @@ def test_what_does_not_fit_is_refused_in_one_line(change, says, tmp_path):
 )
 def test_wrong_requests_get_one_line(results, override, kind, says):
     with refused(says, error=kind):
-        run_of(results, "decodes=4", override).run(quiet)
+        calibrated(results, "decodes=4", override)
 
 
 def test_a_task_without_a_reference_level_is_named():
@@ -425,8 +415,9 @@ def test_tasks_that_the_datastore_does_not_hold_are_left_out():
 
 
 def test_the_ranges_are_those_of_the_chosen_episodes(own):
-    run, made = calibrated(own, "boundary_windows=[7,15]")
-    paths = [run.dataset.load(i).end_effector for i in run.chosen]
+    _, made, _ = calibrated(own, "boundary_windows=[7,15]")
+    dataset = DemoDataset.open(own / "artifacts/demos/few")
+    paths = [dataset.load(i).end_effector for i in choose_episodes(dataset, TASKS, 0)]
     assert made.ranges(7) == BoundaryRanges.fit(paths, 7)
     assert made.ranges(15) == BoundaryRanges.fit(paths, 15)
     with pytest.raises(CheckpointError, match="over 7, 15 positions, the boundary looks at 9: run 'kerv calibrate"):
@@ -436,14 +427,15 @@ def test_the_ranges_are_those_of_the_chosen_episodes(own):
 
 
 def test_the_skip_levels_belong_to_one_datastore(own):
-    run, made = calibrated(own, "epsilon=1.9", "confidence=0.5")
+    path, made, _ = calibrated(own, "epsilon=1.9", "confidence=0.5")
+    described = read_target(find_target(str(own), "nano-state"))
     folder = own / "artifacts/datastore/nano-state"
     row = made.skip.tasks["reach-v3"]
-    store = Datastore.open(folder, run.description)
+    store = Datastore.open(folder, described)
     assert row == task_levels(match(store, "reach-v3", 1.9), 0.5)
     assert row.share > 0
     assert made.skip_levels("reach-v3", store.manifest.content) == (row.low, row.s_min, row.high)
-    assert CalibrationArtifact().checked(run.path, run.description) == made
+    assert CalibrationArtifact().checked(path, described) == made
     with pytest.raises(CheckpointError, match=r"for datastore \w+, not for eeeeeeeeeeee: run 'kerv calibrate' again"):
         made.skip_levels("reach-v3", "e" * 64)
     with pytest.raises(CheckpointError, match="no skip level for push-v3, only for reach-v3, drawer-close-v3"):

@@ -529,7 +529,7 @@ def test_a_name_in_use_is_refused_and_a_killed_command_is_listed_with_how_to_go_
     place.mkdir(parents=True)
     (place / "recording.json").write_text("{}")
     with pytest.raises(CheckpointError, match=again):
-        open_demos(str(tmp_path), "mine")
+        open_demos(Database(tmp_path), "mine")
     told("runs", "rm", "demos/mine", "--yes", f"results={tmp_path}")
     assert listed(tmp_path) == []
 

@@ -21,12 +21,13 @@ from test_calibration import write_dataset
 from kerv_cli.base.errors import CheckpointError, StorageError, UnknownName, UsageError
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.tree import ROOT, TokenTree
+from kerv_cli.lab.database import Database
 from kerv_cli.methods.heisd.datastore import Datastore, Shard, check_seeds, prompt_key
 from kerv_cli.methods.heisd.rules import neighbour_tree
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.checkpoint import TargetDescription, load_target
 from kerv_cli.training import datastore as datastore_build
-from kerv_cli.training.datastore import DatastoreBuild
+from kerv_cli.training.datastore import build_datastore
 from kerv_cli.training.settings import BuildDatastoreSettings
 from kerv_cli.worlds.demos.files import DemoEpisode
 from kerv_cli.worlds.metaworld.spec import SPEC
@@ -78,7 +79,7 @@ def results(policies, tmp_path_factory):
     shutil.copytree(policies, results)
     write_demos(results / "artifacts/demos/few", LENGTHS)
     for name in ("nano-state", "nano-vision"):
-        DatastoreBuild(asked(results, name)).build()
+        build(asked(results, name))
     return results
 
 
@@ -94,6 +95,10 @@ def asked(
     policy = PolicySettings(target=target, artifacts={"datastore": named})
     chosen = BuildDatastoreSettings(policy=policy, demos="few", task=list(TASKS), results=str(results))
     return replace(chosen, **changes)
+
+
+def build(settings: BuildDatastoreSettings) -> tuple[Path, Datastore]:
+    return build_datastore(settings, Database(settings.results))
 
 
 def folder_of(results: Path, name: str = "nano-state") -> Path:
@@ -198,14 +203,14 @@ def test_the_key_pools_the_named_parts_of_the_prompt(results):
 
 
 def test_the_first_episodes_and_tasks_can_be_asked_for(copy):
-    store = DatastoreBuild(asked(copy, task=["reach"], episodes=2, key=["proprioception"])).build()
+    _, store = build(asked(copy, task=["reach"], episodes=2, key=["proprioception"]))
     assert set(entries(store)) == {("reach-v3", s, t) for s in (0, 1) for t in range(LENGTHS[s])}
     assert store.manifest.tasks == {"reach-v3": Shard((0, 15), (0, 1))}
 
 
 def test_a_datastore_of_half_the_bytes_holds_the_same(copy):
     whole, _, description = opened(copy)
-    DatastoreBuild(asked(copy, half=True)).build()
+    build(asked(copy, half=True))
     half = Datastore.open(folder_of(copy), description)
     assert entries(half) == entries(whole)
     assert half.vectors.dtype == np.float32
@@ -215,10 +220,10 @@ def test_a_datastore_of_half_the_bytes_holds_the_same(copy):
 
 def test_projected_keys_find_nearly_always_the_same_neighbour_in_a_smaller_file(copy):
     write_demos(copy / "artifacts/demos/few", LENGTHS, make=smooth)
-    DatastoreBuild(asked(copy)).build()
+    build(asked(copy))
     whole, target, _ = opened(copy)
     size = (folder_of(copy) / "vectors.npy").stat().st_size
-    DatastoreBuild(asked(copy, components=8)).build()
+    build(asked(copy, components=8))
     short, _, _ = opened(copy)
     assert (whole.vectors.shape[1], short.vectors.shape[1], short.manifest.width) == (target.width, 8, 8)
     assert (folder_of(copy) / "vectors.npy").stat().st_size < size / 2
@@ -252,7 +257,7 @@ def test_training_and_evaluation_seeds_are_proved_disjoint(results, tmp_path):
     shutil.copytree(results / "artifacts/target", tmp_path / "artifacts/target")
     write_demos(tmp_path / "artifacts/demos/few", {0: 5, EVALUATION_SEED + 3: 5})
     with pytest.raises(CheckpointError, match="seed 100003 of drawer-close-v3: seeds from 50000 on"):
-        DatastoreBuild(asked(tmp_path))
+        build(asked(tmp_path))
 
 
 Change = Callable[[dict[str, Any]], None]
@@ -306,28 +311,30 @@ def test_a_datastore_that_is_damaged_or_not_of_this_target_is_refused(copy, harm
 )
 def test_what_cannot_be_built_is_refused(results, changes, error, says):
     with refused(says, error=error):
-        DatastoreBuild(asked(results, **changes)).build()
+        build(asked(results, **changes))
 
 
 def test_demonstrations_that_do_not_fit_the_target_are_refused(copy):
     write_demos(copy / "artifacts/demos/few", LENGTHS, tail=2)
     with pytest.raises(CheckpointError, match="2 labels after an episode's end, chunks of 4 need 3"):
-        DatastoreBuild(asked(copy)).build()
+        build(asked(copy))
     write_demos(copy / "artifacts/demos/few", LENGTHS, size=32)
     with pytest.raises(CheckpointError, match="32 x 32 pixels, the policy takes 96"):
-        DatastoreBuild(asked(copy, "nano-vision")).build()
+        build(asked(copy, "nano-vision"))
     assert opened(copy)[0].manifest.rows == 52  # what was there still is
 
 
 def test_only_a_datastore_is_ever_replaced(copy):
     other = copy / "artifacts/datastore/other"
     other.mkdir()
-    assert DatastoreBuild(asked(copy, named="other")).folder == other
+    assert build(asked(copy, named="other"))[0] == other
+    shutil.rmtree(other)
+    other.mkdir()
     (other / "thesis.tex").write_text("years of work")
     with pytest.raises(UsageError):
-        DatastoreBuild(asked(copy, named="other"))
+        build(asked(copy, named="other"))
     with pytest.raises(UsageError):
-        DatastoreBuild(asked(copy, named=str(copy / "artifacts/target/nano-state")))
+        build(asked(copy, named=str(copy / "artifacts/target/nano-state")))
 
 
 def refusing(real: Callable[..., Any]) -> Callable[..., Any]:
@@ -340,17 +347,16 @@ def refusing(real: Callable[..., Any]) -> Callable[..., Any]:
     return failing
 
 
-@pytest.mark.parametrize("stage", ["_write", "write_json", "sha256_of"])
+@pytest.mark.parametrize("stage", ["write_files", "write_json", "sha256_of"])
 @pytest.mark.parametrize("before", [True, False])
 def test_a_build_that_fails_leaves_what_was_there(copy, monkeypatch, stage, before):
     if not before:
         shutil.rmtree(folder_of(copy))
     parent = folder_of(copy).parent
     names = sorted(p.name for p in parent.iterdir())
-    owner = DatastoreBuild if stage == "_write" else datastore_build
-    monkeypatch.setattr(owner, stage, refusing(getattr(owner, stage)))
+    monkeypatch.setattr(datastore_build, stage, refusing(getattr(datastore_build, stage)))
     with pytest.raises(StorageError):
-        DatastoreBuild(asked(copy, episodes=1)).build()
+        build(asked(copy, episodes=1))
     assert sorted(p.name for p in parent.iterdir()) == names
     if before:
         assert opened(copy)[0].manifest.rows == 52
@@ -359,9 +365,9 @@ def test_a_build_that_fails_leaves_what_was_there(copy, monkeypatch, stage, befo
 @pytest.mark.bits
 def test_a_rebuild_replaces_the_whole_datastore_and_is_the_same(copy):
     first = {p.name: p.read_bytes() for p in folder_of(copy).iterdir()}
-    DatastoreBuild(asked(copy, episodes=1)).build()
+    build(asked(copy, episodes=1))
     assert opened(copy)[0].manifest.rows == 2 * LENGTHS[0]
-    DatastoreBuild(asked(copy)).build()
+    build(asked(copy))
     again = {p.name: p.read_bytes() for p in folder_of(copy).iterdir()}
     assert again["vectors.npy"] == first["vectors.npy"]
     assert again["payload.parquet"] == first["payload.parquet"]

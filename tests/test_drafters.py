@@ -233,7 +233,7 @@ def test_the_teachers_tokens_are_the_targets_own_decodes(demonstrated, name):
     assert [bool(x) for x in taught.perturbed] == [dataset.episodes[e].perturbed for e in taught.episodes]
     decoder = Decoder(target)
     for i in range(0, len(samples), 7):
-        prompt, _ = target.encode_batch(samples.inputs(torch.tensor([i]), target.device))
+        prompt, _ = target.encode_batch(samples.where(torch.tensor([i])).inputs(target.device))
         assert taught.tokens[i].tolist() == decoder.decode_prompt(prompt).tokens
         assert torch.allclose(taught.features[i].float(), target.pooled(prompt)[0], atol=1e-2)
     assert torch.equal(held.episodes, unseen.episodes)

@@ -214,7 +214,7 @@ def test_observations_of_several_files_keep_none_of_them_in_memory(two):
     assert isinstance(joined.frames, EncodedFrames)
     assert all(isinstance(file, Path) for file in joined.frames.files)  # neither bytes nor open files
     chosen = torch.tensor([10, 0, 7, 7])
-    images = joined.inputs(chosen, torch.device("cpu")).images
+    images = joined.where(chosen).inputs(torch.device("cpu")).images
     assert np.array_equal(images.permute(0, 2, 3, 1).numpy(), everything[chosen.numpy()])
     masked = joined.where(torch.arange(len(joined)) % 3 == 1)
     assert isinstance(masked.frames, EncodedFrames)

@@ -28,8 +28,8 @@ from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.folders import RESUME
 from kerv_cli.targets.losses import soft_labels, token_loss
+from kerv_cli.training.fit import Metrics, Progress, Save, batches, fit, read_state
 from kerv_cli.training.imitation import Imitation, lit, vocabulary, waypoints_of
-from kerv_cli.training.loop import Loop, Metrics, read_state
 from kerv_cli.training.settings import TrainSettings
 from kerv_cli.worlds.demos.files import DemoEpisode
 from kerv_cli.worlds.metaworld.spec import SPEC
@@ -45,27 +45,28 @@ def results(tmp_path_factory, recorded):
     return Path(shutil.copytree(recorded, tmp_path_factory.mktemp("training") / "results"))
 
 
-class Sums:
-    """A linear layer learns the sum of three numbers."""
-
-    def __init__(self) -> None:
-        self.module = nn.Linear(3, 1)
-        self.data = torch.randn(50, 3, generator=torch.Generator().manual_seed(1))
-
-    def __len__(self) -> int:
-        return len(self.data)
-
-    def loss(self, indices: torch.Tensor, step: int) -> tuple[torch.Tensor, Metrics]:
-        x = self.data[indices]
-        return ((self.module(x) - x.sum(-1, keepdim=True)) ** 2).mean(), {}
-
-    def validate(self, module: nn.Module) -> Metrics:
-        return {"score": -float(next(module.parameters()).detach().sum())}
+def ignored(*given: object) -> None:
+    """Neither saves nor shows anything."""
 
 
-def quadratic(folder: Path) -> Loop:
+def quadratic(
+    folder: Path, progress: Progress = ignored, settings: TrainSettings = TINY, save: Save = ignored
+) -> nn.Linear:
+    """A linear layer that learns the sum of three numbers."""
     torch.manual_seed(0)
-    return Loop(Sums(), lambda module, metrics: None, TINY, folder, "a")
+    network = nn.Linear(3, 1)
+    data = torch.randn(50, 3, generator=torch.Generator().manual_seed(1))
+    draw = batches(len(data), settings)
+
+    def loss(step: int) -> tuple[torch.Tensor, Metrics]:
+        x = data[draw(step)]
+        return ((network(x) - x.sum(-1, keepdim=True)) ** 2).mean(), {}
+
+    def validate(network: nn.Module) -> Metrics:
+        return {"score": -float(next(network.parameters()).detach().sum())}
+
+    fit(network, loss, validate, save, settings, folder, "a", progress)
+    return network
 
 
 @pytest.mark.bits
@@ -74,28 +75,30 @@ def test_ctrl_c_saves_the_step_that_ran_and_the_run_goes_on_there(
     tmp_path, number, last
 ):  # step 2 comes before the first validation
     whole = quadratic(tmp_path / "whole")
-    whole.run()
-    cut = quadratic(tmp_path / "cut")
     steps: list[int] = []
+
+    def stop(step, total, text):
+        if step == last:
+            os.kill(os.getpid(), number)
+
     before = signal.signal(number, signal.default_int_handler)  # a test run in the background ignores Ctrl-C
     try:
         with pytest.raises(Interrupted, match=f"step {last} is saved"):
-            cut.run(lambda step, metrics: os.kill(os.getpid(), number) if step == last else None)
+            quadratic(tmp_path / "cut", stop)
         assert signal.getsignal(number) is signal.default_int_handler
     finally:
         signal.signal(number, before)
-    resumed = quadratic(tmp_path / "cut")
-    resumed.run(lambda step, metrics: steps.append(step))
+    resumed = quadratic(tmp_path / "cut", lambda step, total, text: steps.append(step))
     assert steps[0] == last + 1
-    for name, tensor in whole.module.state_dict().items():
-        assert torch.equal(tensor, resumed.module.state_dict()[name])
+    for name, tensor in whole.state_dict().items():
+        assert torch.equal(tensor, resumed.state_dict()[name])
 
 
 def test_a_finished_training_that_is_repeated_changes_no_file(tmp_path, quick_training):
     """The time of its newest file is the training's own in `kerv runs list`."""
     seen = []
     for _ in range(2):
-        quadratic(tmp_path).run()
+        quadratic(tmp_path)
         save_curves(tmp_path)
         seen.append({path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()})
     assert {"log.csv", "curves.png"} <= set(seen[0])
@@ -103,27 +106,29 @@ def test_a_finished_training_that_is_repeated_changes_no_file(tmp_path, quick_tr
 
 
 def test_one_request_that_arrives_twice_is_one_and_a_run_without_validation_says_so(tmp_path):
-    def stop(step, metrics):
+    def stop(step, total, text):
         for _ in range(2):  # schedulers pass on what the process heard already
             os.kill(os.getpid(), signal.SIGTERM)
 
     with pytest.raises(Interrupted):
-        quadratic(tmp_path).run(stop)
-    over = quadratic(tmp_path)
-    over.settings = replace(TINY, steps=1)
+        quadratic(tmp_path, stop)
     with pytest.raises(CheckpointError, match="before its first validation"):
-        over.run()
+        quadratic(tmp_path, settings=replace(TINY, steps=1))
+
+
+def test_a_training_that_diverges_names_the_figure_and_the_remedy(tmp_path):
+    with refused("loss is", "lower train.lr"):
+        quadratic(tmp_path, settings=replace(TINY, lr=1e38, warmup=0))
 
 
 def test_a_damaged_resume_file_is_one_line(tmp_path):
-    loop = quadratic(tmp_path)
-    loop.run()
+    network = quadratic(tmp_path)
     whole = (tmp_path / RESUME).read_bytes()
-    index = whole.index(loop.module.weight.detach().numpy().tobytes())
+    index = whole.index(network.weight.detach().numpy().tobytes())
     for damaged in (whole[:index] + bytes([whole[index] ^ 1]) + whole[index + 1 :], whole[:-100], b"", b"{}"):
         (tmp_path / RESUME).write_bytes(damaged)
         with refused("damaged", error=CheckpointError):
-            quadratic(tmp_path).run()
+            quadratic(tmp_path)
 
 
 def test_a_kill_between_the_weights_and_the_resume_file_keeps_the_right_best(tmp_path, monkeypatch):
@@ -131,11 +136,9 @@ def test_a_kill_between_the_weights_and_the_resume_file_keeps_the_right_best(tmp
     writes: list[int] = []
 
     def saving(folder):
-        loop = quadratic(folder)
-        loop.save = lambda module, metrics: save_tensors(folder / "best", module.state_dict())
-        return loop
+        quadratic(folder, save=lambda network, metrics: save_tensors(folder / "best", network.state_dict()))
 
-    saving(tmp_path / "whole").run()
+    saving(tmp_path / "whole")
     best = (tmp_path / "whole/best").read_bytes()
     real = files.os.replace
 
@@ -150,9 +153,9 @@ def test_a_kill_between_the_weights_and_the_resume_file_keeps_the_right_best(tmp
         folder = tmp_path / str(cut)
         writes.clear()
         try:
-            saving(folder).run()
+            saving(folder)
         except KeyboardInterrupt:
-            saving(folder).run()
+            saving(folder)
         assert (folder / "best").read_bytes() == best
         assert (folder / "log.csv").read_bytes() == (tmp_path / "whole/log.csv").read_bytes()
 

@@ -15,6 +15,7 @@ from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.episodes.policy import decoder_for
 from kerv_cli.episodes.settings import RolloutSettings
+from kerv_cli.lab.database import Database
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.folder import save_target
@@ -22,11 +23,12 @@ from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training.dagger import PolicyActs
 from kerv_cli.training.demonstrations import open_demos
-from kerv_cli.training.drafter import DrafterRun
+from kerv_cli.training.drafter import train_drafter
+from kerv_cli.training.fit import batches
 from kerv_cli.training.imitation import task_weights
-from kerv_cli.training.loop import draw_samples
-from kerv_cli.training.settings import DemosSettings, TrainDrafterSettings, TrainTargetSettings
-from kerv_cli.training.target import TargetRun
+from kerv_cli.training.making import identity_of
+from kerv_cli.training.settings import DemosSettings, TrainDrafterSettings, TrainSettings, TrainTargetSettings
+from kerv_cli.training.target import train_target
 from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, DemoEntry
 from kerv_cli.worlds.demos.files import DemoEpisode
@@ -79,10 +81,7 @@ def init_settings(with_old: Path, *overrides: str) -> TrainTargetSettings:
 
 
 def trained(with_old: Path, *overrides: str) -> Path:
-    run = TargetRun(init_settings(with_old, *overrides))
-    run.load(lambda done, total: None)
-    run.train(lambda step, metrics: None)
-    return run.folder
+    return train_target(init_settings(with_old, *overrides), Database(with_old))[0]
 
 
 @pytest.mark.bits
@@ -109,7 +108,7 @@ def test_the_weights_belong_to_the_runs_identity_and_their_name_does_not(with_ol
 
 
 def test_scores_with_and_without_success_are_of_different_runs(with_old):
-    alone, some, more = (TargetRun(init_settings(with_old, f"train.closed_loop={n}")).hash for n in (0, 1, 2))
+    alone, some, more = (identity_of(TrainSettings(closed_loop=n), Demos()) for n in (0, 1, 2))  # type: ignore[arg-type]
     assert some == more != alone
 
 
@@ -120,7 +119,7 @@ def test_scores_with_and_without_success_are_of_different_runs(with_old):
 def test_another_shape_is_refused_by_its_name(with_old, override, shape):
     old = read_target(with_old / "artifacts/target/old").settings[shape]
     with pytest.raises(UsageError, match=rf"{shape}={old}, the run {override}"):
-        TargetRun(init_settings(with_old, override))
+        trained(with_old, override)
 
 
 @pytest.mark.parametrize(
@@ -134,13 +133,13 @@ def test_another_shape_is_refused_by_its_name(with_old, override, shape):
 )
 def test_what_cannot_be_trained_is_refused(with_old, overrides, says):
     with pytest.raises(UsageError, match=says):
-        TargetRun(init_settings(with_old, *overrides))
+        trained(with_old, *overrides)
 
 
 @pytest.mark.parametrize("setting", ["init=old", "colour=0.3", "places=path", "balance=0.5", "closed_loop=2"])
-def test_settings_of_targets_are_refused_for_a_drafter(setting):
+def test_settings_of_targets_are_refused_for_a_drafter(tmp_path, setting):
     with pytest.raises(UsageError, match=rf"train\.{setting}"):
-        DrafterRun(compose("train_drafter", [f"train.{setting}"], TrainDrafterSettings))
+        train_drafter(compose("train_drafter", [f"train.{setting}"], TrainDrafterSettings), Database(tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -153,7 +152,7 @@ def test_demonstrations_without_the_positions_that_a_policy_needs_are_refused(
     space = dataclasses.replace(OBSERVATION.without_state(), proprioception=proprioception)
     monkeypatch.setattr(Demos, "manifest", SimpleNamespace(**{**vars(Demos.manifest), "observation": space}))
     with pytest.raises(error):
-        TargetRun(init_settings(with_old, f"target.observation={observation}"))
+        trained(with_old, f"target.observation={observation}")
 
 
 # --- dagger
@@ -172,12 +171,10 @@ def datasets(tmp_path_factory, recorded):
 
 def test_balanced_tasks_are_drawn_alike():
     tasks = torch.tensor([0] * 900 + [1] * 100)
-    generator = torch.Generator().manual_seed(0)
 
     def share(balance):
-        weights = task_weights(tasks, balance)
-        drawn = draw_samples(1000, 20_000, generator, None if weights is None else weights.cumsum(0))
-        return float(tasks[drawn].double().mean())
+        draw = batches(1000, TrainSettings(batch=20_000), task_weights(tasks, balance))
+        return float(tasks[draw(0)].double().mean())
 
     assert share(0.0) == pytest.approx(0.1, abs=0.01)
     assert share(1.0) == pytest.approx(0.5, abs=0.02)
@@ -185,10 +182,10 @@ def test_balanced_tasks_are_drawn_alike():
 
 
 def test_datasets_add_up(datasets):
-    few, more, both = (open_demos(str(datasets), name) for name in ("few", "more", "few+more"))
+    few, more, both = (open_demos(Database(datasets), name) for name in ("few", "more", "few+more"))
     assert [e.path for e in both.episodes] == [e.path for e in (*few.episodes, *more.episodes)]
     assert set(both.manifest.tasks) == {"drawer-close-v3", "reach-v3"}
-    assert len({few.sha256, more.sha256, both.sha256, open_demos(str(datasets), "more+few").sha256}) == 4
+    assert len({few.sha256, more.sha256, both.sha256, open_demos(Database(datasets), "more+few").sha256}) == 4
     assert both.load(6).task == "reach-v3"
 
 
@@ -196,7 +193,7 @@ def test_datasets_of_other_cameras_do_not_add_up(datasets, tmp_path):
     other = DemoConfig(("reach-v3",), 1, camera=CameraSettings(size=48), frame_stride=50, workers=1)
     record(other, tmp_path / "other")
     with pytest.raises(CheckpointError, match="another camera"):
-        DemoDataset.joined([open_demos(str(datasets), "few"), DemoDataset.open(tmp_path / "other")])
+        DemoDataset.joined([open_demos(Database(datasets), "few"), DemoDataset.open(tmp_path / "other")])
 
 
 def acts_of(target: str, spec: EnvironmentSpec, world: WorldSettings | None = None) -> PolicyActs:

@@ -6,7 +6,8 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.places import artifact
 from kerv_cli.base.registry import find, load, parts
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan, end_with_plan, print_figures, progress_bar
+from kerv_cli.cli.common import AsJson, ShowPlan, print_figures
+from kerv_cli.cli.making import as_planned
 from kerv_cli.targets.settings import BuildTargetSettings
 from kerv_cli.training.settings import BuildDatastoreSettings, BuildDrafterSettings
 
@@ -71,16 +72,9 @@ def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
 def datastore(settings: BuildDatastoreSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Store the demonstrations' action chunks with the target's features as search keys, for drafts by retrieval."""
     from kerv_cli.lab.database import opened
-    from kerv_cli.lab.runs import making, time_as_before
-    from kerv_cli.training.datastore import DatastoreBuild
+    from kerv_cli.training.datastore import build_datastore
 
-    run = DatastoreBuild(settings)
-    if plan:
-        end_with_plan(f"{run.plan()}, {time_as_before(opened(settings.results), 'datastore')}", as_json)
-    with (
-        making(opened(settings.results), "datastore", run.folder) as made,
-        progress_bar("encoding demonstrations", made) as advance,
-    ):
-        store = run.build(advance)
-    figures = {"entries": len(store.vectors), "tasks": len(store.shards)}
-    print_figures("datastore", figures, run.folder, as_json)
+    database = opened(settings.results)
+    with as_planned(database, plan, as_json) as begin:
+        folder, store = build_datastore(settings, database, begin)
+    print_figures("datastore", {"entries": len(store.vectors), "tasks": len(store.shards)}, folder, as_json)

@@ -8,16 +8,8 @@ import typer
 
 from kerv_cli.base.config import compose
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import (
-    AsJson,
-    ShowPlan,
-    end_with_json,
-    end_with_plan,
-    print_rows,
-    print_table,
-    progress_bar,
-    settings_yaml,
-)
+from kerv_cli.cli.common import AsJson, ShowPlan, end_with_json, print_rows, print_table, settings_yaml
+from kerv_cli.cli.making import as_planned
 from kerv_cli.episodes.settings import SweepSettings
 from kerv_cli.training.settings import CalibrateSettings, CalibrateSuccessSettings
 
@@ -31,24 +23,18 @@ from kerv_cli.training.settings import CalibrateSettings, CalibrateSuccessSettin
         "kerv calibrate policy.target=mine demos=mine decodes=20 --plan",
     ),
 )
-def calibrate(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
+def constants(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
     """Fit the constants of KERV and HeiSD: predictors, variability per task, boundary ranges and skip levels."""
-    from kerv_cli.training.calibration import CalibrationRun
-
-    run = CalibrationRun(settings)
     from kerv_cli.lab.database import opened
-    from kerv_cli.lab.runs import making, time_as_before
-
-    if plan:
-        end_with_plan(f"{run.plan()}, {time_as_before(opened(settings.results), 'calibration')}")
-
-    with making(opened(settings.results), "calibration", run.path.parent) as record:
-        calibration = run.run(lambda title: progress_bar(title, record))
     from kerv_cli.report.calibration import tables
+    from kerv_cli.training.calibration import calibrate
 
-    for table in tables(calibration, run.path):
+    database = opened(settings.results)
+    with as_planned(database, plan) as begin:
+        path, calibration, notes = calibrate(settings, database, begin)
+    for table in tables(calibration, path):
         print_table(*table)
-    for line in run.notes:
+    for line in notes:
         typer.echo(line)
 
 

@@ -8,7 +8,8 @@ from kerv_cli.base.durations import count
 from kerv_cli.base.errors import Interrupted, UsageError
 from kerv_cli.base.places import artifact
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import ShowPlan, end_with_plan, print_table, progress_bar
+from kerv_cli.cli.common import ShowPlan, print_table, progress_bar
+from kerv_cli.cli.making import as_planned
 from kerv_cli.training.settings import DemosSettings
 from kerv_cli.worlds.settings import DemosImportSettings
 
@@ -25,7 +26,6 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
     With policy=NAME a policy acts instead, and the expert labels the states that it reaches (DAgger).
     """
     from kerv_cli.lab.database import opened
-    from kerv_cli.lab.runs import making, time_as_before
     from kerv_cli.training.dagger import recording_of
     from kerv_cli.training.demonstrations import name_of
     from kerv_cli.worlds.demos.recording import record
@@ -33,13 +33,12 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
     config, actor = recording_of(settings)
     config.spec.check_installed()
     folder = artifact(settings.results, "demos", settings.name or name_of(settings.task))
-    if plan:
-        what = f"{count(len(config.tasks), 'task')} x {count(settings.episodes, 'episode')}"
-        time = time_as_before(opened(settings.results), "demos", len(config.tasks) * settings.episodes)
-        end_with_plan(f"{what} -> {folder}, {time}")
+    what = f"{count(len(config.tasks), 'task')} x {count(settings.episodes, 'episode')} -> {folder}"
     try:
-        with making(opened(settings.results), "demos", folder) as made, progress_bar("demonstrations", made) as advance:
-            manifest = record(config, folder, advance, actor)
+        with as_planned(opened(settings.results), plan) as begin:
+            stage = begin("demos", folder, what, len(config.tasks) * settings.episodes)
+            with stage("demonstrations") as advance:
+                manifest = record(config, folder, advance, actor)
     except KeyboardInterrupt:
         raise Interrupted(
             f"interrupted: finished episodes are kept in {folder}, the same command goes on there"

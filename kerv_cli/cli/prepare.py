@@ -31,34 +31,39 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
     """
     from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import time_of
-    from kerv_cli.training.preparation import THERE, Step
+    from kerv_cli.training.preparation import THERE
     from kerv_cli.training.preparation import plan as planned
 
-    def line(step: Step) -> str:
-        """Return the command line of a step, without `kerv`."""
-        shared = [word for word in overrides if word.split("=")[0] not in NOT_OF_STEPS]
-        if step.command[-1] == "success":
-            shared = [word for word in shared if not word.startswith("demos=")]
-        return shlex.join([*step.command, *shared])
-
-    steps, name = planned(settings), settings.policy.target
-    print_table(("what", "state", "command"), [(s.kind, s.state, f"kerv {line(s)}") for s in steps], name)
+    database, name = opened(settings.results), settings.policy.target
+    steps = planned(settings, database)
+    lines = {step.kind: line_of(step.command, overrides) for step in steps}
+    rows = [(step.kind, step.state, f"kerv {shlex.join(lines[step.kind])}") for step in steps]
+    print_table(("what", "state", "command"), rows, name)
     if plan:
-        database = opened(settings.results)
         for step in steps:
             if step.state != THERE:
-                typer.echo(f"{step.kind}: {time_of(database, step.kind, shlex.split(line(step)), step.steps)}")
+                typer.echo(f"{step.kind}: {time_of(database, step.kind, lines[step.kind], step.steps)}")
         return
-    for kind in [step.kind for step in steps]:
+    for kind, line in lines.items():
         # planned again before each step: an artifact that was just made can make a later one outdated
-        step = next(step for step in planned(settings) if step.kind == kind)
-        if step.state != THERE:
-            typer.echo(f"\nkerv {line(step)}")
-            run(shlex.split(line(step)))
+        states = {step.kind: step.state for step in planned(settings, database)}
+        if states[kind] != THERE:
+            typer.echo(f"\nkerv {shlex.join(line)}")
+            run(line)
     if failing := unsolved_by(settings):
         typer.echo(f"\n{name}: {failing}")
         return
     typer.echo(f"\n{name} is ready: kerv sweep study=own policy.target={name}{results_word(overrides)}")
+
+
+def line_of(command: Sequence[str], overrides: Sequence[str]) -> list[str]:
+    """Return the arguments of a step after `kerv`: its own, and the overrides of `kerv prepare` that it shares."""
+    line = list(command)
+    for word in overrides:
+        key = word.split("=")[0]
+        if key not in NOT_OF_STEPS and (key != "demos" or command[-1] != "success"):
+            line.append(word)
+    return line
 
 
 def unsolved_by(settings: PrepareSettings) -> str:

@@ -1,4 +1,4 @@
-"""Run studies and trainings for the commands: plan them, show their progress, print the results."""
+"""Run studies for the commands: plan them, show their progress, print the results."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from kerv_cli.base.durations import about, count, duration
 from kerv_cli.cli.common import (
     console,
     end_with_json,
-    end_with_plan,
-    print_figures,
     print_rows,
     print_table,
     progress_bar,
@@ -22,16 +20,12 @@ from kerv_cli.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from pandas import DataFrame
 
     from kerv_cli.episodes.resolve import ResolvedStudy
     from kerv_cli.lab.events import Event, Outcome
     from kerv_cli.lab.progress import TimeLeft
-    from kerv_cli.lab.runs import Run
     from kerv_cli.lab.store import Plan, StudyStore
-    from kerv_cli.training.run import TrainingRun
 
 SECONDS_PER_EPISODE = 3.0
 """Guess for commands without a study's file, before anything was measured."""
@@ -253,53 +247,3 @@ def print_verdict(table: DataFrame, store: StudyStore, loss: float) -> None:
     recordings = store.recordings
     mend = "" if store.kind == "import" else "; the same sweep with record=1 rerun=all does that"
     typer.echo(f"watch: {f'kerv view {recordings[0]}' if recordings else f'nothing is recorded{mend}'}")
-
-
-def run_training(run: TrainingRun, plan: bool, as_json: bool, loading: str, training: str) -> None:
-    """Run a training and show its progress, or print the plan.
-
-    Args:
-        run: The training.
-        plan: Print what would be trained, and end the command.
-        as_json: Print the result as JSON.
-        loading: Title of the progress bar while data are read.
-        training: Title of the progress bar during training.
-
-    Raises:
-        UsageError: Another process is training the same artifact.
-    """
-    from kerv_cli.lab.database import opened
-    from kerv_cli.lab.runs import making, time_as_before
-
-    if plan:
-        time = time_as_before(opened(run.settings.results), run.artifact_kind, run.settings.train.steps)
-        end_with_plan(f"{run.plan()}, {time}", as_json)
-    with making(opened(run.settings.results), run.artifact_kind, run.folder) as record:
-        metrics, plot = _train(run, record, loading, training)
-    if as_json:
-        end_with_json({"folder": run.folder, "best": metrics, "curves": plot})
-    print_figures("best checkpoint", metrics, run.folder)
-    typer.echo(f"curves in {run.folder / 'log.csv'} and {plot}")
-
-
-def _train(run: TrainingRun, record: Run, loading: str, training: str) -> tuple[dict[str, float], Path]:
-    from kerv_cli.training.loop import without_subnormals
-
-    with without_subnormals(), progress_bar(loading, record) as advance:
-        run.load(advance)
-    started = False
-    settings = run.settings
-
-    def on_step(step: int, now: dict[str, float]) -> None:
-        nonlocal started
-        if not started and step > 1:
-            typer.echo(f"resuming at step {step - 1}", err=True)
-        started = True
-        line = " ".join(f"{name} {value:.4g}" for name, value in list(now.items())[:6] if name != "step")
-        advance(step, settings.train.steps, line)
-
-    with without_subnormals(), progress_bar(training, record) as advance:
-        metrics = run.train(on_step)
-    from kerv_cli.report.plots import save_curves
-
-    return metrics, save_curves(run.folder)

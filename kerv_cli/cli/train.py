@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import typer
 
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan
-from kerv_cli.cli.studies import run_training
+from kerv_cli.cli.common import AsJson, ShowPlan, end_with_json, print_figures
+from kerv_cli.cli.making import as_planned
 from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
 
 
@@ -22,12 +24,15 @@ from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
 def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Train a target policy on demonstrations by behaviour cloning."""
     typer.echo(f"target {settings.name}: {settings.train.steps} steps", err=True)
-    from kerv_cli.training.target import TargetRun
+    from kerv_cli.lab.database import opened
+    from kerv_cli.report.plots import save_curves
+    from kerv_cli.training.target import train_target
 
-    run = TargetRun(settings)
-    for line in run.notes:
-        typer.echo(line, err=True)
-    run_training(run, plan, as_json, "reading demonstrations", "training the target")
+    database = opened(settings.results)
+    with as_planned(database, plan, as_json) as begin:
+        folder, metrics = train_target(settings, database, begin)
+        plot = save_curves(folder)
+    _print(folder, metrics, plot, as_json)
 
 
 @command(
@@ -42,6 +47,20 @@ def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJso
 def drafter(settings: TrainDrafterSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Train a drafter to imitate a target's greedy decodes. drafter=NAME chooses its kind, such as early."""
     typer.echo(f"drafter={settings.drafter.kind} of {settings.policy.target}: {settings.train.steps} steps", err=True)
-    from kerv_cli.training.drafter import DrafterRun
+    from kerv_cli.lab.database import opened
+    from kerv_cli.report.plots import save_curves
+    from kerv_cli.training.drafter import train_drafter
 
-    run_training(DrafterRun(settings), plan, as_json, "the target's greedy decodes", "training the drafter")
+    database = opened(settings.results)
+    with as_planned(database, plan, as_json) as begin:
+        folder, metrics = train_drafter(settings, database, begin)
+        plot = save_curves(folder)
+    _print(folder, metrics, plot, as_json)
+
+
+def _print(folder: Path, metrics: dict[str, float], plot: Path, as_json: bool) -> None:
+    """Print the metrics of the best weights, and where they and the curves are."""
+    if as_json:
+        end_with_json({"folder": folder, "best": metrics, "curves": plot})
+    print_figures("best checkpoint", metrics, folder)
+    typer.echo(f"curves in {folder / 'log.csv'} and {plot}")

@@ -46,40 +46,6 @@ class DrafterDescription(checkpoint.Description):
 
 
 @dataclass(frozen=True)
-class Training:
-    """All that the optimisation loop needs to train one drafter.
-
-    Attributes:
-        drafter: The kind of drafter, which defines the loss and the validation.
-        module: The network to train.
-        target: The frozen target that the network imitates.
-        examples: The training examples.
-        held_out: Examples from other episodes, for validation.
-        settings: Settings of `kerv train drafter`: `drafter` for the drafter, `train` for the optimisation.
-    """
-
-    drafter: TrainableDrafter
-    module: Any
-    target: Any
-    examples: Any
-    held_out: Any
-    settings: Any
-
-    def __len__(self) -> int:
-        """Return the number of examples."""
-        return len(self.examples)
-
-    def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Return the loss of the examples `indices` (B,) at optimisation step `step`, and metrics to log."""
-        return self.drafter.loss(self, indices, step)
-
-    @torch.no_grad()
-    def validate(self, module: nn.Module) -> Metrics:
-        """Return metrics of a network on the held-out examples."""
-        return self.drafter.validate(self, module)
-
-
-@dataclass(frozen=True)
 class Decodes(Rows):
     """Training examples of a drafter: the tokens that the target decodes greedily from n observations.
 
@@ -178,12 +144,27 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         """Store numbers from the training examples in the network before training, such as their mean and spread."""
 
     @abstractmethod
-    def loss(self, training: Training, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Return the loss of the training examples `indices` (B,) at optimisation step `step`, and metrics to log."""
+    def loss(self, network: Any, target: Any, batch: Any, step: int, settings: Any) -> tuple[Tensor, Metrics]:
+        """Return the loss (a scalar) of a batch of examples, and metrics to log.
+
+        Args:
+            network: The network to train.
+            target: The frozen target that it imitates.
+            batch: Some of the training examples.
+            step: The optimisation step.
+            settings: Settings of `kerv train drafter`: `drafter` for the drafter, `train` for the optimisation.
+        """
 
     @abstractmethod
-    def validate(self, training: Training, module: Any) -> Metrics:
-        """Return metrics of a network on the held-out examples. The best weights are those with the highest `score`."""
+    def validate(self, network: Any, target: Any, held_out: Any, settings: Any) -> Metrics:
+        """Return metrics of a network. The best weights are those with the highest `score`.
+
+        Args:
+            network: The network.
+            target: The target that it imitates.
+            held_out: Examples from episodes that it was not trained on.
+            settings: As in `loss`.
+        """
 
     @classmethod
     @abstractmethod
@@ -194,22 +175,6 @@ class TrainableDrafter(Artifact[DrafterDescription]):
             settings: Settings of the proposer.
             context: The context in which the method is built.
         """
-
-    def objective(self, target: Any, dataset: DemoDataset, settings: Any, progress: OnProgress) -> Training:
-        """Make the training examples and a network with initial weights, and return them for the optimisation loop.
-
-        Args:
-            target: The loaded target, on the device to train on.
-            dataset: The demonstrations.
-            settings: Settings of `kerv train drafter`.
-            progress: Called with the amount of work done and the total amount.
-        """
-        share = settings.train.held_out
-        examples, held_out = self.examples(target, dataset, settings.drafter, share, progress)
-        torch.manual_seed(settings.train.seed)
-        network = self.network(settings.drafter, target)
-        self.prepare(network, examples)
-        return Training(self, network.to(target.device), target, examples, held_out, settings)
 
     def anew(self, path: Path) -> str:
         """Return text for error messages: how to replace the drafter in `path`, which belongs to another target.

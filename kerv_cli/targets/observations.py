@@ -72,12 +72,12 @@ class Observations(Rows):
     words: Tensor
     steps: Tensor
 
-    def inputs(self, indices: Tensor, device: torch.device) -> Inputs:
-        """Return the observations at indices (B,) as a batch on a device, with decoded images."""
+    def inputs(self, device: torch.device) -> Inputs:
+        """Return the observations as a batch on a device, with decoded images."""
         images = None
         if self.frames is not None:
-            images = torch.from_numpy(self.frames[indices].pixels()).to(device).permute(0, 3, 1, 2)
-        return Inputs(images, *(x[indices].to(device) for x in (self.proprioception, self.states, self.words)))
+            images = torch.from_numpy(self.frames.pixels()).to(device).permute(0, 3, 1, 2)
+        return Inputs(images, self.proprioception.to(device), self.states.to(device), self.words.to(device))
 
 
 def read_observations(

@@ -10,10 +10,11 @@ The JSON holds:
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.engine.record import MEAN, MEASURES, DecodeRecord, Measure, variability
 from kerv_cli.episodes.settings import RolloutSettings
+from kerv_cli.lab.database import Database
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.calibration import (
     NEVER,
@@ -43,6 +45,7 @@ from kerv_cli.targets.folders import check_not_shipped
 from kerv_cli.targets.observations import check_tail, observations_of
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_tasks, demos_for
+from kerv_cli.training.making import Begin, quietly
 from kerv_cli.training.settings import CalibrateSettings
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
@@ -71,167 +74,215 @@ RATIOS = np.logspace(-3, 3, 49)
 DAMPINGS = (0.95, 0.9, 0.85, 0.8, 0.75, 0.7, 0.6, 0.5, 0.3)
 """Grid of the damped filter's damping: the factor of the velocity at each control step."""
 
-Stage = Callable[[str], AbstractContextManager[OnProgress]]
-"""Takes the title of a part of the work. Returns a context that yields a progress function (done, total)."""
 
+def calibrate(
+    settings: CalibrateSettings, database: Database, begin: Begin = quietly
+) -> tuple[Path, Calibration, list[str]]:
+    """Measure everything and write the calibration.
 
-class CalibrationRun:
-    """One calibration. The constructor checks that it is possible, and `run` measures and writes it.
+    K_S is not measured if `decodes` is 0 or the drafter is missing. Skip levels, the smallest similarities at which
+    verification is skipped, are not measured without a datastore.
 
-    Attributes:
-        settings: Settings of the command.
-        dataset: The demonstrations.
-        tasks: Full names of the tasks.
-        path: The JSON to write.
-        chosen: Indices of the episodes that are used.
-        notes: After `run`, one line per section of the calibration that was not measured, with the reason.
+    Args:
+        settings: Settings of `kerv calibrate`.
+        database: The database of the results folder.
+        begin: Called once all settings are checked.
+
+    Returns:
+        The JSON that was written, the calibration, and one line per section that was not measured, with the reason.
 
     Raises:
         UsageError: A number is out of range, or a task is unknown.
         CheckpointError: The target or the demonstrations do not exist. Or the demonstrations are of another
-            environment. Or the datastore is of another target.
+            environment or hold images of another size than the target takes. Or the datastore is of another target. Or
+            no end-effector path is curved.
+        KervError: No decode of a task compared a draft with the target, so K_S is unknown.
+        StorageError: The disk cannot be written.
     """
+    settings, dataset = demos_for(settings, database)
+    tasks = resolve_tasks(settings.task or list(dataset.manifest.tasks))
+    artifacts = Artifacts(settings.results, settings.policy, device=settings.runtime.device)
+    target = artifacts.description
+    target.check_autoregressive("kerv calibrate", "there is no draft to calibrate")
+    path = artifacts.new("calibration")
+    chosen = choose_episodes(dataset, tasks, settings.episodes)
+    method = Method.of(RolloutSettings(**{kind: find(kind, name).default for kind, name in DRAFTS.items()}))
+    no_drafter = [kind for kind in method.needs if not artifacts.exists(kind)]
+    missing = [*no_drafter]
+    if artifacts.exists("datastore"):
+        artifacts.check(["datastore"])
+    else:
+        missing.append("datastore")
+    old: Calibration | None = artifacts.load("calibration") if settings.complete else None
+    check_replaceable(path, old, "datastore" not in missing)
+    stage = begin("calibration", path.parent, plan_of(settings, path, len(chosen), len(tasks), missing), 0)
 
-    def __init__(self, settings: CalibrateSettings) -> None:
-        self.settings, self.dataset = demos_for(settings)
-        settings = self.settings
-        self.tasks = resolve_tasks(settings.task or list(self.dataset.manifest.tasks))
-        self.artifacts = Artifacts(settings.results, settings.policy, device=settings.runtime.device)
-        self.description = self.artifacts.description
-        self.description.check_autoregressive("kerv calibrate", "there is no draft to calibrate")
-        self.path = self.artifacts.new("calibration")
-        self.chosen = choose_episodes(self.dataset, self.tasks, settings.episodes)
-        self.method = Method.of(RolloutSettings(**{kind: find(kind, name).default for kind, name in DRAFTS.items()}))
-        self.missing = [kind for kind in (*self.method.needs, "datastore") if not self.artifacts.exists(kind)]
-        if "datastore" not in self.missing:
-            self.artifacts.check(["datastore"])
-        self.old = self.artifacts.load("calibration") if settings.complete else None
-        fills = self.path.is_file() and read_mapping(self.path).get("skip") is None
-        # a shipped calibration may be completed, and skip levels may be added to it
-        if self.old is None and ("datastore" in self.missing or not fills):
-            check_not_shipped(self.path, "policy.artifacts.calibration")
-        self.notes: list[str] = []
-
-    def plan(self) -> str:
-        """Return one line that `--plan` prints: the file, numbers of demonstrations and decodes, what is missing."""
-        settings = self.settings
-        without = f"; without {' and '.join(self.missing)}" if self.missing else ""
-        return (
-            f"{self.path}: predictors fitted on {count(len(self.chosen), 'demonstration')} of "
-            f"{count(len(self.tasks), 'task')}; "
-            f"{settings.decodes} decodes per task; "
-            f"boundary over {', '.join(map(str, settings.boundary_windows))} positions{without}"
-        )
-
-    def run(self, stage: Stage) -> Calibration:
-        """Measure everything and write the calibration.
-
-        K_S is not measured if `decodes` is 0 or the drafter is missing. Skip levels, the smallest similarities at which
-        verification is skipped, are not measured without a datastore. `notes` says so.
-
-        Args:
-            stage: Called with the title of each part of the work, to show its progress.
-
-        Raises:
-            CheckpointError: The images have another size than the target takes. Or no end-effector path is curved.
-            KervError: No decode of a task compared a draft with the target, so K_S is unknown.
-            StorageError: The disk cannot be written.
-        """
-        space, chunk, settings = self.description.actions, self.description.chunk, self.settings
-        with stage("reading demonstrations") as progress:
-            windows = read_windows(self.dataset, self.chosen, space, settings.window, chunk, progress)
-        variability, skip = self.presample(stage), self.skip(stage)
-        with stage("boundary ranges") as progress:
-            known = self.old.boundary.windows if self.old is not None and self.old.boundary is not None else {}
-            ranges = dict(known)
-            for number, window in enumerate(settings.boundary_windows, 1):
-                ranges[str(window)] = BoundaryRanges.fit(windows.paths, window, known.get(str(window)))
-                progress(number, len(settings.boundary_windows))
-        with stage("fitting the predictors"):
-            noise = fit_filters(windows)
-        if not variability:
-            drafter = "".join(f", no {kind}" for kind in self.missing if kind != "datastore")
-            self.notes.append(f"no reference levels K_S: decodes={settings.decodes}{drafter}")
-        if skip is None:
-            self.notes.append("no skip levels: no datastore of these tasks (kerv build datastore)")
-        calibration = Calibration(
-            target=MadeFor.of(self.description),
-            demos=Demonstrations(self.dataset.sha256, {k: {"training": n} for k, n in windows.episodes.items()}),
-            window=settings.window,
-            noise=noise,
-            variability=variability,
-            boundary=BoundarySection(len(windows.paths), ranges),
-            skip=skip,
-            provenance=provenance_of("kerv calibrate", settings, settings.runtime.device),
-        )
-        if self.old is not None:
-            calibration = completed(self.old, calibration)
-        write_json(self.path, asdict(calibration))
-        return calibration
-
-    def skip(self, stage: Stage) -> SkipSection | None:
-        """Return, for each task, the smallest similarity at which verification is skipped. None without a datastore."""
-        if "datastore" in self.missing:
-            return None
-        store = self.artifacts.load("datastore")
-        with stage("skip levels") as progress:
-            return skip_section(store, self.tasks, self.settings.epsilon, self.settings.confidence, progress)
-
-    def presample(self, stage: Stage) -> dict[str, Variability]:
-        """Measure how far drafts are from the target's tokens, by decoding observations of training episodes.
-
-        Returns:
-            For each task its reference level K_S, the median K. Empty if `decodes` is 0 or the drafter is missing.
-        """
-        decodes = self.settings.decodes
-        if not decodes or not set(self.missing).isdisjoint(self.method.needs):
-            return {}
-        decoder, actions = self.method.decoder(self.artifacts.target, self.artifacts.load), self.description.actions
-        # decoding divides by K_S, so it is at least the smallest K above 0: one token of a chunk is off by one bin
-        least = 2.0 / actions.tokens
-        moving = self.description.chunk * int((~actions.is_strict).sum())
-        variability = {}
+    with stage("reading demonstrations") as progress:
+        windows = read_windows(dataset, chosen, target.actions, settings.window, target.chunk, progress)
+    variability: dict[str, Variability] = {}
+    notes: list[str] = []
+    if settings.decodes and not no_drafter:
+        decoder = method.decoder(artifacts.target, artifacts.load)
         with stage("pre-sampling") as progress:
-            for number, name in enumerate(self.tasks, 1):
-                records: list[DecodeRecord] = []
-                for index in self.chosen:
-                    if self.dataset.episodes[index].task == name and len(records) < decodes:
-                        budget = min(math.ceil(decodes / PRESAMPLED), decodes - len(records))
-                        records += self.episode_decodes(decoder, index, budget)
-                if not records:
-                    raise KervError(f"{name}: no decode compared a draft with a target token, so there is no K_S")
-                levels = {
-                    measure.name: max(level_of(records, actions, measure), least / (1 if measure.total else moving))
-                    for measure in MEASURES
-                }
-                variability[name] = Variability(levels[MEAN.name], len(records), levels)
-                progress(number, len(self.tasks))
-        return variability
+            variability = presample(decoder, dataset, chosen, tasks, settings.decodes, progress)
+    else:
+        without = "".join(f", no {kind}" for kind in no_drafter)
+        notes.append(f"no reference levels K_S: decodes={settings.decodes}{without}")
+    skip = None
+    if "datastore" not in missing:
+        with stage("skip levels") as progress:
+            skip = skip_section(artifacts.load("datastore"), tasks, settings.epsilon, settings.confidence, progress)
+    if skip is None:
+        notes.append("no skip levels: no datastore of these tasks (kerv build datastore)")
+    with stage("boundary ranges") as progress:
+        boundary = fit_boundary(windows.paths, settings.boundary_windows, old, progress)
+    with stage("fitting the predictors"):
+        noise = fit_filters(windows)
+    calibration = Calibration(
+        target=MadeFor.of(target),
+        demos=Demonstrations(dataset.sha256, {task: {"training": n} for task, n in windows.episodes.items()}),
+        window=settings.window,
+        noise=noise,
+        variability=variability,
+        boundary=boundary,
+        skip=skip,
+        provenance=provenance_of("kerv calibrate", settings, settings.runtime.device),
+    )
+    if old is not None:
+        calibration = completed(old, calibration)
+    write_json(path, asdict(calibration))
+    return path, calibration, notes
 
-    def episode_decodes(self, decoder: Decoder, index: int, decodes: int) -> list[DecodeRecord]:
-        """Decode observations that are spread evenly over one demonstration.
 
-        The decoder also gets every executed action in between, because some methods use a history. A decode that
-        compared no draft with the target is left out.
+def check_replaceable(path: Path, old: Calibration | None, with_store: bool) -> None:
+    """Check that a calibration may be written here. One of a shipped policy may only get what it lacks.
 
-        Args:
-            decoder: The decoder.
-            index: Index of the episode in the dataset.
-            decodes: Maximum number of observations to decode.
-        """
-        episode = self.dataset.load(index)
-        rows = np.unique(np.linspace(0, len(episode.frame_steps) - 1, decodes).round().astype(int))
-        steps, records, executed = episode.frame_steps[rows], [], 0
-        observations = observations_of(decoder.target, episode, steps, self.dataset.manifest.observation)
-        decoder.reset(episode.task, episode.seed, episode.end_effector[0])
-        for step, observation in zip(steps, observations, strict=True):
-            for t in range(executed, step):
-                decoder.observe(episode.executed[t], episode.end_effector[t + 1])
-            executed = step
-            record = decoder.decode(observation)
-            if record.variability is not None:
-                records.append(record)
-        return records
+    Args:
+        path: The JSON to write.
+        old: The calibration to complete, if `complete` is set.
+        with_store: Whether the policy has a datastore, with which skip levels may be added.
+
+    Raises:
+        UsageError: A shipped policy's calibration would be replaced.
+    """
+    lacks_skip = path.is_file() and read_mapping(path).get("skip") is None
+    if old is None and not (with_store and lacks_skip):
+        check_not_shipped(path, "policy.artifacts.calibration")
+
+
+def plan_of(settings: CalibrateSettings, path: Path, episodes: int, tasks: int, missing: Sequence[str]) -> str:
+    """Return one line that `--plan` prints: the file, numbers of demonstrations and decodes, what is missing."""
+    without = f"; without {' and '.join(missing)}" if missing else ""
+    return (
+        f"{path}: predictors fitted on {count(episodes, 'demonstration')} of {count(tasks, 'task')}; "
+        f"{settings.decodes} decodes per task; "
+        f"boundary over {', '.join(map(str, settings.boundary_windows))} positions{without}"
+    )
+
+
+def presample(
+    decoder: Decoder,
+    dataset: DemoDataset,
+    chosen: Sequence[int],
+    tasks: Sequence[str],
+    decodes: int,
+    progress: OnProgress,
+) -> dict[str, Variability]:
+    """Measure how far drafts are from the target's tokens, by decoding observations of training episodes.
+
+    Args:
+        decoder: The decoder.
+        dataset: The demonstrations.
+        chosen: Indices of the episodes that are used.
+        tasks: Full names of the tasks.
+        decodes: Number of decodes per task.
+        progress: Called with the numbers of tasks done and of all.
+
+    Returns:
+        For each task its reference level K_S, the median K.
+
+    Raises:
+        KervError: No decode of a task compared a draft with the target.
+    """
+    variability = {}
+    for number, name in enumerate(tasks, 1):
+        records: list[DecodeRecord] = []
+        for index in chosen:
+            if dataset.episodes[index].task == name and len(records) < decodes:
+                budget = min(math.ceil(decodes / PRESAMPLED), decodes - len(records))
+                records += episode_decodes(decoder, dataset, index, budget)
+        if not records:
+            raise KervError(f"{name}: no decode compared a draft with a target token, so there is no K_S")
+        variability[name] = reference_level(records, decoder.target.actions, decoder.target.chunk)
+        progress(number, len(tasks))
+    return variability
+
+
+def reference_level(records: Sequence[DecodeRecord], actions: ActionSpace, chunk: int) -> Variability:
+    """Return a task's reference level K_S, by each measure of K.
+
+    Decoding divides by K_S. So it is at least the smallest K above 0: one token of a chunk is off by one bin.
+
+    Args:
+        records: Decodes of the task.
+        actions: The target's action space.
+        chunk: The target's number of control steps per chunk.
+    """
+    bin_width, moving = 2.0 / actions.tokens, chunk * int((~actions.is_strict).sum())
+    levels = {}
+    for measure in MEASURES:
+        least = bin_width if measure.total else bin_width / moving
+        levels[measure.name] = max(level_of(records, actions, measure), least)
+    return Variability(levels[MEAN.name], len(records), levels)
+
+
+def episode_decodes(decoder: Decoder, dataset: DemoDataset, index: int, decodes: int) -> list[DecodeRecord]:
+    """Decode observations that are spread evenly over one demonstration.
+
+    The decoder also gets every executed action in between, because some methods use a history. A decode that compared
+    no draft with the target is left out.
+
+    Args:
+        decoder: The decoder.
+        dataset: The demonstrations.
+        index: Index of the episode in the dataset.
+        decodes: Maximum number of observations to decode.
+    """
+    episode = dataset.load(index)
+    rows = np.unique(np.linspace(0, len(episode.frame_steps) - 1, decodes).round().astype(int))
+    steps, records, executed = episode.frame_steps[rows], [], 0
+    observations = observations_of(decoder.target, episode, steps, dataset.manifest.observation)
+    decoder.reset(episode.task, episode.seed, episode.end_effector[0])
+    for step, observation in zip(steps, observations, strict=True):
+        for t in range(executed, step):
+            decoder.observe(episode.executed[t], episode.end_effector[t + 1])
+        executed = step
+        record = decoder.decode(observation)
+        if record.variability is not None:
+            records.append(record)
+    return records
+
+
+def fit_boundary(
+    paths: list[np.ndarray], windows: Sequence[int], old: Calibration | None, progress: OnProgress
+) -> BoundarySection:
+    """Return the ranges of curvature and path length, for each window length.
+
+    Args:
+        paths: End effector in each episode, (T, 3) metres.
+        windows: Window lengths, in positions.
+        old: A calibration whose ranges are kept.
+        progress: Called with the numbers of window lengths done and of all.
+
+    Raises:
+        CheckpointError: No path is curved.
+    """
+    known = old.boundary.windows if old is not None and old.boundary is not None else {}
+    ranges = dict(known)
+    for number, window in enumerate(windows, 1):
+        ranges[str(window)] = BoundaryRanges.fit(paths, window, known.get(str(window)))
+        progress(number, len(windows))
+    return BoundarySection(len(paths), ranges)
 
 
 def completed(old: Calibration, new: Calibration) -> Calibration:
@@ -239,12 +290,11 @@ def completed(old: Calibration, new: Calibration) -> Calibration:
 
     Its boundary ranges are those of `new`, which kept the old ones where there were any.
     """
-    noise = {
-        kind: Noise(
-            *(tuple(np.where(known.q, a, b).tolist()) for a, b in zip(astuple(known), astuple(found), strict=True))
-        )
-        for kind, known, found in ((kind, old.noise[kind], new.noise[kind]) for kind in FILTERS)
-    }
+    noise = {}
+    for kind in FILTERS:
+        known, found = old.noise[kind], new.noise[kind]
+        columns = zip(astuple(known), astuple(found), strict=True)
+        noise[kind] = Noise(*(tuple(np.where(known.q, a, b).tolist()) for a, b in columns))
     variability = dict(new.variability)
     for task, row in old.variability.items():
         measured = new.variability[task].levels if task in new.variability else {}
@@ -261,7 +311,11 @@ def completed(old: Calibration, new: Calibration) -> Calibration:
 
 def level_of(records: Sequence[DecodeRecord], actions: ActionSpace, measure: Measure) -> float:
     """Return the median over decodes of the variability K; 0 if no draft token counts."""
-    levels = [k for record in records if (k := variability(record.rounds, actions, measure)) is not None]
+    levels = []
+    for record in records:
+        level = variability(record.rounds, actions, measure)
+        if level is not None:
+            levels.append(level)
     return float(np.median(levels)) if levels else 0.0
 
 
@@ -345,8 +399,11 @@ def choose_episodes(dataset: DemoDataset, tasks: Sequence[str], limit: int) -> l
         CheckpointError: A task has no demonstration.
     """
     check_tasks(dataset, tasks)
-    by_task = [[i for i, entry in enumerate(dataset.episodes) if entry.task == task] for task in tasks]
-    return [index for indices in by_task for index in indices[: limit or None]]
+    chosen: list[int] = []
+    for task in tasks:
+        episodes = [index for index, entry in enumerate(dataset.episodes) if entry.task == task]
+        chosen += episodes[: limit or None]
+    return chosen
 
 
 def fit_noise(past: np.ndarray, future: np.ndarray, dampings: Sequence[float]) -> tuple[float, float]:
@@ -366,10 +423,12 @@ def fit_noise(past: np.ndarray, future: np.ndarray, dampings: Sequence[float]) -
     window, steps = past.shape[1], future.shape[1]
 
     def error(candidate: tuple[float, float]) -> float:
-        weights = kalman_weights(candidate[0], 1.0, window, steps, candidate[1])
+        damping, q = candidate
+        weights = kalman_weights(q, 1.0, window, steps, damping)
         return float(np.abs(np.clip(past @ weights.T, -1.0, 1.0) - future).mean())
 
-    return min(((float(q), damping) for damping in dampings for q in RATIOS), key=error)
+    damping, q = min(itertools.product(dampings, map(float, RATIOS)), key=error)
+    return q, damping
 
 
 def fit_filters(windows: Windows) -> dict[str, Noise]:
@@ -385,7 +444,8 @@ def fit_filters(windows: Windows) -> dict[str, Noise]:
     for kind in FILTERS:
         dampings = DAMPINGS if kind == "damped" else (1.0,)
         fits = [fit_noise(past[..., dof], future[..., dof], dampings) for dof in range(past.shape[2])]
-        noise[kind] = Noise(tuple(q for q, _ in fits), (1.0,) * len(fits), tuple(d for _, d in fits))
+        ratios, found = zip(*fits, strict=True)
+        noise[kind] = Noise(ratios, (1.0,) * len(fits), found)
     return noise
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TypeVar
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.places import artifact_or_path, results_dir
+from kerv_cli.base.places import artifact_or_path
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.episodes.settings import DEFAULT_TASKS
-from kerv_cli.lab.database import opened
+from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import command_to_go_on
 from kerv_cli.targets.checkpoint import TargetDescription, described
 from kerv_cli.targets.folders import find_target
@@ -29,11 +29,11 @@ def name_of(tasks: Sequence[str]) -> str:
     return "-".join(tasks or DEFAULT_TASKS).lower()
 
 
-def open_demos(results: str, names: str, tasks: Sequence[str] = (), episodes: int = 0) -> DemoDataset:
+def open_demos(database: Database, names: str, tasks: Sequence[str] = (), episodes: int = 0) -> DemoDataset:
     """Open a dataset, or join several datasets, such as `mt50+mt50-dagger`.
 
     Args:
-        results: The results folder.
+        database: The database of the results folder.
         names: Name of a dataset, or several names joined by `+`.
         tasks: Tasks to record if the dataset is missing, for the error message. Empty: the default tasks.
         episodes: Episodes per task to record, for the error message. 0: the default number.
@@ -42,38 +42,51 @@ def open_demos(results: str, names: str, tasks: Sequence[str] = (), episodes: in
         UsageError: A name cannot be the name of a folder.
         CheckpointError: A dataset is missing, unfinished or damaged, or the datasets cannot be joined.
     """
-    whole = artifact_or_path(results, "demos", names)
-    folders = [whole] if whole.is_dir() else [artifact_or_path(results, "demos", name) for name in names.split("+")]
-    datasets = []
-    for folder in folders:
-        try:
-            datasets.append(DemoDataset.open(folder))
-        except CheckpointError as error:
-            command = command_to_go_on(opened(results), "demos", folder)
-            if command and not (folder / "manifest.json").exists():
-                line = shlex.join(["kerv", *command])
-                raise CheckpointError(f"the demonstrations in {folder} are unfinished: run '{line}'") from error
-            if folder.is_dir():
-                raise
-            remedy = _remedy(results, folder, tasks, episodes)
-            raise CheckpointError(f"no demonstrations in {folder}: {remedy}") from error
-    return DemoDataset.joined(datasets)
+    whole = artifact_or_path(str(database.results), "demos", names)
+    if whole.is_dir():  # its name may contain a plus
+        return DemoDataset.joined([_opened(database, whole, tasks, episodes)])
+    folders = [artifact_or_path(str(database.results), "demos", name) for name in names.split("+")]
+    return DemoDataset.joined([_opened(database, folder, tasks, episodes) for folder in folders])
 
 
-def _remedy(results: str, folder: Path, tasks: Sequence[str], episodes: int) -> str:
-    if folder.parent != results_dir(results) / "artifacts/demos":
+def _opened(database: Database, folder: Path, tasks: Sequence[str], episodes: int) -> DemoDataset:
+    """Open one dataset, or say how to record it; see `open_demos`."""
+    try:
+        return DemoDataset.open(folder)
+    except CheckpointError as error:
+        command = command_to_go_on(database, "demos", folder)
+        if command and not (folder / "manifest.json").exists():
+            line = shlex.join(["kerv", *command])
+            raise CheckpointError(f"the demonstrations in {folder} are unfinished: run '{line}'") from error
+        if folder.is_dir():
+            raise
+        remedy = _remedy(database.results / "artifacts/demos", folder, tasks, episodes)
+        raise CheckpointError(f"no demonstrations in {folder}: {remedy}") from error
+
+
+def _remedy(parent: Path, folder: Path, tasks: Sequence[str], episodes: int) -> str:
+    """Return what to type instead of the dataset `folder`, which does not exist; `parent` holds all datasets."""
+    if folder.parent != parent:
         return "name a folder that holds manifest.json"
     tasks = [folder.name] if stands_for_tasks(folder.name) else tasks
-    name = [] if folder.name == name_of(tasks) else [f"name={folder.name}"]
-    task = [f"task={tasks[0]}" if len(tasks) == 1 else f"task=[{','.join(tasks)}]"] if tasks else []
-    command = ["kerv demos", *name, *task, *([f"episodes={episodes}"] if episodes else [])]
-    stored = sorted(path.parent.name for path in (results_dir(results) / "artifacts/demos").glob("*/manifest.json"))
+    command = ["kerv demos"]
+    if folder.name != name_of(tasks):
+        command.append(f"name={folder.name}")
+    if tasks:
+        command.append(f"task={tasks[0]}" if len(tasks) == 1 else f"task=[{','.join(tasks)}]")
+    if episodes:
+        command.append(f"episodes={episodes}")
+    stored = sorted(path.parent.name for path in parent.glob("*/manifest.json"))
     others = f", or name others: demos={' or demos='.join(stored)}" if stored else ""
     return f"record them with '{' '.join(command)}'{others}"
 
 
-def demos_for(settings: S) -> tuple[S, DemoDataset]:
+def demos_for(settings: S, database: Database) -> tuple[S, DemoDataset]:
     """Open the demonstrations named in the settings, or by default the ones that the target was trained on.
+
+    Args:
+        settings: Settings of the command.
+        database: The database of the results folder.
 
     Returns:
         settings: The settings with `demos` filled in. If `task` is empty, and the demonstrations have tasks that the
@@ -88,10 +101,10 @@ def demos_for(settings: S) -> tuple[S, DemoDataset]:
     target = described(find_target(settings.results, settings.policy.target), "target", TargetDescription)
     name, tasks = settings.demos or target.demos or name_of(()), settings.task
     if settings.demos:
-        dataset = open_demos(settings.results, name, tasks or target.tasks)
+        dataset = open_demos(database, name, tasks or target.tasks)
     else:  # if the dataset is missing, the error message says how to record all tasks of the target
         config = target.provenance.get("demos", {}).get("config", {})
-        dataset = open_demos(settings.results, name, target.tasks, config.get("episodes", 0))
+        dataset = open_demos(database, name, target.tasks, config.get("episodes", 0))
     check_spaces(dataset, target.actions, target.observation, "the target")
     if target.family == "compact" and target.cameras:
         camera = specs()[dataset.manifest.environment].camera_name(target.cameras[0])

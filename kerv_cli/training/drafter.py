@@ -2,95 +2,125 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
-from torch import nn
+import torch
+from torch import Tensor
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import set_up
+from kerv_cli.lab.database import Database
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.drafters import TrainableDrafter
-from kerv_cli.targets.checkpoint import load_target, read_target
-from kerv_cli.targets.folders import check_not_shipped, find_target
+from kerv_cli.targets.checkpoint import TargetDescription, load_target
+from kerv_cli.targets.folders import check_not_shipped
+from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_tasks, demos_for
-from kerv_cli.training.run import TrainingRun, refuse_unused
+from kerv_cli.training.fit import Metrics, batches, fit, without_subnormals
+from kerv_cli.training.making import Begin, figures_of, identity_of, quietly, refuse_other, refuse_unused
 from kerv_cli.training.settings import TrainDrafterSettings
 from kerv_cli.worlds import resolve_tasks
-from kerv_cli.worlds.demos.dataset import OnProgress
 
 OF_TARGETS = ("init", "balance", "closed_loop", "colour", "places")
 """Optimisation settings that only the training of a target reads."""
 
 
-class DrafterRun(TrainingRun):
-    """The training of a drafter, by `kerv train drafter`.
+def train_drafter(settings: TrainDrafterSettings, database: Database, begin: Begin = quietly) -> tuple[Path, Metrics]:
+    """Train a drafter, from the resume file in its folder if there is one.
+
+    The target decodes in the number format `runtime.dtype`. The drafter's own weights are trained in float32.
+
+    Args:
+        settings: Settings of `kerv train drafter`.
+        database: The database of the results folder.
+        begin: Called once all settings are checked.
+
+    Returns:
+        The drafter's folder, and the metrics of the best weights.
 
     Raises:
         UnknownName: The kind of drafter does not exist.
         UsageError: A setting belongs to another kind of drafter, or only to the training of targets.
-        CheckpointError: The target or the demonstrations do not exist, or the folder holds another training.
+        CheckpointError: The target or the demonstrations do not exist or are damaged. Or the folder holds another
+            training.
+        KervError: See `fit`.
     """
+    drafter, train = drafter_of(settings), settings.train
+    artifacts = Artifacts(settings.results, settings.policy)
+    folder = artifacts.new(drafter.kind)
+    check_not_shipped(folder, f"policy.artifacts.{drafter.kind}")
+    settings, dataset = demos_for(settings, database)
+    tasks = resolve_tasks(settings.task) if settings.task else ()
+    if tasks:
+        check_tasks(dataset, tasks)
+        dataset = replace(dataset, episodes=[episode for episode in dataset.episodes if episode.task in tasks])
+    description = artifacts.description
+    description.check_autoregressive(
+        f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
+    )
+    identity = identity_of(train, dataset, **greedy_decodes(settings, description, tasks))
+    refuse_other(folder, identity, drafter.kind, f"policy.artifacts.{drafter.kind}")
+    stage = begin(drafter.kind, folder, plan_of(settings, drafter, artifacts.folder, folder), train.steps)
+    device, dtype = set_up(settings.runtime)
+    with without_subnormals():
+        with stage("the target's greedy decodes") as progress:
+            target: Any = load_target(artifacts.folder, device, dtype)[0]
+            examples, held_out = drafter.examples(target, dataset, settings.drafter, train.held_out, progress)
+        torch.manual_seed(train.seed)
+        network: Any = drafter.network(settings.drafter, target)
+        drafter.prepare(network, examples)
+        network.to(target.device)
+        draw = batches(len(examples), train)
 
-    kind = "drafter"
-    settings: TrainDrafterSettings
+        def loss(step: int) -> tuple[Tensor, Metrics]:
+            return drafter.loss(network, target, examples.where(draw(step)), step, settings)
 
-    def __init__(self, settings: TrainDrafterSettings) -> None:
-        part = find("drafter", settings.drafter.kind, "drafter.kind")
-        if not isinstance(settings.drafter, part.settings):
-            raise UsageError(f"drafter.kind={part.name}: choose drafter={part.name}, each has settings of its own")
-        refuse_unused(settings.train, OF_TARGETS, ": only the training of a target has this setting")
-        self.artifact: TrainableDrafter = part.built()
-        self.artifact_kind = self.artifact.kind
-        self.target_folder = find_target(settings.results, settings.policy.target)
-        self.folder = Artifacts(settings.results, settings.policy).new(self.artifact_kind)
-        check_not_shipped(self.folder, f"policy.artifacts.{self.artifact_kind}")
-        self.settings, self.dataset = demos_for(settings)
-        if self.settings.task:
-            names = resolve_tasks(self.settings.task)
-            check_tasks(self.dataset, names)
-            self.dataset = replace(self.dataset, episodes=[e for e in self.dataset.episodes if e.task in names])
-        self.description = read_target(self.target_folder)
-        self.description.check_autoregressive(
-            f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
-        )
-        self.check_folder(f"policy.artifacts.{self.artifact_kind}")
+        @torch.no_grad()
+        def validate(network: Any) -> Metrics:
+            return drafter.validate(network, target, held_out, settings)
 
-    def plan(self) -> str:
-        """Return one line that `--plan` prints: target, number of observations, number of steps and folder."""
-        drafter, train = asdict(self.settings.drafter), self.settings.train
-        layers = f"{drafter['layers']}-layer " if "layers" in drafter else ""
-        samples = f", greedy decodes of {drafter['samples']} observations" if "samples" in drafter else ""
-        return (
-            f"{self.folder}: {layers}{self.artifact.noun} of {self.target_folder}{samples}, {train.steps} steps of "
-            f"{train.batch}"
-        )
+        def save(network: Any, metrics: Metrics) -> None:
+            figures = figures_of(dataset, network, metrics)
+            provenance = provenance_of("kerv train drafter", settings, device, **figures)
+            shape, made_for = asdict(settings.drafter), MadeFor.of(description)
+            drafter.save(folder, network, made_for, provenance, train.stored, settings=shape)
 
-    def load(self, progress: OnProgress) -> None:
-        """Load the target in the number format `runtime.dtype`, decode demonstrations with it, and make the drafter.
+        with stage("training the drafter") as progress:
+            return folder, fit(network, loss, validate, save, train, folder, identity, progress)
 
-        The drafter's own weights are trained in float32.
 
-        Raises:
-            CheckpointError: The target or the demonstrations are damaged.
-            UsageError: The device does not exist.
-        """
-        self.device, dtype = set_up(self.settings.runtime)
-        target: Any = load_target(self.target_folder, self.device, dtype)[0]
-        self.objective = self.artifact.objective(target, self.dataset, self.settings, progress)
+def drafter_of(settings: TrainDrafterSettings) -> TrainableDrafter:
+    """Return the kind of drafter to train.
 
-    def identity(self) -> dict[str, Any]:
-        """Return the drafter's settings, the hash of the target's weights, the tasks, and the number format.
+    Raises:
+        UnknownName: The kind does not exist.
+        UsageError: A setting belongs to another kind of drafter, or only to the training of targets.
+    """
+    part = find("drafter", settings.drafter.kind, "drafter.kind")
+    if not isinstance(settings.drafter, part.settings):
+        raise UsageError(f"drafter.kind={part.name}: choose drafter={part.name}, each has settings of its own")
+    refuse_unused(settings.train, OF_TARGETS, ": only the training of a target has this setting")
+    drafter: TrainableDrafter = part.built()
+    return drafter
 
-        float32 is left out, so that trainings from before it counted can be resumed.
-        """
-        task, dtype = self.settings.task, self.settings.runtime.dtype
-        tasks = list(resolve_tasks(task)) if task else []
-        shared = {"drafter": asdict(self.settings.drafter), "target": self.description.sha256, "task": tasks}
-        return shared if dtype == "float32" else {**shared, "dtype": dtype}
 
-    def write(self, module: nn.Module, provenance: dict[str, Any]) -> None:
-        """Write the weights and their description into the drafter's folder."""
-        made_for, stored = MadeFor.of(self.description), self.settings.train.stored
-        self.artifact.save(self.folder, module, made_for, provenance, stored, settings=asdict(self.settings.drafter))
+def greedy_decodes(settings: TrainDrafterSettings, target: TargetDescription, tasks: Sequence[str]) -> dict[str, Any]:
+    """Return what determines the weights beside the demonstrations and the optimisation.
+
+    The number format float32 is left out, so that trainings from before it counted can be resumed.
+    """
+    own = {"drafter": asdict(settings.drafter), "target": target.sha256, "task": list(tasks)}
+    dtype = settings.runtime.dtype
+    return own if dtype == "float32" else {**own, "dtype": dtype}
+
+
+def plan_of(settings: TrainDrafterSettings, drafter: TrainableDrafter, target: Path, folder: Path) -> str:
+    """Return one line that `--plan` prints: target, number of observations, number of steps and folder."""
+    shape, train = asdict(settings.drafter), settings.train
+    layers = f"{shape['layers']}-layer " if "layers" in shape else ""
+    samples = f", greedy decodes of {shape['samples']} observations" if "samples" in shape else ""
+    return f"{folder}: {layers}{drafter.noun} of {target}{samples}, {train.steps} steps of {train.batch}"

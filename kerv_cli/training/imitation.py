@@ -29,7 +29,7 @@ from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.losses import position_loss, soft_labels, token_loss
 from kerv_cli.targets.observations import Observations, read_chunks, read_observations, split
-from kerv_cli.training.loop import Metrics
+from kerv_cli.training.fit import Metrics
 from kerv_cli.training.settings import TrainSettings
 from kerv_cli.worlds import specs
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
@@ -165,7 +165,7 @@ def lit(images: Tensor, indices: Tensor, step: int, spread: float) -> Tensor:
 
 
 class Imitation:
-    """The objective of a target's training: its samples, its loss and its validation.
+    """A target's samples, its loss and its validation.
 
     Args:
         target: The network to train, already on its device.
@@ -188,12 +188,9 @@ class Imitation:
         self.weights = task_weights(self.training.tasks, settings.balance)
         self.learns_places = bool(target.cameras and settings.scene_weight)
 
-    def __len__(self) -> int:
-        return len(self.training)
-
-    def tokens(self, samples: Samples, indices: Tensor) -> Tensor:
-        """Return the action tokens (B, N) int64 of the samples `indices` (B,), on the target's device."""
-        encoded = self.module.actions.encode(samples.chunks[indices].numpy())
+    def tokens(self, batch: Samples) -> Tensor:
+        """Return the action tokens (B, N) int64 of B samples, on the target's device."""
+        encoded = self.module.actions.encode(batch.chunks.numpy())
         return torch.from_numpy(encoded).flatten(1).to(self.device)
 
     @contextlib.contextmanager
@@ -222,15 +219,16 @@ class Imitation:
             indices: (B,) indices of the samples.
             step: The optimisation step.
         """
-        inputs = self.training.inputs(indices, self.device)
+        batch = self.training.where(indices)
+        inputs = batch.inputs(self.device)
         if self.settings.colour and inputs.images is not None:
             inputs = replace(inputs, images=lit(inputs.images, indices, step, self.settings.colour))
         with self.precision():
-            places = self.training.places[indices].to(self.device)
+            places = batch.places.to(self.device)
             if self.learns_places and step < self.settings.scene_steps:
                 loss = position_loss(self.module.encode_batch(inputs)[1], places)
                 return loss, {"position_loss": float(loss.detach())}
-            tokens = self.tokens(self.training, indices)
+            tokens = self.tokens(batch)
             logits, positions = self.module.teacher_forced(inputs, tokens)
             loss = token_loss(logits, tokens, self.labels)
             metrics = {"token_loss": float(loss.detach())}
@@ -252,14 +250,14 @@ class Imitation:
         distances, gaps, offsets = [], [], []
         actions = module.actions
         for indices in chosen.split(256):
-            inputs = self.held_out.inputs(indices, self.device)
-            tokens = self.tokens(self.held_out, indices)
-            logits, positions = module.teacher_forced(inputs, tokens)
+            batch = self.held_out.where(indices)
+            tokens = self.tokens(batch)
+            logits, positions = module.teacher_forced(batch.inputs(self.device), tokens)
             guess = logits.argmax(-1)
             distances.append((guess - tokens).abs().flatten())
             gap = np.abs(actions.values_of(guess.cpu().numpy()) - actions.values_of(tokens.cpu().numpy()))
             gaps.append(gap.reshape(-1, actions.dofs))
-            offsets.append((positions - self.held_out.places[indices].to(self.device)).norm(dim=-1))
+            offsets.append((positions - batch.places.to(self.device)).norm(dim=-1))
         distance, error = torch.cat(distances), np.concatenate(gaps).mean(0)
         metrics = {
             "score": -float(error.mean()),

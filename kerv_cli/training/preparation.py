@@ -12,7 +12,7 @@ from kerv_cli.base.registry import find, parts
 from kerv_cli.catalogue.entries import state_of
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings
-from kerv_cli.lab.database import opened
+from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import command_to_go_on
 from kerv_cli.methods.artifacts import Artifacts, kind_of, removal
 from kerv_cli.methods.compose import Method
@@ -42,8 +42,12 @@ class Step:
     steps: int = 0
 
 
-def plan(settings: PrepareSettings) -> list[Step]:
+def plan(settings: PrepareSettings, database: Database) -> list[Step]:
     """Return all steps in order, including finished ones. No weights are loaded and nothing is made.
+
+    Args:
+        settings: Settings of `kerv prepare`.
+        database: The database of the results folder.
 
     Raises:
         UsageError: The target or a method does not exist, or the target does not decode autoregressively and so needs
@@ -64,9 +68,9 @@ def plan(settings: PrepareSettings) -> list[Step]:
             if settings.steps:
                 command = (*command, f"train.steps={settings.steps}")
             number = compose("train_drafter", command[2:], TrainDrafterSettings).train.steps
-        steps.append(Step(kind, _state(artifacts, kind, kinds), command, number))
+        steps.append(Step(kind, _state(artifacts, database, kind, kinds), command, number))
     if any(step.state != THERE and not find("artifact", step.kind).traits.get("study") for step in steps):
-        demos_for(settings)
+        demos_for(settings, database)
     return steps
 
 
@@ -96,23 +100,26 @@ def needs(methods: tuple[str, ...], sees: bool, runnable: bool = True) -> tuple[
             raise UsageError(f"for={name}: it needs a target that sees, this one reads the state")
         kinds |= set(method.needs)
     studies = {kind: part.traits["study"] for kind, part in artifacts.items() if "study" in part.traits}
-    for study in [studies[kind] for kind in kinds & set(studies)] if sees and runnable else ():
-        kinds |= {
-            kind for settings in resolve([f"study={study}"]).settings.values() for kind in Method.of(settings).needs
-        }
+    if sees and runnable:
+        for kind in kinds & set(studies):
+            for settings in resolve([f"study={studies[kind]}"]).settings.values():
+                kinds |= set(Method.of(settings).needs)
     if not sees:
         kinds -= seeing
     if not runnable:
         kinds -= set(studies)
-    order = dict.fromkeys(kind for name, part in artifacts.items() for kind in (*part.needs(None), name))
-    return tuple(kind for kind in order if kind in kinds and kind_of(kind).command)
+    order: list[str] = []
+    for name, part in artifacts.items():
+        order += [*part.needs(None), name]
+    return tuple(kind for kind in dict.fromkeys(order) if kind in kinds and kind_of(kind).command)
 
 
-def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
+def _state(artifacts: Artifacts, database: Database, kind: str, kinds: Sequence[str]) -> str:
     """Return the state of an artifact: `there`, `missing`, `unfinished`, `of other artifacts` or `step 300 of 4000`.
 
     Args:
         artifacts: The artifacts of the policy.
+        database: The database of the results folder.
         kind: Kind of the artifact.
         kinds: All kinds that the methods need, in the order in which they are made.
 
@@ -133,6 +140,6 @@ def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
     if not files.is_complete(described, kinds):
         return MISSING
     state = state_of(path, kind) if isinstance(files, TrainableDrafter) else THERE
-    if state == "complete" and command_to_go_on(opened(artifacts.results), kind, path):
+    if state == "complete" and command_to_go_on(database, kind, path):
         return "unfinished"  # e.g. the disk was full before the last files were written
     return THERE if state == "complete" else state

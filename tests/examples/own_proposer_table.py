@@ -18,7 +18,7 @@ from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.drafters import Metrics, TrainableDrafter, Training
+from kerv_cli.methods.drafters import Metrics, TrainableDrafter
 from kerv_cli.targets.observations import Rows, split
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
@@ -99,12 +99,11 @@ class FollowDrafter(TrainableDrafter):
             progress(index + 1, count)
         return split(Pairs.joined(pairs), held_out)
 
-    def loss(self, training: Training, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        logits = training.module(training.examples.before[indices])
-        return F.cross_entropy(logits.flatten(0, 1), training.examples.after[indices].flatten()), {}
+    def loss(self, network: FollowTable, target: Any, batch: Pairs, step: int, settings: Any) -> tuple[Tensor, Metrics]:
+        return F.cross_entropy(network(batch.before).flatten(0, 1), batch.after.flatten()), {}
 
-    def validate(self, training: Training, module: FollowTable) -> Metrics:
-        right = module(training.held_out.before).argmax(-1) == training.held_out.after
+    def validate(self, network: FollowTable, target: Any, held_out: Pairs, settings: Any) -> Metrics:
+        right = network(held_out.before).argmax(-1) == held_out.after
         return {"score": float(right.float().mean())}
 
     @classmethod

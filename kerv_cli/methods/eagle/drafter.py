@@ -35,7 +35,7 @@ from kerv_cli.engine.transfer import upload
 from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.drafters import Decodes, DrafterDescription, Metrics, TrainableDrafter, Training
+from kerv_cli.methods.drafters import Decodes, DrafterDescription, Metrics, TrainableDrafter
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.public import Convention, PublicDrafter, PublicShape, load_public, read_public
 from kerv_cli.methods.spec_vla import RelaxedRule
@@ -316,81 +316,78 @@ class EagleDrafter(TrainableDrafter):
         tokens, prompts, hidden = map(torch.cat, zip(*kept, strict=True))
         return EagleExamples(tokens, **columns, lengths=torch.tensor(lengths), prompt=prompts, hidden=hidden)
 
-    def loss(self, training: Training, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Return the mean loss over the drafter's passes (see `unrolled`), and the token loss of each pass to log.
-
-        Args:
-            training: The training.
-            indices: (B,) indices of the training examples.
-            step: Not used.
-        """
+    def loss(
+        self, network: EagleNetwork, target: Any, batch: EagleExamples, step: int, settings: Any
+    ) -> tuple[Tensor, Metrics]:
+        """Return the mean loss over the drafter's passes (see `unrolled`), and the token loss of each pass to log."""
         losses: list[Tensor] = []
         metrics: Metrics = {}
-        lengths = training.examples.lengths[indices]
-        for length in lengths.unique().tolist():
-            rows = indices[lengths == length]
-            loss, measured = self.unrolled(training, rows, length)
-            losses.append(loss * len(rows) / len(indices))
+        for length in batch.lengths.unique().tolist():
+            rows = batch.where(batch.lengths == length)
+            loss, measured = self.unrolled(network, target, rows, length, settings.drafter)
+            losses.append(loss * len(rows) / len(batch))
             metrics |= measured
         return torch.stack(losses).sum(), metrics
 
-    def unrolled(self, training: Training, rows: Tensor, length: int) -> tuple[Tensor, Metrics]:
-        """Return the loss and the metrics to log, for examples with prompts of one length.
+    def unrolled(
+        self, network: EagleNetwork, target: Any, rows: EagleExamples, length: int, settings: DrafterSettings
+    ) -> tuple[Tensor, Metrics]:
+        """Return the loss and the metrics to log, for B examples with prompts of one length.
 
         The first pass reads the target's hidden states. Each later pass reads the drafter's own predictions of the pass
         before, as in drafting.
 
         Args:
-            training: The training.
-            rows: (B,) indices of the training examples.
+            network: The drafter.
+            target: The target.
+            rows: The B training examples.
             length: Number of prompt tokens of each of these examples.
+            settings: Settings of the drafter.
         """
-        settings, device, examples = training.settings.drafter, training.target.device, training.examples
-        tokens = examples.tokens[rows].to(device)
-        prompt = examples.prompt[rows, :length].to(device).float()
-        hidden = examples.hidden[rows, : length + tokens.shape[1] - 1].to(device).float()
-        following = torch.cat([prompt[:, 1:], training.target.embed(tokens[:, :-1])], 1)
+        device = target.device
+        tokens = rows.tokens.to(device)
+        prompt = rows.prompt[:, :length].to(device).float()
+        hidden = rows.hidden[:, : length + tokens.shape[1] - 1].to(device).float()
+        following = torch.cat([prompt[:, 1:], target.embed(tokens[:, :-1])], 1)
         positions = torch.arange(hidden.shape[1] - 1, device=device)
         total, metrics = hidden.new_zeros(()), {}
         inputs = hidden[:, :-1]
         for number in range(settings.unroll):
-            predicted = training.module(following, inputs, positions)
-            state_loss, token_loss = self.compare(training, predicted[:, length - 1 :], hidden[:, length:])
+            predicted = network(following, inputs, positions)
+            state_loss, token_loss = compared(target, predicted[:, length - 1 :], hidden[:, length:])
             total = total + settings.state_weight * state_loss + settings.token_weight * token_loss
             metrics[f"token_loss_{number}"] = float(token_loss.detach())
             # after the first drafted position the next pass reads its own predictions, as in drafting
             inputs = torch.cat([inputs[:, :length], predicted[:, length - 1 : -1]], 1)
         return total / settings.unroll, metrics
 
-    def compare(self, training: Training, predicted: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Compare predicted hidden states with the target's, at the chunk's tokens 1 to N − 1.
-
-        Args:
-            training: The training.
-            predicted: (B, N − 1, E) states that the drafter predicts.
-            hidden: (B, N − 1, E) the target's states.
-
-        Returns:
-            The smooth L1 loss of the states, and the cross-entropy of the drafter's token distribution with the
-            target's.
-        """
-        target = training.target
-        teacher, logits = (target.head(states.to(target.dtype)).float() for states in (hidden, predicted))
-        cross_entropy = -(teacher.softmax(-1) * F.log_softmax(logits, -1)).sum(-1).mean()
-        return F.smooth_l1_loss(predicted, hidden), cross_entropy
-
-    def validate(self, training: Training, module: EagleNetwork) -> Metrics:
+    def validate(self, network: EagleNetwork, target: Any, held_out: EagleExamples, settings: Any) -> Metrics:
         """Decode held-out observations. Return the acceptance lengths with strict and relaxed (r = 9) acceptance.
 
         The acceptance length is the number of tokens committed per verification. The score is the sum of both lengths.
         The network drafts in the target's number format, as it will when it is loaded.
         """
-        target, held_out = training.target, training.held_out
         chosen = torch.linspace(0, len(held_out) - 1, min(VALIDATED, len(held_out))).long().tolist()
         prompts = [held_out.prompt[i, : held_out.lengths[i]][None].to(target.device, target.dtype) for i in chosen]
-        network = copy.deepcopy(module).to(target.dtype)
-        strict, relaxed = (acceptance_length(target, network, prompts, r) for r in (0, 9))
+        loaded = copy.deepcopy(network).to(target.dtype)
+        strict, relaxed = (acceptance_length(target, loaded, prompts, r) for r in (0, 9))
         return {"score": relaxed + strict, "acceptance_length_strict": strict, "acceptance_length_r9": relaxed}
+
+
+def compared(target: ReadableTarget, predicted: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+    """Compare predicted hidden states with the target's, at the chunk's tokens 1 to N − 1.
+
+    Args:
+        target: The target.
+        predicted: (B, N − 1, E) states that the drafter predicts.
+        hidden: (B, N − 1, E) the target's states.
+
+    Returns:
+        The smooth L1 loss of the states, and the cross-entropy of the drafter's token distribution with the target's.
+    """
+    teacher, logits = (target.head(states.to(target.dtype)).float() for states in (hidden, predicted))
+    cross_entropy = -(teacher.softmax(-1) * F.log_softmax(logits, -1)).sum(-1).mean()
+    return F.smooth_l1_loss(predicted, hidden), cross_entropy
 
 
 def acceptance_length(target: Target, network: EagleNetwork, prompts: list[Tensor], r: int) -> float:

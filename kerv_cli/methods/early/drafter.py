@@ -26,7 +26,7 @@ from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.engine.transfer import read
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.drafters import Decodes, Metrics, TrainableDrafter, Training
+from kerv_cli.methods.drafters import Decodes, Metrics, TrainableDrafter
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.targets.compact.packable import FORMATS, Packable
 from kerv_cli.targets.compact.program import Program
@@ -256,41 +256,40 @@ class EarlyDrafter(TrainableDrafter):
         """Set the mean and the scale by which the network standardises its inputs, from the training examples."""
         network.standardise(examples.features)
 
-    def outputs(self, training: Training, module: Any, examples: Any, indices: Tensor) -> tuple[Tensor, ...]:
-        """Run the network on the examples `indices` (B,). The first output is the logits (B, N, V)."""
-        return (module(examples.features[indices].to(training.target.device).float()),)
+    def outputs(self, network: Any, target: Any, batch: Any) -> tuple[Tensor, ...]:
+        """Run the network on a batch of B examples. The first output is the logits (B, N, V)."""
+        return (network(batch.features.to(target.device).float()),)
 
-    def token_loss(self, training: Training, logits: Tensor, indices: Tensor) -> Tensor:
+    def token_loss(self, logits: Tensor, target: Any, batch: Decodes, settings: Any) -> Tensor:
         """Return the cross-entropy of logits with soft labels: the target's tokens and, less, their neighbouring bins.
 
         Args:
-            training: The running training, with its examples and settings.
             logits: (B, N, V).
-            indices: (B,) indices of the training examples.
+            target: The target.
+            batch: The B training examples.
+            settings: Settings of `kerv train drafter`.
         """
-        device = training.target.device
-        labels = _labels(training.target.actions.tokens, training.settings.train.label_sigma, device)
-        return token_loss(logits, training.examples.tokens[indices].to(device), labels)
+        labels = _labels(target.actions.tokens, settings.train.label_sigma, target.device)
+        return token_loss(logits, batch.tokens.to(target.device), labels)
 
-    def loss(self, training: Training, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Return the token loss of the training examples `indices` (B,), and metrics to log."""
-        logits = self.outputs(training, training.module, training.examples, indices)[0]
-        loss = self.token_loss(training, logits, indices)
+    def loss(self, network: Any, target: Any, batch: Any, step: int, settings: Any) -> tuple[Tensor, Metrics]:
+        """Return the token loss of a batch, and metrics to log."""
+        loss = self.token_loss(self.outputs(network, target, batch)[0], target, batch, settings)
         return loss, {"token_loss": float(loss.detach())}
 
-    def validate(self, training: Training, module: Any) -> Metrics:
+    def validate(self, network: Any, target: Any, held_out: Any, settings: Any) -> Metrics:
         """Return metrics that compare drafts of held-out observations with the target's tokens.
 
         All plain episodes together weigh as much as all perturbed episodes (executed with noise) together.
         """
-        held_out, actions = training.held_out, training.target.actions
-        batches = (self.outputs(training, module, held_out, i) for i in torch.arange(len(held_out)).split(256))
-        logits, *rest = (torch.cat(parts).cpu() for parts in zip(*batches, strict=True))
-        metrics = measure(logits, held_out, torch.from_numpy(actions.strict_tokens(logits.shape[1])))
+        chosen = torch.arange(len(held_out)).split(256)
+        outputs = [self.outputs(network, target, held_out.where(indices)) for indices in chosen]
+        logits, *rest = (torch.cat(parts).cpu() for parts in zip(*outputs, strict=True))
+        metrics = measure(logits, held_out, torch.from_numpy(target.actions.strict_tokens(logits.shape[1])))
         score = metrics["accepted_r9"] + metrics["accepted_strict"]
-        return {"score": score, **metrics, **self.further_metrics(training, *rest)}
+        return {"score": score, **metrics, **self.further_metrics(target, held_out, *rest)}
 
-    def further_metrics(self, training: Training, *outputs: Tensor) -> Metrics:
+    def further_metrics(self, target: Any, held_out: Any, *outputs: Tensor) -> Metrics:
         """Return metrics of the network's outputs other than the logits. The early drafter has no such outputs."""
         return {}
 

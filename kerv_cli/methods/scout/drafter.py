@@ -23,7 +23,7 @@ from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.drafters import Decodes, Metrics, Training
+from kerv_cli.methods.drafters import Decodes, Metrics
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyNetwork, EarlyProposer
 from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.targets.compact.features import hand_features, mlp, scene_features, scene_width
@@ -208,7 +208,7 @@ class ScoutDrafter(EarlyDrafter):
         rows = read_observations(episode, settings, space, target.words, chosen)
         tokens, places = [], []
         for indices in torch.arange(len(rows)).split(BATCH):
-            prompt, located = target.encode_batch(rows.inputs(indices, target.device))
+            prompt, located = target.encode_batch(rows.where(indices).inputs(target.device))
             tokens.append(greedy(target, prompt)[0].cpu())
             places.append(located.float().cpu())
         return ScoutExamples(**(vars(rows) | columns), tokens=torch.cat(tokens), places=torch.cat(places))
@@ -216,31 +216,29 @@ class ScoutDrafter(EarlyDrafter):
     def prepare(self, network: Any, examples: Any) -> None:
         """Do nothing. The features cannot be standardised, because they change while the vision encoder is trained."""
 
-    def outputs(self, training: Training, module: Any, examples: Any, indices: Tensor) -> tuple[Tensor, ...]:
-        """Run the network on the examples `indices` (B,). Return logits (B, N, V) and positions (B, K, 3)."""
-        return module(examples.inputs(indices, training.target.device))
+    def outputs(self, network: Any, target: Any, batch: Any) -> tuple[Tensor, ...]:
+        """Run the network on a batch of B examples. Return logits (B, N, V) and positions (B, K, 3)."""
+        return network(batch.inputs(target.device))
 
-    def loss(self, training: Training, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Return the loss of the examples `indices` (B,), and metrics to log.
+    def loss(self, network: Any, target: Any, batch: Any, step: int, settings: Any) -> tuple[Tensor, Metrics]:
+        """Return the loss of a batch, and metrics to log.
 
         The loss is the token loss plus the weighted position loss. In the first `train.scene_steps` steps it is the
         position loss alone.
         """
-        train, device = training.settings.train, training.target.device
-        labels = training.examples.places[indices].to(device)
+        train, labels = settings.train, batch.places.to(target.device)
         if step < train.scene_steps:
-            given = training.module.views(training.examples.inputs(indices, device))
-            loss = position_loss(training.module.see(*given)[1], labels)
+            loss = position_loss(network.see(*network.views(batch.inputs(target.device)))[1], labels)
             return loss, {"position_loss": float(loss.detach())}
-        logits, places = self.outputs(training, training.module, training.examples, indices)
-        token, position = self.token_loss(training, logits, indices), position_loss(places, labels)
+        logits, places = self.outputs(network, target, batch)
+        token, position = self.token_loss(logits, target, batch, settings), position_loss(places, labels)
         metrics = {"token_loss": float(token.detach()), "position_loss": float(position.detach())}
         return token + train.scene_weight * position, metrics
 
-    def further_metrics(self, training: Training, *outputs: Tensor) -> Metrics:
+    def further_metrics(self, target: Any, held_out: Any, *outputs: Tensor) -> Metrics:
         """Return the median error of each estimated position, in centimetres."""
-        error = (outputs[0] - training.held_out.places).norm(dim=-1).median(0).values
-        names = [place.name.replace(" ", "_") for place in training.target.observation.places]
+        error = (outputs[0] - held_out.places).norm(dim=-1).median(0).values
+        names = [place.name.replace(" ", "_") for place in target.observation.places]
         return {f"{name}_error_cm": 100 * float(e) for name, e in zip(names, error, strict=True)}
 
 

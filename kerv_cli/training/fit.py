@@ -1,4 +1,4 @@
-"""The optimisation loop of targets and drafters: schedule, averaged weights, validation, exact resume.
+"""The optimisation of targets and drafters: schedule, averaged weights, validation, exact resume.
 
 A resumed run writes the same bytes as an uninterrupted run, on the same machine with the same number of threads. For
 this, the batch of step s depends only on the seed and s. The resume file holds the weights, their average, the
@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -30,6 +30,15 @@ from kerv_cli.targets.folders import RESUME
 from kerv_cli.training.settings import TrainSettings
 
 Metrics = dict[str, float]
+Loss = Callable[[int], tuple[Tensor, Metrics]]
+"""Takes an optimisation step. Returns the loss (a scalar) of that step's batch, and metrics to log."""
+Validate = Callable[[Any], Metrics]
+"""Takes the network. Returns metrics on held-out samples. The best weights are those with the highest `score`."""
+Save = Callable[[Any, Metrics], None]
+"""Takes the network and the metrics of its validation, and writes its weights."""
+Progress = Callable[[int, int, str], None]
+"""Takes the numbers of steps done and of all, and the latest metrics as text."""
+
 _UNREADABLE = (OSError, EOFError, RuntimeError, KeyError, TypeError, ValueError, pickle.PickleError, zipfile.BadZipFile)
 SAME_REQUEST = 2.0
 """A second signal within this many seconds counts as the same request.
@@ -38,91 +47,82 @@ A scheduler may pass on a Ctrl-C that the process has received already.
 """
 
 
-class Objective(Protocol):
-    """What a training optimises: a network, its training samples and its loss.
-
-    An optional attribute `weights` (n,) float64 makes sample i as likely to be drawn as `weights[i]`. Without it all
-    samples are equally likely.
-    """
-
-    @property
-    def module(self) -> nn.Module:
-        """The network to train, on its device."""
-
-    def __len__(self) -> int:
-        """Return the number of training samples."""
-
-    def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Return the loss (a scalar) of the samples `indices` (B,) at optimisation step `step`, and metrics to log."""
-
-    def validate(self, module: nn.Module) -> Metrics:
-        """Return metrics of a network on held-out samples. The best weights are those with the highest `score`."""
-
-
-class Loop:
-    """Trains a network: draws batches, updates the weights, validates, and saves the best weights.
+def fit(
+    network: nn.Module,
+    loss: Loss,
+    validate: Validate,
+    save: Save,
+    settings: TrainSettings,
+    folder: Path,
+    identity: str,
+    progress: Progress = lambda done, total, text: None,
+) -> Metrics:
+    """Train a network to `settings.steps`, from the folder's resume file if there is one.
 
     Args:
-        objective: The network, its training samples and its loss.
-        save: Called with the module and its metrics after each validation whose score is the best so far.
+        network: The network, on its device.
+        loss: The loss of a step.
+        validate: The metrics of the averaged weights. It is called every `settings.validate_every` steps.
+        save: Called after each validation whose score is the best so far.
         settings: Optimisation settings.
         folder: Folder for the resume file and `log.csv`.
         identity: Hash of everything that determines the training. It goes into the resume file.
+        progress: Called after each step and after each validation.
+
+    Returns:
+        The metrics of the best weights.
+
+    Raises:
+        CheckpointError: The resume file is damaged. Or it has reached `settings.steps` without a validation.
+        KervError: The training diverged.
+        StorageError: The disk cannot be written.
+        Interrupted: The process got Ctrl-C or SIGTERM. The current step was finished and the state is saved.
+    """
+    network.train()
+    state = State(network, settings, folder, identity)
+    state.restore()
+    with until_interrupted() as stop:
+        while state.step < settings.steps:
+            metrics = state.update(loss)
+            progress(state.step, settings.steps, text_of(metrics))
+            if state.step % settings.validate_every == 0 or state.step == settings.steps:
+                state.validate(validate, save, metrics["loss"])
+                progress(state.step, settings.steps, text_of(state.history[-1]))
+            if stop.is_set() and state.step < settings.steps:
+                state.store()
+                raise Interrupted(f"interrupted: step {state.step} is saved. The same command resumes from there")
+    if not state.history:
+        raise CheckpointError(
+            f"{folder} was interrupted at step {state.step}, before its first validation: set train.steps above that"
+        )
+    return max(state.history, key=lambda metrics: metrics["score"])
+
+
+class State:
+    """All that changes during a training: weights, their average, optimiser, step and metrics.
+
+    Args:
+        network: The network to train.
+        settings: Optimisation settings.
+        folder: Folder for the resume file and `log.csv`.
+        identity: Hash of everything that determines the training.
     """
 
-    def __init__(
-        self,
-        objective: Objective,
-        save: Callable[[nn.Module, Metrics], None],
-        settings: TrainSettings,
-        folder: Path,
-        identity: str,
-    ) -> None:
-        self.objective, self.module, self.save, self.settings = objective, objective.module, save, settings
-        self.folder, self.identity = folder, identity
+    def __init__(self, network: nn.Module, settings: TrainSettings, folder: Path, identity: str) -> None:
+        self.network, self.settings, self.folder, self.identity = network, settings, folder, identity
         self.step = 0
         self.history: list[Metrics] = []
-        matrices = [p for p in self.module.parameters() if p.dim() >= 2]
-        vectors = [p for p in self.module.parameters() if p.dim() < 2]
+        matrices = [parameter for parameter in network.parameters() if parameter.dim() >= 2]
+        vectors = [parameter for parameter in network.parameters() if parameter.dim() < 2]
         groups = [{"params": matrices, "weight_decay": settings.weight_decay}, {"params": vectors, "weight_decay": 0.0}]
         self.optimiser = torch.optim.AdamW(groups, lr=settings.lr, betas=(0.9, 0.95), fused=True)
-        self.ema = {k: v.detach().clone() for k, v in self.module.state_dict().items()}
-        weights: Tensor | None = getattr(objective, "weights", None)
-        self.cumulative = None if weights is None else weights.cumsum(0)
+        self.average = self.copied()
 
-    def run(self, on_step: Callable[[int, Metrics], None] = lambda step, metrics: None) -> Metrics:
-        """Train to `settings.steps`, from the resume file if there is one, and return the metrics of the best weights.
+    def copied(self) -> dict[str, Tensor]:
+        """Return a copy of the network's present weights, by name."""
+        return {name: value.detach().clone() for name, value in self.network.state_dict().items()}
 
-        Args:
-            on_step: Called after each step and after each validation, with the number of steps done and the metrics.
-
-        Raises:
-            CheckpointError: The resume file is damaged. Or it has reached `settings.steps` without a validation.
-            KervError: The training diverged.
-            StorageError: The disk cannot be written.
-            Interrupted: The process got Ctrl-C or SIGTERM. The current step was finished and the state is saved.
-        """
-        self.restore()
-        settings = self.settings
-        with until_interrupted() as stop:
-            while self.step < settings.steps:
-                metrics = self.update()
-                self.step += 1
-                on_step(self.step, metrics)
-                if self.step % settings.validate_every == 0 or self.step == settings.steps:
-                    self.validate(metrics["loss"])
-                    on_step(self.step, self.history[-1])
-                if stop.is_set() and self.step < settings.steps:
-                    self.store()
-                    raise Interrupted(f"interrupted: step {self.step} is saved. The same command resumes from there")
-        if not self.history:
-            raise CheckpointError(
-                f"{self.folder} was interrupted at step {self.step}, before its first validation: set train.steps "
-                "above that"
-            )
-        return max(self.history, key=lambda metrics: metrics["score"])
-
-    def update(self) -> Metrics:
+    def update(self, loss: Loss) -> Metrics:
         """Do one optimiser step on one batch, and return its loss and the other metrics to log.
 
         Raises:
@@ -131,45 +131,42 @@ class Loop:
         settings = self.settings
         for group in self.optimiser.param_groups:
             group["lr"] = settings.lr * schedule(self.step, settings)
-        generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + self.step)
-        indices = draw_samples(len(self.objective), settings.batch, generator, self.cumulative)
-        loss, metrics = self.objective.loss(indices, self.step)
+        scalar, metrics = loss(self.step)
         self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        value = loss.item()
-        if not math.isfinite(value):
-            raise KervError(f"training diverged at step {self.step} (loss {value}): lower train.lr")
-        nn.utils.clip_grad_norm_(self.module.parameters(), settings.clip)
+        scalar.backward()
+        metrics = {"loss": scalar.item(), **metrics}
+        check_finite({"loss": metrics["loss"]}, self.step)
+        nn.utils.clip_grad_norm_(self.network.parameters(), settings.clip)
         self.optimiser.step()
         decay = min(settings.ema, (1 + self.step) / (10 + self.step))
-        live = self.module.state_dict()
+        live = self.network.state_dict()
         with torch.no_grad():
-            torch._foreach_lerp_([self.ema[k] for k in live], list(live.values()), 1 - decay)
-        return {"loss": value, **metrics}
+            torch._foreach_lerp_([self.average[name] for name in live], list(live.values()), 1 - decay)
+        self.step += 1
+        return metrics
 
-    def validate(self, training_loss: float) -> None:
+    def validate(self, validate: Validate, save: Save, training_loss: float) -> None:
         """Validate the averaged weights, save them if their score is the best so far, and write the resume file.
 
         Args:
+            validate: See `fit`.
+            save: See `fit`.
             training_loss: Loss of the last step, to log beside the metrics.
 
         Raises:
             KervError: A metric is not finite.
             StorageError: The disk cannot be written.
         """
-        module = self.module
-        live = {k: v.detach().clone() for k, v in module.state_dict().items()}
-        module.load_state_dict(self.ema)
-        module.eval()
-        metrics = {"step": float(self.step), "train_loss": training_loss, **self.objective.validate(module)}
-        for name, value in metrics.items():
-            if not math.isfinite(value):
-                raise KervError(f"training diverged: {name} is {value} at step {self.step}: lower train.lr")
+        live = self.copied()
+        self.network.load_state_dict(self.average)
+        self.network.eval()
+        metrics = {"step": float(self.step), "train_loss": training_loss, **validate(self.network)}
+        check_finite(metrics, self.step)
         self.history.append(metrics)
         if metrics["score"] >= max(one["score"] for one in self.history):
-            self.save(module, metrics)
-        module.load_state_dict(live)
-        module.train()
+            save(self.network, metrics)
+        self.network.load_state_dict(live)
+        self.network.train()
         self.store()
 
     def store(self) -> None:
@@ -178,8 +175,8 @@ class Loop:
             "identity": self.identity,
             "step": self.step,
             "history": self.history,
-            "model": self.module.state_dict(),
-            "ema": self.ema,
+            "model": self.network.state_dict(),
+            "ema": self.average,
             "optimiser": self.optimiser.state_dict(),
         }
         buffer = io.BytesIO()
@@ -196,7 +193,7 @@ class Loop:
             write_if_changed(self.folder / "log.csv", table.encode())
 
     def restore(self) -> None:
-        """Load weights, optimiser and progress from the folder's resume file. Without a file, change nothing.
+        """Load weights, optimiser and progress from the folder's resume file, if there is one, and say so.
 
         Raises:
             CheckpointError: The resume file is damaged.
@@ -205,12 +202,51 @@ class Loop:
         if not path.is_file():
             return
         state = read_state(path)
-        self.module.load_state_dict(state["model"])
+        self.network.load_state_dict(state["model"])
         self.optimiser.load_state_dict(state["optimiser"])
-        for name, average in self.ema.items():
+        for name, average in self.average.items():
             average.copy_(state["ema"][name])
         self.step, self.history = state["step"], state["history"]
         self.log()  # the process may have ended before it wrote the log
+        if self.step < self.settings.steps:
+            print(f"resuming at step {self.step}", file=sys.stderr)
+
+
+def text_of(metrics: Metrics) -> str:
+    """Return the first metrics as text for a progress bar."""
+    first = list(metrics.items())[:6]
+    return " ".join(f"{name} {value:.4g}" for name, value in first if name != "step")
+
+
+def check_finite(metrics: Metrics, step: int) -> None:
+    """Check that a training has not diverged.
+
+    Raises:
+        KervError: A metric is not finite.
+    """
+    for name, value in metrics.items():
+        if not math.isfinite(value):
+            raise KervError(f"training diverged: {name} is {value} at step {step}: lower train.lr")
+
+
+def batches(count: int, settings: TrainSettings, weights: Tensor | None = None) -> Callable[[int], Tensor]:
+    """Return a function that draws the samples of a step's batch, which depend only on `settings.seed` and the step.
+
+    Args:
+        count: Number of samples.
+        settings: Optimisation settings.
+        weights: (count,) float64. Sample i is as likely to be drawn as `weights[i]`. None: all are equally likely.
+
+    Returns:
+        Takes the step. Returns indices (B,) int64 of the samples.
+    """
+    cumulative = None if weights is None else weights.cumsum(0)
+
+    def draw(step: int) -> Tensor:
+        generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + step)
+        return draw_samples(count, settings.batch, generator, cumulative)
+
+    return draw
 
 
 def draw_samples(count: int, size: int, generator: torch.Generator, cumulative: Tensor | None = None) -> Tensor:
