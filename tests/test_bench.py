@@ -15,12 +15,11 @@ from examples.tiny_openvla import TINY, write_checkpoint
 from flips import flipped
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.bench import phases as measuring
+from kerv_cli.bench import measure as measuring
 from kerv_cli.bench.machine import measure_machine
+from kerv_cli.bench.measure import Laps, Phase, card_of, costs_of, decoders, measure, profile_of
 from kerv_cli.bench.model import layer_weights, open_model
-from kerv_cli.bench.phases import Laps, Phase, costs_of, decoders, measure
 from kerv_cli.bench.physics import Sizes
-from kerv_cli.bench.results import card_of, profile_of
 from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.engine.cost import READ_PHASES, Profile, Work, prices, read_profile, work_of, work_of_record
 from kerv_cli.engine.decoder import Decoder, Parts
@@ -133,7 +132,7 @@ def test_the_sizes_of_an_openvla_policy_are_counted_and_its_decodes_measured(tmp
     weights = layers * (4 * width**2 + 3 * width * TINY.language.intermediate_size) + width * 256
     card = card_of(model, machine)
     assert (card["weights"], card["weight_bytes"]) == (weights, 4 * weights)
-    phases = measure(model, machine, settings)[1]
+    phases = measure(model, machine, settings).phases
     assert {phase.kind for phase in phases} == {"encode", "prefill", "verify", "feed", "draft", "tree"}
 
 

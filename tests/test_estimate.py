@@ -14,11 +14,9 @@ from examples import trace_of_log
 from studies_synthetic import swept, threshold_study
 
 from kerv_cli.bench.described import described, language_of
-from kerv_cli.bench.estimate import FAMILIES, Estimate, closest, computed
-from kerv_cli.bench.expected import Decodes, Drafts
+from kerv_cli.bench.expected import TABLES, Decodes, Drafts, recorded
 from kerv_cli.bench.physics import DEVICES, ENGINES, SHAPES, Sizes, priced
-from kerv_cli.bench.projection import ANCHORS
-from kerv_cli.bench.recorded import TABLES, recorded
+from kerv_cli.bench.prices import ANCHORS, FAMILIES, Estimate, closest, computed
 from kerv_cli.bench.settings import EstimateSettings
 from kerv_cli.engine.cost import Profile, prices, read_profile, work_of_record
 from kerv_cli.engine.record import DecodeRecord, Round

@@ -12,8 +12,9 @@ import pytest
 from command import kerv
 
 from kerv_cli.bench.physics import DEVICES, ENGINES, ROOFLINE, SHAPES, Device, priced
-from kerv_cli.bench.projection import ANCHORS, anchor_rows, projections
+from kerv_cli.bench.prices import ANCHORS, projections
 from kerv_cli.bench.settings import BenchSettings
+from kerv_cli.bench.tables import anchor_rows
 from kerv_cli.engine.cost import FORWARDS, read_profile, source_costs
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -63,7 +64,7 @@ def test_an_action_takes_what_the_published_ranges_allow():
 def test_the_page_has_the_published_figures_beside_ours():
     page = re.sub(" +", " ", (ROOT / "docs/measuring.md").read_text())
     for row in anchor_rows():
-        assert f"| {' | '.join(row)} |" in page
+        assert f"| {' | '.join(row.values())} |" in page
 
 
 def test_the_weights_are_those_of_the_published_checkpoint():

@@ -1,17 +1,21 @@
 """Compute what a decode costs on average, from a profile and from how often draft tokens are accepted.
 
-Nothing is run, and this module needs no torch. The costs are those of `engine.cost`: a decode is a prefill, then rounds
-of a draft and a verification.
+The costs are those of `engine.cost`: a decode is a prefill, then rounds of a draft and a verification. How a method
+drafts is given, or read from a published table. Nothing is run, and this module needs no torch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import csv
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
+from kerv_cli.base.files import read_json
 from kerv_cli.base.registry import DRAFTING
 from kerv_cli.engine.cost import Profile
+from kerv_cli.targets.folders import shipped_dir
 
 _TOP = 8  # children of a node, and kept nodes of a level, in EAGLE-2's tree
 _STEPS = 20  # halvings of an interval until a search ends
@@ -177,3 +181,94 @@ def _least(enough: Callable[[float], bool]) -> float:
         middle = (low + high) / 2
         low, high = (low, middle) if enough(middle) else (middle, high)
     return high
+
+
+TABLES = {"papers": 4, "papers_libero": 7, "main": 16}
+"""Published tables, each with N, the number of tokens per chunk of its decodes."""
+
+_SOURCES = {"merged": "early", "early": "early", "scout": "scout", "scoped": "scout", "retrieval": "retrieval"}
+_DRAFTERS = ("drafter", "hybrid")
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """How a setting of a published table decoded.
+
+    Attributes:
+        table: Name of the table.
+        label: Label of the setting.
+        method: Name of its method.
+        tokens: N, number of tokens in a chunk.
+        drafts: How it drafted.
+        forwards: Forwards of the trunk per verified decode.
+        speed: Measured speed against AR, per control step.
+    """
+
+    table: str
+    label: str
+    method: str
+    tokens: int
+    drafts: Drafts
+    forwards: float
+    speed: float
+
+
+def nearest_table(tokens: int) -> str:
+    """Return the table whose chunks are nearest in length to `tokens` tokens."""
+    return min(TABLES, key=lambda name: abs(TABLES[name] - tokens))
+
+
+def recorded(table: str) -> list[Recorded]:
+    """Return the settings of a published table that decode token by token or with drafts, AR first.
+
+    A wheel without the table gives none.
+
+    Args:
+        table: One of TABLES.
+    """
+    folder = shipped_dir().parent / "tables"
+    if not (folder / f"{table}.json").is_file():
+        return []
+    settings = read_json(folder / f"{table}.json")["labels"]
+    rows = _rows(folder / f"{table}.csv")
+    found = []
+    for label, row in rows.items():
+        chosen = settings[label]["settings"]
+        if chosen["skip"]["kind"] == "parallel":
+            continue
+        drafts = _drafts(chosen, float(row["skip_rate"] or 0), float(row["retrieval_share"] or 0))
+        verified, forwards = 1 - drafts.skipped, 0.0
+        if verified:
+            per_step, of_ar = float(row["forwards_per_step"]), float(rows[row["baseline"]]["forwards_per_step"])
+            forwards = TABLES[table] * per_step / of_ar / verified
+        found.append(Recorded(table, label, chosen["method"], TABLES[table], drafts, forwards, float(row["speedup"])))
+    return found
+
+
+def _rows(path: Path) -> dict[str, dict[str, str]]:
+    """Return the rows over all tasks, by the setting's label."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return {row["label"]: row for row in csv.DictReader(file) if row["averaging"].startswith("micro")}
+
+
+def _drafts(settings: Mapping[str, Any], skipped: float, retrieved: float) -> Drafts:
+    """Return how a setting drafts.
+
+    Args:
+        settings: Its settings.
+        skipped: Share of its decodes that ran unverified.
+        retrieved: Share of its decodes that retrieved a draft.
+    """
+    proposer, before = settings["proposer"], settings["prefill_draft"]["kind"]
+    hybrid = proposer["kind"] == "hybrid"
+    source = "retrieval" if hybrid else _SOURCES.get(before, "")
+    searched = (retrieved - skipped) / (1 - skipped) if hybrid and skipped < 1 else 0.0
+    return Drafts(
+        depth=proposer["depth"] if proposer["kind"] in _DRAFTERS else 0,
+        nodes=proposer["nodes"] if proposer.get("shape") == "tree" else 0,
+        source=source,
+        in_prefill=bool(source) and not hybrid,
+        retrieved=max(searched, 0.0),
+        skipped=skipped,
+        encodes=source != "scout",
+    )

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.bench.estimate import Costs, check_tokens
 from kerv_cli.bench.expected import Decodes, Drafts
+from kerv_cli.bench.prices import Costs, check_tokens
 from kerv_cli.engine.cost import prices
 from kerv_cli.engine.trace import TracedDecode, grouped, work_of_trace
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import print_table
+from kerv_cli.cli.common import print_rows, print_table
 
 AsJson = Annotated[bool, typer.Option("--json", help="Also print the whole result as JSON, in the last line.")]
 
@@ -32,27 +32,40 @@ def bench(settings: BenchSettings, as_json: AsJson = False) -> None:
         _project(settings, as_json)
         return
     from kerv_cli.bench.machine import measure_machine
+    from kerv_cli.bench.measure import card_of, measure
     from kerv_cli.bench.model import open_model
-    from kerv_cli.bench.results import PHASE_COLUMNS, card_of, card_rows, phase_rows, run, write
+    from kerv_cli.bench.tables import card_rows, phase_rows
 
     model = open_model(settings)
     machine = measure_machine(model.target.device, model.dtype)
     print_table(("card", ""), card_rows(card_of(model, machine)), f"{model.name}, {model.dtype}".replace("torch.", ""))
-    done = run(settings, model, machine)
-    print_table(PHASE_COLUMNS, phase_rows(done.phases), done.title)
-    typer.echo(str(write(settings, done)))
+    done = measure(model, machine, settings)
+    print_rows(phase_rows(done.phases), done.title)
+    document = done.document()
+    _write(settings, f"{model.name.rstrip('/').rsplit('/', 1)[-1]}-{done.dtype}", document)
     if as_json:
-        typer.echo(json.dumps(done.document(), allow_nan=False))
+        typer.echo(json.dumps(document, allow_nan=False))
 
 
 def _project(settings: BenchSettings, as_json: bool) -> None:
     """Compute and write profiles for GPUs, and print them beside what others published."""
-    from kerv_cli.bench.projection import ANCHOR_COLUMNS, PROJECTION_COLUMNS, anchor_rows, projections, write
+    from kerv_cli.bench.prices import projections
+    from kerv_cli.bench.tables import anchor_rows, projection_rows
 
     computed = list(projections(settings))
-    print_table(PROJECTION_COLUMNS, [one.row for one in computed], f"{settings.projected}, computed, not measured")
-    print_table(ANCHOR_COLUMNS, anchor_rows(), "one action of OpenVLA-7B, as published and as computed")
+    print_rows(projection_rows(computed), f"{settings.projected}, computed, not measured")
+    print_rows(anchor_rows(), "one action of OpenVLA-7B, as published and as computed")
     for one in computed:
-        typer.echo(str(write(settings, one)))
+        _write(settings, f"{one.name}-profile", one.document)
     if as_json:
         typer.echo(json.dumps({one.name: one.document for one in computed}, allow_nan=False))
+
+
+def _write(settings: BenchSettings, name: str, document: dict[str, Any]) -> None:
+    """Write a result as JSON (docs/formats.md), and print its path."""
+    from kerv_cli.base.files import write_json
+    from kerv_cli.base.places import results_dir
+
+    path = results_dir(settings.results) / "bench" / f"{name}.json"
+    write_json(path, document)
+    typer.echo(str(path))

@@ -1,14 +1,41 @@
-"""`kerv doctor`: check this machine, and say how to fix each problem."""
+"""`kerv doctor`: check this machine, a target or an environment, and say how to fix each problem."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import shutil
+import time
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, ClassVar
 
 import typer
 
-from kerv_cli.bench.doctor import DoctorSettings, check_environment_of, check_machine, check_policy
+from kerv_cli.base.errors import UnknownName
+from kerv_cli.base.files import visible
+from kerv_cli.base.limits import number, setting
+from kerv_cli.base.places import check_writable, results_dir
+from kerv_cli.base.settings import RunSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, end_with_json, print_table
+from kerv_cli.methods.settings import PolicySettings
+from kerv_cli.targets.folders import find_target, shipped_dir
+from kerv_cli.worlds.findings import Finding, find, need
+from kerv_cli.worlds.settings import EVALUATION_SEED, WorldSettings
+
+if TYPE_CHECKING:
+    from kerv_cli.worlds.spec import EnvironmentSpec
+
+
+@dataclass
+class DoctorSettings(RunSettings):
+    """Settings of `kerv doctor`. If a target or an environment is given, only these are checked."""
+
+    groups: ClassVar = {"world": "default", "runtime": "cpu"}
+
+    policy: PolicySettings = setting(lambda: PolicySettings(target=""), "the target to check")
+    environment: str | None = setting(None, "the environment to check")
+    seed: int = number(EVALUATION_SEED, 0, 2**31 - 1, help="seed of the scene that is rendered")
+    world: WorldSettings = setting(WorldSettings, "camera and length of an episode")
 
 
 @command(
@@ -25,12 +52,132 @@ def doctor(settings: DoctorSettings, as_json: AsJson = False) -> None:
 
     With target=NAME or environment=NAME check only whether that target or environment behaves as kerv requires.
     """
-    if settings.policy.target or settings.environment:
-        findings = [*check_policy(settings), *check_environment_of(settings)]
-    else:
+    findings: list[Finding] = []
+    if settings.policy.target:
+        findings += check_policy(settings)
+    if settings.environment:
+        findings += check_environment_of(settings.environment, settings.seed)
+    if not settings.policy.target and not settings.environment:
         findings = check_machine(settings)
     failed = not all(finding.ok for finding in findings)
     if as_json:
         end_with_json([asdict(finding) for finding in findings], code=int(failed))
-    print_table(("check", "", "finding"), ((f.what, "ok" if f.ok else "FAILS", f.says) for f in findings))
+    states = {True: "ok", False: "FAILS"}
+    print_table(("check", "", "finding"), ((one.what, states[one.ok], one.says) for one in findings))
     raise typer.Exit(int(failed))
+
+
+def check_machine(settings: DoctorSettings) -> list[Finding]:
+    """Check rendering, torch, the shipped policies, disk, database and display."""
+    from kerv_cli.report.viewing.viewer import has_display
+    from kerv_cli.targets.provenance import versions
+    from kerv_cli.worlds import specs
+
+    packages = ", ".join(f"{name} {number}" for name, number in versions().items())
+    display = "a display is there: kerv view opens a window" if has_display() else "none: kerv view prints the command"
+    findings = [Finding("versions", True, packages)]
+    findings += [find(f"rendering {spec.name}", partial(_rendering, spec, settings)) for spec in specs().values()]
+    findings.append(find("torch", partial(_torch, settings)))
+    shipped = [path.name for path in visible(shipped_dir()) if path.is_dir()]
+    findings += [find(f"policy {name}", partial(_policy, name, settings)) for name in shipped]
+    findings.append(find("results", partial(_disk, settings)))
+    findings.append(find("database", partial(_database, settings)))
+    findings.append(Finding("display", True, display))
+    return findings
+
+
+def check_policy(settings: DoctorSettings) -> list[Finding]:
+    """Check on a random observation whether the target behaves as the engine requires."""
+    import numpy as np
+
+    from kerv_cli.base.runtime import set_up
+    from kerv_cli.base.spaces import Observation
+    from kerv_cli.methods.artifacts import Artifacts
+    from kerv_cli.targets.conformance import check_target
+    from kerv_cli.worlds.views import frame_shape
+
+    device, _ = set_up(settings.runtime)
+    artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
+    described, random = artifacts.description, np.random.default_rng(settings.seed)
+    size, space = int(described.settings.get("image_size", settings.world.camera.size)), described.observation
+    images = {name: random.integers(0, 256, frame_shape(name, size), dtype=np.uint8) for name in described.cameras}
+    state = random.normal(size=space.state)
+    words = " ".join(described.words[:3]) or "move"
+    return check_target(artifacts.target, Observation(state[: len(space.proprioception)], state, words, images))
+
+
+def check_environment_of(name: str, seed: int) -> list[Finding]:
+    """Check on an environment's first task whether it behaves as kerv requires.
+
+    Raises:
+        UnknownName: There is no such environment.
+    """
+    from kerv_cli.worlds import specs
+    from kerv_cli.worlds.conformance import check_environment
+
+    environments = specs()
+    if name not in environments:
+        raise UnknownName("environment", name, environments)
+    return check_environment(environments[name], seed)
+
+
+def _rendering(spec: EnvironmentSpec, settings: DoctorSettings) -> str:
+    """Render camera images of an environment and time them. Return the result as text.
+
+    An image must not be empty, because a broken OpenGL backend can load without an error and render nothing. A
+    simulator that is an optional dependency of kerv may be missing, and may need more than 50 ms for an image.
+    """
+    from kerv_cli.worlds.mujoco_world import choose_backend
+
+    if not spec.installed:
+        return f"not installed: pip install 'kerv[{spec.extra}]'"
+    backend, first = choose_backend(), next(iter(spec.suites.values()), tuple(spec.tasks))[0]
+    with spec.open_world(first, replace(settings.world.camera, name="")) as world:
+        world.reset(settings.seed)
+        world.frame()
+        began = time.perf_counter()
+        spread = [int(world.frame().std()) for _ in range(20)][-1]
+        milliseconds = 1000 * (time.perf_counter() - began) / 20
+    need(spread, f"{backend} draws empty frames: set MUJOCO_GL=osmesa and run 'kerv doctor' again")
+    says = f"{backend}, {milliseconds:.1f} ms a frame at {settings.world.camera.size}x{settings.world.camera.size}"
+    need(milliseconds < 50 or spec.extra, says)
+    return says
+
+
+def _torch(settings: DoctorSettings) -> str:
+    import torch
+
+    from kerv_cli.base.runtime import set_up
+    from kerv_cli.targets.provenance import device_name
+
+    device, _ = set_up(settings.runtime)
+    cuda = "CUDA available" if torch.cuda.is_available() else "no CUDA device"
+    return f"{device}: {device_name(device)}, {torch.get_num_threads()} thread(s), {cuda}"
+
+
+def _policy(name: str, settings: DoctorSettings) -> str:
+    from kerv_cli.targets.checkpoint import read_target
+
+    described = read_target(find_target(settings.results, name))
+    parameters = described.provenance.get("parameters")
+    size = f"{parameters / 1e6:.1f} M parameters, " if isinstance(parameters, int | float) else ""
+    return f"{size}{described.sha256[:12]}"
+
+
+def _disk(settings: DoctorSettings) -> str:
+    free = shutil.disk_usage(check_writable(settings.results)).free / 1e9
+    says = f"{results_dir(settings.results).resolve()} can be written, {free:.0f} GB free"
+    need(free > 2, says)
+    return says
+
+
+def _database(settings: DoctorSettings) -> str:
+    """Return which database is used, as text. Raises KervError if it does not answer."""
+    from kerv_cli.lab.database import opened
+    from kerv_cli.lab.runs import run_rows
+
+    database = opened(settings.results)
+    rows = len(run_rows(database))
+    what = "PostgreSQL" if database.file is None else "SQLite"
+    says = f"{rows} commands in it" if database.exists else "made by the first command that needs it"
+    return f"{what}, {database.shown}: {says}"

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import typer
 
 from kerv_cli.bench.settings import EstimateSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, end_with_json, print_rows, print_table
+from kerv_cli.cli.common import AsJson, end_with_json, print_rows
 
 if TYPE_CHECKING:
     from kerv_cli.bench.described import Described
-    from kerv_cli.bench.estimate import Costs, Estimate
+    from kerv_cli.bench.prices import Costs, Estimate
 
 
 @command(
@@ -30,7 +31,8 @@ def estimate(settings: EstimateSettings, as_json: AsJson = False) -> None:
     chains is the fastest for them.
     """
     from kerv_cli.bench.described import described
-    from kerv_cli.bench.estimate import NO_TOKENS, Estimate, check_tokens
+    from kerv_cli.bench.prices import NO_TOKENS, Estimate, check_tokens
+    from kerv_cli.bench.tables import document, notes, rate, sentence
 
     if settings.trace:
         _trace(settings, as_json)
@@ -42,53 +44,52 @@ def estimate(settings: EstimateSettings, as_json: AsJson = False) -> None:
         typer.echo(NO_TOKENS)
         return
     tokens = policy.tokens if policy else 7 if settings.tokens is None else settings.tokens
-    found = {}
-    for title, costs in _costs(settings, policy).items():
-        for one in costs:
-            check_tokens(one.engine, one.profile, tokens)
-        found[title] = [Estimate(one, tokens) for one in costs]
-    if as_json:
-        end_with_json({"applies": True, "machines": [_row(settings, policy, *one) for one in found.items()]})
+    found: dict[str, list[Estimate]] = {}
+    for title, costs in _costs(settings, policy):
+        check_tokens(costs.engine, costs.profile, tokens)
+        found.setdefault(title, []).append(Estimate(costs, tokens))
+    rows = []
     for title, estimates in found.items():
-        _print(settings, policy, title, estimates)
+        row: dict[str, Any] = {"machine": title, "tokens": tokens, "engines": [document(one) for one in estimates]}
+        row["notes"] = notes(policy, estimates)
+        if settings.hz:
+            row["rate"] = rate(estimates, settings.hz, settings.actions)
+        rows.append(row | {"sentence": sentence(estimates)})
+    if as_json:
+        end_with_json({"applies": True, "machines": rows})
+    for row, (title, estimates) in zip(rows, found.items(), strict=True):
+        _print_tables(policy, title, estimates)
+        for line in (*row["notes"], row.get("rate"), row["sentence"]):
+            if line:
+                typer.echo(line)
 
 
-def _costs(settings: EstimateSettings, policy: Described | None) -> dict[str, list[Costs]]:
-    """Return the costs on each machine, with each engine or of a profile, by the machine's title."""
-    from kerv_cli.bench.estimate import Costs, computed
+def _costs(settings: EstimateSettings, policy: Described | None) -> list[tuple[str, Costs]]:
+    """Return the costs on each machine with each engine, or of each profile, beside the machine's title."""
     from kerv_cli.bench.physics import DEVICES
+    from kerv_cli.bench.prices import Costs, computed
 
-    if policy is not None:
-        devices = [DEVICES[name] for name in settings.device]
-        return {device.title: computed(policy, device) for device in devices}
-    from kerv_cli.report.reprice import open_profiles
+    if policy is None:
+        from kerv_cli.report.reprice import open_profiles
 
-    profiles = open_profiles(settings.results, settings.on)
-    return {one.title: [Costs(one.name, one.profile, {})] for one in profiles}
-
-
-def _row(settings: EstimateSettings, policy: Described | None, title: str, estimates: list[Estimate]) -> dict[str, Any]:
-    from kerv_cli.bench.estimate import document, notes, rate, sentence
-
-    about = {"machine": title, "tokens": estimates[0].tokens, "engines": document(estimates)}
-    hz = {"rate": rate(estimates, settings.hz, settings.actions)} if settings.hz else {}
-    return {**about, "notes": notes(policy, estimates), **hz, "sentence": sentence(estimates)}
+        profiles = open_profiles(settings.results, settings.on)
+        return [(one.title, Costs(one.name, one.profile, {})) for one in profiles]
+    found = []
+    for name in dict.fromkeys(settings.device):
+        device = DEVICES[name]
+        found += [(device.title, costs) for costs in computed(policy, device)]
+    return found
 
 
-def _print(settings: EstimateSettings, policy: Described | None, title: str, estimates: list[Estimate]) -> None:
-    from kerv_cli.bench.estimate import FAMILY_COLUMNS, PART_COLUMNS, family_rows, notes, part_rows, rate, sentence
+def _print_tables(policy: Described | None, title: str, estimates: Sequence[Estimate]) -> None:
+    """Print the parts of an action and the families of methods."""
+    from kerv_cli.bench.tables import family_rows, part_rows
 
-    name = f"{policy.shape.name} on {title}" if policy and policy.shape else title
-    engines = " / ".join(one.costs.engine for one in estimates)
-    print_table(PART_COLUMNS, part_rows(estimates), f"{name}, computed, not measured: {engines}" if policy else name)
-    print_table(
-        FAMILY_COLUMNS, family_rows(estimates), "speed against AR; break-even: accepted tokens per verification"
-    )
-    for line in notes(policy, estimates):
-        typer.echo(line)
-    if settings.hz:
-        typer.echo(rate(estimates, settings.hz, settings.actions))
-    typer.echo(sentence(estimates))
+    if policy and policy.shape:
+        engines = " / ".join(one.costs.engine for one in estimates)
+        title = f"{policy.shape.name} on {title}, computed, not measured: {engines}"
+    print_rows(part_rows(estimates), title)
+    print_rows(family_rows(estimates), "speed against AR; break-even: accepted tokens per verification")
 
 
 def _trace(settings: EstimateSettings, as_json: bool) -> None:
@@ -101,14 +102,14 @@ def _trace(settings: EstimateSettings, as_json: bool) -> None:
     trace = read_trace(as_path(settings.trace))
     settings.prompt = settings.prompt or next((one.prompt for one in trace if one.prompt), None)
     answer = choose_length if settings.choose == "draft" else price
-    found = [
-        ({"machine": title, "engine": costs.engine}, one)
-        for title, several in _costs(settings, None if settings.on else described(settings)).items()
-        for costs in several
-        for one in answer(trace, costs)
-    ]
+    documents, rows = [], []
+    for title, costs in _costs(settings, None if settings.on else described(settings)):
+        machine = {"machine": title, "engine": costs.engine}
+        for one in answer(trace, costs):
+            documents.append({**machine, **one.document})
+            rows.append({**machine, **one.cells})
     if as_json:
-        end_with_json({"rows": [{**machine, **one.document} for machine, one in found], "note": CANNOT})
-    print_rows([{**machine, **one.cells} for machine, one in found], settings.trace)
+        end_with_json({"rows": documents, "note": CANNOT})
+    print_rows(rows, settings.trace)
     if settings.choose == "draft":
         typer.echo(CANNOT)

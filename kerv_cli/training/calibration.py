@@ -99,11 +99,11 @@ def calibrate(
         KervError: No decode of a task compared a draft with the target, so K_S is unknown.
         StorageError: The disk cannot be written.
     """
-    settings, dataset = demos_for(settings, database)
-    tasks = resolve_tasks(settings.task or list(dataset.manifest.tasks))
     artifacts = Artifacts(settings.results, settings.policy, device=settings.runtime.device)
     target = artifacts.description
     target.check_autoregressive("kerv calibrate", "there is no draft to calibrate")
+    settings, dataset = demos_for(settings, target, database)
+    tasks = resolve_tasks(settings.task or list(dataset.manifest.tasks))
     path = artifacts.new("calibration")
     chosen = choose_episodes(dataset, tasks, settings.episodes)
     method = Method.of(RolloutSettings(**{kind: find(kind, name).default for kind, name in DRAFTS.items()}))

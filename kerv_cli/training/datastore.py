@@ -67,12 +67,12 @@ def build_datastore(
         UnknownName: `key` names an unknown part of the prompt.
         StorageError: The disk cannot be written.
     """
-    settings, dataset = demos_for(settings, database)
-    tasks = sorted(resolve_tasks(settings.task or list(dataset.manifest.tasks)))
-    device, _ = set_up(settings.runtime)
-    artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
     if not settings.key:
         raise UsageError("key=[]: name at least one part of the prompt: scene, vision, proprioception")
+    device, _ = set_up(settings.runtime)
+    artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
+    settings, dataset = demos_for(settings, artifacts.description, database)
+    tasks = sorted(resolve_tasks(settings.task or list(dataset.manifest.tasks)))
     folder = artifacts.new("datastore")
     check_replaceable(folder)
     chosen, seeds = first_episodes(dataset, tasks, settings.episodes)

@@ -14,8 +14,7 @@ from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.episodes.settings import DEFAULT_TASKS
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import command_to_go_on
-from kerv_cli.targets.checkpoint import TargetDescription, described
-from kerv_cli.targets.folders import find_target
+from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.training.settings import DemonstrationSettings
 from kerv_cli.worlds import resolve_tasks, specs, stands_for_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset
@@ -81,11 +80,12 @@ def _remedy(parent: Path, folder: Path, tasks: Sequence[str], episodes: int) -> 
     return f"record them with '{' '.join(command)}'{others}"
 
 
-def demos_for(settings: S, database: Database) -> tuple[S, DemoDataset]:
+def demos_for(settings: S, target: TargetDescription, database: Database) -> tuple[S, DemoDataset]:
     """Open the demonstrations named in the settings, or by default the ones that the target was trained on.
 
     Args:
         settings: Settings of the command.
+        target: Description of the target.
         database: The database of the results folder.
 
     Returns:
@@ -94,11 +94,9 @@ def demos_for(settings: S, database: Database) -> tuple[S, DemoDataset]:
         dataset: The demonstrations.
 
     Raises:
-        UsageError: The target does not exist.
         CheckpointError: The demonstrations are missing, unfinished, damaged, of another environment, or show other
             camera views than the target sees.
     """
-    target = described(find_target(settings.results, settings.policy.target), "target", TargetDescription)
     name, tasks = settings.demos or target.demos or name_of(()), settings.task
     if settings.demos:
         dataset = open_demos(database, name, tasks or target.tasks)

@@ -51,17 +51,16 @@ def train_drafter(settings: TrainDrafterSettings, database: Database, begin: Beg
     """
     drafter, train = drafter_of(settings), settings.train
     artifacts = Artifacts(settings.results, settings.policy)
-    folder = artifacts.new(drafter.kind)
+    folder, description = artifacts.new(drafter.kind), artifacts.description
     check_not_shipped(folder, f"policy.artifacts.{drafter.kind}")
-    settings, dataset = demos_for(settings, database)
+    description.check_autoregressive(
+        f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
+    )
+    settings, dataset = demos_for(settings, description, database)
     tasks = resolve_tasks(settings.task) if settings.task else ()
     if tasks:
         check_tasks(dataset, tasks)
         dataset = replace(dataset, episodes=[episode for episode in dataset.episodes if episode.task in tasks])
-    description = artifacts.description
-    description.check_autoregressive(
-        f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
-    )
     identity = identity_of(train, dataset, **greedy_decodes(settings, description, tasks))
     refuse_other(folder, identity, drafter.kind, f"policy.artifacts.{drafter.kind}")
     stage = begin(drafter.kind, folder, plan_of(settings, drafter, artifacts.folder, folder), train.steps)

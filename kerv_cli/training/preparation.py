@@ -70,7 +70,7 @@ def plan(settings: PrepareSettings, database: Database) -> list[Step]:
             number = compose("train_drafter", command[2:], TrainDrafterSettings).train.steps
         steps.append(Step(kind, _state(artifacts, database, kind, kinds), command, number))
     if any(step.state != THERE and not find("artifact", step.kind).traits.get("study") for step in steps):
-        demos_for(settings, database)
+        demos_for(settings, description, database)
     return steps
 
 

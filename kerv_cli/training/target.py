@@ -79,7 +79,7 @@ def train_target(settings: TrainTargetSettings, database: Database, begin: Begin
     device, _ = set_up(settings.runtime)
     with without_subnormals():
         with stage("reading demonstrations") as progress:
-            target, samples = opened(settings, dataset, tasks, init, world.camera.name, progress)
+            target, samples = load_training(settings, dataset, tasks, init, world.camera.name, progress)
         seeds = spec_of(tasks[0]).seeds.selection[: train.closed_loop]
         success = functools.partial(success_of, tasks=tasks, seeds=seeds, settings=world) if seeds else None
         imitation = Imitation(target.to(device), samples, train, success)
@@ -200,7 +200,7 @@ def plan_of(
     )
 
 
-def opened(
+def load_training(
     settings: TrainTargetSettings,
     dataset: DemoDataset,
     tasks: tuple[str, ...],

@@ -1,4 +1,7 @@
-"""Measure how long each phase of a decode takes. The engine runs complete decodes with dummy drafts."""
+"""Measure how long each phase of a decode takes. The engine runs complete decodes with dummy drafts.
+
+`measure` is the whole benchmark. What stands before it makes the decodes and cuts them into phases.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,7 @@ from kerv_cli.bench.model import Model, blank
 from kerv_cli.bench.physics import Sizes
 from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.engine.chunk import Chunk
-from kerv_cli.engine.cost import FORWARDS
+from kerv_cli.engine.cost import FORWARDS, Profile
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.parts import Fixed
@@ -36,6 +39,7 @@ from kerv_cli.methods.early.drafter import EarlyProposer
 from kerv_cli.methods.scout.drafter import ScoutProposer
 from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.targets.compact.program import stored_bytes
+from kerv_cli.targets.provenance import stamp
 
 _LOG = logging.getLogger("kerv")
 
@@ -146,11 +150,12 @@ def decoders(model: Model) -> list[Decoder]:
         draft = Dummy(in_prefill) if in_prefill else None
         return Decoder(target, Parts(rule, everything, draft, proposer))
 
-    equal = [n - 1 for n in range(2, size) if size % n == 0]  # draft sizes for which all rounds commit as many tokens
-    every = [decoder(), *(decoder(n, Dummy(n)) for n in equal), decoder(0, Dummy(size - 2))]
-    every += [decoder(size - 1), decoder(max(_MERGED, size - 1))]
-    shapes = ((size - 2, 1, size - 2), (min(3, size - 2), 1, 3), _TREE)
-    return every + [decoder(0, DrafterProposer(model.drafter, target, *shape)) for shape in shapes]
+    equal = [rows - 1 for rows in range(2, size) if size % rows == 0]  # drafts of which all rounds commit as many
+    every = [decoder(), *(decoder(nodes, Dummy(nodes)) for nodes in equal)]
+    every += [decoder(0, Dummy(size - 2)), decoder(size - 1), decoder(max(_MERGED, size - 1))]
+    for shape in ((size - 2, 1, size - 2), (min(3, size - 2), 1, 3), _TREE):
+        every.append(decoder(0, DrafterProposer(model.drafter, target, *shape)))
+    return every
 
 
 def costs_of(
@@ -166,7 +171,9 @@ def costs_of(
         rounds: Records of the decode's rounds. A round is one forward and the draft that it verified.
         laps: Name and seconds of each lap (interval of the stopwatch `Laps`), in order.
     """
-    seconds = {phase: sum(s for name, s in laps if name == phase) for phase in ("vision", "prefill", "verify")}
+    seconds = dict.fromkeys(("vision", "prefill", "verify", "propose"), 0.0)
+    for name, lap in laps:
+        seconds[name] = seconds.get(name, 0.0) + lap
     yield ("encode", 1), seconds["vision"]
     yield ("prefill", prompt + rounds[0].tree_size), seconds["prefill"]
     nodes = {one.tree_size for one in rounds[1:]}
@@ -185,49 +192,10 @@ def costs_of(
             yield ("feed", 1 + one.accepted), feeding
 
 
-@torch.inference_mode()
-def measure(model: Model, machine: Machine, settings: BenchSettings) -> tuple[Machine, list[Phase]]:
-    """Measure the time of each phase of a decode (prefill, verify, …).
-
-    All decoders run in turn, `settings.repeats` times.
-
-    Args:
-        model: The model.
-        machine: The device's measured bandwidth and operations per second. Both are measured again after the decodes;
-            the higher values count.
-        settings: Settings of the benchmark.
-
-    Returns:
-        The device with the values that count, and the measured phases.
-    """
-    device, evicting = model.target.device, torch.ones(_EVICTING)
-    every, seconds = decoders(model), dict[Key, list[float]]()
-    sources = source_decoders(settings)
-    for turn in range(_WARM_UP + settings.repeats):
-        costs: list[tuple[Key, float]] = []
-        for decoder in every:
-            evicting.sum()
-            clock = Laps(device)
-            prompt = model.target.encode(model.observation)
-            clock.lap("vision")
-            chunk = decoder.decode_prompt(prompt, clock)
-            chunk.actions()
-            clock.stop()
-            costs += costs_of(decoder, prompt.shape[1], chunk.rounds, clock.laps)
-        for kind, source in sources.items():
-            evicting.sum()
-            costs.append(((kind, 1), source.decode(blank(source.target)).phases["propose"]))
-        for key, value in costs if turn >= _WARM_UP else ():
-            seconds.setdefault(key, []).append(value)
-    machine = machine.best_of(measure_machine(device, model.dtype))
-    drafts = {(kind, 1): needs_of_draft(source) for kind, source in sources.items()}
-    return machine, phases_of(seconds, model.sizes, machine, drafts)
-
-
 def phases_of(
     seconds: Mapping[Key, Sequence[float]], sizes: Sizes, machine: Machine, drafts: Mapping[Key, tuple[float, float]]
 ) -> list[Phase]:
-    """Summarise measured times as phases.
+    """Summarise measured times as phases, in the order of a decode.
 
     Args:
         seconds: Seconds of each repeat, by the kind and rows of the phase.
@@ -238,12 +206,28 @@ def phases_of(
     """
     order = (*FORWARDS, *source_methods())
     phases, prompt = [], min(rows for kind, rows in seconds if kind == "prefill")
-    for (kind, rows), times in sorted(seconds.items(), key=lambda item: (order.index(item[0][0]), item[0][1])):
+    for kind, rows in sorted(seconds, key=lambda key: (order.index(key[0]), key[1])):
         read, flops = drafts.get((kind, rows)) or sizes.needs(kind, rows, prompt)
+        times = seconds[kind, rows]
         median, p95 = np.percentile(times, [50, 95])
         floor = max(machine.bounds(read, flops))
         phases.append(Phase(kind, rows, float(median), float(p95), float(min(times)), read, flops, floor))
     return phases
+
+
+def profile_of(phases: Sequence[Phase], tokens: int) -> Profile:
+    """Return a latency profile: the median seconds of each kind of phase, by its number of rows.
+
+    Args:
+        phases: Measured phases. Those of a kind are sorted by their rows.
+        tokens: N, tokens of a chunk.
+    """
+    costs: dict[str, tuple[tuple[int, ...], tuple[float, ...]]] = {}
+    for phase in phases:
+        rows, seconds = costs.get(phase.kind, ((), ()))
+        costs[phase.kind] = (*rows, phase.rows), (*seconds, phase.seconds)
+    prompt = costs["prefill"][0][0] if "prefill" in costs else 0
+    return Profile(prompt, costs, tokens)
 
 
 @torch.inference_mode()
@@ -266,8 +250,11 @@ def needs_of_draft(decoder: Any) -> tuple[float, float]:
 
 def source_methods() -> dict[str, str]:
     """Return by kind of draft the method that measures it: {"early": "early_unverified", …}."""
-    measured = [part.traits for part in parts("proposer").values() if "measured_by" in part.traits]
-    return {traits["cost"]: traits["measured_by"] for traits in measured}
+    found = {}
+    for part in parts("proposer").values():
+        if "measured_by" in part.traits:
+            found[part.traits["cost"]] = part.traits["measured_by"]
+    return found
 
 
 def source_decoders(settings: BenchSettings) -> dict[str, Any]:
@@ -284,3 +271,118 @@ def source_decoders(settings: BenchSettings) -> dict[str, Any]:
         except KervError as error:
             _LOG.warning("the profile has no time of the draft '%s': %s", kind, error)
     return found
+
+
+def card_of(model: Model, machine: Machine) -> dict[str, Any]:
+    """Compute the shortest times that a model's forwards can take on this device. No forward is executed.
+
+    A shortest time (floor) has two parts in seconds: one for reading memory, one for arithmetic. The larger one counts.
+
+    Args:
+        model: The model.
+        machine: The device's measured bandwidth and operations per second.
+
+    Returns:
+        By name: the model's sizes, the device's bandwidth and operations per second, and the floors. `card_rows` prints
+        them.
+    """
+    prompt, tokens, sizes = model.target.max_prompt, model.size, model.sizes
+    needs = {
+        "one token": sizes.forward(1, prompt),
+        f"verification of {tokens}": sizes.forward(tokens, prompt),
+        "prefill": sizes.forward(prompt, 0),
+        f"prefill and {tokens - 1} drafted": sizes.forward(prompt + tokens - 1, 0),
+    }
+    weights = sizes.trunk_weights * sizes.weight
+    return {
+        "weights": sizes.trunk_weights,
+        "weight_bytes": weights,
+        "cache_bytes": float(sizes.cached) * (prompt + tokens) * sizes.slot,
+        "prompt": prompt,
+        "tokens": tokens,
+        "bandwidth": machine.bandwidth,
+        "bandwidth_of_weights": machine.bandwidth_of(weights),
+        "flops": machine.flops,
+        "floors": {name: machine.bounds(*need) for name, need in needs.items()},
+    }
+
+
+@dataclass(frozen=True)
+class Bench:
+    """The results of a benchmark.
+
+    Attributes:
+        model: The measured model.
+        machine: The device's measured bandwidth and operations per second.
+        phases: Measured times of the phases of a decode.
+        profile: Median seconds by kind and rows of a phase, from which the time of a decode can be computed.
+    """
+
+    model: Model
+    machine: Machine
+    phases: list[Phase]
+    profile: Profile
+
+    @property
+    def dtype(self) -> str:
+        """Number format of the trunk, such as `float32`."""
+        return str(self.model.dtype).removeprefix("torch.")
+
+    @property
+    def title(self) -> str:
+        """Title of the table of phases: target, number format, device, threads."""
+        where = stamp(str(self.model.target.device))["device_name"]
+        return f"{self.model.name}, {self.dtype}, {where}, {torch.get_num_threads()} thread, caches cold at first"
+
+    def document(self) -> dict[str, Any]:
+        """Return all results for JSON (docs/formats.md)."""
+        device = self.model.target.device
+        return {
+            "target": self.model.name,
+            "random_weights": self.model.is_shape,
+            "dtype": self.dtype,
+            "device": str(device),
+            "threads": torch.get_num_threads(),
+            **stamp(str(device)),
+            "card": card_of(self.model, self.machine),
+            "phases": [phase.as_dict() for phase in self.phases],
+            "profile": self.profile.as_dict(),
+        }
+
+
+@torch.inference_mode()
+def measure(model: Model, machine: Machine, settings: BenchSettings) -> Bench:
+    """Measure the time of each phase of a decode (prefill, verify, …).
+
+    All decoders run in turn, `settings.repeats` times.
+
+    Args:
+        model: The model.
+        machine: The device's measured bandwidth and operations per second. Both are measured again after the decodes;
+            the higher values count.
+        settings: Settings of the benchmark.
+    """
+    device, evicting = model.target.device, torch.ones(_EVICTING)
+    every, sources = decoders(model), source_decoders(settings)
+    seconds: dict[Key, list[float]] = {}
+    for turn in range(_WARM_UP + settings.repeats):
+        costs: list[tuple[Key, float]] = []
+        for decoder in every:
+            evicting.sum()
+            clock = Laps(device)
+            prompt = model.target.encode(model.observation)
+            clock.lap("vision")
+            chunk = decoder.decode_prompt(prompt, clock)
+            chunk.actions()
+            clock.stop()
+            costs += costs_of(decoder, prompt.shape[1], chunk.rounds, clock.laps)
+        for kind, source in sources.items():
+            evicting.sum()
+            costs.append(((kind, 1), source.decode(blank(source.target)).phases["propose"]))
+        if turn >= _WARM_UP:
+            for key, value in costs:
+                seconds.setdefault(key, []).append(value)
+    machine = machine.best_of(measure_machine(device, model.dtype))
+    drafts = {(kind, 1): needs_of_draft(source) for kind, source in sources.items()}
+    phases = phases_of(seconds, model.sizes, machine, drafts)
+    return Bench(model, machine, phases, profile_of(phases, model.size))

@@ -1,0 +1,288 @@
+"""Price decodes: what an action costs on a GPU, and how fast each family of methods can be.
+
+Nothing is run and nothing is measured. This module needs no torch. `tables.py` shows what is computed here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.bench.described import Described
+from kerv_cli.bench.expected import Decodes, Drafts, Recorded, nearest_table, recorded
+from kerv_cli.bench.physics import DEVICES, ENGINES, ROOFLINE, SHAPES, Device, Engine, Shape, priced
+from kerv_cli.bench.settings import BenchSettings
+from kerv_cli.engine.cost import Profile
+
+NO_TOKENS = (
+    "speculation does not apply: the policy emits no action tokens, so there is nothing to draft. What applies: longer "
+    "chunks (fewer decodes per second), and rollout.clock=real, which shows what its latency costs in success"
+)
+
+
+@dataclass(frozen=True)
+class Family:
+    """Methods that draft in the same way.
+
+    Attributes:
+        name: Name in the table.
+        method: The method that stands for it, see `conf/method`.
+        drafts: How it drafts at best: whatever can be retrieved or skipped is.
+        length: Tokens that a verification commits, of seven, as its paper has them. None: not published.
+        reported: The paper's own speed against AR, on its machine.
+    """
+
+    name: str
+    method: str
+    drafts: Drafts
+    length: float | None = None
+    reported: str = ""
+
+
+_TREE = Drafts(5, 49)
+FAMILIES = (
+    Family("drafter, chain", "spec_vla_tuned", Drafts(15)),
+    Family("drafter, tree", "spec_vla", _TREE, length=(3.63 + 3.91) / 2, reported="1.22–1.42"),
+    Family("tree, then prediction", "kerv", _TREE, reported="1.27–1.37 × naive SD"),
+    Family("retrieval, then tree", "heisd", replace(_TREE, source="retrieval", retrieved=1.0), reported="up to 2.45"),
+    Family("one pass", "one_pass", Drafts(source="early", in_prefill=True)),
+    Family("streak", "one_pass_streak", Drafts(15, source="early", in_prefill=True, skipped=1.0)),
+    Family("unverified", "early_unverified", Drafts(source="early", skipped=1.0)),
+    Family("unverified, own encoder", "scout_unverified", Drafts(source="scout", skipped=1.0, encodes=False)),
+)
+"""Families of methods. The published length is Spec-VLA's, as HeiSD quotes it (docs/methods.md §2.3)."""
+_PUBLISHED_TOKENS = 7
+
+
+@dataclass(frozen=True)
+class Costs:
+    """The costs of a policy's decodes with an engine.
+
+    Attributes:
+        engine: Name of the engine, or of a measured profile.
+        profile: Seconds of each phase.
+        bounds: What bounds the encoder, the prefill and one further token. Empty if the profile was measured.
+    """
+
+    engine: str
+    profile: Profile
+    bounds: Mapping[str, str]
+
+
+def computed(policy: Described, device: Device) -> list[Costs]:
+    """Return the costs of a policy on a device, with each engine."""
+    assert policy.shape is not None
+    return [_computed(policy.shape, policy.encoder, device, engine) for engine in ENGINES.values()]
+
+
+def _computed(shape: Shape, encoder: float | None, device: Device, engine: Engine) -> Costs:
+    profile = priced(shape, device, engine)
+    needs = {"encode": shape.needs("encode", 1), "prefill": shape.needs("prefill", shape.prompt)}
+    needs["verify"] = shape.needs("verify", 1)
+    bounds = {kind: engine.bound(one, device) for kind, one in needs.items()}
+    if encoder is not None:
+        profile = replace(profile, phases={**profile.phases, "encode": ((1,), (encoder,))})
+        bounds["encode"] = "given"
+    elif not profile.seconds("encode", 1):
+        bounds["encode"] = "none"
+    return Costs(engine.name, profile, bounds)
+
+
+def check_tokens(name: str, profile: Profile, tokens: int) -> None:
+    """Check that a profile has costs of chunks of so many tokens.
+
+    Raises:
+        UsageError: Its costs are for shorter chunks.
+    """
+    if profile.tokens < tokens:
+        command = f"kerv bench target={profile.about.get('target', 'TARGET')} tokens={tokens}"
+        raise UsageError(f"on={name}: its costs are for chunks of {profile.tokens} tokens. Measure it with '{command}'")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a family of methods gives with an engine. Speeds are against AR.
+
+    Attributes:
+        family: The family.
+        ceiling: Speed if every draft token is accepted and every decode that may is executed unverified.
+        published: Speed at the acceptance that its paper reports. None: it reports none.
+        own: Speed at kerv's own acceptance. None: no table has it.
+        recorded: The setting of a published table that kerv's acceptance is from.
+        break_even: Accepted draft tokens per verification with which it is as fast as AR. None: it never is, or it
+            verifies nothing.
+    """
+
+    family: Family
+    ceiling: float
+    published: float | None
+    own: float | None
+    recorded: Recorded | None
+    break_even: float | None
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What speculation can give a policy with an engine.
+
+    Attributes:
+        costs: What its decodes cost.
+        tokens: N, tokens of a chunk.
+    """
+
+    costs: Costs
+    tokens: int
+
+    @property
+    def seconds(self) -> float:
+        """Seconds of one autoregressive decode."""
+        return self.costs.profile.decode(self.tokens)
+
+    @cached_property
+    def parts(self) -> dict[str, tuple[float, str]]:
+        """Part of an autoregressive decode -> its seconds, and what bounds them."""
+        profile, bounds = self.costs.profile, self.costs.bounds
+        rest = self.tokens - 1
+        seconds = {
+            "vision encoder": ("encode", profile.seconds("encode", 1)),
+            f"prefill, {profile.prompt} tokens": ("prefill", profile.seconds("prefill", profile.prompt)),
+            f"{rest} further token{'s' * (rest != 1)}": ("verify", rest * profile.seconds("verify", 1)),
+        }
+        return {name: (taken, bounds.get(kind, "measured")) for name, (kind, taken) in seconds.items()}
+
+    @property
+    def encoder(self) -> float:
+        """The vision encoder's share of an autoregressive decode."""
+        return self.parts["vision encoder"][0] / self.seconds
+
+    @cached_property
+    def answers(self) -> list[Answer]:
+        """What each family of methods gives that the profile can price."""
+        table, answers = recorded(nearest_table(self.tokens)), []
+        for family in FAMILIES:
+            needed = [family.drafts.source] if family.drafts.source else ["feed", "draft"]
+            if not self.costs.profile.lacks(needed):
+                answers.append(self._answer(family, table))
+        return answers
+
+    def _answer(self, family: Family, table: Sequence[Recorded]) -> Answer:
+        profile, best = self.costs.profile, Decodes(self.costs.profile, self.tokens, family.drafts)
+        published, own = None, None
+        if family.length is not None:
+            paper = Decodes(profile, _PUBLISHED_TOKENS, family.drafts)
+            chance = paper.acceptance_for(1 + (_PUBLISHED_TOKENS - 1) / family.length)
+            published = best.speed([chance])
+        shown = closest(table, family)
+        if shown is not None:
+            chance = Decodes(profile, shown.tokens, shown.drafts).acceptance_for(shown.forwards)
+            own = Decodes(profile, self.tokens, shown.drafts).speed([chance])
+        even = None if family.drafts.skipped else best.break_even()
+        return Answer(family, best.speed([1.0]), published, own, shown, even and even.accepted_each)
+
+
+def closest(table: Iterable[Recorded], family: Family) -> Recorded | None:
+    """Return the setting of a table that stands for a family: its method's, if possible with drafts of its form."""
+    found = None
+    for one in table:
+        if one.method == family.method:
+            found = found or one
+            if bool(one.drafts.nodes) == bool(family.drafts.nodes):
+                return one
+    return found
+
+
+ACTION = 7
+"""Number of tokens of one action of OpenVLA."""
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """A published time of one action of OpenVLA-7B: one sequence, seven tokens, vision included.
+
+    Attributes:
+        device: Name in `DEVICES`.
+        engine: The engine, or `ROOFLINE`.
+        low: Shortest published time, milliseconds.
+        high: Longest published time, milliseconds.
+        source: Who published it.
+        weight: Bytes of a weight of the language model.
+    """
+
+    device: str
+    engine: Engine
+    low: float
+    high: float
+    source: str
+    weight: float = 2.0
+
+    @property
+    def ours(self) -> float:
+        """The computed time, milliseconds."""
+        shape = SHAPES["openvla-7b"]
+        shape = replace(shape, sizes=replace(shape.sizes, weight=self.weight))
+        return 1e3 * priced(shape, DEVICES[self.device], self.engine).decode(ACTION)
+
+
+ANCHORS = (
+    Anchor("h100", ROOFLINE, 30.7, 30.7, "VLA-Perf (NVIDIA, arXiv 2602.18397): vision 0.56, prefill 4.1, tokens 26.0"),
+    Anchor("a100", ROOFLINE, 55.1, 55.1, "VLA-Perf: vision 1.2, prefill 11.2, tokens 42.7"),
+    Anchor("a100", ENGINES["eager"], 170, 199, "Hugging Face code; 174 = vision 8 + trunk 113 + system 53 (HeiSD)"),
+    Anchor("4090", ENGINES["eager"], 162, 229, "Hugging Face code 162 (2026-07) and 229; SGLang 173"),
+    Anchor("3090", ENGINES["eager"], 283, 283, "Hugging Face code (2026-07)"),
+    Anchor("orin", ENGINES["tuned"], 345, 400, "2.5 to 2.9 actions per second in int4", weight=0.5),
+)
+"""Published times of OpenVLA-7B. `tests/test_physics.py` compares them with ours, docs/measuring.md prints them."""
+
+
+@dataclass(frozen=True)
+class Projection:
+    """The computed times of a shape on a device with an engine.
+
+    Attributes:
+        name: Name of the profile, such as `a100-openvla-7b-eager`.
+        device: The device.
+        engine: The engine.
+        profile: Seconds of each phase of a decode.
+        floors: The shortest seconds that the device allows, for the same phases.
+    """
+
+    name: str
+    device: Device
+    engine: Engine
+    profile: Profile
+    floors: Profile
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The projection for JSON (docs/formats.md)."""
+        profile = self.profile.as_dict()
+        for costs in profile["phases"].values():
+            costs["seconds"] = [float(f"{seconds:.4g}") for seconds in costs["seconds"]]
+        device, engine = self.device, self.engine
+        published = f"{device.bandwidth / 1e9:g} GB/s, {device.flops / 1e12:g} TFLOP/s"
+        return {
+            "target": self.profile.about["target"],
+            "dtype": "bfloat16",
+            "device_name": device.title,
+            "engine": engine.name,
+            "projected": True,
+            "from": f"{published}, {100 * engine.share:.0f} % of both; {engine.source}",
+            "encoder_floor": float(f"{self.floors.seconds('encode', 1):.4g}"),
+            "encoder_system": engine.system,
+            "profile": profile,
+        }
+
+
+def projections(settings: BenchSettings) -> Iterator[Projection]:
+    """Yield the times of the shape `settings.projected`, on each of its devices with each engine."""
+    shape: Shape = SHAPES[settings.projected]
+    for name, (bandwidth, flops) in settings.projections.items():
+        title = DEVICES[name].title if name in DEVICES else name
+        device = Device(title, bandwidth * 1e9, flops * 1e12)
+        floors = priced(shape, device, ROOFLINE)
+        for engine in ENGINES.values():
+            chosen, end = replace(engine, share=settings.share), "" if engine.name == "tuned" else f"-{engine.name}"
+            yield Projection(f"{name}-{shape.name}{end}", device, chosen, priced(shape, device, chosen), floors)

@@ -1,0 +1,224 @@
+"""Rows and sentences in which `kerv bench` and `kerv estimate` show their results. This module needs no torch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from kerv_cli.bench.expected import TABLES, nearest_table
+from kerv_cli.bench.physics import DEVICES
+from kerv_cli.bench.prices import ACTION, ANCHORS, Answer, Estimate, Projection
+
+if TYPE_CHECKING:
+    from kerv_cli.bench.described import Described
+    from kerv_cli.bench.measure import Phase
+
+Row = dict[str, str]
+"""Cells of a row by the names of their columns."""
+
+
+def card_rows(card: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return rows (name, value): sizes of the model, rates of the device, and shortest times of forwards.
+
+    Args:
+        card: Result of `measure.card_of`.
+    """
+    rows = [
+        ("weights that a forward reads", f"{card['weights'] / 1e6:.1f} M, {card['weight_bytes'] / 1e6:.1f} MB"),
+        ("cache of prompt and chunk", f"{card['cache_bytes'] / 1e6:.2f} MB"),
+        ("memory, measured", f"{card['bandwidth'] / 1e9:.1f} GB/s"),
+        ("memory that holds the weights, measured", f"{card['bandwidth_of_weights'] / 1e9:.1f} GB/s"),
+        ("arithmetic, measured", f"{card['flops'] / 1e9:.0f} GFLOP/s"),
+    ]
+    for name, (reading, computing) in card["floors"].items():
+        why = "to read the weights" if reading >= computing else "for the arithmetic"
+        rows.append((f"floor of {name}", f"{1e3 * max(reading, computing):.2f} ms, {why}"))
+    return rows
+
+
+def phase_rows(phases: Sequence[Phase]) -> list[Row]:
+    """Return a row per measured phase. The floor is the shortest time that the device allows."""
+    rows = []
+    for phase in phases:
+        row = {"phase": phase.name}
+        for name, seconds in (("median ms", phase.seconds), ("p95", phase.p95), ("least", phase.least)):
+            row[name] = f"{1e3 * seconds:.2f}"
+        limits = dict.fromkeys(("GB/s", "GFLOP/s", "floor ms", "least ÷ floor"), "–")
+        if phase.floor > 0:
+            limits["GB/s"] = f"{phase.read / phase.seconds / 1e9:.1f}"
+            limits["GFLOP/s"] = f"{phase.flops / phase.seconds / 1e9:.0f}"
+            limits["floor ms"] = f"{1e3 * phase.floor:.3f}"
+            limits["least ÷ floor"] = f"{phase.least / phase.floor:.1f}"
+        rows.append(row | limits)
+    return rows
+
+
+def projection_rows(computed: Iterable[Projection]) -> list[Row]:
+    """Return a row per computed profile."""
+    rows = []
+    for one in computed:
+        row = {"profile": one.name, "device": one.device.title, "engine": one.engine.name}
+        row["encoder ms"] = f"{1e3 * one.profile.seconds('encode', 1):.2f}"
+        row["one token ms"] = f"{1e3 * one.profile.seconds('verify', 1):.2f}"
+        row["seven tokens ms"] = f"{1e3 * one.profile.decode(ACTION):.2f}"
+        row["floor ms"] = f"{1e3 * one.floors.decode(ACTION):.2f}"
+        rows.append(row)
+    return rows
+
+
+def anchor_rows() -> list[Row]:
+    """Return a row per published time of OpenVLA-7B, beside ours."""
+    rows = []
+    for one in ANCHORS:
+        row = {"device": DEVICES[one.device].title, "engine": one.engine.name}
+        if one.weight < 1:
+            row["engine"] += ", int4"
+        row["published, ms"] = f"{one.low:g}" if one.low == one.high else f"{one.low:g}–{one.high:g}"
+        rows.append(row | {"ours, ms": f"{one.ours:.1f}", "source": one.source})
+    return rows
+
+
+def part_rows(estimates: Sequence[Estimate]) -> list[Row]:
+    """Return a row per part of an autoregressive decode. Each cell has the engines side by side."""
+    rows = []
+    for name in estimates[0].parts:
+        taken, shares, bounds = [], [], []
+        for one in estimates:
+            seconds, bound = one.parts[name]
+            taken.append(f"{1e3 * seconds:.3g}")
+            shares.append(f"{100 * seconds / one.seconds:.0f} %")
+            bounds.append(bound)
+        rows.append(_part_row(name, taken, shares, bounds))
+    return [*rows, _part_row("all", [f"{1e3 * one.seconds:.3g}" for one in estimates], [""], [""])]
+
+
+def _part_row(name: str, taken: Sequence[str], shares: Sequence[str], bounds: Sequence[str]) -> Row:
+    return {
+        "one action under AR": name,
+        "ms": _beside(taken),
+        "share": _beside(shares),
+        "bound": _beside(bounds),
+    }
+
+
+def family_rows(estimates: Sequence[Estimate]) -> list[Row]:
+    """Return a row per family of methods. Each cell has the engines side by side."""
+    rows = []
+    for answers in zip(*(one.answers for one in estimates), strict=True):
+        family = answers[0].family
+        row = {
+            "family": family.name,
+            "method": family.method,
+            "ceiling": _numbers(answers, "ceiling"),
+            "at the paper's acceptance": _numbers(answers, "published"),
+            "paper reports": family.reported or "–",
+            "at kerv's": _numbers(answers, "own"),
+            "break-even": _numbers(answers, "break_even", "–" if family.drafts.skipped else "never"),
+        }
+        rows.append(row)
+    return rows
+
+
+def _numbers(answers: Iterable[Answer], name: str, none: str = "–") -> str:
+    """Return a field of several answers as a cell; `none` stands for None."""
+    texts = []
+    for answer in answers:
+        value = getattr(answer, name)
+        if value is None:
+            texts.append(none)
+        else:
+            texts.append(f"{value:.2f}" if value < 10 else f"{value:.1f}")
+    return _beside(texts)
+
+
+def _beside(texts: Sequence[str]) -> str:
+    """Return cells side by side, or one if all are equal."""
+    return texts[0] if len(set(texts)) == 1 else " / ".join(texts)
+
+
+def sentence(estimates: Sequence[Estimate]) -> str:
+    """Return one sentence that answers whether speculation helps.
+
+    Args:
+        estimates: Of the same policy on the same device: the best engine first.
+    """
+    best, worst = estimates[0], estimates[-1]
+    verified = [one for one in best.answers if not one.family.drafts.skipped]
+    tokens = f"At {best.tokens} token{'s' * (best.tokens != 1)} and {1e3 * best.seconds:.3g} ms per action"
+    if not verified:
+        return f"{tokens} nothing can be said: the profile has no cost of a draft."
+    top = max(verified, key=lambda one: one.ceiling)
+    most = max(best.answers, key=lambda one: one.ceiling)
+    unverified = f" (unverified drafts, a policy of their own: {most.ceiling:.3g})" if most is not top else ""
+    gains = {f"{one.family.method} ({one.own:.2f} at kerv's acceptance)": one.own for one in verified if one.own}
+    if worst is not best and worst.seconds > best.seconds:
+        gain = worst.seconds / best.seconds
+        gains[f"a {best.costs.engine} engine ({gain:.2f} over {worst.costs.engine} code)"] = gain
+    without = 1 / (1 - best.encoder)
+    gains[f"a faster vision encoder (at most {without:.2f})"] = without
+    first = sorted(gains, key=lambda name: -gains[name])
+    names = [name for name in first if gains[name] > 1.05] or ["a smaller or faster target"]
+    engine = f" with a {best.costs.engine} engine" if best.costs.bounds else ""
+    return (
+        f"{tokens}{engine} speculation can give at most {top.ceiling:.2f}{unverified}; the encoder takes "
+        f"{100 * best.encoder:.0f} %; what pays first is {', then '.join(names[:2])}."
+    )
+
+
+def rate(estimates: Sequence[Estimate], hz: float, actions: int) -> str:
+    """Return a sentence that says who decodes fast enough for a robot.
+
+    Args:
+        estimates: Of the same policy on the same device.
+        hz: Control steps per second.
+        actions: Control steps per chunk.
+    """
+    limit, words = actions / hz, []
+    for one in estimates:
+        enough, best = [], []
+        for answer in one.answers:
+            if answer.own and one.seconds / answer.own <= limit:
+                enough.append(answer.family.method)
+            if one.seconds / answer.ceiling <= limit:
+                best.append(answer.family.method)
+        who = "no method is"
+        if one.seconds <= limit:
+            who = "AR is fast enough"
+        elif enough:
+            who = f"at kerv's acceptance {', '.join(enough)} would be"
+        elif best:
+            who = f"only with all drafts accepted {', '.join(best)} would be"
+        words.append(f"{one.costs.engine}: AR takes {1e3 * one.seconds:.3g} ms, {who}")
+    return f"{hz:g} Hz leave {1e3 * limit:.3g} ms per decode. {'; '.join(words)}."
+
+
+def document(one: Estimate) -> dict[str, Any]:
+    """Return an estimate for JSON."""
+    parts = [{"part": name, "ms": 1e3 * taken, "bound": by} for name, (taken, by) in one.parts.items()]
+    families = []
+    for answer in one.answers:
+        family, own = answer.family, answer.recorded
+        row = {
+            "family": family.name,
+            "method": family.method,
+            "ceiling": answer.ceiling,
+            "at_published_acceptance": answer.published,
+            "paper_reports": family.reported or None,
+            "at_own_acceptance": answer.own,
+            "own_acceptance_from": own and f"results/tables/{own.table}.csv, {own.label}",
+            "break_even_tokens": answer.break_even,
+        }
+        families.append(row)
+    about = {"engine": one.costs.engine, "ms": 1e3 * one.seconds, "encoder_share": one.encoder}
+    return {**about, "parts": parts, "families": families}
+
+
+def notes(policy: Described | None, estimates: Sequence[Estimate]) -> list[str]:
+    """Return what the tables rest on, a line each."""
+    table = nearest_table(estimates[0].tokens)
+    source = "this installation has no results/tables"
+    if any(one.recorded for one in estimates[0].answers):
+        length = TABLES[table]
+        source = f"results/tables/{table}.csv, {length} tokens per chunk, on its own tasks; yours may be lower"
+    assumed = [f"assumed: {'; '.join(policy.assumed)}"] if policy and policy.assumed else []
+    return [*assumed, f"kerv's acceptance: {source}"]
