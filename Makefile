@@ -29,7 +29,9 @@ test: lint ## check style, types and imports, then run the tests
 test-cpus: setup ## run the tests of equal bits and tokens under four kinds of CPU kernels
 	@$(BIN)/python scripts/cpus.py $(PARALLEL)
 
-demo: setup ## run the demo study; ends with its verdict, its page and a recording
+demo: setup ## README's table in small: eight settings, one task, about four minutes
+	@echo "README's table in small: eight settings decode the same three episodes in turn, about four minutes on one core"
+	@$(BIN)/kerv build target grow=150m policy.target=mt10-vision name=mt10-150m > /dev/null
 	@$(BIN)/kerv sweep study=demo
 
 torture: setup ## kill commands, break their disk, damage their files, at random (MINUTES=1)

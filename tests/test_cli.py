@@ -273,7 +273,10 @@ ANSWERS = [
     ("rollout results=~/runs", "quote the value: \"results='~/runs'\""),
     ("rollout results=", "results= is empty: write a value, or leave it out"),
     ("rollout task=", "task= is empty: name a task or a suite, or leave it out"),
-    ("rollout threshold.r=3,9", "threshold.r=3,9: several values need 'kerv rollout -m'"),
+    (
+        "rollout threshold.r=3,9",
+        "threshold.r=3,9: several values need -m, as in 'kerv rollout -m threshold.r=3,9'; a list is",
+    ),
     # unknown keys and names
     ("rollout nonsense=3", "unknown key 'nonsense': see 'kerv rollout --cfg' for the keys"),
     ("rollout device=cuda", "unknown key 'device': did you mean runtime.device?"),
@@ -282,12 +285,17 @@ ANSWERS = [
     ("rollout rollout.clock=reel", "unknown rollout.clock 'reel': did you mean real?"),
     ("runs list state=finished", "unknown state 'finished': known: complete, begun, damaged, step"),
     # values
-    ("rollout episodes=1e400", "episodes: Value 'inf' of type 'float' could not be converted to Integer"),
+    (
+        "rollout episodes=1e400",
+        "episodes: Value 'inf' of type 'float' could not be converted to Integer from 1 to 1000000",
+    ),
     ("rollout world.stress=push", "world.stress: Invalid type assigned"),
     ("rollout world.stress.level=9", "world.stress.level=9: from 0 to 4"),
     ("demos episodes=10 seed=100000", "seed 100000 is for evaluation; seeds for training are 0 to 49999"),
     ("runs list since=yesterday", "since=yesterday is not a date: write 2026-11-23"),
     ("rollout method=spec_vla boundary.f_star=0.3", "unknown key 'boundary.f_star'"),
+    ("rollout -m method=spec_vla,kerv threshold.r=5", "method=kerv: unknown key 'threshold.r'"),
+    ("bench policy.target=mt10-vision", "unknown key 'policy.target': did you mean target?"),
     ("rollout episodes=3 episodes=4", "episodes is given twice"),
     ("rollout seed=5", "seed=5 is a training seed"),
     ("rollout runtime.device=tpu", "runtime.device=tpu: known are cpu, cuda"),
@@ -298,7 +306,7 @@ ANSWERS = [
     ("rollout method=type.yaml", "type.yaml:2: threshold.r: Value 'wide' of type 'str'"),
     ("rollout method=nothing.yaml", "method=nothing.yaml cannot be read: No such file"),
     # what is not there
-    ("rollout policy.target=mine", "train it with 'kerv train target name=mine'"),
+    ("rollout policy.target=mine", "make it with 'kerv train target name=mine'"),
     ("rollout policy.target=../../etc", "name a folder that holds target.json"),
     ("demos import source=file", "file is a file: name the folder of a LeRobot dataset"),
     ("rollout results=file", "results=file is a file: name a folder"),

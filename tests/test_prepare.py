@@ -85,7 +85,7 @@ def test_a_rollout_and_a_study_run_on_the_tasks_that_the_target_knows():
     assert resolve_rollout([MINE], False).settings["ar"].task == [TASK]
     assert tasks("study=own", MINE) == [TASK]
     assert tasks("study=main", MINE) == [TASK]  # the study names ten
-    assert tasks("study=demo", MINE) == [TASK]  # one of its three
+    assert tasks("study=demo", MINE) == [TASK]  # the target does not know the study's task
     assert tasks("study=main", MINE, "task=push") == ["push"]
     assert tasks("study=main") == ["MT10"]
     assert len(resolve_rollout(["policy=expert"], False).settings["expert"].task) == 10

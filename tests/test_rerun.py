@@ -1,6 +1,7 @@
 """Recordings read back from disk: entities, timelines, values, layout, and what a failure leaves behind."""
 
 import os
+import shlex
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -221,6 +222,18 @@ def test_the_newest_recordings_come_first_and_not_all_are_opened(tmp_path, monke
     monkeypatch.setattr(viewer, "has_display", lambda: False)
     assert f"the newest {MOST_OPENED} of {MOST_OPENED + 4}" in open_recording(found)
     assert "rerun episode.rrd" in open_recording([first])
+
+
+def test_without_a_display_recordings_of_two_runs_can_be_copied_to_one_folder(tmp_path, monkeypatch):
+    path = saved(episode("ar", horizon=4), tmp_path / "one run/rollouts")
+    other = tmp_path / "other/rollouts" / path.name
+    other.parent.mkdir(parents=True)
+    other.write_bytes(path.read_bytes())
+    monkeypatch.setattr(viewer, "has_display", lambda: False)
+    _, *copies, opens = (shlex.split(line) for line in open_recording([path, other]).splitlines())
+    assert [Path(source.partition(":")[2]) for _, source, _ in copies] == [path, other]
+    assert opens == ["rerun", *(name for *_, name in copies)]
+    assert len(set(opens)) == 3
 
 
 @pytest.mark.parametrize("name", ["nowhere.rrd", "notes.txt", ""])

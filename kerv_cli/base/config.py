@@ -11,15 +11,16 @@ import functools
 import itertools
 import math
 import os
+import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import Field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from kerv_cli.base.errors import UnknownName, UsageError, did_you_mean
 from kerv_cli.base.files import read_yaml_lines
-from kerv_cli.base.limits import check_settings
+from kerv_cli.base.limits import check_settings, range_of
 from kerv_cli.base.registry import PREFILL, SETTINGS_GROUPS, Part, part_of, parts
 from kerv_cli.base.settings import choices_of
 
@@ -80,7 +81,7 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
     """
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
-    from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+    from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException, ValidationError
 
     typed = _typed(overrides, schema)
     if typed.get("quick"):
@@ -112,6 +113,8 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
     except (HydraException, OmegaConfBaseException, ValueError, TypeError, RecursionError) as error:
         key = getattr(error, "full_key", None) or key
         message = str(error).partition("\n")[0]
+        if isinstance(error, ValidationError) and (at := _field(nodes, key)) is not None:
+            message += f" {range_of(at)}".rstrip()
         raise UsageError(f"{places.get(key, '')}{f'{key}: ' if key else ''}{message}", key) from error
     return settings
 
@@ -127,7 +130,8 @@ def _typed(overrides: Sequence[str], schema: type) -> dict[str, Any]:
         if key in typed:
             raise UsageError(f"{key} is given twice: leave one out", key)
         if parsed.is_sweep_override():
-            raise UsageError(f"{override}: several values need 'kerv rollout -m'; as a list write {key}=[{value}]", key)
+            as_list = f"; a list is written {key}=[{value}]" if "." in key else ""
+            raise UsageError(f"{override}: several values need -m, as in 'kerv rollout -m {override}'{as_list}", key)
         typed[key] = parsed.value()
     if "task" in lists and typed.get("task") == []:
         raise UsageError("task= is empty: name a task or a suite, or leave it out")
@@ -206,8 +210,11 @@ def _parsed(override: str) -> Any:
     key, equals, value = override.lstrip("+").partition("=")  # Hydra's `+key=` for new keys is accepted, not needed
     if not equals or not key or key[0] == "~":  # Hydra's `~key`, which would delete a setting
         raise UsageError(f"'{override}' is not an override: write key=value, a list without spaces: task=[reach,push]")
+    parse = OverridesParser.create().parse_overrides
     try:
-        return OverridesParser.create().parse_overrides([override.lstrip("+")])[0]
+        if not re.search(r"""[][{}(),='"\\]""", value) and not value.isascii():  # Hydra reads such text in quotes alone
+            return parse([f"{key}='{value}'"])[0]
+        return parse([f"{key}={value}"])[0]
     except (HydraException, ValueError, TypeError, AttributeError, RecursionError) as error:
         hint = f"""write a list without spaces, task=[reach,push], or quote the value: "{key}='{value}'\""""
         raise UsageError(f"cannot read '{override[:200]}': {hint}", key) from error
@@ -267,6 +274,15 @@ def _open_mappings(node: Any) -> None:
             OmegaConf.set_struct(child, False)
         elif isinstance(child, DictConfig):
             _open_mappings(child)
+
+
+def _field(node: Any, key: str) -> Field[Any] | None:
+    """Return the field of the settings dataclass that declares a setting. None if no dataclass does."""
+    from omegaconf import OmegaConf
+
+    above, _, name = key.rpartition(".")
+    kind = OmegaConf.get_type(OmegaConf.select(node, above) if above else node)
+    return next((at for at in fields(kind) if at.name == name), None) if is_dataclass(kind) else None
 
 
 def _keys(node: Any, prefix: str = "") -> Iterator[str]:

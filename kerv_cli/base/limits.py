@@ -72,6 +72,11 @@ def description(at: Field[Any]) -> str:
     return ": ".join(filter(None, (" | ".join(at.metadata.get("names", ())), at.metadata.get("help", ""))))
 
 
+def range_of(at: Field[Any]) -> str:
+    """Return the values that a setting may have, as in `from 1 to 1024`. Empty if it has no limits."""
+    return _range_text(*at.metadata["limits"]) if "limits" in at.metadata else ""
+
+
 def check_name(name: str, what: str) -> str:
     """Check that a name can be used for a folder, and return it.
 

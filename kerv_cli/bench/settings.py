@@ -57,7 +57,7 @@ class EstimateSettings(CommandSettings):
     vision: str = setting("", "vision encoder: its weights (400M), or its time (8ms)")
     bits: int = number(16, 1, 32, help="bits of a weight of the language model; arithmetic stays in bfloat16")
     device: list[str] = setting(["h100"], f"GPUs: {', '.join(DEVICES)}")
-    on: list[str] = setting([], "instead: profiles of 'kerv bench', as in 'kerv report on='")
+    on: list[str] = setting([], "instead: profiles of 'kerv bench', as on= of 'kerv report'")
     trace: str = setting("", "price the decodes of this file, see docs/trace.md")
     choose: str = choice("none", "none", "draft", help="draft: which length of drafted chains the trace's decodes want")
 

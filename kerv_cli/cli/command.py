@@ -25,7 +25,7 @@ import typer
 from typer.core import TyperCommand
 
 from kerv_cli.base.config import compose, groups, plain_text
-from kerv_cli.base.errors import UnknownName
+from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.places import check_writable
 from kerv_cli.base.registry import NoSettings, Part, add, find, load, parts
 from kerv_cli.base.settings import CommandSettings, choices_of
@@ -198,6 +198,10 @@ def _settings(part: Part, overrides: list[str], cfg: bool) -> Any:
         StorageError: The command writes to the results folder, which cannot be written.
     """
     typed = part.traits.get("typed", {})
+    for key in (word.partition("=")[0] for word in overrides):
+        own = key.rpartition(".")[2]
+        if own in typed and key not in typed and key.partition(".")[0] not in top_keys(part):
+            raise UsageError(f"unknown key '{key}': did you mean {own}?", key)
     pairs = [(typed.get(key, key), equals, value) for key, equals, value in (word.partition("=") for word in overrides)]
     settings: Any = compose(part.name.replace(" ", "_"), ["".join(pair) for pair in pairs], part.settings)
     if cfg:

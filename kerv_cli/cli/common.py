@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -113,7 +114,7 @@ def one_line_errors(words: Sequence[str]) -> Iterator[None]:
     except KervError as error:
         if isinstance(error, UsageError) and _is_of_an_interrupt(error):
             _refuse("interrupted", Interrupted.exit_code, None)
-        _refuse(str(error), error.exit_code, error)
+        _refuse(str(error), error.exit_code, error, words)
     except typer.TyperException as error:
         if "\n" in error.format_message():  # not an error: the help, because no command was typed
             raise
@@ -152,17 +153,46 @@ def _parse_error(error: Any, words: Sequence[str]) -> str:
 
 def results_word(overrides: Iterable[str]) -> str:
     """Return ` results=DIR` and ` store=URL` as far as the overrides contain them, to append to a suggested command."""
-    return "".join(f" {shlex.quote(word)}" for word in overrides if word.startswith(("results=", "store=")))
+    return "".join(f" {quoted(word)}" for word in overrides if word.startswith(("results=", "store=")))
 
 
-def _refuse(message: str, code: int, error: BaseException | None) -> None:
+def quoted(word: str) -> str:
+    """Return a word as a shell reads it. Quotes are double: commands in messages are in single ones."""
+    if shlex.quote(word) == word:
+        return word
+    return '"' + re.sub(r'(["$`\\])', r"\\\1", word) + '"'
+
+
+def _refuse(message: str, code: int, error: BaseException | None, words: Sequence[str] = ()) -> None:
+    """Print an error in one line and exit. `words`: command-line arguments after `kerv`."""
     if error is not None and os.environ.get("KERV_TRACEBACK"):
         raise error
     if code == Interrupted.exit_code:
         # half-built objects, such as a GL context, may fail to clean up: the user need not see that
         sys.unraisablehook = lambda unraisable: None
-    typer.echo(f"kerv: {' '.join(message.split())}", err=True)
+    typer.echo(f"kerv: {with_results(' '.join(message.split()), words)}", err=True)
     raise typer.Exit(code)
+
+
+def with_results(message: str, words: Iterable[str]) -> str:
+    """Append the `results=` and `store=` that were typed to the quoted commands of a message that lack them.
+
+    Args:
+        message: The message, with commands as in `'kerv calibrate task=reach'`.
+        words: Command-line arguments after `kerv`.
+    """
+    from kerv_cli.base.registry import parts
+
+    where, known = results_word(words), parts("command")
+
+    def complete(found: re.Match[str]) -> str:
+        quote, command = found.groups()
+        typed = command.split()[1:]
+        part = known.get(" ".join(typed[:2])) or known.get(typed[0])
+        is_elsewhere = part is not None and hasattr(part.settings, "results") and "results=" not in command
+        return f"{quote}{command}{where if is_elsewhere else ''}{quote}"
+
+    return re.sub(r"(['`])(kerv [a-z].*?)\1(?!\w)", complete, message)
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
@@ -79,4 +80,5 @@ def _print_rollout(store: StudyStore, as_json: bool, where: str) -> None:
     show = f"kerv runs show {store.name}{where}"
     typer.echo(f"run {store.name} in {store.root}; its settings and figures: {show}")
     if store.recordings:
-        typer.echo(f"{len(store.recordings)} recordings; open one with: kerv view {store.recordings[0]}")
+        first = shlex.quote(str(store.recordings[0]))
+        typer.echo(f"{count(len(store.recordings), 'recording')}; open one with: kerv view {first}")

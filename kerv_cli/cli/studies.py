@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -68,7 +69,7 @@ def planned_study(resolved: ResolvedStudy, command: Sequence[str], is_rollout: b
         if names:
             typer.echo(f"kerv: warning: policy {target} was never trained on {', '.join(names)}", err=True)
     for task in dict.fromkeys(one.task for one in planned.to_run):
-        spec_of(task).check_installed()
+        spec_of(task).check_installed(resolved.first.policy.target)
     if is_rollout and planned.existing:
         there, wanted = len(planned.existing), len(planned.study.episodes)
         typer.echo(f"resuming {planned.store.name}: {there} of {wanted} episodes are there", err=True)
@@ -203,8 +204,7 @@ def print_study(table: DataFrame, store: StudyStore, all_columns: bool = False, 
     from kerv_cli.report.summary import SummaryTable, not_in_turn
     from kerv_cli.report.tables import values_of
 
-    where = results_word([f"results={store.database.results}"] if str(store.database.results) != "results" else [])
-    how = how or f"kerv report study={store.name}{where} --all"
+    how = how or f"kerv report study={store.name}{results_word(store.database.words)} --all"
     console().print(SummaryTable(table, all_columns, how))
     codes, commits = values_of(table, "code"), values_of(table, "git_commit")
     if len(codes) > 1:
@@ -241,9 +241,9 @@ def print_verdict(table: DataFrame, store: StudyStore, loss: float) -> None:
 
     typer.echo(f"verdict: {verdict_of(table, loss)[0]}")
     typer.echo(f"page: {store.root / 'report.html'}")
-    typer.echo(
-        f"browse: kerv board{'' if store.database.results.name == 'results' else f' results={store.database.results}'}"
-    )
+    typer.echo(f"browse: kerv board{results_word(store.database.words)}")
     recordings = store.recordings
     mend = "" if store.kind == "import" else "; the same sweep with record=1 rerun=all does that"
-    typer.echo(f"watch: {f'kerv view {recordings[0]}' if recordings else f'nothing is recorded{mend}'}")
+    typer.echo(
+        f"watch: {shlex.join(['kerv', 'view', str(recordings[0])]) if recordings else f'nothing is recorded{mend}'}"
+    )

@@ -23,8 +23,8 @@ def view(settings: CommandSettings, names: list[str]) -> None:
     """Open recordings in the Rerun viewer; without a display, print the command that opens them."""
     from kerv_cli.report.viewing.viewer import find_recordings, open_recording
 
-    paths = [_place(settings.results, name) for name in names] or [Path(settings.results)]
-    typer.echo(open_recording(find_recordings(paths)))
+    paths = [_place(settings.results, name) for name in names]
+    typer.echo(open_recording(find_recordings(paths or filter(Path.is_dir, [Path(settings.results)]))))
 
 
 def _place(results: str, name: str) -> Path:

@@ -159,6 +159,17 @@ def _line_of(path: Path, typed: Collection[str], place: str, others: Mapping[str
         raise UsageError(f"{path}:{line}: {error}", error.key) from error
 
 
+@contextmanager
+def _named(point: str) -> Iterator[None]:
+    """Add the point of a grid, such as `method=kerv`, to the message of a UsageError. Empty: there is one point."""
+    try:
+        yield
+    except UsageError as error:
+        if not point:
+            raise
+        raise UsageError(f"{point}: {error}", error.key) from error
+
+
 def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
     """Compose the settings of `kerv rollout`. With -m, compose one for each combination of the values in comma lists.
 
@@ -174,13 +185,15 @@ def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
     """
     tasks = [override for override in overrides if override.startswith("task=")]
     others = [override for override in overrides if override not in tasks]
-    varied = [key for key in swept_keys(others) if key != "method"] if multirun else []
+    swept = swept_keys(others) if multirun else []
+    varied = [key for key in swept if key != "method"]
     if "results" in varied:
         raise UsageError("results= cannot have several values: a rollout has one results folder")
     settings: dict[str, RolloutSettings] = {}
     points: dict[str, Point] = {}
     for words in expand(others) if multirun else [others]:
-        composed = compose("rollout", [*tasks, *words], RolloutSettings)
+        with _named(" ".join(word for word in words if _key(word) in swept)):
+            composed = compose("rollout", [*tasks, *words], RolloutSettings)
         parts = [word for word in words if _key(word) in METHOD_KINDS and _key(word) not in varied]
         point = Point.of(" ".join([composed.method, *parts]), words, varied)
         settings[point.label], points[point.label] = composed, point

@@ -92,6 +92,7 @@ class StudySettings:
     seconds: float = number(
         1.0, above=0, most=86_400, help="guess of the seconds per episode, for a plan without measured ones"
     )
+    first: list[str] = setting([], "commands to run once before the study, which make what it needs")
     note: str = setting("", "a sentence printed below the table, such as what to look for")
     machines: list[str] = setting([], "profiles of 'kerv bench': also estimate the study's speeds on those machines")
 

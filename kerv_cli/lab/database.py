@@ -277,6 +277,12 @@ class Database:
         return self._url.render_as_string(hide_password=False)
 
     @property
+    def words(self) -> list[str]:
+        """The overrides that choose this database, for commands that are printed. Empty for the folder `results`."""
+        folder = [] if self.results == results_dir("results") else [f"results={self.results}"]
+        return folder + ([f"store={self.shown}"] if self.store else [])
+
+    @property
     def exists(self) -> bool:
         """Whether the SQLite file exists. Always True for a server."""
         return self.file is None or self.file.exists()

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import sqlalchemy as sa
 
-from kerv_cli.base.errors import UsageError
+from kerv_cli.base.config import groups
+from kerv_cli.base.errors import UsageError, did_you_mean
 from kerv_cli.base.limits import check_label, check_name
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.lab.database import (
@@ -138,8 +139,9 @@ class StudyStore:
         """
         typed = (row.command for row in run_rows(self.database, SWEEP, self.name) if row.command[:1] == ("sweep",))
         words: Iterable[str] = next(typed, ("sweep", f"study={self.name}"))
-        words = (word for word in words if not word.startswith(("results=", "rerun=", "-")))
-        return shlex.join(["kerv", *words, *overrides])
+        replaced = {"results", "rerun", *(word.partition("=")[0] for word in overrides)}
+        words = (word for word in words if word.partition("=")[0] not in replaced and not word.startswith("-"))
+        return shlex.join(["kerv", *words, *overrides, *self.database.words])
 
     def load(self) -> Study:
         """Return the study as it was planned last.
@@ -149,7 +151,10 @@ class StudyStore:
         """
         row = self._row()
         if row is None:
-            raise UsageError(f"no study '{self.name}' in {self.database.shown}: {self.how_to_run()}")
+            stored = [store.name for store in studies(self.database)]
+            hint = did_you_mean(self.name, stored) or "'kerv runs list' shows what is there"
+            hint = self.how_to_run() if self.name in groups()["study"] else hint
+            raise UsageError(f"no study '{self.name}' in {self.database.shown}: {hint}")
         with self.database.reading() as connection, self.database.checking(f"study {self.name}"):
             return stored_study(connection, row)[0]
 

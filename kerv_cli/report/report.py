@@ -169,6 +169,6 @@ def check_publishable(data: StudyData) -> None:
     clauses += refusals(data.table)
     if clauses:
         raise Unpublishable(
-            f"study {data.study.name} may not be published: {'; '.join(clauses)}. Commit, then run 'kerv sweep "
-            f"study={data.study.name}' into a fresh results folder on one machine"
+            f"study {data.study.name} may not be published: {'; '.join(clauses)}. Commit, then run it on one "
+            f"machine: 'kerv sweep study={data.study.name} results=fresh'"
         )

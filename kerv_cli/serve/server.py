@@ -7,6 +7,7 @@ open. No client can stop the server.
 from __future__ import annotations
 
 import contextlib
+import errno
 import http
 import logging
 import threading
@@ -87,7 +88,8 @@ class PolicyServer:
                 logger=_one_line_logger(self.log),
             )
         except OSError as error:
-            raise UsageError(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
+            remedy = ": port=0 takes a free one" if error.errno == errno.EADDRINUSE else ""
+            raise UsageError(f"cannot listen on {host}:{port}: {error.strerror or error}{remedy}") from error
         port = server.socket.getsockname()[1]
         _start(server.serve_forever)
         try:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from kerv_cli.base.config import conf_dir
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.files import read_yaml_lines
 from kerv_cli.base.places import artifact_or_path, results_dir
 
 RELEASED = ("libero-state", "mt10-state", "mt10-vision", "mt10-vision-parallel", "mt50-plain", "mt50-vision")
@@ -49,15 +51,22 @@ def find_target(results: str, name: str) -> Path:
         )
     if (folders[0] / RESUME).is_file():
         raise UsageError(
-            f"target '{name}' is unfinished: 'kerv runs show target/{name} results={results}' shows the command that "
-            "goes on with its training"
+            f"target '{name}' is unfinished: 'kerv runs show target/{name}' shows the command that goes on with its "
+            "training"
         )
-    remedies = [
-        "name a folder that holds target.json" if "/" in name else f"train it with 'kerv train target name={name}'"
-    ]
+    remedies = ["name a folder that holds target.json" if "/" in name else f"make it with '{_made_by(name)}'"]
     names = target_names(results)
     remedies += [f"take one of {', '.join(names)}"] if names else []
     raise UsageError(f"no target '{name}' in {', '.join(map(str, folders))}: {', or '.join(remedies)}")
+
+
+def _made_by(name: str) -> str:
+    """Return the command that makes a target: the one that a study names that runs on it, else `kerv train target`."""
+    for path in sorted((conf_dir() / "study").glob("*.yaml")):
+        for command in read_yaml_lines(path, f"study={path.stem}")[0].get("first", []):
+            if f"name={name}" in command.split():
+                return str(command)
+    return f"kerv train target name={name}"
 
 
 def check_not_shipped(path: Path, word: str) -> None:

@@ -216,16 +216,20 @@ class EnvironmentSpec:
         except PackageNotFoundError:
             return False
 
-    def check_installed(self) -> None:
+    def check_installed(self, target: str = "NAME") -> None:
         """Refuse an environment whose simulator is not installed, or not in versions that work.
+
+        Args:
+            target: The policy that was to run in it, for the error message.
 
         Raises:
             UsageError: A package is missing or has a wrong version, or the environment is a recorded dataset.
         """
         if not self.world_class:
             raise UsageError(
-                f"{self.name} is a recording: no episode can run in it. Serve a policy of its tasks with 'kerv serve "
-                "policy.target=NAME', or import it again with environment=NAME, the simulator that recorded it"
+                f"{self.name} is a recording: no episode can run in it. Serve the policy with 'kerv serve "
+                f"policy.target={target}', or import the dataset again with environment=NAME, the simulator that "
+                "recorded it"
             )
         if not self.installed:
             raise UsageError(f"{self.name} needs more packages: pip install 'kerv[{self.extra}]'")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import shlex
+import socket
 import subprocess
 import sys
 import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,7 +29,7 @@ def recordings_below(folder: Path) -> Iterator[Path]:
     return (path for path in folder.rglob("[!.]*.rrd") if path.is_file())
 
 
-def find_recordings(paths: Sequence[Path]) -> list[Path]:
+def find_recordings(paths: Iterable[Path]) -> list[Path]:
     """Return all recordings among some paths, the newest first.
 
     Args:
@@ -37,8 +38,8 @@ def find_recordings(paths: Sequence[Path]) -> list[Path]:
     Raises:
         UsageError: A path does not exist or is neither a recording nor a folder, or no recording was found.
     """
-    found: set[Path] = set()
-    for path in (Path(p).expanduser() for p in paths):
+    paths, found = [Path(path).expanduser() for path in paths], set[Path]()
+    for path in paths:
         if path.is_dir():
             found.update(recordings_below(path))
         elif path.suffix == ".rrd" and path.exists():
@@ -46,7 +47,7 @@ def find_recordings(paths: Sequence[Path]) -> list[Path]:
         else:
             raise UsageError(f"{path} does not exist or is no recording: name a file that ends in .rrd, or a folder")
     if not found:
-        where = ", ".join(map(str, paths))
+        where = ", ".join(map(str, paths)) or "the results folder"
         raise UsageError(f"no recordings in {where}: make some with 'kerv rollout method=ar task=reach-v3'")
     return sorted(found, key=lambda path: (-path.stat().st_mtime, path))
 
@@ -75,12 +76,19 @@ def open_recording(paths: Sequence[Path]) -> str:
         read_chunks(path)
     more = f" (the newest {len(chosen)} of {len(paths)})" if len(paths) > len(chosen) else ""
     if not has_display():
-        command = f"rerun {' '.join(shlex.quote(path.name) for path in chosen)}"
-        remedy = "copy the files to a machine that has one (pip install 'rerun-sdk==0.41.*')"
-        return f"no display here{more}: {remedy}:\n  {command}"
+        own = {path: _own_name(path) for path in chosen}
+        lines = [shlex.join(["scp", f"{socket.gethostname()}:{path.absolute()}", name]) for path, name in own.items()]
+        lines += [shlex.join(["rerun", *own.values()])]
+        where = "no display here{}: type on a machine that has one (pip install 'rerun-sdk==0.41.*')"
+        return "\n  ".join([where.format(more), *lines])
     _start([*viewer_command(), "--bind", "127.0.0.1", *map(str, chosen)])
     names = chosen[0].name if len(chosen) == 1 else f"{len(chosen)} recordings"
     return f"opened {names}{more} in the Rerun viewer"
+
+
+def _own_name(path: Path) -> str:
+    """Return a file name that recordings of other runs do not have: the run's name goes before the recording's."""
+    return f"{path.parent.parent.name}-{path.name}" if path.parent.name == "rollouts" else path.name
 
 
 def viewer_command() -> list[str]:

@@ -130,8 +130,9 @@ class Source:
         version = str(info.get("codebase_version"))
         if not version.startswith("v3."):
             raise CheckpointError(
-                f"{folder / INFO} is of version {version}, v3.x is read: convert it with LeRobot's own "
-                "convert_dataset_v21_to_v30"
+                f"{folder / INFO} is of version {version}, v3.x is read: convert a copy of {folder} with LeRobot, "
+                "'python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=local/copy --root=COPY "
+                "--push-to-hub=false'"
             )
         features = info["features"].items()
         keys = {n.removeprefix(IMAGES): n for n, feature in features if feature["dtype"] in ("image", "video")}
