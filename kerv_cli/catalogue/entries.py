@@ -7,7 +7,6 @@ import csv
 import dataclasses
 import fnmatch
 import io
-import itertools
 import os
 import re
 import shlex
@@ -441,7 +440,9 @@ def plan_of(run: RunEntry, database: Database) -> Plan:
     elif study.kind == ROLLOUT:
         name = new_name(database, study)
     else:
-        names = (f"{run.id}-again{number if number > 1 else ''}" for number in itertools.count(1))
-        name = next(one for one in names if not StudyStore(database, one).exists)
+        number, name = 1, f"{run.id}-again"
+        while StudyStore(database, name).exists:
+            number += 1
+            name = f"{run.id}-again{number}"
     study = dataclasses.replace(study, name=name)
     return plan_study(database, study, ALL, row.started if row else "", command=command)

@@ -96,6 +96,11 @@ class Evaluation:
         return dict(self.server.get("kerv") or {})
 
     @property
+    def worlds(self) -> set[tuple[str, int]]:
+        """Task and seed of every recorded episode."""
+        return {(one.task, one.seed) for one in self.episodes}
+
+    @property
     def name(self) -> str:
         """The decoding method, if kerv served the policy; otherwise the name of the model server."""
         method = self.facts.get("settings", {}).get("method")
@@ -229,18 +234,21 @@ def labelled(recordings: Sequence[list[Evaluation]], labels: Sequence[str] = ())
 
 
 def _check_same_episodes(names: str, first: Sequence[Evaluation], other: Sequence[Evaluation]) -> None:
-    pairs = [(a, b) for a in first for b in other if a.benchmark == b.benchmark]
-    if not pairs:
-        benchmarks = (", ".join(one.benchmark for one in evaluations) for evaluations in (first, other))
-        raise UsageError(f"{names} have different benchmarks: {' and '.join(benchmarks)}")
-    for a, b in pairs:
+    ours, theirs = ({one.benchmark: one for one in side} for side in (first, other))
+    shared = [benchmark for benchmark in ours if benchmark in theirs]
+    if not shared:
+        raise UsageError(f"{names} have different benchmarks: {', '.join(ours)} and {', '.join(theirs)}")
+    has_pairs = False
+    for benchmark in shared:
+        a, b = ours[benchmark], theirs[benchmark]
         left, right = _conditions(a.config), _conditions(b.config)
         for key in sorted(left.keys() | right.keys()):
             if left.get(key) != right.get(key):
                 raise UsageError(
-                    f"{names} have different episodes of {a.benchmark}: {key} is {left.get(key)} and {right.get(key)}"
+                    f"{names} have different episodes of {benchmark}: {key} is {left.get(key)} and {right.get(key)}"
                 )
-    if not any({(e.task, e.seed) for e in a.episodes} & {(e.task, e.seed) for e in b.episodes} for a, b in pairs):
+        has_pairs |= not a.worlds.isdisjoint(b.worlds)
+    if not has_pairs:
         raise UsageError(f"{names} have no episode in common: neither task nor seed agree")
 
 
@@ -306,7 +314,7 @@ def _identity(evaluations: Sequence[Evaluation]) -> dict[str, str]:
 
     The hash of the results keeps rollouts from reusing imported episodes.
     """
-    recorded = [[one.id, [dataclasses.astuple(e) for e in one.episodes]] for one in evaluations]
+    recorded = [[one.id, list(map(dataclasses.astuple, one.episodes))] for one in evaluations]
     digest = hashlib.sha256(json.dumps(recorded, sort_keys=True).encode()).hexdigest()
     hashes = {str(k): str(v) for k, v in dict(evaluations[0].facts.get("identity") or {}).items()}
     return {"target": "", **hashes, "evaluation": digest, OBSERVATION: "of the benchmark"}

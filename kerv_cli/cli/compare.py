@@ -89,11 +89,11 @@ def power(names: list[str], as_json: AsJson = False) -> None:
     ]
     if as_json:
         end_with_json(plans)
-    shown = [f"{row['pairs']}" if row["pairs"] <= MOST_PAIRS else f"more than {MOST_PAIRS:,}" for row in plans]
-    rows = (
-        (row["assumption"], f"{row['lost']:.1%}", f"{row['won']:.1%}", pairs)
-        for row, pairs in zip(plans, shown, strict=True)
-    )
+    rows, shown = [], []
+    for row in plans:
+        pairs = f"{row['pairs']}" if row["pairs"] <= MOST_PAIRS else f"more than {MOST_PAIRS:,}"
+        shown.append(pairs)
+        rows.append((row["assumption"], f"{row['lost']:.1%}", f"{row['won']:.1%}", pairs))
     print_table(("in a pair, only one side succeeds", "only the first", "only the second", "pairs needed"), rows)
     needed = " to ".join(dict.fromkeys(shown))
     typer.echo(

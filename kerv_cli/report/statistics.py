@@ -246,9 +246,8 @@ def speedup(
         _, members, sizes = np.unique(groups, return_inverse=True, return_counts=True)
         weights = 1.0 / (sizes[members] * len(sizes))
     mean_a, mean_b = float(weights @ a), float(weights @ b)
-    strata, clusters = (
-        np.unique(one, return_inverse=True)[1] for one in (strata, range(a.size) if blocks is None else blocks)
-    )
+    strata = np.unique(strata, return_inverse=True)[1]
+    clusters = np.unique(range(a.size) if blocks is None else blocks, return_inverse=True)[1]
     clusters = np.unique(strata * a.size + clusters, return_inverse=True)[1]  # blocks are named within their task
     if not clusters.any():
         clusters = np.arange(a.size)

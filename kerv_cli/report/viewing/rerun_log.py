@@ -86,7 +86,12 @@ class _Log:
         self.rows(path, steps, rr.StateChange.columns(state=list(values)))
 
     def numbers(
-        self, path: str, steps: Steps, names: Sequence[str], values: Iterable[Sequence[float]], colors: Colors = COLORS
+        self,
+        path: str,
+        steps: Steps,
+        names: Sequence[str],
+        values: Iterable[Sequence[float | None]],
+        colors: Colors = COLORS,
     ) -> None:
         """Log numbers over time, drawn as step lines.
 
@@ -94,16 +99,19 @@ class _Log:
             path: Name of the plot in the viewer.
             steps: Control step of each row.
             names: Name of each line.
-            values: For each row, one number per line. A row that is empty is left out.
+            values: For each row, one number per line. A row that is empty or begins with None is left out.
             colors: Colour of each line (0xRRGGBBAA). Repeated if there are more lines.
         """
-        present = [(step, value) for step, value in zip(steps, values, strict=True) if len(value)]
+        present, numbers = [], []
+        for step, row in zip(steps, values, strict=True):
+            if len(row) and row[0] is not None:
+                present.append(step)
+                numbers.append(row)
         if present:
             shades = np.resize(np.array(colors, dtype=np.uint32), len(names))
             self.static(path, rr.SeriesLines(names=list(names), colors=shades, interpolation_mode="StepAfter"))
-            flat = np.array([value for _, value in present], dtype=np.float64).ravel()
-            columns = rr.Scalars.columns(scalars=flat).partition([len(names)] * len(present))
-            self.rows(path, np.array([step for step, _ in present]), columns)
+            columns = rr.Scalars.columns(scalars=np.array(numbers, dtype=np.float64).ravel())
+            self.rows(path, np.array(present), columns.partition([len(names)] * len(present)))
 
 
 @catch_and_log_exceptions(strict=True)  # rerun would turn exceptions into warnings and missing views
@@ -174,10 +182,9 @@ def _log_tokens(log: _Log, record: EpisodeRecord) -> None:
     changes = [i for i in range(len(modes)) if i == 0 or modes[i] != modes[i - 1]]
     shades = {mode: part.colour << 8 | 0xFF for mode, part in parts("proposer").items() if part.colour is not None}
     shades |= {"ar": GREY, "skip": YELLOW}
-    looks = {
-        mode: (readable(mode), shades.get(mode, COLORS[number % len(COLORS)]))
-        for number, mode in enumerate(sorted(set(modes)))
-    }
+    looks = {}
+    for number, mode in enumerate(sorted(set(modes))):
+        looks[mode] = readable(mode), shades.get(mode, COLORS[number % len(COLORS)])
     log.states("mode", starts[changes], [modes[i] for i in changes], looks)
     size = chunk_size(record.decodes, len(names))
     chunks = [outcomes_of(decode, size, len(names)) for decode in record.decodes]
@@ -203,20 +210,22 @@ def _log_numbers(log: _Log, record: EpisodeRecord) -> None:
     log.numbers("actions", steps[:-1], names, record.actions)
     log.numbers("gripper", steps, ["gripper opening"], record.gripper[:, None], [YELLOW])
     log.numbers("decode/forwards", starts, ["forwards"], [(d.forwards,) for d in decodes], [GREY])
-    per_verification = [acceptance(d.rounds) if d.verifications else () for d in decodes]
+    per_verification = [acceptance([d]) for d in decodes]
     titles = ["tokens committed per verification (AL)", "drafts accepted per verification"]
     log.numbers("decode/acceptance", starts, titles, per_verification, [0x56B4E9FF, 0x009E73FF])
     limits = [threshold_of(d) for d in decodes]
-    if all(len(set(r)) <= 1 for r in limits):
+    if all(min(r, default=0) == max(r, default=0) for r in limits):
         log.numbers("decode/threshold", starts, ["r"], [r[:1] for r in limits])
     else:
         log.numbers("decode/threshold", starts, [f"r {name}" for name in names], limits)
-    phases = [phase for phase in PHASES if any(d.phases.get(phase) for d in decodes)]
-    times = [(1000 * d.seconds, *(1000 * d.phases.get(phase, 0.0) for phase in phases)) for d in decodes]
-    log.numbers("decode/phases", starts, ["total", *phases], times, [GREY, *COLORS])
+    times = {"total": [1000 * d.seconds for d in decodes]}
+    for phase in PHASES:
+        milliseconds = [1000 * d.phases.get(phase, 0.0) for d in decodes]
+        if any(milliseconds):
+            times[phase] = milliseconds
+    log.numbers("decode/phases", starts, list(times), np.transpose(list(times.values())), [GREY, *COLORS])
     for signal, title in SIGNALS.items():
-        values = [getattr(d, signal) for d in decodes]
-        log.numbers(f"signals/{signal}", starts, [title], [() if value is None else (value,) for value in values])
+        log.numbers(f"signals/{signal}", starts, [title], [(getattr(d, signal),) for d in decodes])
 
 
 STEP, TIME = "step", "time"

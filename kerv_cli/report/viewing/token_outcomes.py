@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -94,16 +95,19 @@ def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome
     """
     executed = len(decode.actions) * dofs
     outcomes = [TokenOutcome(_unjudged(decode))] * size
-    judged = [pair for one_round in decode.rounds for pair in _judged(one_round)]
-    filled = decode.filled or range(max(0, executed - decode.compensated), executed)
-    for index, outcome in [*judged, *((index, TokenOutcome("compensated")) for index in filled)]:
+    for one_round in decode.rounds:
+        for index, outcome in _judged(one_round):
+            if outcomes[index].kind != "rejected":
+                outcomes[index] = outcome
+    for index in decode.filled or range(max(0, executed - decode.compensated), executed):
         if outcomes[index].kind != "rejected":
-            outcomes[index] = outcome
-    tokens = [*decode.tokens, *[None] * size]
-    return [
-        replace(one, kind=one.kind if index < executed or one.kind == "rejected" else "dropped", token=tokens[index])
-        for index, one in enumerate(outcomes)
-    ]
+            outcomes[index] = TokenOutcome("compensated")
+    for index in range(executed, size):
+        if outcomes[index].kind != "rejected":
+            outcomes[index] = replace(outcomes[index], kind="dropped")
+    for index, token in enumerate(decode.tokens[:size]):
+        outcomes[index] = replace(outcomes[index], token=token)
+    return outcomes
 
 
 def _judged(one_round: Round) -> list[tuple[int, TokenOutcome]]:
@@ -132,20 +136,24 @@ def _unjudged(decode: DecodeRecord) -> str:
     return "skipped" if decode.skipped or not decode.forwards else "target"
 
 
-def acceptance(rounds: Sequence[Round]) -> tuple[float, float]:
+def acceptance(decodes: Iterable[DecodeRecord]) -> tuple[float, ...]:
     """Return the acceptance length and the accepted drafts per verification (docs/methods.md §7).
 
-    Args:
-        rounds: Rounds of one or more decodes. At least one must be a verification.
-
     Returns:
-        Mean number of committed tokens, and mean number of accepted draft tokens, per verification.
+        Mean number of committed tokens, and mean number of accepted draft tokens, per verification. Empty if the
+        decodes have no verification.
     """
-    rounds = [r for r in rounds if r.is_verification]
-    return sum(r.committed for r in rounds) / len(rounds), sum(r.accepted for r in rounds) / len(rounds)
+    verifications = committed = accepted = 0
+    for decode in decodes:
+        for one_round in decode.rounds:
+            if one_round.is_verification:
+                verifications += 1
+                committed += one_round.committed
+                accepted += one_round.accepted
+    return (committed / verifications, accepted / verifications) if verifications else ()
 
 
-_SHOWN_SYMBOLS = set("→✓×≈·–…≤≥±αφσ") | {style.symbol for style in OUTCOMES.values()}
+_SHOWN_SYMBOLS = "→✓≈–…≤≥αφσ"  # and those of OUTCOMES, which are among them or in Latin-1
 
 
 def readable(text: str) -> str:
@@ -153,7 +161,7 @@ def readable(text: str) -> str:
 
     Such characters crash version 0.41 of the viewer.
     """
-    return "".join(c if " " <= c <= "~" or "\xa1" <= c <= "ÿ" or c in _SHOWN_SYMBOLS else "?" for c in text)
+    return re.sub(rf"[^ -~\xa1-ÿ{_SHOWN_SYMBOLS}]", "?", text)
 
 
 def tokens_hash(decodes: Sequence[DecodeRecord]) -> str:
@@ -164,7 +172,6 @@ def tokens_hash(decodes: Sequence[DecodeRecord]) -> str:
 def facts_of(record: EpisodeRecord, method: str) -> dict[str, str | float]:
     """Return the totals of an episode, which the recording stores as its properties."""
     modes = [decode.mode for decode in record.decodes]
-    rounds = [r for decode in record.decodes for r in decode.rounds if r.is_verification]
     facts: dict[str, str | float] = {
         "environment": readable(record.environment),
         "task": readable(record.task),
@@ -183,22 +190,24 @@ def facts_of(record: EpisodeRecord, method: str) -> dict[str, str | float]:
         "skipped_decodes": sum(d.skipped for d in record.decodes),
         "compensated_tokens": sum(d.compensated for d in record.decodes),
     }
-    if rounds:
-        facts["acceptance_length"], facts["accepted_per_round"] = acceptance(rounds)
-    return facts
+    names = ("acceptance_length", "accepted_per_round")
+    return facts | dict(zip(names, acceptance(record.decodes)))  # noqa: B905 - there may be none
 
 
 def summary(record: EpisodeRecord, method: str) -> str:
     """Return the episode's totals as Markdown, with a key to the symbols of the tokens."""
-    facts = facts_of(record, method).items()
-    rows = {name.replace("_", " "): f"{value:.4g}" if isinstance(value, float) else value for name, value in facts}
-    key = {f"{style.symbol} {name}": style.meaning for name, style in OUTCOMES.items()}
-    return "\n".join([*_table(("episode", ""), rows), "", *_table(("token", "outcome"), key)])
+    lines = ["| episode |  |", "|:--|:--|"]
+    for name, value in facts_of(record, method).items():
+        lines.append(f"| {name.replace('_', ' ')} | {f'{value:.4g}' if isinstance(value, float) else value} |")
+    lines += ["", "| token | outcome |", "|:--|:--|"]
+    for name, style in OUTCOMES.items():
+        lines.append(f"| {style.symbol} {name} | {style.meaning} |")
+    return "\n".join(lines)
 
 
-def _table(head: tuple[str, str], rows: Mapping[str, object]) -> list[str]:
-    """Return the lines of a Markdown table with two columns."""
-    return [f"| {head[0]} | {head[1]} |", "|:--|:--|", *(f"| {name} | {value} |" for name, value in rows.items())]
+def _text(value: object) -> str:
+    """Return a value as text. None is empty."""
+    return "" if value is None else str(value)
 
 
 def decode_table(
@@ -230,8 +239,8 @@ def decode_table(
     ]
     for index, outcome in enumerate(outcomes):
         step, dof = divmod(index, len(names))
-        tokens = ("" if v is None else v for v in (outcome.draft, outcome.target, outcome.limit, outcome.token))
         word = f"{OUTCOMES[outcome.kind].symbol} {outcome.kind}"
-        cells = (index, step, names[dof], *tokens, f"**{word}**" if outcome.kind == "rejected" else word)
-        lines.append(f"| {' | '.join(map(str, cells))} |")
+        word = f"**{word}**" if outcome.kind == "rejected" else word
+        cells = (index, step, names[dof], outcome.draft, outcome.target, outcome.limit, outcome.token, word)
+        lines.append(f"| {' | '.join(map(_text, cells))} |")
     return "\n".join(lines)
