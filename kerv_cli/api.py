@@ -25,10 +25,9 @@ from kerv_cli.lab.command import chosen_store
 from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import ROLLOUT, StudyStore
 from kerv_cli.lab.study import plan, plan_rollout, run
-from kerv_cli.report.measures import MICRO, Row
-from kerv_cli.report.report import report as write_report
+from kerv_cli.report.report import report as write_reports
+from kerv_cli.report.results import Row, averaged, frame_of, rows_of
 from kerv_cli.report.tables import load_study as load_data
-from kerv_cli.report.tables import rows_of
 from kerv_cli.report.viewing import save_recording
 from kerv_cli.serve.interface import Message
 from kerv_cli.serve.openpi import EXECUTED, RESET, OpenPi, metadata
@@ -76,7 +75,7 @@ class Study:
             return data.episodes
         if table == "tasks":
             return data.per_task
-        return data.table[data.table["averaging"] == MICRO].reset_index(drop=True)
+        return frame_of(averaged(data.results))
 
     def episodes(self) -> list[Row]:
         """Return the rows of the table `episodes` as dictionaries. It raises the same errors as `to_pandas`."""
@@ -91,7 +90,8 @@ class Study:
         """
         if self.store.kind == ROLLOUT:
             raise UsageError(f"{self.name} is a rollout: kerv reports sweeps")
-        return write_report(self.store.database, self.name).files
+        (written,) = write_reports(self.store.database, self.name)
+        return written.files
 
 
 def rollout(*overrides: str, grid: bool = False, **settings: object) -> Study:

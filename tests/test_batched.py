@@ -35,7 +35,7 @@ from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.methods.parallel import ParallelPass
 from kerv_cli.methods.streak import AlwaysSkip
 from kerv_cli.report.plots import study_figures
-from kerv_cli.report.reprice import NamedProfile, repriced_table
+from kerv_cli.report.reprice import NamedProfile, repriced
 from kerv_cli.report.summary import summary_frame
 from kerv_cli.report.tables import load_study
 from kerv_cli.targets.compact.packable import pack
@@ -320,7 +320,8 @@ def test_no_speedup_is_made_of_what_was_not_timed(tmp_path, which):
     study = threshold_study(TASKS)
     labels = [one for one in study.labels if which == "both" or (which == "baseline") == (one == "ar")]
     store, _ = swept(tmp_path, batched(study, labels), Prepared())
-    table = load_study(store).table
+    data = load_study(store)
+    table = data.table
     methods = table[table["label"] != "ar"]
     for name in ("speedup", "speedup_low", "episode_speedup"):
         assert methods[name].isna().all()
@@ -329,16 +330,16 @@ def test_no_speedup_is_made_of_what_was_not_timed(tmp_path, which):
     assert table.loc[table["rollout.batch"] == 1, "time_per_step_ms"].notna().all()
     assert (methods["pairs"] > 0).all()
     assert methods["success"].notna().all()
-    printed = summary_frame(table).set_index("setting")
+    printed = summary_frame(data.results).set_index("setting")
     assert (printed.loc[methods["label"], "speed, per episode"] == "–").all()
     assert printed.loc["ar", "speed, per episode"] == ("1×" if which == "method" else "–")
-    assert study_figures(table, "threshold.r")
+    assert study_figures(data.results, "threshold.r")
 
 
 def test_decodes_without_host_times_have_no_price(tmp_path):
     store, _ = swept(tmp_path, ar_study(), Prepared())
     with pytest.raises(UsageError, match="setting 'ar' ran 4 episodes at a time, without times"):
-        repriced_table(load_study(store), store, [NamedProfile("there", Profile(31, {}))])
+        repriced(load_study(store), [NamedProfile("there", Profile(31, {}))])
 
 
 # --- the command

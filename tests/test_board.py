@@ -30,7 +30,7 @@ TASKS = ["drawer-open-v3", "reach-v3"]
 
 
 def client_of(results):
-    return TestClient(make_app(opened(opened(results))), base_url=HERE)
+    return TestClient(make_app(opened(results)), base_url=HERE)
 
 
 @pytest.fixture(scope="module")

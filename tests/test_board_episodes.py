@@ -57,7 +57,7 @@ def rolled(policies, tmp_path_factory):
 
 @pytest.fixture
 def client(tmp_path):
-    with TestClient(make_app(opened(opened(tmp_path))), base_url=HERE) as client:
+    with TestClient(make_app(opened(tmp_path)), base_url=HERE) as client:
         yield client
 
 
@@ -136,7 +136,7 @@ def test_a_recording_that_is_a_link_out_of_the_results_folder_is_refused(tmp_pat
     secret.write_text("secret")
     store.rollouts.mkdir(parents=True)
     (store.rollouts / found.episode.recording).symlink_to(secret)
-    with TestClient(make_app(opened(opened(results))), base_url=HERE) as client:
+    with TestClient(make_app(opened(results)), base_url=HERE) as client:
         assert client.get(f"/episodes/{found.id}/recording.rrd").status_code == 404
 
 
@@ -159,7 +159,7 @@ def test_decodes_that_are_read_back_are_those_that_were_written(rolled):
 
 def test_the_command_on_the_page_repeats_the_episode(rolled):
     numbers = rows_of_wanted(rolled)
-    with TestClient(make_app(opened(opened(rolled.results))), base_url=HERE) as client:
+    with TestClient(make_app(opened(rolled.results)), base_url=HERE) as client:
         text = client.get(f"/episodes/{numbers[1]}").text
     command = html.unescape(text.partition('<code id="command">')[2].partition("</code>")[0])
     kerv(*shlex.split(command)[1:], "record=0")

@@ -22,7 +22,7 @@ from kerv_cli.engine.cost import Profile, prices, read_profile, work_of_record
 from kerv_cli.engine.record import DecodeRecord, Round
 from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.reprice import open_profiles, repriced_table
+from kerv_cli.report.reprice import open_profiles, prices_table, repriced
 from kerv_cli.report.tables import load_study
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -326,8 +326,8 @@ def swept_results(tmp_path_factory):
     words = (f"results={results}", "--json")
     (trace,) = json.loads(told("runs", "export", "threshold", "--to", "trace", *words))["written"]
     store = StudyStore(opened(results), "threshold")
-    table = repriced_table(load_study(store), store, open_profiles(results, ["a100-openvla-7b-eager"]))
-    return Path(trace), table.set_index("label").to_dict("index")
+    rows = repriced(load_study(store), open_profiles(results, ["a100-openvla-7b-eager"]))
+    return Path(trace), prices_table(rows).set_index("label").to_dict("index")
 
 
 def priced_trace(trace: Path, *words: str) -> list[dict]:

@@ -20,7 +20,8 @@ from kerv_cli.episodes.episode import run_episode
 from kerv_cli.episodes.policy import ExpertDecoder, check
 from kerv_cli.episodes.rows import decodes_table, episode_row, read_decodes, table_blob
 from kerv_cli.episodes.settings import RolloutSettings
-from kerv_cli.report.measures import MACRO, MICRO, measure, paired
+from kerv_cli.report.measures import measure, paired
+from kerv_cli.report.results import MACRO, MICRO
 from kerv_cli.report.viewing import save_recording
 from kerv_cli.report.viewing.token_outcomes import summary
 from kerv_cli.worlds.demos.recording import DemoConfig, _identity
@@ -70,11 +71,11 @@ def test_rows_keep_it_and_measures_are_undefined_instead_of_divided_by_zero(epis
     episodes = pd.concat([frame.assign(label="own"), slow], ignore_index=True)
     for averaging in (MICRO, MACRO):
         found = measure(episodes, paired(episodes, {"own": "slow"}), averaging=averaging)["own"]
-        assert found["success"] == 1.0
-        assert (found["only_method"], found["both"]) == (1, 0)
-        assert found["time_per_step_ms"] > 0
-        assert found["forwards_per_step"] == found["skip_rate"] == 0.0
-        assert all(math.isnan(found[name]) for name in ("AL", "accepted_per_round", "AFEP", "deviation"))
+        assert found.success.value == 1.0
+        assert (found.counts.only_method, found.counts.both) == (1, 0)
+        assert found.time_per_step_ms > 0
+        assert found.forwards_per_step == found.skip_rate == 0.0
+        assert all(map(math.isnan, (found.AL, found.accepted_per_round, found.AFEP, found.deviation)))
 
 
 @pytest.mark.parametrize("frames", [False, True])

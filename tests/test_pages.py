@@ -77,7 +77,7 @@ def test_a_report_has_a_film_of_one_success_and_one_failure_per_method(tmp_path,
     Image.new("RGB", (8, 8)).save(buffer, "jpeg")
     monkeypatch.setattr("kerv_cli.report.page.film_of", lambda path: Film((buffer.getvalue(),), 80.0, {"steps": 4}, 0))
     monkeypatch.setattr("kerv_cli.report.page.library", str)
-    page = render(store, data, 3.0)
+    page = render(data, 3.0)
     expected = data.episodes.groupby("label")["success"].nunique().sum()
     assert page.count("data:image/webp;base64,") == expected > 3
     assert page.count('class="lost"') == expected - 3

@@ -17,7 +17,7 @@ from kerv_cli.engine.cost import Profile, prices, work_of_record
 from kerv_cli.episodes.rows import decode_records
 from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.reprice import NamedProfile, open_profiles, own_prices, repriced_summary, repriced_table
+from kerv_cli.report.reprice import NamedProfile, open_profiles, own_prices, prices_table, repriced, repriced_summary
 from kerv_cli.report.tables import load_study
 
 PROFILE = Profile(
@@ -55,11 +55,9 @@ def profile_file(results: Path, name: str = "there", without: str = "", **change
     (folder / f"{name}.json").write_text(json.dumps({**ABOUT, "profile": profile}))
 
 
-def test_an_episode_costs_its_decodes_at_the_profiles_costs(results, data):
+def test_an_episode_costs_its_decodes_at_the_profiles_costs(data):
     """Ratios of means over episodes and over times per step, of the very records of the sweep."""
-    table = repriced_table(data, StudyStore(opened(results), "threshold"), [NamedProfile("there", PROFILE)]).set_index(
-        "label"
-    )
+    table = prices_table(repriced(data, [NamedProfile("there", PROFILE)])).set_index("label")
     seconds: dict[str, list[float]] = {}
     steps: dict[str, list[int]] = {}
     for one in data.study.episodes:
@@ -81,10 +79,9 @@ def test_an_episode_costs_its_decodes_at_the_profiles_costs(results, data):
     assert first["decodes"] == len(first["decode_seconds"])
 
 
-def test_decodes_from_before_rounds_had_levels_cost_what_their_settings_say(results, data, monkeypatch):
-    store = StudyStore(opened(results), "threshold")
+def test_decodes_from_before_rounds_had_levels_cost_what_their_settings_say(data, monkeypatch):
     profiles = [NamedProfile("there", PROFILE)]
-    whole, decodes = repriced_table(data, store, profiles), store.decodes
+    whole, decodes = repriced(data, profiles), data.store.decodes
 
     def old(*arguments: Any) -> pa.Table:
         table = decodes(*arguments)
@@ -93,8 +90,8 @@ def test_decodes_from_before_rounds_had_levels_cost_what_their_settings_say(resu
         rounds = pa.chunked_array([pa.array(table["rounds"].to_pylist(), pa.list_(pa.struct(fields)))])
         return table.set_column(place, "rounds", rounds)
 
-    monkeypatch.setattr(store, "decodes", old)
-    pd.testing.assert_frame_equal(repriced_table(data, store, profiles), whole)
+    monkeypatch.setattr(data.store, "decodes", old)
+    pd.testing.assert_frame_equal(prices_table(repriced(data, profiles)), prices_table(whole))
     table = old([int(data.episodes["episode"].iloc[-1])])
     assert {one.levels for decode in decode_records(table) for one in decode.rounds} == {0}
 
@@ -116,21 +113,21 @@ def test_a_report_prices_the_study_on_several_machines(results):
     assert "same tokens in the same control steps" in page
 
 
-def test_a_table_shows_how_a_row_depends_on_the_encoder(results, data):
+def test_a_table_shows_how_a_row_depends_on_the_encoder(data):
     """At its floor, twice its floor, and 8 ms, each with the engine's system time."""
     about = {**ABOUT, "projected": True, "engine": "eager", "encoder_floor": 0.001, "encoder_system": 0.006}
     named = NamedProfile("there", dataclasses.replace(PROFILE, about=about))
     assert named.title == "vla-150m, GPU, eager, projected"
-    table = repriced_table(data, StudyStore(opened(results), "threshold"), [named])
-    rows = table.set_index("label")
+    priced = repriced(data, [named])
+    rows = prices_table(priced).set_index("label")
     for column, seconds in (("encoder_floor", 0.007), ("encoder_twice", 0.008), ("encoder_8ms", 0.014)):
         other = dataclasses.replace(PROFILE, phases={**PROFILE.phases, "encode": ((1,), (seconds,))})
-        priced = repriced_table(data, StudyStore(opened(results), "threshold"), [NamedProfile("other", other)])
-        assert list(rows[column]) == pytest.approx(list(priced["episode_speedup"]))
-        assert "encoder_floor" not in priced, "a measured encoder has one cost"
+        measured = repriced(data, [NamedProfile("other", other)])
+        assert list(rows[column]) == pytest.approx([row.measures.episode_speedup.value for row in measured])
+        assert not any(row.encoders for row in measured), "a measured encoder has one cost"
     fast, slow = rows.loc["spec_vla r=9", ["encoder_floor", "encoder_8ms"]]
     assert abs(1 - fast) > abs(1 - slow), "what every method pays hides their difference"
-    (shown,) = (repriced_summary(table).filter(regex="encoder")).to_dict("list").values()
+    (shown,) = (repriced_summary(priced).filter(regex="encoder")).to_dict("list").values()
     assert shown[0] == "1 / 1 / 1×"
     assert shown[-1] == f"{fast:.2f} / {rows.loc['spec_vla r=9', 'encoder_twice']:.2f} / {slow:.2f}×"
 
@@ -151,20 +148,20 @@ def test_a_study_is_also_priced_by_the_profile_of_its_own_machine(tmp_path):
     store, _ = swept(tmp_path, study)
     data = load_study(store)
     device = data.episodes["device_name"].iloc[0]
-    assert own_prices(data, store) is None
+    assert own_prices(data) == []
     profile_file(tmp_path)
     own = tmp_path / "bench/mt10-vision-float32.json"
     for name, machines in (("another one", {"there"}), (device, {"there", "mt10-vision-float32"})):
         profile_file(tmp_path, own.stem)
         own.write_text(json.dumps({**json.loads(own.read_text()), "device_name": name}))
-        assert set(own_prices(data, store)["on"]) == machines
+        assert {row.machine.name for row in own_prices(data)} == machines
     with client_of(tmp_path) as client:
         page = client.get("/studies/threshold/tables").text
     assert f"vla-150m, {device}: per episode" in page
     assert f"measured, {device}: per episode" in page
     assert "GPU: per episode" not in page, "the board prices no other machine, which would take time"
     profile_file(tmp_path, own.stem, without="feed")
-    assert set(own_prices(data, store)["on"]) == {"there"}, "a profile that lacks a cost is left out"
+    assert {row.machine.name for row in own_prices(data)} == {"there"}, "a profile that lacks a cost is left out"
 
 
 def test_a_report_compares_with_another_baseline(results):

@@ -28,10 +28,10 @@ from kerv_cli.lab.database import opened
 from kerv_cli.lab.plan import Episode, Setting, Study
 from kerv_cli.lab.store import StudyStore, plan_study
 from kerv_cli.lab.work import RunEpisode
-from kerv_cli.report.measures import MACRO, MICRO
 from kerv_cli.report.page import render
 from kerv_cli.report.plots import acceptance_figure, curves_figure, png, study_figures, with_lines
 from kerv_cli.report.report import Unpublishable, refusals, report
+from kerv_cli.report.results import MACRO, MICRO, Result, averaged, frame_of
 from kerv_cli.report.statistics import PairedCounts, mean_of, paired_difference, speedup, wilson
 from kerv_cli.report.summary import SummaryTable, not_in_turn, of_runs, summary_frame
 from kerv_cli.report.tables import StudyData, further_of, load_study
@@ -243,7 +243,7 @@ def harmed(data: StudyData, **harm: Any) -> StudyData:
     for name, value in harm.items():
         for index in mine if isinstance(value, str) else mine[:1]:
             episodes.at[index, name] = value
-    return StudyData(data.study, episodes)
+    return replace(data, episodes=episodes)
 
 
 def reach_of(data: StudyData) -> dict[str, Any]:
@@ -256,7 +256,7 @@ def test_other_devices_and_initial_states_are_no_pair(data):
     assert math.isnan(row["speedup"])
     row = reach_of(harmed(data, initial_state=(0.5,)))
     assert (row["pairs"], row["speedup"]) == (1, pytest.approx(0.3 / 0.05))
-    alone = StudyData(data.study, data.episodes[data.episodes["label"] == "kerv"])
+    alone = replace(data, episodes=data.episodes[data.episodes["label"] == "kerv"])
     assert alone.absent == [one for one in data.study.episodes if one.setting.label == "ar"]
     assert alone.table["speedup"].isna().all()
 
@@ -267,14 +267,14 @@ def test_pairs_of_one_block_are_told_from_others(tmp_path):
     early = [one for one in study.episodes if one.seed < 100_002 or one.setting.label == "ar"]
     swept(tmp_path, replace(study, episodes=tuple(early)))
     store, _ = swept(tmp_path, study)
-    table = load_study(store).table
-    row = row_of(table, label="kerv", averaging=MICRO)
+    data = load_study(store)
+    row = row_of(data.table, label="kerv", averaging=MICRO)
     assert (row["pairs"], row["same_run"], row["same_block"]) == (4, False, 0.5)
     assert row["speedup"] > 1
-    alone = StudyData(store.load(), load_study(store).episodes.query("seed >= 100002"))
+    alone = replace(data, episodes=data.episodes.query("seed >= 100002"))
     # success is compared, times are not
-    assert summary_frame(alone.table)["speed, per episode"].tolist() == ["1×", "–"]
-    assert not_in_turn(alone.table) == ["kerv"]
+    assert summary_frame(alone.results)["speed, per episode"].tolist() == ["1×", "–"]
+    assert not_in_turn(alone.results) == ["kerv"]
     assert row_of(alone.table, label="kerv", averaging=MICRO)["pairs"] == 2
 
 
@@ -300,14 +300,14 @@ def test_repeats_are_paired_with_their_own(tmp_path):
     assert row["speedup"] == row["speedup_low"] == row["speedup_high"] == pytest.approx(2.0)
 
 
-def printed(table: pd.DataFrame, width: int = 80, everything: bool = False) -> list[str]:
+def printed(results: Sequence[Result], width: int = 80, everything: bool = False) -> list[str]:
     console = Console(width=width, file=io.StringIO(), record=True)
-    console.print(SummaryTable(table, everything, "--all"))
+    console.print(SummaryTable(results, everything, "--all"))
     return console.export_text().splitlines()
 
 
 def test_a_terminal_shows_the_columns_that_people_need_first_and_all_in_parts_that_fit(data):
-    few, wide, narrow = printed(data.table), printed(data.table, 200, True), printed(data.table, 60, True)
+    few, wide, narrow = printed(data.results), printed(data.results, 200, True), printed(data.results, 60, True)
     assert ["--all" in " ".join(lines) for lines in (few, wide, narrow)] == [True, False, False]
     assert all(len(line) <= 80 for line in few)
     (line,) = [line for line in few if line.startswith("kerv")]
@@ -319,6 +319,12 @@ def test_a_terminal_shows_the_columns_that_people_need_first_and_all_in_parts_th
     assert {"unverified", "verification"} <= set(" ".join(narrow).split())
     assert all(len(line) <= 60 and "…" not in line for line in narrow)
     assert len([line for line in narrow if line.startswith("kerv")]) > 2
+
+
+def files_of(folder: Path, **options: Any) -> list[Path]:
+    """The files of the report of the study `threshold`."""
+    (written,) = report(opened(folder), "threshold", **options)
+    return written.files
 
 
 @pytest.fixture(scope="module")
@@ -334,7 +340,8 @@ def results(tmp_path_factory):
 @pytest.fixture(scope="module")
 def written(results):
     """The files of its report."""
-    return report(opened(results)).files
+    (written,) = report(opened(results))
+    return written.files
 
 
 def test_report_writes_the_same_bytes_again(results, written):
@@ -354,7 +361,7 @@ def test_report_writes_the_same_bytes_again(results, written):
     before = {path: path.read_bytes() for path in written}
     for path in written:
         path.unlink()
-    again = report(opened(results), "threshold").files
+    again = files_of(results)
     assert again == written
     assert {path: path.read_bytes() for path in again} == {path: before[path] for path in again}
     assert all(content.startswith(b"\x89PNG") for path, content in before.items() if path.suffix == ".png")
@@ -375,7 +382,7 @@ def test_a_page_shows_hostile_names_as_text(tmp_path, monkeypatch):
     settings = {"ar": settings_of("ar"), name: settings_of("spec_vla", 9)}
     store, _ = swept(tmp_path, study_of(settings, ["reach-v3"], title=name))
     monkeypatch.setattr("kerv_cli.report.page.library", lambda: "")
-    page = render(store, load_study(store), 3.0)
+    page = render(load_study(store), 3.0)
     assert "<img" not in page
     assert page.count("</script>") == page.count("<script") == 4
 
@@ -392,7 +399,7 @@ def test_the_interval_of_a_ratio_takes_the_run_as_a_cluster_from_three_runs_on(t
             connection.execute(sa.update(tables.EPISODES).where(tables.EPISODES.c.id.in_(newest)).values(seconds))
         data = load_study(store)
         row = row_of(data.table, averaging=MICRO, label="naive_sd")
-        said.append((row["runs"], of_runs(data.table)))
+        said.append((row["runs"], of_runs(data.results)))
         before = row["episode_speedup"] if slower == 1 else before
     assert [runs for runs, _ in said] == [1, 1, 3]
     assert ["alone" in text for _, text in said] == [True, True, False]
@@ -464,13 +471,13 @@ def commit(monkeypatch):
 
 def test_one_run_of_one_commit_is_published_where_it_is_committed(tmp_path):
     swept(tmp_path, STUDY)
-    draft = report(opened(tmp_path), "threshold")
+    draft = files_of(tmp_path)
     assert not (tmp_path / "tables").exists()
-    published = report(opened(tmp_path), "threshold", publish=True)
+    published = files_of(tmp_path, publish=True)
     table = tmp_path / "tables" / "threshold.csv"
-    assert table in published.files
+    assert table in published
     assert table.read_bytes() == (tmp_path / "report" / "tables" / "threshold.csv").read_bytes()
-    assert len(draft.files) == len(published.files)
+    assert len(draft) == len(published)
 
 
 def test_what_is_missing_or_not_committed_is_refused(tmp_path, commit):
@@ -486,17 +493,18 @@ def test_sides_of_several_runs_or_commits_are_refused(tmp_path, commit):
     swept(tmp_path, replace(STUDY, episodes=tuple(one for one in STUDY.episodes if one.setting.label == "ar")))
     commit("d" * 40)
     store, _ = swept(tmp_path, STUDY)
-    found = refusals(load_study(store).table)
+    found = refusals(load_study(store).results)
     assert "its episodes are from 2 commits" in found
     assert any(reason.startswith("not measured in one run with the baseline: naive_sd") for reason in found)
     assert any(reason.startswith("not measured in turn with the baseline") for reason in found)
 
 
-def test_several_machines_are_refused():
-    rows = {"label": ["ar", "x"], "baseline": "ar", "pairs": [0, 3], "same_run": True, "same_block": 1.0}
-    table = pd.DataFrame(rows | {"git_commit": COMMIT, "host": ["a", "a;b"], "device_name": "chip", "engine": 1})
-    assert refusals(table) == ["its episodes are from 2 machines"]
-    assert refusals(table.assign(host="a")) == []
+def test_several_machines_are_refused(data):
+    first, *others = data.results
+    here = dict(first.provenance) | {"git_commit": COMMIT, "host": "a"}
+    assert refusals([replace(row, provenance=here) for row in data.results]) == []
+    there = [replace(row, provenance=here | {"host": "a;b"}) for row in others]
+    assert refusals([replace(first, provenance=here), *there]) == ["its episodes are from 2 machines"]
 
 
 # --- charts
@@ -510,9 +518,9 @@ def drawn(method: str = "heisd", **parts: dict[str, Any]) -> RolloutSettings:
     return found
 
 
-def charted(results: Path, settings: dict[str, RolloutSettings], baseline: str = "ar") -> pd.DataFrame:
-    store, _ = swept(results, study_of(settings, ["reach-v3"], baseline=baseline))
-    return load_study(store).table
+def charted(folder: Path, settings: dict[str, RolloutSettings], baseline: str = "ar") -> list[Result]:
+    store, _ = swept(folder, study_of(settings, ["reach-v3"], baseline=baseline))
+    return load_study(store).results
 
 
 @pytest.fixture(scope="module")
@@ -530,8 +538,8 @@ def test_settings_along_the_axis_are_a_line_and_others_levels(boundaries):
     assert speed["line"].value_counts().to_dict() == {"fused": 3, "ar": 1, "always drafter": 1, "radius alone": 1}
     fused = speed[speed["line"] == "fused"]
     assert list(fused["x"]) == [0.1, 0.3, 0.7]
-    expected = boundaries[boundaries["averaging"] == MICRO].set_index("label")["episode_speedup"]
-    assert dict(zip(speed["setting"], speed["value"], strict=True)) == expected.to_dict()
+    expected = {row.label: row.measures.episode_speedup.value for row in averaged(boundaries)}
+    assert dict(zip(speed["setting"], speed["value"], strict=True)) == expected
     assert speed.set_index("line").loc["ar", "value"] == 1.0
     assert speed[speed["line"] != "fused"]["x"].isna().all()
     assert (success["high"] >= success["value"]).all()
@@ -543,7 +551,7 @@ def test_a_baseline_that_is_a_point_of_a_series_is_drawn_in_it(tmp_path):
         for steps in (1, 4, 8):
             settings[f"{method} chunk={steps}"] = drawn(method)
             settings[f"{method} chunk={steps}"].chunk = steps
-    rows = with_lines(charted(tmp_path, settings, "ar chunk=4").query("averaging == @MICRO"), "chunk")
+    rows = with_lines(frame_of(averaged(charted(tmp_path, settings, "ar chunk=4"))), "chunk")
     assert {name: list(line["x"]) for name, line in rows.groupby("line")} == {"ar": [1, 4, 8], "kerv": [1, 4, 8]}
     assert rows.set_index("label").loc["ar chunk=4", "speedup"] == 1.0
 
@@ -553,7 +561,7 @@ def test_without_numbers_on_the_axis_every_setting_has_a_row_of_speed_and_of_cha
     figures = study_figures(boundaries, axis)
     assert set(figures) == {"_tradeoff"}
     speed, change = points_of(figures["_tradeoff"])
-    assert list(speed["setting"]) == list(change["setting"]) == list(boundaries["label"].unique())
+    assert list(speed["setting"]) == list(change["setting"]) == [row.label for row in averaged(boundaries)]
     own = change["is_baseline"]
     assert change.loc[own, "low"].isna().all()
     assert (change.loc[~own, "low"] <= change.loc[~own, "value"]).all()

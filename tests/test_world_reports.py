@@ -14,12 +14,13 @@ from kerv_cli.episodes.settings import RolloutSettings, SweepSettings, TimingSet
 from kerv_cli.lab.database import opened
 from kerv_cli.lab.plan import Setting
 from kerv_cli.lab.work import RunEpisode
-from kerv_cli.report.decide import verdict_of
 from kerv_cli.report.plots import latency_figure, study_figures
 from kerv_cli.report.report import report
-from kerv_cli.report.stressed import is_stressed, summed_table
+from kerv_cli.report.results import averaged, columns_of, rows_of
+from kerv_cli.report.statistics import PairedCounts
 from kerv_cli.report.summary import summary_frame
-from kerv_cli.report.tables import latency_table, load_study, rows_of
+from kerv_cli.report.tables import is_stressed, latency_table, load_study, summed_table
+from kerv_cli.report.verdict import verdict_of
 from kerv_cli.worlds.settings import StressSettings
 
 TASKS = ["reach-v3", "push-v3"]
@@ -54,12 +55,12 @@ def stressed(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def stressed_table(stressed):
-    return stressed[1].table
+def stressed_results(stressed):
+    return stressed[1].results
 
 
-def test_a_stressed_setting_is_compared_with_the_baseline_under_the_same_stress(stressed, stressed_table):
-    rows = {row["label"]: row for row in rows_of(stressed_table, "micro over tasks")}
+def test_a_stressed_setting_is_compared_with_the_baseline_under_the_same_stress(stressed, stressed_results):
+    rows = {row.label: columns_of(vars(row)) for row in averaged(stressed_results)}
     assert stressed[1].references["bold"] == "ar"
     assert rows["bold, kind=push level=4"]["baseline"] == "ar, kind=push level=4"
     assert rows["bold, kind=push level=4"]["difference"] == 0.0
@@ -69,8 +70,8 @@ def test_a_stressed_setting_is_compared_with_the_baseline_under_the_same_stress(
     assert (rows["ar"]["stress"], rows["ar"]["stress_level"]) == ("none", 0)
 
 
-def test_the_figure_has_a_panel_per_kind_and_a_line_per_method(stressed_table):
-    figures = study_figures(stressed_table, "")
+def test_the_figure_has_a_panel_per_kind_and_a_line_per_method(stressed_results):
+    figures = study_figures(stressed_results, "")
     assert list(figures) == [""]
     assert [panel.title for panel in figures[""].concat] == ["push", "light"]
     light = points_of(figures[""])[1]
@@ -80,9 +81,9 @@ def test_the_figure_has_a_panel_per_kind_and_a_line_per_method(stressed_table):
     }
 
 
-def test_sums_count_every_stressed_world_once(stressed_table):
+def test_sums_count_every_stressed_world_once(stressed_results):
     """20 seeds x 2 tasks; level 4 of a push fails half of everything, level 4 of light half of what is bold."""
-    found = {row["label"]: row for row in rows_of(summed_table(stressed_table))}
+    found = {row["label"]: row for row in rows_of(summed_table(stressed_results))}
     sums = ["light", "push", "level 1", "level 4", "all"]
     assert list(found) == [f"{name} {one}" for one in sums for name in ("ar", "bold")]
     counted = {one: (found[f"bold {one}"]["successes"], found[f"bold {one}"]["episodes"]) for one in sums}
@@ -97,19 +98,20 @@ def test_sums_count_every_stressed_world_once(stressed_table):
 
 
 def test_the_report_writes_the_sums(stressed):
-    written = {path.name for path in report(opened(stressed[0]), "stress").files}
-    assert {"stress_summed.csv", "stress.png"} <= written
+    (written,) = report(opened(stressed[0]), "stress")
+    assert {"stress_summed.csv", "stress.png"} <= {path.name for path in written.files}
 
 
-def test_the_verdict_says_who_falls_behind_where(stressed_table):
-    behind, is_shown = verdict_of(stressed_table, 3.0)
+def test_the_verdict_says_who_falls_behind_where(stressed_results):
+    behind, is_shown = verdict_of(stressed_results, 3.0)
     assert "less successful than ar: bold, kind=light level=4. More successful: no setting" in behind
     assert not is_shown
-    kept = stressed_table[(stressed_table["stress"] != "light") | (stressed_table["stress_level"] != 4)]
+    kept = [row for row in stressed_results if (row.stress, row.stress_level) != ("light", 4)]
     assert "less successful than ar: no setting" in verdict_of(kept, 3.0)[0]
-    unsolved = stressed_table.assign(both=0, only_baseline=2)
+    counts = PairedCounts(0, 2, 0, 38)
+    unsolved = [replace(row, measures=replace(row.measures, counts=counts)) for row in stressed_results]
     assert "nothing is compared: ar; ar, kind=push level=1" in verdict_of(unsolved, 3.0)[0]
-    assert not is_stressed(stressed_table[stressed_table["stress"] == "none"])
+    assert not is_stressed(row for row in stressed_results if row.stress == "none")
 
 
 def test_the_shipped_study_has_every_method_under_every_kind_and_level():
@@ -165,7 +167,7 @@ def delayed(tmp_path_factory):
     about = {"title": "Latency", "baseline": "ar waits", "axis": "rollout.ar_ms"}
     folder = tmp_path_factory.mktemp("latency")
     store, _ = swept(folder, study_of(settings, TASKS, "latency", **about), run_delayed)
-    return folder, load_study(store).table
+    return folder, load_study(store).results
 
 
 def test_every_setting_is_compared_with_ar_at_its_latency(delayed):
@@ -186,7 +188,7 @@ def test_every_setting_is_compared_with_ar_at_its_latency(delayed):
     assert printed.loc["ar waits"]["a decode takes, ms"] == "–"
     answer, _ = verdict_of(whole, 3.0)
     assert "do not solve the tasks, nothing is compared: ar ar_ms=100 none" in answer
-    assert latency_table(whole[whole["label"] == "ar waits"]).empty
+    assert latency_table(row for row in whole if row.label == "ar waits").empty
 
 
 def test_the_figure_has_a_panel_per_compensation_and_a_line_per_method(delayed):
@@ -200,5 +202,6 @@ def test_the_figure_has_a_panel_per_compensation_and_a_line_per_method(delayed):
 
 
 def test_a_report_has_the_table_and_the_figure(delayed):
-    names = {path.name for path in report(opened(delayed[0]), "latency").files}
+    (written,) = report(opened(delayed[0]), "latency")
+    names = {path.name for path in written.files}
     assert {"latency.csv", "latency_latency.csv", "latency_latency.png", "report.html"} <= names

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import pandas as pd
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
@@ -17,10 +16,10 @@ from kerv_cli.board import episode
 from kerv_cli.board.pages import database_of, render
 from kerv_cli.catalogue.episodes import outcomes, settings_in
 from kerv_cli.episodes.identity import stress_of
-from kerv_cli.lab.plan import Setting, Study
+from kerv_cli.lab.plan import Setting
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import NEAR
-from kerv_cli.report.tables import StudyData
+from kerv_cli.report.tables import references_of
 
 SUCCESS, FAILURE, LOST, WON, ERROR, MISSING = "success", "failure", "lost", "won", "error", "missing"
 OUTCOMES = {
@@ -114,10 +113,11 @@ def cells_of(rows: Sequence[Any], baseline: str, settings: Mapping[str, Setting]
         baseline: Label of the baseline.
         settings: The settings by label.
     """
-    study = Study("", tuple(settings.values()), (), baseline=baseline)
-    references = StudyData(study, pd.DataFrame()).references
-    stresses = {label: stress_of(one.settings) for label, one in settings.items()}
-    names = {label: f"{one['kind']} {one['level']}" if one["level"] else "" for label, one in stresses.items()}
+    references = references_of(list(settings.values()), baseline)
+    names = {}
+    for label, one in settings.items():
+        stress = stress_of(one.settings)
+        names[label] = f"{stress['kind']} {stress['level']}" if stress["level"] else ""
     solved = {(row.label, row.task, row.seed): row.success for row in rows if row.episode is not None}
     return [
         Cell(
@@ -211,7 +211,8 @@ def show_failures(request: Request) -> Response:
     for cell in cells:
         if cell.kind in FAILURES:
             counts[cell.label][cell.phase] += 1
-    phases = {phase: why for phase, why in PHASES.items() if any(one[phase] for one in counts.values())}
+    seen = set().union(*counts.values())
+    phases = {phase: why for phase, why in PHASES.items() if phase in seen}
     shown: dict[str, Any] = {"clusters": clusters_of(cells), "counts": counts, "phases": phases, "most": MOST_SHOWN}
     return render(request, "failures.html", **shown, **asked)
 

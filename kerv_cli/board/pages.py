@@ -13,7 +13,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse
 
 from kerv_cli.lab.database import Database
-from kerv_cli.report.tables import is_number
+from kerv_cli.report.results import is_number
 
 TEMPLATES = Environment(
     loader=ChoiceLoader([PackageLoader("kerv_cli.board"), PackageLoader("kerv_cli.report")]),

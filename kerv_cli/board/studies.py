@@ -5,9 +5,8 @@ from __future__ import annotations
 import functools
 import os
 import time
-from collections.abc import Callable
 from typing import Any
-from urllib.parse import quote, urlencode
+from urllib.parse import quote
 
 from starlette.requests import Request
 from starlette.responses import Response
@@ -40,12 +39,11 @@ def _parts(database: Database, name: str, version: str, is_running: bool) -> tup
     from kerv_cli.report.reprice import own_profiles, prices_on
     from kerv_cli.report.tables import load_study
 
-    clock, store = time.thread_time(), StudyStore(database, name)
-    data = load_study(store)
-    priced = None if is_running else prices_on(data, store, own_profiles(data, store))
-    parts = study_parts(store, data, priced=priced)
+    began = time.thread_time()
+    data = load_study(StudyStore(database, name))
+    parts = study_parts(data, priced=[] if is_running else prices_on(data, own_profiles(data)))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return parts, max(_SECONDS, (time.thread_time() - clock) / (_SHARE * cores))
+    return parts, max(_SECONDS, (time.thread_time() - began) / (_SHARE * cores))
 
 
 def show_study(request: Request) -> Response:
@@ -94,22 +92,8 @@ def show_tables(request: Request) -> Response:
         is_running=is_running,
         version=version,
         seconds=round(seconds),
-        **parts | hidden | {"cell_link": _episodes_of(name)},
+        **parts | hidden | {"episodes": f"/studies/{quote(name)}/episodes"},
     )
-
-
-def _episodes_of(study: str) -> Callable[[str, str, str], str]:
-    """Return a function that links a cell of the table by task to its episodes.
-
-    The function takes the heading of the table's first column (`task` or `setting`), the name of the cell's row, and
-    the name of its column.
-    """
-
-    def address(heading: str, row: str, column: str) -> str:
-        setting, task = (column, row) if heading == "task" else (row, column)
-        return f"/studies/{quote(study)}/episodes?{urlencode({'setting': setting, 'task': task})}"
-
-    return address
 
 
 @functools.cache

@@ -36,8 +36,9 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
     from kerv_cli.catalogue.imports import database_in, import_databases
     from kerv_cli.lab.database import opened
     from kerv_cli.lab.store import StudyStore
+    from kerv_cli.report.results import rows_of
     from kerv_cli.report.summary import SummaryTable
-    from kerv_cli.report.tables import load_study, rows_of
+    from kerv_cli.report.tables import load_study
 
     if not names:
         raise UsageError("name what to import: kerv runs import old-results, or kerv runs import recording-ID.sqlite")
@@ -55,10 +56,10 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
         return
     words = ["runs", "import", *names]
     name, notes = import_evaluations(database, paths, settings.name, settings.labels, settings.baseline, words)
-    table = load_study(StudyStore(database, name)).table
+    data = load_study(StudyStore(database, name))
     if as_json:
-        end_with_json({"study": name, "notes": notes, "settings": rows_of(table)})
+        end_with_json({"study": name, "notes": notes, "settings": rows_of(data.table)})
     for line in notes:
         typer.echo(line)
-    console().print(SummaryTable(table))
+    console().print(SummaryTable(data.results))
     typer.echo(f"study {name}: kerv report study={name}, kerv report --choose study={name}")

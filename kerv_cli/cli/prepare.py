@@ -70,7 +70,7 @@ def unsolved_by(settings: PrepareSettings) -> str:
     """Return a sentence if the test for the certificate has shown that the policy does not solve its tasks, else ""."""
     from kerv_cli.methods.artifacts import Artifacts
     from kerv_cli.methods.certified.certificate import CertificateArtifact
-    from kerv_cli.report.matched import SOLVED
+    from kerv_cli.report.decide import SOLVED
     from kerv_cli.report.verdict import unsolved
 
     artifact = CertificateArtifact()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,6 +11,10 @@ from kerv_cli.base.limits import number, setting
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, end_with_json
+
+if TYPE_CHECKING:
+    from kerv_cli.lab.database import Database
+    from kerv_cli.report.report import Report
 
 
 @dataclass
@@ -58,48 +62,60 @@ def report(
     from kerv_cli.cli.studies import print_prices, print_study, print_verdict
     from kerv_cli.episodes.resolve import study_name
     from kerv_cli.lab.database import opened
-    from kerv_cli.lab.store import StudyStore
-    from kerv_cli.report.report import report as write_report
-    from kerv_cli.report.tables import rows_of
+    from kerv_cli.report.report import report as write_reports
 
-    settings.only = settings.only and study_name(settings.only)
+    study, database = settings.only and study_name(settings.only), opened(settings.results)
     if choose:
-        _print_choice(settings, as_json)
+        _print_choice(database, study, settings.loss, as_json)
         return
-    database = opened(settings.results)
-    output = write_report(database, settings.only, publish, settings.on, settings.loss, settings.baseline)
+    reports = write_reports(database, study, publish, settings.on, settings.loss, settings.baseline)
     if as_json:
-        tables = {name: rows_of(table) for name, table in output.tables.items()}
-        priced = {} if output.priced is None else {"priced": rows_of(output.priced)}
-        end_with_json({"files": output.files, "studies": tables, "acceptance": output.acceptance, **priced})
-    for name, table in output.tables.items():
-        print_study(table, StudyStore(database, name), all_columns, "--all")
-    print_prices(output.priced)
-    for name, table in output.tables.items():
-        if settings.only is None:
-            typer.echo(name)
-        print_verdict(table, StudyStore(database, name), settings.loss)
+        end_with_json(_as_json(reports))
+    for one in reports:
+        print_study(one.data, all_columns, "--all")
+    for one in reports:
+        print_prices(one.priced)
+    for one in reports:
+        if study is None:
+            typer.echo(one.data.study.name)
+        print_verdict(one.data, settings.loss)
 
 
-def _print_choice(settings: ReportSettings, as_json: bool) -> None:
+def _as_json(reports: list[Report]) -> dict[str, object]:
+    """Return what reports contain, as JSON values."""
+    from kerv_cli.report.reprice import prices_table
+    from kerv_cli.report.results import rows_of
+
+    files, priced = [], []
+    studies, acceptance = {}, {}
+    for one in reports:
+        name, data = one.data.study.name, one.data
+        files += one.files
+        priced += one.priced
+        studies[name] = rows_of(data.table)
+        acceptance[name] = {label: tally.as_dict() for label, tally in data.tallies.items()}
+    content: dict[str, object] = {"files": files, "studies": studies, "acceptance": acceptance}
+    return content | ({"priced": rows_of(prices_table(priced))} if priced else {})
+
+
+def _print_choice(database: Database, study: str | None, loss: float, as_json: bool) -> None:
     """Print which setting to use in the chosen study, or in each study with results."""
-    from kerv_cli.lab.database import opened
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.decide import choices
     from kerv_cli.report.report import names_to_report
     from kerv_cli.report.tables import load_study
     from kerv_cli.report.verdict import sentence, short_sentence
 
-    database, answers = opened(settings.results), {}
-    for name in names_to_report(database, settings.only):
+    answers = {}
+    for name in names_to_report(database, study):
         data = load_study(StudyStore(database, name))
-        groups = choices(data.table, data.per_task, settings.loss)
-        answers[name] = [choice.as_dict() for choice in groups]
+        whole, *tasks = choices(data.results, data.task_results, loss)
+        answers[name] = [choice.as_dict() for choice in (whole, *tasks)]
         if not as_json:
-            front = f", not beaten in speed and success at once: {', '.join(groups[0].front)}"
-            typer.echo(f"{name}{front if groups[0].front else ''}")
-            typer.echo(f"  {sentence(groups[0], settings.loss, data.study.baseline)}")
-            for choice in groups[1:]:
+            front = f", not beaten in speed and success at once: {', '.join(whole.front)}"
+            typer.echo(f"{name}{front if whole.front else ''}")
+            typer.echo(f"  {sentence(whole, loss, data.study.baseline)}")
+            for choice in tasks:
                 typer.echo(f"  {short_sentence(choice)}")
     if as_json:
         end_with_json(answers)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from kerv_cli.catalogue.entries import RunEntry
     from kerv_cli.cli.command import F
-    from kerv_cli.report.measures import Row
+    from kerv_cli.report.results import Row
 
 
 RUNS = "NAME: runs (id, a unique part of it, or last) and results=DIR."
@@ -110,18 +110,18 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
     from kerv_cli.catalogue.entries import disk_bytes, find_runs, parents, store_of
     from kerv_cli.lab.database import opened
     from kerv_cli.report.compare import compared_runs
+    from kerv_cli.report.results import rows_of
     from kerv_cli.report.summary import SummaryTable
-    from kerv_cli.report.tables import load_study, rows_of
+    from kerv_cli.report.tables import load_study
 
     database, (name,) = opened(settings.results), _run_names(names)
     chosen = compared_runs(database, name)
     run = chosen[0].run
-    table = load_study(store_of(run, database)).table if run.has_episodes and run.episodes else None
-    if table is not None:
-        table = table[table["label"].isin([side.label for side in chosen])]
+    data = load_study(store_of(run, database)) if run.has_episodes and run.episodes else None
+    labels = [side.label for side in chosen]
     size, origin = disk_bytes(run.folder), parents(run, find_runs(database))
     if as_json:
-        rows = [] if table is None else rows_of(table)
+        rows = [] if data is None else rows_of(data.table[data.table["label"].isin(labels)])
         end_with_json({**_entry_row(run), "made_from": origin, "bytes": size, "settings": rows})
     line = run.command_line or "unknown"
     lines = {"run": run.id, "kind": run.kind, "state": run.state, "started": run.started, "folder": run.folder}
@@ -129,8 +129,8 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
     words = "command" if run.has_episodes else "made by"
     for name, value in (lines | {"size": f"{size / 1e6:.1f} MB", words: line} | parts).items():
         typer.echo(f"{name:<9} {value}")
-    if table is not None:
-        console().print(SummaryTable(table))
+    if data is not None:
+        console().print(SummaryTable([row for row in data.results if row.label in labels]))
     elif run.figures:
         print_table(("measure", "value"), ((name, f"{value:.4g}") for name, value in run.figures.items()))
 
@@ -158,7 +158,7 @@ def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False
 
 def _result_cells(row: Row) -> dict[str, str]:
     """Return the cells of one measure in the comparison of two runs."""
-    from kerv_cli.report.tables import is_number
+    from kerv_cli.report.results import is_number
 
     interval = f"{row['low']:.3g} to {row['high']:.3g}" if is_number(row.get("low")) else ""
     numbers = {name: f"{row[name]:.4g}" for name in ("first", "second", "change")}

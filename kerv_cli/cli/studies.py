@@ -21,12 +21,12 @@ from kerv_cli.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
-
     from kerv_cli.episodes.resolve import ResolvedStudy
     from kerv_cli.lab.events import Event, Outcome
     from kerv_cli.lab.progress import TimeLeft
-    from kerv_cli.lab.store import Plan, StudyStore
+    from kerv_cli.lab.store import Plan
+    from kerv_cli.report.reprice import Priced
+    from kerv_cli.report.tables import StudyData
 
 SECONDS_PER_EPISODE = 3.0
 """Guess for commands without a study's file, before anything was measured."""
@@ -190,56 +190,56 @@ def event_printer(show: Callable[[int, int, str], None], left: TimeLeft | None =
     return on_event
 
 
-def print_study(table: DataFrame, store: StudyStore, all_columns: bool = False, how: str = "") -> None:
+def print_study(data: StudyData, all_columns: bool = False, how: str = "") -> None:
     """Print the table of a study and its note.
 
     If times cannot be compared, because they were not measured in turn, print the command that measures them again.
 
     Args:
-        table: Summary with one row per setting.
-        store: The study in the database.
+        data: The study.
         all_columns: Print all columns, not only those that people need first.
         how: What to type to see all columns. Empty: `kerv report study=NAME --all`.
     """
     from kerv_cli.report.summary import SummaryTable, not_in_turn
-    from kerv_cli.report.tables import values_of
+    from kerv_cli.report.tables import split_values
 
+    store = data.store
     how = how or f"kerv report study={store.name}{results_word(store.database.words)} --all"
-    console().print(SummaryTable(table, all_columns, how))
-    codes, commits = values_of(table, "code"), values_of(table, "git_commit")
+    console().print(SummaryTable(data.results, all_columns, how))
+    codes = split_values(row.provenance["code"] for row in data.results)
     if len(codes) > 1:
+        commits = split_values(row.provenance["git_commit"] for row in data.results)
         names = ", ".join(sorted(commit[:12] for commit in commits))
         typer.echo(f"its episodes are of {len(codes)} states of the code, commits {names}")
-    apart = not_in_turn(table)
+    apart = not_in_turn(data.results)
     if apart:
         mend = "" if store.kind == "import" else f"; '{store.sweep_command('rerun=timed')}' does that"
         typer.echo(f"no speedup of {', '.join(apart)}: not measured in turn with the baseline{mend}")
-    note = store.load().note
-    if note:
-        typer.echo(f"\n{note}\n")
+    if data.study.note:
+        typer.echo(f"\n{data.study.note}\n")
 
 
-def print_prices(priced: DataFrame | None) -> None:
-    """Print the speeds on other machines, from `reprice.repriced_table`. Nothing if there are none."""
+def print_prices(priced: Sequence[Priced]) -> None:
+    """Print the speeds on other machines. Nothing if there are none."""
     from kerv_cli.report.reprice import ASSUMES, repriced_summary
 
-    if priced is not None:
+    if priced:
         summary = repriced_summary(priced)
         summary = summary.filter(regex="setting|per episode")  # the page has the speeds per step
         print_table(summary.columns, summary.itertuples(index=False), ASSUMES)
 
 
-def print_verdict(table: DataFrame, store: StudyStore, loss: float) -> None:
+def print_verdict(data: StudyData, loss: float) -> None:
     """Print the last lines about a study: the verdict, the page to open, the recording to watch, the board.
 
     Args:
-        table: Summary with one row per setting.
-        store: The study in the database.
+        data: The study.
         loss: Largest loss of success that is accepted, percentage points.
     """
-    from kerv_cli.report.decide import verdict_of
+    from kerv_cli.report.verdict import verdict_of
 
-    typer.echo(f"verdict: {verdict_of(table, loss)[0]}")
+    store = data.store
+    typer.echo(f"verdict: {verdict_of(data.results, loss)[0]}")
     typer.echo(f"page: {store.root / 'report.html'}")
     typer.echo(f"browse: kerv board{results_word(store.database.words)}")
     recordings = store.recordings

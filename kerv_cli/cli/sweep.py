@@ -79,7 +79,8 @@ def _list_studies(as_json: bool) -> None:
 
 def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, planned: Plan, as_json: bool) -> None:
     """Print the results of a sweep and end the command, with exit code 1 if episodes failed."""
-    from kerv_cli.report.tables import load_study, rows_of
+    from kerv_cli.report.results import rows_of
+    from kerv_cli.report.tables import load_study
 
     if outcome.detached:
         missing = count(len(planned.to_run), "episode")
@@ -97,7 +98,7 @@ def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, planned: Plan, as_
         content = {"study": store.name, "folder": store.root, "episodes": counts, "settings": rows}
         end_with_json({**content, "recordings": store.recordings}, code=int(bool(failed)))
     if data is not None:
-        print_study(data.table, store)
+        print_study(data)
     minutes = outcome.seconds / 60
     if outcome.done and minutes:
         rate = len(outcome.done) / minutes
@@ -110,8 +111,8 @@ def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, planned: Plan, as_
         # the study in the database may have more tasks, from earlier sweeps
         is_whole = store.counts()[1] == len(data.study.episodes)
         data = data if is_whole else load_study(store)
-        priced = own_prices(data, store)
-        write_study(store, data, resolved.sweep.loss, priced=priced)
+        priced = own_prices(data)
+        write_study(data, resolved.sweep.loss, priced)
         print_prices(priced)
-        print_verdict(data.table, store, resolved.sweep.loss)
+        print_verdict(data, resolved.sweep.loss)
     raise typer.Exit(int(bool(failed)))

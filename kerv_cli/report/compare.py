@@ -12,9 +12,11 @@ from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, without
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.plan import seeds_text
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.measures import Row, measure, paired
+from kerv_cli.report.measures import measure, paired
+from kerv_cli.report.results import Row, is_number
+from kerv_cli.report.statistics import Estimate
 from kerv_cli.report.summary import DIFFERENCE, SPEEDS
-from kerv_cli.report.tables import StudyData, differences, flatten, is_number, load_study, values_of
+from kerv_cli.report.tables import StudyData, differences, flatten, load_study, split_values
 
 _MEASURES = {
     "AL": "tokens per verification",
@@ -71,10 +73,9 @@ def compared_runs(database: Database, name: str) -> list[ComparedRun]:
         raise UsageError(f"study {run.id} has no setting: remove it with 'kerv runs rm {run.id}'")
     if label and label not in labels:
         raise UsageError(f"run {run.id} has no setting '{label}': it has {', '.join(labels)}")
-    return [
-        ComparedRun(f"{run.id}:{one}" if len(labels) > 1 else run.id, run, one)
-        for one in ([label] if label else labels)
-    ]
+    if len(labels) == 1:
+        return [ComparedRun(run.id, run, labels[0])]
+    return [ComparedRun(f"{run.id}:{one}", run, one) for one in labels if label in ("", one)]
 
 
 def pairs_to_compare(database: Database, first: str, second: str) -> list[tuple[ComparedRun, ComparedRun]]:
@@ -119,10 +120,10 @@ def compare(first: ComparedRun, second: ComparedRun) -> Row:
         UsageError: A setting has no episodes.
     """
     differing = differences(_settings_of(first), _settings_of(second))
-    settings = [{"key": key, "first": ours, "second": theirs} for key, ours, theirs in differing]
+    settings = [dict(zip(("key", "first", "second"), values, strict=True)) for values in differing]
     if first.data is None or second.data is None:
-        figures = first.run.figures, second.run.figures
-        results = [_change(name, *(side[name] for side in figures)) for name in figures[0] if name in figures[1]]
+        ours, theirs = first.run.figures, second.run.figures
+        results = [_change(name, ours[name], theirs[name]) for name in ours if name in theirs]
         is_timed = True
     else:
         results = _episode_results(first.episodes, second.episodes)
@@ -139,17 +140,15 @@ def _settings_of(side: ComparedRun) -> Row:
         return flatten(settings)
     setting, episodes = side.data.settings[side.label], side.episodes
     wanted = [one for one in side.data.study.episodes if one.setting.label == side.label]
-    return {
-        **flatten(without(setting.settings, NOT_DETERMINING - {"policy", "method"})),
-        **{name: value[:12] for name, value in setting.identity.items() if name != OBSERVATION},
-        "tasks": ";".join(sorted({one.task for one in wanted})),
-        "seeds": seeds_text(one.seed for one in wanted),
-        **{
-            name: ";".join(sorted(values_of(episodes.dropna(subset=name), name)))
-            for name in _PROVENANCE
-            if name in episodes
-        },
-    }
+    settings = flatten(without(setting.settings, NOT_DETERMINING - {"policy", "method"}))
+    for name, value in without(setting.identity, {OBSERVATION}).items():
+        settings[name] = value[:12]
+    settings["tasks"] = ";".join(sorted({one.task for one in wanted}))
+    settings["seeds"] = seeds_text(one.seed for one in wanted)
+    for name in _PROVENANCE:
+        if name in episodes:
+            settings[name] = ";".join(sorted(split_values(episodes[name].dropna())))
+    return settings
 
 
 def _episode_results(first: pd.DataFrame, second: pd.DataFrame) -> list[Row]:
@@ -157,26 +156,25 @@ def _episode_results(first: pd.DataFrame, second: pd.DataFrame) -> list[Row]:
         raise UsageError("one of the two settings has no episode yet: run it first")
     both = pd.concat([first.assign(label="first"), second.assign(label="second")], ignore_index=True)
     a, b = measure(both, paired(both, {"first": "first", "second": "first"})).values()
-    rows = [_change("success", a["success"], b["success"]) | _interval(b, "difference", DIFFERENCE)]
-    rows += [
-        _change(head, 1.0, b[name]) | _interval(b, name, "ratio of times")
-        for name, head in SPEEDS.items()
-        if is_number(b[name])  # not if the two were not measured in turn
-    ]
-    rows += [
-        _change(heading, a[name], b[name])
-        for name, heading in _MEASURES.items()
-        if is_number(a[name]) and is_number(b[name]) and (a[name] or b[name])
-    ]
-    return [*rows, {"measure": "pairs", "first": len(first), "second": len(second), "change": b["pairs"]}]
+    success = _change("success", a.success.value, b.success.value)
+    rows = [success | _interval(b.difference, DIFFERENCE)]
+    for name, heading in SPEEDS.items():
+        speed = getattr(b, name)
+        if is_number(speed.value):  # not if the two were not measured in turn
+            rows.append(_change(heading, 1.0, speed.value) | _interval(speed, "ratio of times"))
+    for name, heading in _MEASURES.items():
+        ours, theirs = getattr(a, name), getattr(b, name)
+        if is_number(ours) and is_number(theirs) and (ours or theirs):
+            rows.append(_change(heading, ours, theirs))
+    return [*rows, {"measure": "pairs", "first": len(first), "second": len(second), "change": b.pairs}]
 
 
 def _change(name: str, first: float, second: float) -> Row:
     return {"measure": name, "first": first, "second": second, "change": second - first}
 
 
-def _interval(values: Row, name: str, what: str) -> Row:
-    return {"change": values[name], "low": values[f"{name}_low"], "high": values[f"{name}_high"], "what": what}
+def _interval(change: Estimate, what: str) -> Row:
+    return {"change": change.value, "low": change.low, "high": change.high, "what": what}
 
 
 def same_tokens(first: StudyStore, second: StudyStore) -> tuple[int, int]:

@@ -1,62 +1,87 @@
 """Decide which setting to take (`kerv report --choose`): the fastest that is shown to lose little success.
 
-It tests the settings of a finished study in a fixed order, the safest first, and ends at the first that fails
+The settings of a finished study are tested in a fixed order, the safest first. The test ends at the first that fails
 (fixed-sequence testing). So all tests together have the error rate of one test (docs/methods.md §7).
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Sequence
-
-import pandas as pd
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 from kerv_cli.report import statistics as stats
-from kerv_cli.report import verdict
-from kerv_cli.report.matched import SOLVED, passing, safety
-from kerv_cli.report.measures import MICRO, Row
-from kerv_cli.report.tables import is_baseline, is_number, rows_of
-from kerv_cli.report.verdict import Choice
+from kerv_cli.report.measures import MARGIN
+from kerv_cli.report.results import Result, Row, averaged, columns_of, is_number
 
+SOLVED = 0.20
+"""Smallest success rate at which the baseline counts as solving its tasks."""
 POINTS = 100.0
-SPEED = "episode_speedup"
 
 
-def verdict_of(table: pd.DataFrame, loss: float) -> tuple[str, bool]:
-    """Return a study's answer as a sentence for the report.
+@dataclass(frozen=True)
+class Choice:
+    """Which setting to take, for one task or for all tasks together.
 
-    Args:
-        table: The study's table, with one row per setting and averaging.
-        loss: Largest acceptable loss of success against the baseline, in points (percentage points).
-
-    Returns:
-        The sentence, and whether a setting is shown both to be faster and to lose less than `loss`.
+    Attributes:
+        where: The task, or `all tasks`.
+        pairs: Number of pairs of the setting with the most pairs.
+        baseline_success: Success rate of the baseline.
+        front: Settings that no other setting beats in both speed and success, the fastest first.
+        chosen: Fastest setting that is shown to lose less success than the bound. Empty if there is none.
+        loss_at_most: Upper bound on the chosen setting's loss of success, in points, at 95 % confidence. NaN if no
+            setting is chosen.
+        candidate: Fastest setting that more pairs would show to lose less than the bound, if the rates stay the same.
+            Empty if there is none, or if a setting is chosen.
+        candidate_pairs: About how many pairs in all the candidate needs. NaN without a candidate.
+        tested: Number of settings that are tested for their loss of success: those that are faster than the baseline or
+            were not timed.
+        episode_speedup: Speed per episode of the chosen setting against the baseline. NaN if it was not timed.
+        runs: Number of runs that its interval covers.
     """
-    rows, is_shown = rows_of(table, MICRO), False
-    if not any(row["pairs"] and not is_baseline(row) for row in rows):
-        text = "success: " + ", ".join(f"{row['label']} {POINTS * row['success']:.1f} %" for row in rows)
-    elif table["baseline"].nunique() > 1:
-        text = verdict.under_conditions(rows, next(row["method"] for row in rows if is_baseline(row)))
-    else:
-        choice = _choice("all tasks", rows, loss)
-        text, is_shown = verdict.sentence(choice, loss, str(rows[0]["baseline"])), choice.is_shown
-    return f"{text}.", is_shown
+
+    where: str
+    pairs: int
+    baseline_success: float
+    front: tuple[str, ...] = ()
+    chosen: str = ""
+    loss_at_most: float = math.nan
+    candidate: str = ""
+    candidate_pairs: float = math.nan
+    tested: int = 0
+    episode_speedup: stats.Estimate = stats.NO_ESTIMATE
+    runs: int = 0
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether a setting is shown both to be faster and to lose less success than the bound."""
+        return bool(self.chosen) and self.episode_speedup.low > 1
+
+    @property
+    def is_unsolved(self) -> bool:
+        """Whether the baseline's success rate is too low for a recommendation."""
+        return self.baseline_success < SOLVED
+
+    def as_dict(self) -> Row:
+        """Return all fields by name, as JSON values. `front` becomes one text, joined by semicolons."""
+        return columns_of(vars(self)) | {"front": ";".join(self.front)}
 
 
-def choices(table: pd.DataFrame, per_task: pd.DataFrame, loss: float) -> list[Choice]:
+def choices(results: Iterable[Result], task_results: Iterable[Result], loss: float) -> list[Choice]:
     """Return which setting to take for all tasks together, followed by which to take for each task.
 
     Args:
-        table: The study's table, pooled over tasks.
-        per_task: The same table with rows per task.
+        results: The study's rows over all tasks.
+        task_results: Its rows per task.
         loss: Largest acceptable loss of success against the baseline, in points.
     """
-    tasks = {str(task): rows_of(rows) for task, rows in per_task.groupby("task", sort=True)}
-    return [_choice(where, rows, loss) for where, rows in {"all tasks": rows_of(table, MICRO), **tasks}.items()]
+    tasks: dict[str, list[Result]] = {}
+    for row in sorted(task_results, key=lambda row: row.task):
+        tasks.setdefault(row.task, []).append(row)
+    return [choose("all tasks", averaged(results), loss), *(choose(task, tasks[task], loss) for task in tasks)]
 
 
-def _choice(where: str, rows: Sequence[Row], loss: float) -> Choice:
+def choose(where: str, rows: Sequence[Result], loss: float) -> Choice:
     """Choose a setting for one task or for all tasks.
 
     Args:
@@ -64,66 +89,129 @@ def _choice(where: str, rows: Sequence[Row], loss: float) -> Choice:
         rows: The table's rows for that task or for all tasks, one per setting, the baseline included.
         loss: Largest acceptable loss of success against the baseline, in points.
     """
-    success = next((float(row["success"]) for row in rows if is_baseline(row)), math.nan)
-    order = [] if success < SOLVED else safest_first(rows)
+    success = next((row.measures.success.value for row in rows if row.is_baseline), math.nan)
+    pairs = max((row.measures.pairs for row in rows if not row.is_baseline), default=0)
+    undecided = Choice(where, pairs, success)
+    if undecided.is_unsolved:
+        return undecided
+    order = safest_first(rows)
+    undecided = replace(undecided, front=tuple(row.label for row in pareto(rows)), tested=len(order))
     best = _fastest(passing(order, loss / POINTS))
-    # a setting is tested only after all safer ones have passed, so it needs the most pairs of all of these
-    counts = (stats.PairedCounts(*(int(row[name]) for name in stats.PairedCounts._fields)) for row in order)
-    pairs = itertools.accumulate((stats.pairs_to_settle(one, loss / POINTS) for one in counts), max)
-    reached = {str(row["label"]): least for row, least in zip(order, pairs, strict=True) if math.isfinite(least)}
-    candidate = None if best else _fastest([row for row in order if str(row["label"]) in reached])
-    label = str(candidate["label"]) if candidate else ""
-    return Choice(
-        where,
-        pairs=max((int(row["pairs"]) for row in rows if not is_baseline(row)), default=0),
-        baseline_success=success,
-        front=() if success < SOLVED else tuple(str(row["label"]) for row in pareto(rows)),
-        chosen=str(best["label"]) if best else "",
-        loss_at_most=-POINTS * float(best["difference_low"]) if best else math.nan,
-        candidate=label,
-        candidate_pairs=reached.get(label, math.nan),
-        tested=len(order),
-        runs=int(best["runs"]) if best else 0,
-        **{f"{SPEED}{end}": float(best[f"{SPEED}{end}"]) if best else math.nan for end in ("", "_low", "_high")},
-    )
+    if best is None:
+        return _with_candidate(undecided, order, loss)
+    loss_at_most, speed = -POINTS * best.measures.difference.low, best.measures.episode_speedup
+    return replace(undecided, chosen=best.label, loss_at_most=loss_at_most, episode_speedup=speed, runs=best.runs)
 
 
-def safest_first(rows: Sequence[Row]) -> list[Row]:
+def _with_candidate(undecided: Choice, order: Sequence[Result], loss: float) -> Choice:
+    """Add the fastest setting that more pairs would show to lose less than `loss` points, if there is one."""
+    needed, reached = 0.0, {}
+    for row in order:
+        # a setting is tested only after all safer ones have passed, so it needs the most pairs of all of these
+        needed = max(needed, stats.pairs_to_settle(row.measures.counts, loss / POINTS))
+        if math.isfinite(needed):
+            reached[row.label] = needed
+    candidate = _fastest([row for row in order if row.label in reached])
+    if candidate is None:
+        return undecided
+    return replace(undecided, candidate=candidate.label, candidate_pairs=reached[candidate.label])
+
+
+def safest_first(rows: Iterable[Result]) -> list[Result]:
     """Return the rows of the settings to test, the safest first. Success does not influence the order.
 
     Safe means: few unverified tokens, then many forwards per control step (`safety`). Settings that are equally safe
     keep the study's order. The baseline, settings without pairs, and settings that were timed and were not faster are
     left out.
     """
-    compared = [row for row in rows if not is_baseline(row) and row["pairs"]]
-    return sorted((row for row in compared if not is_number(row[SPEED]) or row[SPEED] > 1), key=safety)
+    tested = []
+    for row in rows:
+        speed = row.measures.episode_speedup.value
+        if not row.is_baseline and row.measures.pairs and not speed <= 1:
+            tested.append(row)
+    return sorted(tested, key=safety)
 
 
-def _fastest(rows: Sequence[Row]) -> Row | None:
+def safety(row: Result) -> tuple[float, float]:
+    """Return the key that sorts settings from the safest on. It does not depend on success.
+
+    The setting with the smallest unverified share comes first: the share of executed actions that the target has not
+    verified, rounded to whole per cent. Settings that decode nothing come last. Of settings with equal shares, the one
+    with the most target forwards per control step comes first.
+    """
+    unverified = row.measures.unverified_share
+    return (1.0 if math.isnan(unverified) else round(unverified, 2), -row.measures.forwards_per_step)
+
+
+def passing(rows: Iterable[Result], loss: float) -> list[Result]:
+    """Return the rows of settings that are shown to lose less than `loss`: those before the first that is not.
+
+    By fixed-sequence testing, all tests together have the error rate of one test.
+
+    Args:
+        rows: Rows of a table, in the order of the tests.
+        loss: Largest acceptable loss of success, as a share of episodes.
+    """
+    passed = []
+    for row in rows:
+        if not row.measures.difference.low > -loss:
+            break
+        passed.append(row)
+    return passed
+
+
+def _fastest(rows: Sequence[Result]) -> Result | None:
     """Return the row of the fastest of the tested settings, or None if there are none.
 
     A setting whose interval shows that it is faster than the baseline is preferred to any other. If no setting has a
     measured speed, return the one that was tested last.
     """
-    return max(
-        reversed(rows),
-        key=lambda row: (row[f"{SPEED}_low"] > 1, row[SPEED]) if is_number(row[SPEED]) else (False, -math.inf),
-        default=None,
-    )
+
+    def speed(row: Result) -> tuple[bool, float]:
+        found = row.measures.episode_speedup
+        return (found.low > 1, found.value) if is_number(found.value) else (False, -math.inf)
+
+    return max(reversed(rows), key=speed, default=None)
 
 
-def pareto(rows: Sequence[Row]) -> list[Row]:
+def pareto(rows: Iterable[Result]) -> list[Result]:
     """Return the rows that no other row beats in both speed per episode and success, the fastest first.
 
     The baseline has speed 1. Rows without a measured speed are left out.
     """
 
-    def point(row: Row) -> tuple[float, float]:
-        return (1.0 if is_baseline(row) else float(row[SPEED]), float(row["success"]))
+    def point(row: Result) -> tuple[float, float]:
+        speed = 1.0 if row.is_baseline else row.measures.episode_speedup.value
+        return speed, row.measures.success.value
 
-    timed = [row for row in rows if is_baseline(row) or is_number(row[SPEED])]
-    front: list[Row] = []
+    timed = [row for row in rows if is_number(point(row)[0])]
+    front: list[Result] = []
     for row in sorted(timed, key=point, reverse=True):
-        if not front or row["success"] > front[-1]["success"] or point(row) == point(front[-1]):
+        if not front or point(row)[1] > point(front[-1])[1] or point(row) == point(front[-1]):
             front.append(row)
     return front
+
+
+def with_matched_speed(rows: Sequence[Result]) -> list[Result]:
+    """Add the matched-success speed: one figure per method and baseline, in each of the method's rows.
+
+    How fast is a method at its fastest setting that keeps success (docs/methods.md §7)? The measure is from
+    WA-SpecDec, arXiv 2608.08725. It is the largest `episode_speedup` of the settings that pass the test with a margin
+    of 3 points. It is missing if no setting passes, or if the settings that pass were not timed. It is also missing for
+    the baseline itself, and if the baseline does not solve the tasks.
+
+    Args:
+        rows: One row per setting, with one way of averaging.
+    """
+    solved = {row.label for row in rows if row.is_baseline and row.measures.success.value >= SOLVED}
+    compared = [row for row in rows if row.baseline in solved and not row.is_baseline and row.measures.pairs]
+    groups: dict[tuple[str, str], list[Result]] = {}
+    for row in sorted(compared, key=safety):
+        groups.setdefault((row.method, row.baseline), []).append(row)
+    matched = []
+    for row in rows:
+        group = [] if row.is_baseline else passing(groups.get((row.method, row.baseline), ()), MARGIN)
+        speeds = [one.measures.episode_speedup.value for one in group]
+        fastest = max((speed for speed in speeds if speed > 0), default=math.nan)
+        matched.append(replace(row, matched_success_speed=fastest))
+    return matched

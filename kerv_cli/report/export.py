@@ -19,7 +19,7 @@ from kerv_cli.episodes.rows import DECODE_SCHEMA
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.reprice import levels_of
-from kerv_cli.report.tables import csv_text
+from kerv_cli.report.results import csv_text
 from kerv_cli.targets.compact.settings import prompt_tokens
 from kerv_cli.targets.folders import find_target
 
@@ -127,17 +127,18 @@ def _line(row: Mapping[str, Any], levels: int) -> dict[str, Any]:
         levels: Levels of a drafted tree, for episodes from before rounds had levels.
     """
     seconds = {phase: row[f"seconds.{phase}"] for phase in READ_PHASES if row[f"seconds.{phase}"] is not None}
-    rounds = [
-        {
+    rounds = []
+    for one in row["rounds"]:
+        own_levels = levels if one.get("levels") is None else one["levels"]
+        line = {
             "mode": one["mode"] if one["mode"] in ("skip", PARALLEL) else "forward",
             "proposer": one["proposer"],
             "start": one["start"],
             "nodes": one["tree_size"],
-            "levels": (levels if one.get("levels") is None else one["levels"]) if one["tree_size"] else 0,
+            "levels": own_levels if one["tree_size"] else 0,
             "accepted": one["accepted"],
             "committed": one["committed"],
         }
-        for one in row["rounds"]
-    ]
+        rounds.append(line)
     searched, encoded = row["similarity"] is not None, bool(seconds.pop("vision", 1.0))
     return {"encoded": encoded, "searched": searched, "seconds": seconds, "rounds": rounds}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -12,13 +12,9 @@ import pandas as pd
 from kerv_cli.base.registry import Part, parts
 from kerv_cli.engine.record import PHASES
 from kerv_cli.report import statistics as stats
+from kerv_cli.report.results import MACRO, MICRO, Measures
 from kerv_cli.report.statistics import Estimate
 
-Row = dict[str, Any]
-"""One row of a table: column name to value."""
-
-MICRO = "micro over tasks"
-MACRO = "macro over difficulty groups"
 NEAR = 0.02
 """Distance between hand and object, in metres, below which a failed episode counts as a near-contact failure."""
 MARGIN = 0.03
@@ -42,6 +38,7 @@ _RATIOS = {
     "held_share": ("held_steps", "steps"),
 }
 """Measure -> (numerator, denominator), each a column summed over episodes. NaN if the denominator is 0."""
+_PHASES = [f"ms.{phase}" for phase in PHASES]
 
 
 def measure(
@@ -50,12 +47,8 @@ def measure(
     by: Sequence[str] = ("label",),
     averaging: str = MICRO,
     all_pairs: bool = False,
-) -> dict[Hashable, Row]:
+) -> dict[Hashable, Measures]:
     """Return every measure of each group of episodes.
-
-    The speedups are explained in `speedups`. `same_run` says whether the
-    two episodes of every pair come from one run. `same_block` is the share of pairs that were measured in one block
-    (side by side in one process).
 
     Args:
         episodes: One row per episode. Columns: those of rows.EPISODE_SCHEMA, `label`, `decode_seconds`, `difficulty`,
@@ -67,7 +60,7 @@ def measure(
         all_pairs: Whether speedups also use pairs that were not measured in one block.
 
     Returns:
-        For each group, its measures by column name. A measure without data is NaN.
+        The measures by group.
     """
     if averaging != MACRO:
         episodes, pairs = episodes.assign(difficulty=""), pairs.assign(difficulty="")
@@ -84,57 +77,52 @@ def measure(
     sums = counts.groupby(level=by).sum().join(pairs.groupby(by)[["same_run", "same_block"]].mean())
     means: dict[Hashable, Any] = _means(episodes, parts).groupby(level=by).mean().to_dict("index")
     speeds = speedups(pairs, by, averaging, all_pairs)
-    rows: dict[Hashable, Row] = {}
+    measured: dict[Hashable, Measures] = {}
     for group, row in sums.to_dict("index").items():
+        others = means[group]
         pooled = stats.PairedCounts(*(row[name] for name in outcomes))
-        rows[group] = {
-            "successes": row["successes"],
-            **columns_of("success", success[group]),
-            **means[group],
-            **paired_columns(pooled, difference[group]),
-            "pairs_to_settle": stats.pairs_to_settle(pooled, MARGIN),
-            "same_run": row["same_run"] == 1,
-            "same_block": row["same_block"],
-            "steps": row["steps"],
-            "decodes": row["decodes"],
-            "deviation_samples": row["deviation_count"],
-        }
-        for name, found in speeds.items():
-            rows[group] |= columns_of(name, found.get(group, stats.NO_ESTIMATE))
-    return rows
+        measured[group] = Measures(
+            successes=row["successes"],
+            success=success[group],
+            phases={name: others.pop(name) for name in _PHASES},
+            added={name: others.pop(name) for name in registered_columns()},
+            **others,
+            **compared(pooled, difference[group]),
+            pairs_to_settle=stats.pairs_to_settle(pooled, MARGIN),
+            same_run=row["same_run"] == 1,
+            same_block=row["same_block"],
+            steps=row["steps"],
+            decodes=row["decodes"],
+            deviation_samples=row["deviation_count"],
+            **speeds.get(group, Speeds())._asdict(),
+        )
+    return measured
 
 
 def _averaged(groups: Iterable[Hashable], estimates: Iterable[Estimate]) -> dict[Hashable, Estimate]:
     """Return each group's mean estimate. `groups[i]` is the group of `estimates[i]`. NaN estimates are left out."""
     known: dict[Hashable, list[Estimate]] = {}
     for group, estimate in zip(groups, estimates, strict=True):
-        known.setdefault(group, []).extend([] if math.isnan(estimate.value) else [estimate])
+        known.setdefault(group, [])
+        if not math.isnan(estimate.value):
+            known[group].append(estimate)
     return {group: stats.mean_of(several) for group, several in known.items()}
 
 
-def paired_columns(counts: stats.PairedCounts, difference: Estimate) -> Row:
-    """Return the table columns that compare a setting's success with the baseline's.
+def compared(counts: stats.PairedCounts, difference: Estimate) -> dict[str, Any]:
+    """Return the fields of `Measures` that compare a setting's success with the baseline's.
 
     Args:
         counts: Outcomes of the pairs.
         difference: Success rate of the setting minus the baseline's, with its interval.
-
-    Returns:
-        The values by column name. `mcnemar_p` is NaN if there are no pairs.
     """
     return {
-        "pairs": sum(counts),
-        **counts._asdict(),
+        "counts": counts,
         "mcnemar_p": stats.mcnemar(counts) if sum(counts) else math.nan,
-        **columns_of("difference", difference),
+        "difference": difference,
         "margin": MARGIN,
         "non_inferior": bool(difference.low > -MARGIN),
     }
-
-
-def columns_of(name: str, estimate: Estimate) -> dict[str, float]:
-    """Return an estimate as three columns: `name`, `name`_low and `name`_high."""
-    return {name: estimate.value, f"{name}_low": estimate.low, f"{name}_high": estimate.high}
 
 
 def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame:
@@ -182,41 +170,53 @@ def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame
     )
 
 
-def speedups(
-    pairs: pd.DataFrame, by: list[str], averaging: str, all_pairs: bool = False
-) -> dict[str, dict[Hashable, Estimate]]:
-    """Return the speedups of each group of pairs: mean time of the baseline ÷ mean time of the method.
+class Speeds(NamedTuple):
+    """Speedups of a group of pairs: mean time of the baseline ÷ mean time of the method.
 
-    `speedup` compares seconds per control step, `episode_speedup` seconds per episode. `solved_speedup` is
-    `episode_speedup` over the pairs that both solved: one failed episode runs to the horizon and can decide the others.
-    A group has no speedup if it has no usable pairs, if an episode was not timed, or if its setting runs no decoder
-    (the scripted expert).
+    Attributes:
+        speedup: Of the seconds per control step.
+        episode_speedup: Of the seconds per episode.
+        solved_speedup: Of the seconds per episode, over the pairs that both solved. One failed episode runs to the
+            horizon and can decide the others.
+    """
+
+    speedup: Estimate = stats.NO_ESTIMATE
+    episode_speedup: Estimate = stats.NO_ESTIMATE
+    solved_speedup: Estimate = stats.NO_ESTIMATE
+
+
+def speedups(pairs: pd.DataFrame, by: list[str], averaging: str, all_pairs: bool = False) -> dict[Hashable, Speeds]:
+    """Return the speedups of each group of pairs.
+
+    A group is left out if it has no usable pairs, if an episode was not timed, or if its setting runs no decoder (the
+    scripted expert).
 
     Args:
         pairs: Table made by `paired`.
         by: Columns that form the groups.
         averaging: MACRO: a mean time is the mean of the difficulty groups' means. Otherwise: the mean of all pairs.
         all_pairs: Whether to use pairs that were not measured in one block (side by side in one process), too.
-
-    Returns:
-        For each of the three names, the speedups by group.
     """
     timed = pairs if all_pairs else pairs[pairs["same_block"]]
     blocks = timed["block_method"].astype(str) + "|" + timed["block_baseline"].astype(str)
     # repeats of a world count once
-    blocks = blocks.groupby([timed[name] for name in ("label", "task", "seed")]).transform("first")
-    tasks, difficulties, clusters = (pd.factorize(one)[0] for one in (timed["task"], timed["difficulty"], blocks))
+    blocks = blocks.groupby([timed["label"], timed["task"], timed["seed"]]).transform("first")
+    tasks, clusters = pd.factorize(timed["task"])[0], pd.factorize(blocks)[0]
+    difficulties = pd.factorize(timed["difficulty"])[0] if averaging == MACRO else np.zeros(len(timed), int)
     decodes = timed["decodes"].to_numpy()
     solved = (timed["success_baseline"].astype(bool) & timed["success_method"].astype(bool)).to_numpy()
-    compared = {"speedup": ("time", None), "episode_speedup": ("seconds", None), "solved_speedup": ("seconds", solved)}
-    found: dict[str, dict[Hashable, Estimate]] = {name: {} for name in compared}
-    for name, (column, used) in compared.items():
-        baseline, method = (timed[f"{column}_{side}"].to_numpy(float) for side in ("baseline", "method"))
-        for group, members in timed.groupby(by).indices.items():
-            index = members if used is None else members[used[members]]
-            if decodes[members].any() and not np.isnan(baseline[members] + method[members]).any():
-                about = tasks[index], difficulties[index] if averaging == MACRO else None, clusters[index]
-                found[name][group] = stats.speedup(baseline[index], method[index], *about)
+
+    def ratio(column: str, index: np.ndarray) -> Estimate:
+        baseline, method = timed[f"{column}_baseline"].to_numpy(float), timed[f"{column}_method"].to_numpy(float)
+        return stats.speedup(baseline[index], method[index], tasks[index], difficulties[index], clusters[index])
+
+    untimed = timed["seconds_baseline"].isna().to_numpy() | timed["seconds_method"].isna().to_numpy()
+    found = {}
+    for group, members in timed.groupby(by).indices.items():
+        index = np.asarray(members)
+        if decodes[index].any() and not untimed[index].any():
+            solved_by_both = index[solved[index]]
+            found[group] = Speeds(ratio("time", index), ratio("seconds", index), ratio("seconds", solved_by_both))
     return found
 
 

@@ -15,23 +15,12 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from kerv_cli.episodes.identity import NOT_DETERMINING, without
-from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.decide import verdict_of
-from kerv_cli.report.measures import MACRO, Row
 from kerv_cli.report.plots import about, acceptance_figure, latency_figure, library, study_figures
-from kerv_cli.report.reprice import ASSUMES, repriced_summary
-from kerv_cli.report.summary import MAIN, NOTE, SPEEDS, of_runs, summary_frame
-from kerv_cli.report.tables import (
-    StudyData,
-    differences,
-    flatten,
-    is_baseline,
-    is_number,
-    latency_table,
-    load_study,
-    rows_of,
-)
-from kerv_cli.report.verdict import caution, question
+from kerv_cli.report.reprice import ASSUMES, Priced, repriced_summary
+from kerv_cli.report.results import MACRO, Result, is_number
+from kerv_cli.report.summary import MAIN, MISSING, NOTE, SPEEDS, of_runs, summary_frame
+from kerv_cli.report.tables import StudyData, differences, flatten, latency_table
+from kerv_cli.report.verdict import caution, question, verdict_of
 from kerv_cli.report.viewing.film import animation, film_of
 
 LOSS = 3.0
@@ -40,64 +29,54 @@ _FRAMES = 240
 """Films play at half speed. One with more than half this number of frames plays faster, to stay short and small."""
 
 
-def render(
-    store: StudyStore, data: StudyData, loss: float, priced: pd.DataFrame | None = None, tables: Sequence[Path] = ()
-) -> str:
+def render(data: StudyData, loss: float, priced: Sequence[Priced] = (), tables: Sequence[Path] = ()) -> str:
     """Return the study's page as one HTML file that needs no other file and no network.
 
     `study_parts` explains the arguments.
     """
     loader = PackageLoader("kerv_cli.report", "templates")
     template = Environment(loader=loader, autoescape=True, undefined=StrictUndefined).get_template("study.html")
-    values = study_parts(store, data, loss, priced, tables) | {"films": _films(store, data)}
+    values = study_parts(data, loss, priced, tables) | {"films": _films(data)}
     return template.render(**values, library=library())
 
 
 def study_parts(
-    store: StudyStore,
-    data: StudyData | None = None,
-    loss: float = LOSS,
-    priced: pd.DataFrame | None = None,
-    tables: Sequence[Path] = (),
+    data: StudyData, loss: float = LOSS, priced: Sequence[Priced] = (), tables: Sequence[Path] = ()
 ) -> dict[str, Any]:
     """Return the values that the template _study.html shows.
 
     Args:
-        store: The study's files and recordings.
-        data: The study's episodes and tables. None: read them from the database.
+        data: The study's episodes and tables.
         loss: Largest loss of success, in points, that the verdict accepts.
-        priced: The study's speeds on other machines, from `repriced_table`. None: leave them out.
+        priced: The study's speeds on other machines, from `repriced`.
         tables: CSV files of the study, which are linked.
-
-    Raises:
-        UsageError: No episode of the study is stored.
     """
-    data = data or load_study(store)
-    answer, is_shown = verdict_of(data.table, loss)
-    first, results, figures = data.table.iloc[0], str(store.database.results), figures_of(data, loss)
+    store, rows = data.store, data.results
+    answer, is_shown = verdict_of(rows, loss)
+    first, results, figures = rows[0].provenance, str(store.database.results), figures_of(data, loss)
     return {
         "name": store.name,
         "title": data.study.title or store.name,
         "note": data.study.note,
-        "about": f"{about(data.table)} · kerv {first['kerv_version']} at {str(first['git_commit'])[:12]}",
-        "question": question(data.table, loss),
+        "about": f"{about(rows)} · kerv {first['kerv_version']} at {first['git_commit'][:12]}",
+        "question": question(rows, loss),
         "verdict": answer[:1].upper() + answer[1:],
         "is_shown": is_shown,
-        "caution": caution(data.table),
+        "caution": caution(rows),
         "wanted": len(data.study.episodes),
         "missing": len(data.absent),
         "absent": list(dict.fromkeys(f"{one.setting.label} on {one.task}" for one in data.absent)),
         "results": "" if results == "results" else f" results={shlex.quote(results)}",
         "baseline": data.study.baseline,
         "main": MAIN,
-        "columns": f"{NOTE} {of_runs(data.table)}",
-        "suite": _suite(data.table),
+        "columns": f"{NOTE} {of_runs(rows)}",
+        "suite": _suite(rows),
         "charts": [figure.to_dict() for figure in figures.values()],
         "has_bounds": "_tradeoff" in figures,
         "has_places": "_acceptance" in figures,
-        "tasks": _by_task(data.per_task),
-        "cell_link": None,  # the board gives a function: heading of the first column, row, column -> address
-        "machines": None if priced is None else repriced_summary(priced),
+        "tasks": _by_task(data.task_results),
+        "episodes": "",  # the board gives the address of the page of episodes
+        "machines": repriced_summary(priced) if priced else None,
         "assumes": ASSUMES,
         "settings": _settings(data),
         "films": [],
@@ -111,57 +90,58 @@ def figures_of(data: StudyData, loss: float) -> dict[str, alt.ConcatChart]:
 
     `loss` is the largest acceptable loss of success, in points.
     """
-    figures = study_figures(data.table, data.study.axis, loss)
-    figures |= {"_latency": latency_figure(data.table)} if len(latency_table(data.table)) else {}
-    return figures | ({"_acceptance": acceptance_figure(data.tallies, data.references)} if data.tallies else {})
+    figures = study_figures(data.results, data.study.axis, loss)
+    if len(latency_table(data.results)):
+        figures["_latency"] = latency_figure(data.results)
+    if data.tallies:
+        figures["_acceptance"] = acceptance_figure(data.tallies, data.references)
+    return figures
 
 
-def _suite(table: pd.DataFrame) -> pd.DataFrame:
+def _suite(results: Sequence[Result]) -> pd.DataFrame:
     """Return the page's table of settings, pooled over tasks.
 
     If the tasks have several difficulty groups, further columns have the unweighted mean of the groups.
     """
-    frame = summary_frame(table)
-    if table["difficulty"].str.contains(";").any():
-        macro = summary_frame(table, MACRO)
+    frame = summary_frame(results)
+    if any(";" in row.difficulty for row in results):
+        macro = summary_frame(results, MACRO)
         for name in ("success", *SPEEDS.values()):
-            frame[f"{name}, by difficulty"] = macro.get(name, "–")
+            frame[f"{name}, by difficulty"] = macro.get(name, MISSING)
     return frame
 
 
-def _by_task(per_task: pd.DataFrame) -> pd.DataFrame:
+def _by_task(results: Sequence[Result]) -> pd.DataFrame:
     """Return the page's table of successes and speeds per episode, by task and setting.
 
     Tasks are rows and settings are columns, unless there are more settings than tasks.
     """
-    cells = per_task.assign(text=[_cell(row) for row in rows_of(per_task)])
-    table = cells.pivot(index="task", columns="label", values="text")[per_task["label"].unique()].fillna("–")
+    cells: dict[str, dict[str, str]] = {}
+    for row in results:
+        cells.setdefault(row.label, {})[row.task] = _cell(row)
+    table = pd.DataFrame(cells).sort_index().fillna(MISSING).rename_axis("task")
     return (table.T.rename_axis("setting") if len(table.columns) > len(table) else table).reset_index()
 
 
-def _cell(row: Row) -> str:
+def _cell(row: Result) -> str:
     """Return successes / episodes and, if measured, the speed per episode, as text."""
-    share = f"{int(row['successes'])}/{int(row['episodes'] // max(1, row['repeats']))}"
-    if is_baseline(row) or not is_number(row["episode_speedup"]):
-        return share
-    return f"{share} · {row['episode_speedup']:.2f}×"
+    share = f"{row.measures.successes}/{row.episodes // max(1, row.repeats)}"
+    speed = row.measures.episode_speedup.value
+    return share if row.is_baseline or not is_number(speed) else f"{share} · {speed:.2f}×"
 
 
 def _settings(data: StudyData) -> list[dict[str, Any]]:
     """Return every setting's label, overrides, and the values in which it differs from the one it is compared with."""
     flat = {label: flatten(without(one.settings, NOT_DETERMINING)) for label, one in data.settings.items()}
-    return [
-        {
-            "label": label,
-            "overrides": data.settings[label].overrides,
-            "reference": (reference := data.references[label]),
-            "differs": differences(flat.get(reference, {}), own),
-        }
-        for label, own in flat.items()
-    ]
+    settings = []
+    for label, own in flat.items():
+        reference = data.references[label]
+        about = {"label": label, "overrides": data.settings[label].overrides, "reference": reference}
+        settings.append({**about, "differs": differences(flat.get(reference, {}), own)})
+    return settings
 
 
-def _films(store: StudyStore, data: StudyData) -> list[dict[str, Any]]:
+def _films(data: StudyData) -> list[dict[str, Any]]:
     """Return for each method a film of its first recorded success and one of its first recorded failure.
 
     If no episode with an outcome was filmed, there is no film of it. A film is a dictionary with the setting's
@@ -171,7 +151,7 @@ def _films(store: StudyStore, data: StudyData) -> list[dict[str, Any]]:
     outcomes = data.episodes.set_index(keys)["success"].to_dict()
     films: dict[tuple[str, bool], dict[str, Any]] = {}
     for one in data.study.episodes:
-        path, method = store.rollouts / one.recording, one.setting.settings["method"]
+        path, method = data.store.rollouts / one.recording, one.setting.settings["method"]
         success = outcomes.get((one.setting.label, *one.key[1:]))
         if success is None or (method, success) in films or not path.is_file():
             continue

@@ -8,7 +8,7 @@ to the setting that was clicked.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +22,9 @@ from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import write_if_changed
 from kerv_cli.engine.tally import Tally
-from kerv_cli.report.measures import MICRO
-from kerv_cli.report.stressed import NONE, is_stressed
+from kerv_cli.report.results import Result, averaged, frame_of, is_number
 from kerv_cli.report.summary import MAIN, summary_frame
-from kerv_cli.report.tables import is_number, latency_table
+from kerv_cli.report.tables import NO_STRESS, is_stressed, latency_table
 
 INK, MUTED, BLUE, GREEN = "#1f2933", "#6b7785", "#0b6fb8", "#2a9d6f"
 COLOURS = (BLUE, "#d1495b", GREEN, "#8d5fd3", "#e08e1b", "#3aa6b9", "#7a5c3e")  # distinct when colour-blind
@@ -44,7 +43,7 @@ _CONFIG = {
 }  # fmt: skip
 
 
-def study_figures(table: pd.DataFrame, axis: str, loss: float = 3.0) -> dict[str, alt.ConcatChart]:
+def study_figures(results: Sequence[Result], axis: str, loss: float = 3.0) -> dict[str, alt.ConcatChart]:
     """Draw the chart that suits a study, from its rows pooled over tasks.
 
     - A study of stress: success against the level of stress.
@@ -52,7 +51,7 @@ def study_figures(table: pd.DataFrame, axis: str, loss: float = 3.0) -> dict[str
     - Any other study that compares settings or was timed: speed and change in success of every setting.
 
     Args:
-        table: The study's table.
+        results: The study's rows over all tasks.
         axis: Table column for the x axis, such as `threshold.r`. Empty: none.
         loss: Largest acceptable loss of success, in points.
 
@@ -60,12 +59,12 @@ def study_figures(table: pd.DataFrame, axis: str, loss: float = 3.0) -> dict[str
         The charts. A key is what the chart adds to the study's name in its file's name, such as `_tradeoff`. Empty if
         there is nothing to draw.
     """
-    rows = _pooled(table)
-    if is_stressed(table):
-        kinds = [kind for kind in rows["stress"].unique() if kind != NONE]
-        parts = [rows[rows["stress"].isin([NONE, kind])].assign(panel=kind) for kind in kinds]
-        drawn = pd.concat(parts).assign(line=lambda all: all["unstressed"], x=lambda all: all["stress_level"])
-        return {"": lines_figure([_points(drawn, SUCCESS)], "level of stress", "success, %")}
+    rows = _drawn(results)
+    if is_stressed(results):
+        kinds = [kind for kind in rows["stress"].unique() if kind != NO_STRESS]
+        points = pd.concat(rows[rows["stress"].isin([NO_STRESS, kind])].assign(panel=kind) for kind in kinds)
+        points = points.assign(line=points["unstressed"], x=points["stress_level"])
+        return {"": lines_figure([_points(points, SUCCESS)], "level of stress", "success, %")}
     rows = with_lines(rows, axis)
     if rows["x"].notna().any():
         measures = [_points(rows.assign(panel=TITLES[name]), name) for name in (SPEED, SUCCESS)]
@@ -73,20 +72,22 @@ def study_figures(table: pd.DataFrame, axis: str, loss: float = 3.0) -> dict[str
     return {"_tradeoff": _tradeoff(rows, loss)} if rows["pairs"].any() else {}
 
 
-def about(table: pd.DataFrame) -> str:
+def about(results: Sequence[Result]) -> str:
     """Return the subtitle of a chart: policies, number of settings, tasks and episodes, device, number format."""
-    first, targets = table.iloc[0], list(map(str, table["policy.target"].unique()))
+    labels = {row.label for row in results}
+    targets = list(dict.fromkeys(str(row.settings["policy.target"]) for row in results))
+    tasks, episodes = max(row.tasks for row in results), max(row.episodes for row in results)
     names = ", ".join(targets) if len(targets) <= 2 else f"{len(targets)} policies"
-    counts = f"{count(table['label'].nunique(), 'setting')} on {count(table['tasks'].max(), 'task')}"
-    each = f"{count(table['episodes'].max(), 'episode')} each"
-    return f"{names} · {counts}, {each} · {first['device_name']}, {first['runtime.dtype']}"
+    counts = f"{count(len(labels), 'setting')} on {count(tasks, 'task')}, {count(episodes, 'episode')} each"
+    return f"{names} · {counts} · {results[0].provenance['device_name']}, {results[0].settings['runtime.dtype']}"
 
 
-def _pooled(table: pd.DataFrame) -> pd.DataFrame:
+def _drawn(results: Sequence[Result]) -> pd.DataFrame:
     """Return the rows pooled over tasks, with `setting`, `is_baseline` and the text to show on hovering."""
-    rows = table[table["averaging"] == MICRO].reset_index(drop=True)
-    texts = summary_frame(table).iloc[:, :MAIN].add_prefix("text ")
-    return rows.assign(setting=rows["label"], is_baseline=rows["label"] == rows["baseline"], panel="").join(texts)
+    rows = averaged(results)
+    texts = summary_frame(rows).iloc[:, :MAIN].add_prefix("text ")
+    frame = frame_of(rows)
+    return frame.assign(setting=frame["label"], is_baseline=frame["label"] == frame["baseline"], panel="").join(texts)
 
 
 def with_lines(rows: pd.DataFrame, axis: str) -> pd.DataFrame:
@@ -174,7 +175,9 @@ def lines_figure(measures: Iterable[pd.DataFrame], xlabel: str, ylabel: str | No
     points = pd.concat(measures)
     names = points["line"].unique()
     dark = set(points.loc[points["is_baseline"], "line"])
-    colours = [INK if name in dark else COLOURS[number % len(COLOURS)] for number, name in enumerate(names)]
+    colours = []
+    for number, name in enumerate(names):
+        colours.append(INK if name in dark else COLOURS[number % len(COLOURS)])
     legend = alt.Legend(orient="bottom", columns=4, title=None)
     colour = alt.Color("line:N", scale=alt.Scale(domain=list(names), range=colours), legend=legend)
     scale, charts = alt.Scale(zero=False, padding=12), []
@@ -193,10 +196,10 @@ def lines_figure(measures: Iterable[pd.DataFrame], xlabel: str, ylabel: str | No
     return _chart(charts, _ACROSS)
 
 
-def latency_figure(table: pd.DataFrame) -> alt.ConcatChart:
+def latency_figure(results: Sequence[Result]) -> alt.ConcatChart:
     """Draw success against the time that an AR decode takes, with one panel per kind of delay compensation."""
-    latencies = latency_table(table).set_index("label")["ar_latency_ms"]
-    rows = _pooled(table)
+    latencies = latency_table(results).set_index("label")["ar_latency_ms"]
+    rows = _drawn(results)
     rows = rows.assign(x=rows["label"].map(latencies)).query("x > 0").sort_values("x", kind="stable")
     panels = "delay compensation: " + rows["rollout.delay_compensation"]
     points = _points(rows.assign(line=rows["method"], panel=panels), SUCCESS)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
@@ -15,9 +14,18 @@ from kerv_cli.lab.database import Database
 from kerv_cli.lab.store import ROLLOUT, StudyStore, studies
 from kerv_cli.report.page import LOSS, figures_of, render
 from kerv_cli.report.plots import about, png
-from kerv_cli.report.reprice import open_profiles, own_prices, repriced_table
-from kerv_cli.report.stressed import is_stressed, summed_table
-from kerv_cli.report.tables import CSV_COLUMNS, StudyData, csv_text, further_of, latency_table, load_study, values_of
+from kerv_cli.report.reprice import Priced, open_profiles, own_prices, prices_table, repriced
+from kerv_cli.report.results import Result, csv_text
+from kerv_cli.report.tables import (
+    CSV_COLUMNS,
+    StudyData,
+    further_of,
+    is_stressed,
+    latency_table,
+    load_study,
+    split_values,
+    summed_table,
+)
 
 
 def names_to_report(database: Database, study: str | None) -> list[str]:
@@ -37,21 +45,19 @@ def names_to_report(database: Database, study: str | None) -> list[str]:
     return names
 
 
-@dataclass
+@dataclass(frozen=True)
 class Report:
-    """What `report` wrote and computed.
+    """What `report` wrote and computed about one study.
 
     Attributes:
+        data: The study with its tables.
+        priced: Its speeds on other machines. Empty: none were estimated.
         files: Written files, in the order of writing.
-        tables: The table of each study, by the study's name.
-        acceptance: How many draft tokens were accepted, by place (`Tally.as_dict`), by study and setting.
-        priced: The study's speeds on other machines, from `repriced_table`. None if `on` was empty.
     """
 
+    data: StudyData
+    priced: list[Priced]
     files: list[Path]
-    tables: dict[str, pd.DataFrame]
-    acceptance: dict[str, dict[str, dict[str, Any]]]
-    priced: pd.DataFrame | None = None
 
 
 def report(
@@ -61,8 +67,8 @@ def report(
     on: Sequence[str] = (),
     loss: float = LOSS,
     baseline: str = "",
-) -> Report:
-    """Write the tables, plots and page of one study, or of every study that has an episode.
+) -> list[Report]:
+    """Write the tables, plots and page of one study, or of every study that has an episode. Return a report of each.
 
     The tables are <study>.csv, <study>_per_task.csv, <study>.json and, with `on`, <study>_on.csv. The same episodes
     give the same bytes.
@@ -85,77 +91,87 @@ def report(
     if (on or baseline) and not study:
         given = f"on={','.join(on)}" if on else f"baseline={baseline}"
         raise UsageError(f"{given}: name the study with study=NAME")
-    names = names_to_report(database, study)
-    profiles, output = open_profiles(database.results, on), Report([], {}, {})
-    for name in names:
-        store = StudyStore(database, name)
-        data = load_study(store)
-        data = data.compared_with(baseline) if baseline else data
-        output.priced = repriced_table(data, store, profiles) if profiles else own_prices(data, store)
-        output.files += write_study(store, data, loss, publish, output.priced)
-        output.tables[name] = data.table
-        output.acceptance[name] = {label: tally.as_dict() for label, tally in data.tallies.items()}
-    return output
+    profiles, reports = open_profiles(database.results, on), []
+    for name in names_to_report(database, study):
+        data = load_study(StudyStore(database, name))
+        if baseline:
+            data = data.compared_with(baseline)
+        priced = repriced(data, profiles) if profiles else own_prices(data)
+        reports.append(Report(data, priced, write_study(data, loss, priced, publish)))
+    return reports
 
 
-def write_study(
-    store: StudyStore, data: StudyData, loss: float, publish: bool = False, priced: pd.DataFrame | None = None
-) -> list[Path]:
+def write_study(data: StudyData, loss: float, priced: Sequence[Priced] = (), publish: bool = False) -> list[Path]:
     """Write the tables, plots and page of one study. Return the files, the page last.
 
     Args:
-        store: The study's files.
         data: The study with all its episodes.
         loss: Largest loss of success, in points, that the verdict accepts.
+        priced: The study's speeds on other machines, from `repriced`.
         publish: Write tables and plots into the results folder itself instead of its report/.
-        priced: The study's speeds on other machines, from `repriced_table`. None: leave them out.
 
     Raises:
         Unpublishable: `publish` is set and the study may not be published.
         StorageError: The disk is full or read-only.
     """
-    results, name, title = store.database.results, data.study.name, data.study.title or store.name
     if publish:
         check_publishable(data)
-    tables = {"": data.table[list(CSV_COLUMNS)], "_per_task": data.per_task[list(CSV_COLUMNS)]}
-    if priced is not None:
-        tables["_on"] = priced
-    if len(latencies := latency_table(data.table)):
-        tables["_latency"] = latencies
-    if is_stressed(data.table):
-        tables["_summed"] = summed_table(data.table)
-    folder, page = results if publish else results / "report", store.root / "report.html"
-    texts = {folder / "tables" / f"{name}{suffix}.csv": csv_text(table) for suffix, table in tables.items()}
-    for path, text in texts.items():
-        write_text(path, text)
-    document = folder / "tables" / f"{name}.json"
+    results, name = data.store.database.results, data.study.name
+    folder, page = results if publish else results / "report", data.store.root / "report.html"
+    tables, document = [], folder / "tables" / f"{name}.json"
+    for suffix, table in tables_of(data, priced).items():
+        tables.append(folder / "tables" / f"{name}{suffix}.csv")
+        write_text(tables[-1], csv_text(table))
     write_json(document, further_of(data))
-    pictures = []
+    pictures, title = [], data.study.title or data.store.name
     for suffix, figure in figures_of(data, loss).items():
         pictures.append(folder / "plots" / f"{name}{suffix}.png")
-        write_bytes(pictures[-1], png(figure, title, about(data.table)))
-    write_text(page, render(store, data, loss, priced, list(texts)))
-    return [*texts, document, *pictures, page]
+        write_bytes(pictures[-1], png(figure, title, about(data.results)))
+    write_text(page, render(data, loss, priced, tables))
+    return [*tables, document, *pictures, page]
+
+
+def tables_of(data: StudyData, priced: Sequence[Priced]) -> dict[str, pd.DataFrame]:
+    """Return the tables of a study's CSV files. A key is what a file's name adds to the study's name: `_per_task`."""
+    tables = {"": data.table[list(CSV_COLUMNS)], "_per_task": data.per_task[list(CSV_COLUMNS)]}
+    if priced:
+        tables["_on"] = prices_table(priced)
+    if len(latencies := latency_table(data.results)):
+        tables["_latency"] = latencies
+    if is_stressed(data.results):
+        tables["_summed"] = summed_table(data.results)
+    return tables
 
 
 class Unpublishable(KervError):
     """A study does not meet the conditions for publishing."""
 
 
-def refusals(table: pd.DataFrame) -> list[str]:
-    """Return the reasons why a study's table may not be published, as clauses of an error message. Empty if it may."""
+def refusals(results: Sequence[Result]) -> list[str]:
+    """Return the reasons why a study may not be published, as clauses of an error message. Empty if it may.
+
+    Args:
+        results: The study's rows over all tasks.
+    """
     clauses = []
-    commits = values_of(table, "git_commit")
-    if any(commit.endswith("+changes") or commit in ("none", "nan", "") for commit in commits):
+    commits = split_values(row.provenance["git_commit"] for row in results)
+    if any(commit.endswith("+changes") or commit in ("none", "") for commit in commits):
         clauses.append("some episodes were computed by code that is not committed")
     several = {"git_commit": "commits", "host": "machines", "device_name": "devices", "engine": "engines"}
     for column, what in several.items():
-        if len(values_of(table, column)) > 1:
-            clauses.append(f"its episodes are from {len(values_of(table, column))} {what}")
-    compared = table[(table["label"] != table["baseline"]) & (table["pairs"] > 0)]
-    for column, what in (("same_run", "in one run with"), ("same_block", "in turn with")):
-        if apart := list(dict.fromkeys(compared.loc[compared[column] < 1, "label"])):
-            clauses.append(f"not measured {what} the baseline: {', '.join(map(str, apart))}")
+        values = split_values(row.provenance[column] for row in results)
+        if len(values) > 1:
+            clauses.append(f"its episodes are from {len(values)} {what}")
+    apart: dict[str, dict[str, None]] = {"in one run with": {}, "in turn with": {}}
+    for row in results:
+        if not row.is_baseline and row.measures.pairs:
+            if not row.measures.same_run:
+                apart["in one run with"][row.label] = None
+            if row.measures.same_block < 1:
+                apart["in turn with"][row.label] = None
+    for what, labels in apart.items():
+        if labels:
+            clauses.append(f"not measured {what} the baseline: {', '.join(labels)}")
     return clauses
 
 
@@ -166,7 +182,7 @@ def check_publishable(data: StudyData) -> None:
         Unpublishable: The message lists all reasons.
     """
     clauses = [f"{len(data.absent)} of its episodes are missing"] if data.absent else []
-    clauses += refusals(data.table)
+    clauses += refusals(data.results)
     if clauses:
         raise Unpublishable(
             f"study {data.study.name} may not be published: {'; '.join(clauses)}. Commit, then run it on one "

@@ -20,10 +20,10 @@ from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.places import as_path
 from kerv_cli.engine.cost import COUNTED, READ_PHASES, Profile, Work, prices, read_profile, work_of
 from kerv_cli.episodes.identity import batch_of
-from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.measures import MICRO, Row, measure, paired
-from kerv_cli.report.summary import SPEEDS, intervals
-from kerv_cli.report.tables import StudyData, is_baseline, is_number, rows_of
+from kerv_cli.report.measures import measure, paired
+from kerv_cli.report.results import Measures, Result, Row, averaged, columns_of, is_number
+from kerv_cli.report.summary import interval
+from kerv_cli.report.tables import StudyData
 from kerv_cli.targets.folders import shipped_dir
 
 ASSUMES = (
@@ -32,7 +32,6 @@ ASSUMES = (
 )
 _COLUMNS = ("index", "rounds", "similarity", *(f"seconds.{phase}" for phase in READ_PHASES))
 _SHIPPED = "-profile.json"
-_TIMES = ("time_per_episode_ms", "time_per_step_ms", "latency_p95_ms")
 _EIGHT_MS = 0.008  # what HeiSD's encoder takes on an A100 (arXiv 2603.17573)
 ENCODERS = {"encoder_floor": "its floor", "encoder_twice": "twice its floor", "encoder_8ms": "8 ms"}
 """Column with the speed per episode at another cost of the target's encoder -> that cost, in words."""
@@ -99,77 +98,107 @@ def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfil
     return profiles
 
 
-def repriced_table(data: StudyData, store: StudyStore, profiles: Sequence[NamedProfile]) -> pd.DataFrame:
+@dataclass(frozen=True)
+class Priced:
+    """How fast a setting would be on the machine of a profile.
+
+    Attributes:
+        result: The setting's row as measured, pooled over tasks.
+        machine: The profile.
+        measures: The same measures, estimated.
+        encoders: Estimated speeds per episode with another encoder, by `ENCODERS`. Empty for measured profiles.
+    """
+
+    result: Result
+    machine: NamedProfile
+    measures: Measures
+    encoders: Mapping[str, float]
+
+    @property
+    def columns(self) -> Row:
+        """The row of `prices_table`."""
+        result, estimated, measured = self.result, self.measures, self.result.measures
+        return columns_of(
+            {
+                "study": result.study,
+                "label": result.label,
+                "baseline": result.baseline,
+                "on": self.machine.name,
+                "machine": self.machine.title,
+                "projected": bool(self.machine.profile.about.get("projected")),
+                "episode_speedup": estimated.episode_speedup,
+                "speedup": estimated.speedup,
+                "time_per_episode_ms": estimated.time_per_episode_ms,
+                "time_per_step_ms": estimated.time_per_step_ms,
+                "latency_p95_ms": estimated.latency_p95_ms,
+                "encoders": self.encoders,
+                "measured_episode_speedup": measured.episode_speedup,
+                "measured_speedup": measured.speedup,
+                "measured_on": result.provenance["device_name"],
+                "episodes": result.episodes,
+                "pairs": estimated.pairs,
+            }
+        )
+
+
+def prices_table(priced: Iterable[Priced]) -> pd.DataFrame:
+    """Return estimates as a data frame: one row per profile and setting."""
+    return pd.DataFrame(row.columns for row in priced)
+
+
+def repriced(data: StudyData, profiles: Sequence[NamedProfile]) -> list[Priced]:
     """Estimate how fast every setting would be on the machine of each profile.
 
     Args:
         data: The study's episodes.
-        store: The study in the database, to read its decodes.
         profiles: For each machine, the seconds that each operation of a decode takes there (`kerv bench`).
 
     Returns:
-        One row per profile and setting, pooled over tasks: the estimated speeds against the baseline with their
-        intervals, the estimated times, and the speeds as measured. A computed profile also gives the speeds per episode
-        with another encoder, see `ENCODERS`. Settings that run no decoder are left out.
+        One row per profile and setting. Settings that run no decoder are left out.
 
     Raises:
         UsageError: A profile lacks a cost that the study needs, or has costs for shorter chunks only. Or a setting has
             no times, because its episodes ran in a batch.
     """
     decoded = data.episodes.groupby("label")[["forwards", "skipped_decodes"]].sum().any(axis=1)
-    labels = [label for label in data.labels if decoded[label]]
-    episodes = {label: data.episodes[data.episodes["label"] == label] for label in labels}
-    works = {label: _work_of_label(data, label, store) for label in labels}
-    measured = {row["label"]: row for row in rows_of(data.table, MICRO)}
+    works = {label: _work_of_label(data, label) for label in data.labels if decoded[label]}
+    if not works:
+        return []
     rows = []
     for named in profiles:
         for label, work in works.items():
             _check(named, label, work)
         estimated = _estimated(data, works, named.profile)
-        otherwise = {name: _estimated(data, works, profile) for name, profile in named.encoders.items()}
-        rows += [
-            {
-                "study": data.study.name,
-                "label": label,
-                "baseline": data.references[label],
-                "on": named.name,
-                "machine": named.title,
-                "projected": bool(named.profile.about.get("projected")),
-                **_speeds(estimated[label], ""),
-                **{name: estimated[label][name] for name in _TIMES},
-                **{name: values[label]["episode_speedup"] for name, values in otherwise.items()},
-                **_speeds(measured[label], "measured_"),
-                "measured_on": ";".join(dict.fromkeys(episodes[label]["device_name"])),
-                "episodes": len(episodes[label]),
-                "pairs": estimated[label]["pairs"],
-            }
-            for label in labels
-        ]
-    return pd.DataFrame(rows)
+        encoders = {name: _estimated(data, works, profile) for name, profile in named.encoders.items()}
+        for result in averaged(data.results):
+            if result.label in works:
+                speeds = {name: of[result.label].episode_speedup.value for name, of in encoders.items()}
+                rows.append(Priced(result, named, estimated[result.label], speeds))
+    return rows
 
 
-def _estimated(data: StudyData, works: Mapping[str, _LabelWork], profile: Profile) -> dict[Hashable, Row]:
+def _estimated(data: StudyData, works: Mapping[str, _LabelWork], profile: Profile) -> dict[Hashable, Measures]:
     """Return the measures of every setting, by its label, if its decodes took what the profile says."""
     episodes = data.episodes
     priced = pd.concat([_priced(episodes[episodes["label"] == label], work, profile) for label, work in works.items()])
     return measure(priced, paired(priced, data.references), all_pairs=True)
 
 
-def own_prices(data: StudyData, store: StudyStore) -> pd.DataFrame | None:
+def own_prices(data: StudyData) -> list[Priced]:
     """Return `prices_on` the machines that the study's file names and, if it was benchmarked, on its own."""
-    return prices_on(data, store, dict.fromkeys((*data.study.machines, *own_profiles(data, store))))
+    return prices_on(data, dict.fromkeys((*data.study.machines, *own_profiles(data))))
 
 
-def prices_on(data: StudyData, store: StudyStore, names: Iterable[str]) -> pd.DataFrame | None:
-    """Return `repriced_table` for profiles, as far as they are there and have all costs. None if none is left."""
-    tables = []
+def prices_on(data: StudyData, names: Iterable[str]) -> list[Priced]:
+    """Return `repriced` for those profiles that exist and have all costs."""
+    rows = []
     for name in names:
         with suppress(UsageError):
-            tables.append(repriced_table(data, store, open_profiles(store.database.results, [name])))
-    return pd.concat(tables, ignore_index=True) if tables else None
+            rows += repriced(data, open_profiles(data.store.database.results, [name]))
+    return rows
 
 
-def own_profiles(data: StudyData, store: StudyStore) -> list[str]:
+def own_profiles(data: StudyData) -> list[str]:
     """Return the names of the profiles that `kerv bench` measured of the study's targets on the study's machines.
 
     Their estimates, beside what was measured, show how far the cost model is from the truth.
@@ -180,14 +209,10 @@ def own_profiles(data: StudyData, store: StudyStore) -> list[str]:
         target = str(policy.get("target")).rstrip("/").rsplit("/", 1)[-1]
         name = f"{target}-{runtime.get('dtype')}"
         with suppress(CheckpointError):
-            if read_profile(store.database.results / "bench" / f"{name}.json").about.get("device_name") in devices:
+            profile = read_profile(data.store.database.results / "bench" / f"{name}.json")
+            if profile.about.get("device_name") in devices:
                 names.append(name)
     return names
-
-
-def _speeds(values: Row, prefix: str) -> dict[str, float]:
-    """Return the speeds per episode and per step and their intervals, with `prefix` before each column's name."""
-    return {f"{prefix}{name}{end}": values[f"{name}{end}"] for name in SPEEDS for end in ("", "_low", "_high")}
 
 
 class _LabelWork(NamedTuple):
@@ -204,7 +229,7 @@ class _LabelWork(NamedTuple):
     size: int
 
 
-def _work_of_label(data: StudyData, label: str, store: StudyStore) -> _LabelWork:
+def _work_of_label(data: StudyData, label: str) -> _LabelWork:
     """Read which operations the decodes of a setting executed, in the order of its episodes.
 
     Raises:
@@ -216,14 +241,14 @@ def _work_of_label(data: StudyData, label: str, store: StudyStore) -> _LabelWork
             f"setting '{label}' ran {batch} episodes at a time, without times: run it with rollout.batch=1"
         )
     episodes = data.episodes.loc[data.episodes["label"] == label, "episode"]
-    table = store.decodes(episodes.tolist(), _COLUMNS).combine_chunks()
+    table = data.store.decodes(episodes.tolist(), _COLUMNS).combine_chunks()
     rounds = table["rounds"].combine_chunks()
     counts = pc.list_value_length(rounds).to_numpy(zero_copy_only=False).astype(np.int64)
     every = rounds.flatten()
-    stored = {field.name for field in every.type}
-    columns = {
-        name: every.field(name).to_numpy(zero_copy_only=False) for name in (*COUNTED, "committed") if name in stored
-    }
+    columns = {}
+    for name in (*COUNTED, "committed"):
+        if every.type.get_field_index(name) >= 0:  # rounds had no levels before
+            columns[name] = every.field(name).to_numpy(zero_copy_only=False)
     decode = np.repeat(np.arange(len(counts)), counts)
     size = int(np.bincount(decode, columns.pop("committed")).max())
     phases = {phase: np.nan_to_num(table[f"seconds.{phase}"].to_numpy()) for phase in READ_PHASES}
@@ -268,20 +293,22 @@ def _priced(episodes: pd.DataFrame, work: _LabelWork, profile: Profile) -> pd.Da
     return episodes.assign(seconds=total, decode_seconds=pd.Series(np.split(seconds[order], stops), episodes.index))
 
 
-def repriced_summary(table: pd.DataFrame) -> pd.DataFrame:
+def repriced_summary(priced: Sequence[Priced]) -> pd.DataFrame:
     """Return a table of speeds to print: one row per setting.
 
     Two columns hold the speeds as measured. Two more columns per machine hold the estimated ones. For a computed
     profile, a third one holds the speeds with another encoder, see `ENCODERS`.
     """
     rows: dict[str, dict[str, str]] = {}
-    for row in rows_of(table):
-        cells = rows.setdefault(row["label"], {"setting": row["label"]})
-        for machine, prefix in ((f"measured, {row['measured_on']}", "measured_"), (row["machine"], "")):
-            for name, heading in SPEEDS.items():
-                text = "1×" if is_baseline(row) else intervals(f"{prefix}{name}", unit="×")(row)
-                cells[f"{machine}: {heading.removeprefix('speed, ')}"] = text
-        if is_number(row.get("encoder_floor")):
-            speeds = " / ".join("1" if is_baseline(row) else f"{row[name]:.2f}" for name in ENCODERS)
-            cells[f"{row['machine']}: per episode, if the encoder takes {', '.join(ENCODERS.values())}"] = f"{speeds}×"
+    for row in priced:
+        machine, is_baseline = row.machine.title, row.result.is_baseline
+        cells = rows.setdefault(row.result.label, {"setting": row.result.label})
+        measured = f"measured, {row.result.provenance['device_name']}"
+        for source, of in ((measured, row.result.measures), (machine, row.measures)):
+            cells[f"{source}: per episode"] = "1×" if is_baseline else interval(of.episode_speedup, unit="×")
+            cells[f"{source}: per step"] = "1×" if is_baseline else interval(of.speedup, unit="×")
+        if row.encoders:
+            heading = f"{machine}: per episode, if the encoder takes {', '.join(ENCODERS.values())}"
+            texts = ["1"] * len(ENCODERS) if is_baseline else [f"{speed:.2f}" for speed in row.encoders.values()]
+            cells[heading] = f"{' / '.join(texts)}×"
     return pd.DataFrame(rows.values())

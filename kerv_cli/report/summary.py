@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pandas as pd
@@ -17,11 +17,11 @@ from rich.text import Text
 from kerv_cli.base.durations import count
 from kerv_cli.engine.record import PHASES
 from kerv_cli.episodes.identity import batch_of, stress_text
-from kerv_cli.report.measures import MICRO, Row, registered_columns
-from kerv_cli.report.tables import StudyData, is_baseline, is_number, rows_of
+from kerv_cli.report.results import MICRO, Result, averaged, is_number
+from kerv_cli.report.statistics import Estimate
+from kerv_cli.report.tables import StudyData
 
-TextOf = Callable[[Row], str]
-
+MISSING = "–"
 APART = "*"
 SPEEDS = {"episode_speedup": "speed, per episode", "speedup": "speed, per step"}
 """Table column of each kind of speed -> its heading."""
@@ -38,47 +38,35 @@ _LABEL = 16
 """Width at which a label is wrapped, in characters."""
 
 
-def numbers(name: str) -> TextOf:
-    """Return a function that formats a column's value.
-
-    The text has three significant digits and no exponent. It is `–` if the value is missing.
-    """
-
-    def text(row: Row) -> str:
-        value = row[name]
-        if not is_number(value):
-            return "–"
-        return f"{value:.0f}" if abs(value) >= 100 else f"{value:#.3g}"
-
-    return text
+def number(value: float) -> str:
+    """Return a value with three significant digits and no exponent. `–` if it is missing."""
+    if not is_number(value):
+        return MISSING
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:#.3g}"
 
 
-def shares(name: str) -> TextOf:
-    """Return a function that formats a column's value (a share from 0 to 1) in per cent."""
-    return lambda row: f"{100 * row[name]:.0f} %" if is_number(row[name]) else "–"
+def share(value: float) -> str:
+    """Return a value from 0 to 1 in per cent. `–` if it is missing."""
+    return f"{100 * value:.0f} %" if is_number(value) else MISSING
 
 
-def intervals(name: str, form: str = ".2f", unit: str = "", scale: float = 1.0, between: str = "–") -> TextOf:
-    """Return a function that formats a column's value with its interval in brackets. The text is `–` if it is missing.
+def interval(estimate: Estimate, form: str = ".2f", unit: str = "", scale: float = 1.0, between: str = "–") -> str:
+    """Return an estimate with its interval in brackets. `–` if it is missing.
 
     Args:
-        name: The column.
+        estimate: The estimate.
         form: Format of the numbers. Even with `.0f` the value gets one decimal unless that is 0, because a success of
             99.5 % must not read as 100 %.
         unit: Text after the value.
         scale: Factor for value and interval; 100 for per cent.
         between: Text between the two ends of the interval.
     """
-
-    def text(row: Row) -> str:
-        if not is_number(row[name]):
-            return "–"
-        value, low, high = (row[f"{name}{end}"] * scale for end in ("", "_low", "_high"))
-        ends = ".1f" if form == ".2f" and value >= 10 else form
-        shown = f"{value:{ends.replace('.0f', '.1f')}}".removesuffix(".0") + unit
-        return _minus(f"{shown} ({low:{ends}}{between}{high:{ends}})" if is_number(low) else shown)
-
-    return text
+    if not is_number(estimate.value):
+        return MISSING
+    value, low, high = estimate.value * scale, estimate.low * scale, estimate.high * scale
+    ends = ".1f" if form == ".2f" and value >= 10 else form
+    shown = f"{value:{ends.replace('.0f', '.1f')}}".removesuffix(".0") + unit
+    return _minus(f"{shown} ({low:{ends}}{between}{high:{ends}})" if is_number(low) else shown)
 
 
 def _minus(text: str) -> str:
@@ -86,69 +74,56 @@ def _minus(text: str) -> str:
     return text.replace("+0 ", "0 ").replace("-0 ", "0 ").replace("-", "−")
 
 
-def _difference(row: Row) -> str:
-    """Return the change in success, in points with its interval, as text. Empty for the baseline."""
-    return "" if is_baseline(row) else intervals("difference", "+.0f", "", 100.0, " to ")(row)
-
-
-def _speed(name: str) -> TextOf:
-    """Return a function that formats a speed.
+def _speed(row: Result, speed: Estimate) -> str:
+    """Return a speed as text.
 
     The baseline's speed is 1, or `–` if it was not timed. An asterisk marks a speed for which some pairs were not
     measured side by side in one block; those pairs do not count.
     """
-
-    def text(row: Row) -> str:
-        if is_baseline(row):
-            return "1×" if is_number(row["time_per_step_ms"]) else "–"
-        apart = is_number(row["speedup"]) and row["same_block"] < 1 and not row["same_run"]
-        return intervals(name, unit="×")(row) + (APART if apart else "")
-
-    return text
+    measures = row.measures
+    if row.is_baseline:
+        return "1×" if measures.is_timed else MISSING
+    apart = is_number(measures.speedup.value) and measures.same_block < 1 and not measures.same_run
+    return interval(speed, unit="×") + (APART if apart else "")
 
 
-def _columns() -> dict[str, TextOf]:
-    """Return the functions that format a cell, by the column's heading. The first `MAIN` columns are always shown."""
+def cells_of(row: Result) -> dict[str, str]:
+    """Return a row of a study's table as text, by the column's heading. The first `MAIN` columns are always shown."""
+    of, is_compared = row.measures, not row.is_baseline
     return {
-        "setting": lambda row: str(row["label"]),
-        "success": intervals("success", ".0f", " %", 100.0),
-        DIFFERENCE: _difference,
-        SPEEDS["episode_speedup"]: _speed("episode_speedup"),
-        "slowest 5 % of decodes, ms": numbers("latency_p95_ms"),
-        "tokens unverified": shares("unverified_share"),
-        SPEEDS["speedup"]: _speed("speedup"),
-        "a decode takes, ms": numbers("felt_latency_ms"),
-        "steps on a held action": shares("held_share"),
-        "tokens per verification": numbers("AL"),
-        "forwards per step": numbers("forwards_per_step"),
-        "time per step, ms": numbers("time_per_step_ms"),
-        "steps per episode": lambda row: f"{row['steps'] / row['episodes']:.0f}",
-        "decodes skipped": shares("skip_rate"),
-        "decodes compensated": shares("compensation_rate"),
-        "decodes retrieved": shares("retrieval_share"),
-        "deviation from AR": numbers("deviation"),
-        "failures near the object": shares("near_contact_failure"),
-        **{name.replace("_", " "): numbers(name) for name in registered_columns()},
-        "speed at matched success": numbers("matched_success_speed"),
-        "pairs lost / won": lost_won,
+        "setting": row.label,
+        "success": interval(of.success, ".0f", " %", 100.0),
+        DIFFERENCE: interval(of.difference, "+.0f", "", 100.0, " to ") if is_compared else "",
+        SPEEDS["episode_speedup"]: _speed(row, of.episode_speedup),
+        "slowest 5 % of decodes, ms": number(of.latency_p95_ms),
+        "tokens unverified": share(of.unverified_share),
+        SPEEDS["speedup"]: _speed(row, of.speedup),
+        "a decode takes, ms": number(of.felt_latency_ms),
+        "steps on a held action": share(of.held_share),
+        "tokens per verification": number(of.AL),
+        "forwards per step": number(of.forwards_per_step),
+        "time per step, ms": number(of.time_per_step_ms),
+        "steps per episode": f"{of.steps / row.episodes:.0f}",
+        "decodes skipped": share(of.skip_rate),
+        "decodes compensated": share(of.compensation_rate),
+        "decodes retrieved": share(of.retrieval_share),
+        "deviation from AR": number(of.deviation),
+        "failures near the object": share(of.near_contact_failure),
+        **{name.replace("_", " "): number(value) for name, value in of.added.items()},
+        "speed at matched success": number(row.matched_success_speed),
+        "pairs lost / won": f"{of.counts.only_baseline} / {of.counts.only_method}" if is_compared and of.pairs else "",
     }
 
 
-def lost_won(row: Row) -> str:
-    """Return in how many pairs only the baseline succeeded (lost), and in how many only the setting (won), as text."""
-    return "" if is_baseline(row) or not row["pairs"] else f"{row['only_baseline']} / {row['only_method']}"
-
-
-def summary_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame:
+def summary_frame(results: Sequence[Result], averaging: str = MICRO) -> pd.DataFrame:
     """Return the rows of a study's table as text, with the main columns and those that are not all empty or zero.
 
     Args:
-        table: The study's table.
+        results: The study's rows over all tasks.
         averaging: Take the rows that pool all tasks (MICRO) or that average over difficulty groups (MACRO).
     """
-    rows, columns = rows_of(table, averaging), _columns()
-    frame = pd.DataFrame([{title: text(row) for title, text in columns.items()} for row in rows])
-    is_used = ~frame.isin(["–", "0 %", ""]).all() | frame.columns.isin(frame.columns[:MAIN])
+    frame = pd.DataFrame(map(cells_of, averaged(results, averaging)))
+    is_used = ~frame.isin([MISSING, "0 %", ""]).all() | frame.columns.isin(frame.columns[:MAIN])
     return frame.loc[:, is_used]
 
 
@@ -157,41 +132,41 @@ class SummaryTable:
     """A study's table as `rich` prints it, pooled over tasks.
 
     Attributes:
-        table: The study's table.
+        results: The study's rows over all tasks.
         all: Print every column. If they do not fit side by side, they are printed in several parts.
         how: What to type to see every column. Empty: do not say it.
     """
 
-    table: pd.DataFrame
+    results: Sequence[Result]
     all: bool = False
     how: str = ""
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
         """Yield the title, the table and the notes below it."""
-        rows = self.table[self.table["averaging"] == MICRO]
-        first, tasks = rows.iloc[0], int(rows["tasks"].max())
-        counts = f"{count(tasks, 'task')}, {count(rows['episodes'].max(), 'episode')} per setting"
-        yield Text(
-            f"{first['study']}: {counts}, {first['device_name']}, {first['runtime.dtype']}", "bold", overflow="fold"
-        )
-        frame = summary_frame(self.table)
-        own = [name for name in frame.columns if name.replace(" ", "_") in registered_columns()]  # of plugins
+        rows = averaged(self.results)
+        first = rows[0]
+        tasks, episodes = max(row.tasks for row in rows), max(row.episodes for row in rows)
+        counts = f"{count(tasks, 'task')}, {count(episodes, 'episode')} per setting"
+        device = f"{first.provenance['device_name']}, {first.settings['runtime.dtype']}"
+        yield Text(f"{first.study}: {counts}, {device}", "bold", overflow="fold")
+        frame = summary_frame(rows)
+        own = [name for name in frame.columns if name.replace(" ", "_") in first.measures.added]  # of plugins
         shown = frame if self.all else frame[[*frame.columns[:MAIN], *own]]
         for part in _parts(shown, options.max_width):
             yield _printed(part)
         if self.how and len(shown.columns) < len(frame.columns):
             yield Text(f"{len(shown.columns)} of {len(frame.columns)} columns; {self.how} shows all")
-        several = ", under the same stress and clock" if rows["baseline"].nunique() > 1 else ""
-        yield Text(f"{NOTE} {of_runs(self.table)} Baseline: {first['baseline']}{several}.")
+        several = ", under the same stress and clock" if len({row.baseline for row in rows}) > 1 else ""
+        yield Text(f"{NOTE} {of_runs(rows)} Baseline: {first.baseline}{several}.")
         if frame[SPEEDS["episode_speedup"]].str.endswith(APART).any():
             yield Text(f"{APART} only from pairs that were measured in turn")
-        if untimed := list(rows.loc[rows["time_per_step_ms"].isna(), "label"]):
+        if untimed := [row.label for row in rows if not row.measures.is_timed]:
             yield Text(f"not timed, for success alone: {', '.join(untimed)}")
 
 
-def of_runs(table: pd.DataFrame) -> str:
+def of_runs(results: Sequence[Result]) -> str:
     """Return one sentence that says how many runs the intervals of speed cover."""
-    runs = int(table["runs"].min()) if "runs" in table else 1
+    runs = min(row.runs for row in results)
     return f"Intervals of speed: of {runs} runs." if runs > 2 else "Intervals of speed: of this run alone."
 
 
@@ -225,15 +200,20 @@ def _parts(frame: pd.DataFrame, width: int) -> Iterator[pd.DataFrame]:
     yield frame[part]
 
 
-def not_in_turn(table: pd.DataFrame) -> list[str]:
+def not_in_turn(results: Sequence[Result]) -> list[str]:
     """Return labels of settings that were timed but have no speedup.
 
     They have none because no pair was measured in the same block as its baseline.
     """
-    timed = table["time_per_step_ms"].notna() & (table["forwards_per_step"] + table["skip_rate"] > 0)
-    rows = table[timed & (table["label"] != table["baseline"]) & (table["pairs"] > 0) & table["speedup"].isna()]
-    of_baseline = table.loc[table["label"] == table["baseline"], "time_per_step_ms"].notna().all()
-    return [str(label) for label in dict.fromkeys(rows["label"])] if of_baseline else []
+    apart: dict[str, None] = {}
+    for row in results:
+        of = row.measures
+        if row.is_baseline and not of.is_timed:
+            return []
+        decodes = of.forwards_per_step + of.skip_rate > 0
+        if decodes and of.is_timed and of.pairs and not row.is_baseline and not is_number(of.speedup.value):
+            apart[row.label] = None
+    return list(apart)
 
 
 def setting_tables(data: StudyData) -> Iterator[tuple[Any, Any, str]]:
@@ -242,25 +222,31 @@ def setting_tables(data: StudyData) -> Iterator[tuple[Any, Any, str]]:
     Yields:
         Column names, rows and title of each table.
     """
-    episodes, setting, every = data.episodes, data.study.settings[0], _columns()
-    columns: dict[str, TextOf] = {
-        "task": lambda row: str(row["task"]),
-        "success": lambda row: f"{row['successes']}/{row['episodes']}",
-        **{name: every[name] for name in ("steps per episode", "forwards per step", "tokens per verification")},
-        "drafts accepted": numbers("accepted_per_round"),
-        "time per step, ms": every["time per step, ms"],
-    }
-    rows = rows_of(data.per_task) + [row | {"task": "all"} for row in rows_of(data.table, MICRO) if row["tasks"] > 1]
+    episodes, setting = data.episodes, data.study.settings[0]
+    over_all = [replace(row, task="all") for row in averaged(data.results) if row.tasks > 1]
+    rows = [_task_cells(row) for row in [*data.task_results, *over_all]]
     seeds = f"{episodes['seed'].min()}…{episodes['seed'].max()}"
     observation = setting.identity.get("observation", "")
     title = f"{setting.label}, observation {observation}{stress_text(setting.settings)}, seeds {seeds}"
     timed = episodes["seconds"].notna().all()
     if not timed:
         title += f"; not timed: {batch_of(setting.settings)} episodes at a time"
-    yield columns, ([text(row) for text in columns.values()] for row in rows), title
+    yield rows[0].keys(), [row.values() for row in rows], title
     if timed:
-        sums = episodes[[f"seconds.{phase}" for phase in PHASES]].sum()
         decodes, total = episodes["decodes"].sum(), episodes["seconds"].sum()
-        phases = {str(name).removeprefix("seconds."): float(s) for name, s in sums.items() if s}
-        cells = [(name, f"{1000 * s / decodes:.2f}", f"{s / total:.0%}") for name, s in phases.items()]
+        sums = {phase: float(episodes[f"seconds.{phase}"].sum()) for phase in PHASES}
+        cells = [(phase, f"{1000 * s / decodes:.2f}", f"{s / total:.0%}") for phase, s in sums.items() if s]
         yield ("phase", "ms per decode", "share"), cells, "time by phase"
+
+
+def _task_cells(row: Result) -> dict[str, str]:
+    """Return a row of the table of a single setting as text, by the column's heading."""
+    cells = cells_of(row)
+    names = ("steps per episode", "forwards per step", "tokens per verification")
+    return {
+        "task": row.task,
+        "success": f"{row.measures.successes}/{row.episodes}",
+        **{name: cells[name] for name in names},
+        "drafts accepted": number(row.measures.accepted_per_round),
+        "time per step, ms": cells["time per step, ms"],
+    }

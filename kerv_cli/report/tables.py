@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import json
 import math
 import re
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from numbers import Real
-from operator import itemgetter
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from kerv_cli.base.errors import UsageError
@@ -20,10 +18,12 @@ from kerv_cli.engine.tally import Tally
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, flat, stress_of, without
 from kerv_cli.lab.plan import Episode, Setting, Study, seeds_text
 from kerv_cli.lab.store import StudyStore
+from kerv_cli.report import statistics as stats
 from kerv_cli.report.acceptance import tally_of
-from kerv_cli.report.matched import with_matched_speed
-from kerv_cli.report.measures import MACRO, MICRO, Row, columns_of, measure, paired, speedups
-from kerv_cli.report.statistics import NO_ESTIMATE, Estimate, over_runs
+from kerv_cli.report.decide import with_matched_speed
+from kerv_cli.report.measures import Speeds, compared, measure, paired, speedups
+from kerv_cli.report.results import MACRO, MICRO, Result, Row, averaged, columns_of, frame_of, is_number
+from kerv_cli.report.statistics import PairedCounts
 from kerv_cli.targets.provenance import PACKAGES
 from kerv_cli.worlds import specs
 
@@ -45,6 +45,7 @@ _PROVENANCE = (
 )  # fmt: skip
 
 
+NO_STRESS = "none"
 _ONE_STATE = ("code", "git_commit", "device_name")
 """Columns in which runs must agree, to be averaged."""
 
@@ -54,6 +55,7 @@ class StudyData:
     """A study (settings that are compared) with its stored episodes. Each table is computed once.
 
     Attributes:
+        store: The study in the database, to read its decodes.
         study: The settings, and the episodes that the study asks for.
         episodes: One row per stored episode (label, task, seed and repeat). Columns: those of `StudyStore.frame`, and
             difficulty, device, number format and threads.
@@ -61,14 +63,13 @@ class StudyData:
             machine. Each run measured all episodes of the study, or all settings and tasks on seeds of its own. Empty
             if there are no such runs.
         same_pairs: Whether each run measured all episodes of the study.
-        store: The study in the database, to read its decodes. None: the decodes are unknown.
     """
 
+    store: StudyStore
     study: Study
     episodes: pd.DataFrame
     runs: tuple[pd.DataFrame, ...] = ()
     same_pairs: bool = False
-    store: StudyStore | None = None
 
     @functools.cached_property
     def settings(self) -> dict[str, Setting]:
@@ -84,22 +85,13 @@ class StudyData:
     @property
     def absent(self) -> list[Episode]:
         """Episodes that the study asks for and that have not been stored yet."""
-        names = ("label", "task", "seed", "repeat")
-        present = set(zip(*(self.episodes[name] for name in names), strict=True))
+        present = set(self.episodes[["label", "task", "seed", "repeat"]].itertuples(index=False, name=None))
         return [one for one in self.study.episodes if (one.setting.label, *one.key[1:]) not in present]
 
     @functools.cached_property
     def references(self) -> dict[str, str]:
-        """For each setting's label, the label of the setting that it is compared with.
-
-        That is the baseline's method under the same stress and clock, if the study has such a setting. Otherwise it is
-        the study's baseline.
-        """
-        same: dict[str, str] = {}
-        if baseline := self.settings.get(self.study.baseline):
-            group = [one for one in self.study.settings if _methods_of(one) == _methods_of(baseline)]
-            same = {_conditions_of(one): one.label for one in [*group, baseline]}
-        return {label: same.get(_conditions_of(one), self.study.baseline) for label, one in self.settings.items()}
+        """For each setting's label, the label of the setting that it is compared with (`references_of`)."""
+        return references_of(self.study.settings, self.study.baseline)
 
     def compared_with(self, label: str) -> StudyData:
         """Return the study with the setting `label` as its baseline, and with the name NAME_against_LABEL.
@@ -120,12 +112,12 @@ class StudyData:
         only in stress and `rollout.*`.
         """
         first: dict[str, str] = {}
-        for setting in sorted(self.study.settings, key=lambda one: bool(stress_of(one.settings)["level"])):
+        for setting in sorted(self.study.settings, key=_has_stress):
             first.setdefault(_methods_of(setting), setting.label)
-        return {
-            label: first[_methods_of(one)] if stress_of(one.settings)["level"] else label
-            for label, one in self.settings.items()
-        }
+        found = {}
+        for setting in self.study.settings:
+            found[setting.label] = first[_methods_of(setting)] if _has_stress(setting) else setting.label
+        return found
 
     @functools.cached_property
     def pairs(self) -> pd.DataFrame:
@@ -133,29 +125,60 @@ class StudyData:
         return paired(self.episodes, self.references)
 
     @functools.cached_property
-    def run_pairs(self) -> list[pd.DataFrame]:
-        """One table like `pairs` for each run in `runs`, with the episodes that this run measured."""
-        return [paired(run, self.references) for run in self.runs]
-
-    @functools.cached_property
     def tallies(self) -> dict[str, Tally]:
         """How many draft tokens were accepted, by place, for each setting that verified drafts. Reads all decodes."""
-        if self.store is None:
-            return {}
-        episodes = self.episodes.groupby("label")["episode"]
-        found = {label: tally_of(self.store, episodes.get_group(label).tolist()) for label in self.labels}
-        return {label: tally for label, tally in found.items() if tally is not None}
+        episodes, tallies = self.episodes.groupby("label")["episode"], {}
+        for label in self.labels:
+            tally = tally_of(self.store, episodes.get_group(label).tolist())
+            if tally is not None:
+                tallies[label] = tally
+        return tallies
+
+    @functools.cached_property
+    def results(self) -> list[Result]:
+        """Two rows per setting: one pools all tasks (MICRO), one averages over difficulty groups (MACRO)."""
+        return [*with_matched_speed(_results(self, MICRO)), *with_matched_speed(_results(self, MACRO))]
+
+    @functools.cached_property
+    def task_results(self) -> list[Result]:
+        """One row per task and setting. Tasks are sorted by name, settings are in the study's order."""
+        tasks: dict[str, list[Result]] = {}
+        for row in _results(self, "one task", by_task=True):
+            tasks.setdefault(row.task, []).append(row)
+        return [row for rows in tasks.values() for row in with_matched_speed(rows)]
 
     @functools.cached_property
     def table(self) -> pd.DataFrame:
-        """Two rows per setting: one pools all tasks (micro), one averages over difficulty groups (macro)."""
-        return pd.DataFrame(row for averaging in (MICRO, MACRO) for row in with_matched_speed(_rows(self, averaging)))
+        """`results` as a data frame."""
+        return frame_of(self.results)
 
     @functools.cached_property
     def per_task(self) -> pd.DataFrame:
-        """One row per task and setting. Tasks are sorted by name, settings are in the study's order."""
-        by_task = itertools.groupby(_rows(self, "one task", by_task=True), key=itemgetter("task"))
-        return pd.DataFrame(row for _, rows in by_task for row in with_matched_speed(list(rows)))
+        """`task_results` as a data frame."""
+        return frame_of(self.task_results)
+
+
+def references_of(settings: Sequence[Setting], baseline: str) -> dict[str, str]:
+    """Return for each setting's label the label of the setting that it is compared with.
+
+    That is the baseline's method under the same stress and clock, if the study has such a setting. Otherwise it is
+    the study's baseline.
+
+    Args:
+        settings: The study's settings.
+        baseline: Label of its baseline.
+    """
+    same: dict[str, str] = {}
+    for own in settings:
+        if own.label == baseline:
+            group = [one for one in settings if _methods_of(one) == _methods_of(own)]
+            same = {_conditions_of(one): one.label for one in [*group, own]}
+    return {one.label: same.get(_conditions_of(one), baseline) for one in settings}
+
+
+def _has_stress(setting: Setting) -> bool:
+    """Return whether a setting disturbs the world."""
+    return bool(stress_of(setting.settings)["level"])
 
 
 def _conditions_of(setting: Setting) -> str:
@@ -191,10 +214,14 @@ def load_study(store: StudyStore, wanted: Sequence[Episode] | None = None) -> St
     whole = store.whole_runs() if wanted is None else []
     same_pairs = len(whole) > 2
     frames = [store.frame(run=run) for run in whole] if same_pairs else _with_new_seeds(frame)
-    names = [name for name in _ONE_STATE if name in frame]  # imported episodes may lack some
-    alike = [one for one in frames if all(set(one[name]) == set(frame[name]) for name in names)]
-    runs = [_labelled(study, one) for one in alike] if len(alike) > 2 else []
-    return StudyData(study, _labelled(study, frame), tuple(runs), same_pairs, store)
+    runs = [_labelled(study, run) for run in frames if _same_state(run, frame)]
+    return StudyData(store, study, _labelled(study, frame), tuple(runs) if len(runs) > 2 else (), same_pairs)
+
+
+def _same_state(run: pd.DataFrame, episodes: pd.DataFrame) -> bool:
+    """Return whether the same code on the same machine computed a run as the episodes of the study."""
+    # imported episodes may lack some columns
+    return all(set(run[name]) == set(episodes[name]) for name in _ONE_STATE if name in episodes)
 
 
 def _with_new_seeds(episodes: pd.DataFrame) -> list[pd.DataFrame]:
@@ -202,25 +229,27 @@ def _with_new_seeds(episodes: pd.DataFrame) -> list[pd.DataFrame]:
 
     Otherwise return an empty list.
     """
-    runs = [one for _, one in sorted(episodes.groupby("run"), key=lambda item: item[1]["started"].min())]
-    keys = [set(zip(one["label"], one["task"], strict=True)) for one in runs]
-    complete = all(len(one) == episodes["label"].nunique() * episodes["task"].nunique() for one in keys)
-    worlds = [episode for one in runs for episode in set(zip(one["task"], one["seed"], strict=True))]
-    return runs if complete and len(worlds) == len(set(worlds)) else []
+    runs = sorted((run for _, run in episodes.groupby("run")), key=lambda run: run["started"].min())
+    groups = episodes["label"].nunique() * episodes["task"].nunique()
+    seen: set[tuple[Any, ...]] = set()
+    for run in runs:
+        worlds = set(run[["task", "seed"]].itertuples(index=False, name=None))
+        if len(run[["label", "task"]].drop_duplicates()) < groups or worlds & seen:
+            return []
+        seen |= worlds
+    return runs
 
 
 def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
     """Add the columns difficulty, device, dtype and threads to the episodes."""
-    groups = {task: difficulty_of(task) for task in set(episodes["task"])}
-    runtime = {setting.label: setting.settings["runtime"] for setting in study.settings}
-    columns = {name: episodes["label"].map({k: v[name] for k, v in runtime.items()}) for name in _RUNTIME}
+    added = {"difficulty": episodes["task"].map({task: difficulty_of(task) for task in set(episodes["task"])})}
+    for name in _RUNTIME:
+        values = {setting.label: setting.settings["runtime"][name] for setting in study.settings}
+        added[name] = episodes["label"].map(values)
+    added["initial_state"] = episodes["initial_state"].map(tuple)  # tuples can be compared
     # strings as Python objects: these frames are cut into hundreds of small ones, and arrow's arrays are slow at that
-    texts = {
-        name: episodes[name].astype(object) for name in ("label", "task", "block", "started", "device_name", "run")
-    }
-    states = episodes["initial_state"].map(tuple)  # tuples can be compared
-    episodes = episodes.assign(difficulty=episodes["task"].map(groups), initial_state=states, **columns, **texts)
-    return episodes.astype(dict.fromkeys(("difficulty", "device", "dtype"), object))
+    texts = ("label", "task", "block", "started", "device_name", "run", "difficulty", "device", "dtype")
+    return episodes.assign(**added).astype(dict.fromkeys(texts, object))
 
 
 def difficulty_of(task: str) -> str:
@@ -228,10 +257,8 @@ def difficulty_of(task: str) -> str:
     return next((spec.tasks[task].difficulty for spec in specs().values() if task in spec.tasks), "other")
 
 
-def _rows(data: StudyData, averaging: str, by_task: bool = False) -> list[Row]:
-    """Return a table row per setting, or per task and setting: its name, measures, settings and provenance.
-
-    If the episodes have different values in a provenance column, the values are joined by semicolons.
+def _results(data: StudyData, averaging: str, by_task: bool = False) -> list[Result]:
+    """Return a row per setting, or per task and setting, in the study's order.
 
     Args:
         data: The study.
@@ -241,64 +268,77 @@ def _rows(data: StudyData, averaging: str, by_task: bool = False) -> list[Row]:
     """
     by = ["task", "label"] if by_task else ["label"]
     measured = measure(data.episodes, data.pairs, by, averaging)
-    runs = [speedups(pairs, by, averaging) for pairs in data.run_pairs]
-    episodes, indices = data.episodes, data.episodes.groupby(by).indices
-    known = [name for name in ("task", "difficulty", "seed", "repeat", *_PROVENANCE) if name in episodes]
-    columns = {name: episodes[name].astype(object).where(episodes[name].notna(), None).to_numpy() for name in known}
-    groups: Iterable[tuple[Hashable, str]] = ((label, label) for label in data.labels)
-    if by_task:
-        groups = (((task, label), label) for task in sorted(set(episodes["task"])) for label in data.labels)
-    rows = []
-    for group, label in groups:
-        if group not in indices:
-            continue
-        values = {name: pd.unique(column[indices[group]]) for name, column in columns.items()}
+    runs = [speedups(paired(run, data.references), by, averaging) for run in data.runs]
+    indices = data.episodes.groupby(by).indices
+    texts = _texts_of(data.episodes)
+
+    def place(group: Any) -> tuple[str, int]:
+        task, label = group if by_task else ("", group)
+        return task, data.labels.index(label)
+
+    results = []
+    groups: list[Any] = sorted(indices, key=place)
+    for group in groups:
+        values = {name: pd.unique(column[indices[group]]) for name, column in texts.items()}
+        label = group[1] if by_task else group
+        measures = measured[group]
+        if runs:  # docs/methods.md §7
+            speeds = zip(*(run.get(group, Speeds()) for run in runs), strict=True)
+            combined = Speeds(*(stats.over_runs(several, data.same_pairs) for several in speeds))
+            measures = replace(measures, **combined._asdict())
         setting = data.settings[label]
-        stress, hashes = stress_of(setting.settings), without(setting.identity, {OBSERVATION})
-        varied = [f"{key.split('.')[-1]} {value}" for key, value in setting.varies.items() if key != data.study.axis]
-        rows.append(
-            {
-                "study": data.study.name,
-                "averaging": averaging,
-                "label": label,
-                # settings that differ only along the study's axis are one series
-                "series": ", ".join([setting.name.rstrip(", "), *varied]),
-                "unstressed": data.unstressed[label],
-                "method": setting.settings["method"],
-                "task": _joined(sorted(values["task"])),
-                "tasks": len(values["task"]),
-                "difficulty": _joined(sorted(values["difficulty"])),
-                "seeds": seeds_text(values["seed"]),
-                "repeats": len(values["repeat"]),
-                "episodes": len(indices[group]),
-                "baseline": data.references[label],
-                **measured[group],
-                "runs": max(1, len(runs)),
-                **_over_runs(runs, group, data.same_pairs),
-                "overrides": setting.overrides,
-                **flatten(without(setting.settings, NOT_DETERMINING - {"policy"})),
-                "observation": setting.identity.get(OBSERVATION, ""),
-                **{f"{name}_sha256": value for name, value in sorted(hashes.items())},
-                "stress": stress["kind"],
-                "stress_level": stress["level"],
-                **{name: _joined(one for one in values.get(name, ()) if one is not None) for name in _PROVENANCE},
-            }
+        stress = stress_of(setting.settings)
+        row = Result(
+            study=data.study.name,
+            averaging=averaging,
+            label=label,
+            series=_series_of(setting, data.study.axis),
+            unstressed=data.unstressed[label],
+            method=setting.settings["method"],
+            task=_joined(sorted(values["task"])),
+            tasks=len(values["task"]),
+            difficulty=_joined(sorted(values["difficulty"])),
+            seeds=seeds_text(values["seed"]),
+            repeats=len(values["repeat"]),
+            episodes=len(indices[group]),
+            baseline=data.references[label],
+            measures=measures,
+            runs=max(1, len(runs)),
+            overrides=setting.overrides,
+            settings=flatten(without(setting.settings, NOT_DETERMINING - {"policy"})),
+            observation=setting.identity.get(OBSERVATION, ""),
+            hashes=_hashes_of(setting),
+            stress=stress["kind"],
+            stress_level=stress["level"],
+            provenance={name: _joined(values.get(name, ())) for name in _PROVENANCE},
         )
-    return rows
+        results.append(row)
+    return results
 
 
-def _over_runs(runs: Sequence[Mapping[str, Mapping[Hashable, Estimate]]], group: Hashable, same_pairs: bool) -> Row:
-    """Return the speeds of a group over all runs, if there are several (docs/methods.md §7).
+def _texts_of(episodes: pd.DataFrame) -> dict[str, np.ndarray]:
+    """Return those columns of the episodes of which a row names all values. Missing values are None."""
+    columns = {}
+    for name in ("task", "difficulty", "seed", "repeat", *_PROVENANCE):
+        if name in episodes:
+            column = episodes[name].astype(object)
+            columns[name] = column.where(column.notna(), None).to_numpy()
+    return columns
 
-    Args:
-        runs: What `measures.speedups` returned for each run.
-        group: Key of the group in those results.
-        same_pairs: Whether all runs measured the same pairs.
-    """
-    row: Row = {}
-    for name in runs[0] if runs else ():
-        row |= columns_of(name, over_runs([run[name].get(group, NO_ESTIMATE) for run in runs], same_pairs))
-    return row
+
+def _series_of(setting: Setting, axis: str) -> str:
+    """Return a name that settings share if they differ only along the study's axis."""
+    words = [setting.name.rstrip(", ")]
+    for key, value in setting.varies.items():
+        if key != axis:
+            words.append(f"{key.split('.')[-1]} {value}")
+    return ", ".join(words)
+
+
+def _hashes_of(setting: Setting) -> dict[str, str]:
+    """Return the hashes of a setting's weights and data, by the name of their column."""
+    hashes = without(setting.identity, {OBSERVATION})
+    return {f"{name}_sha256": value for name, value in sorted(hashes.items())}
 
 
 def flatten(settings: Plain) -> Row:
@@ -306,22 +346,27 @@ def flatten(settings: Plain) -> Row:
 
     The values of a list become one text, separated by semicolons.
     """
-    return {k: _joined(v) if isinstance(v, list | tuple) else v for k, v in flat(settings).items()}
+    values = flat(settings)
+    for key, value in values.items():
+        if isinstance(value, list | tuple):
+            values[key] = _joined(value)
+    return values
 
 
 def differences(first: Row, second: Row) -> list[tuple[str, Any, Any]]:
     """Return every key whose values differ, with both values. A value is None if that side does not have the key."""
-    pairs = ((key, first.get(key), second.get(key)) for key in first | second)
-    return [pair for pair in pairs if pair[1] != pair[2]]
+    keys = [key for key in first | second if first.get(key) != second.get(key)]
+    return [(key, first.get(key), second.get(key)) for key in keys]
 
 
 def _joined(values: Iterable[object]) -> str:
-    return ";".join(dict.fromkeys(str(value) for value in values))
+    """Return all different values as one text, separated by semicolons. None is left out."""
+    return ";".join(dict.fromkeys(str(value) for value in values if value is not None))
 
 
-def values_of(table: pd.DataFrame, column: str) -> set[str]:
-    """Return all different values in a column. A cell may hold several values, joined by semicolons."""
-    return {value for text in table[column].astype(str) for value in text.split(";")}
+def split_values(texts: Iterable[object]) -> set[str]:
+    """Return all different values in texts that may hold several, separated by semicolons."""
+    return set(";".join(map(str, texts)).split(";"))
 
 
 def further_of(data: StudyData) -> dict[str, Any]:
@@ -338,63 +383,73 @@ def further_of(data: StudyData) -> dict[str, Any]:
         - `measures`: for each averaging and each task, the measures that have no column in the CSV files
         - `acceptance`: how many draft tokens were accepted, by place, over all tasks; only if drafts were verified
     """
-    columns = list(data.table.columns)
-    left_out = {*CSV_COLUMNS, "series", "unstressed"}
-    measures = [name for name in columns[: columns.index("overrides")] if name not in left_out]
     labels: dict[str, Any] = {}
-    for row in [*rows_of(data.table), *rows_of(data.per_task)]:
-        setting = data.settings[row["label"]]
+    for row in [*data.results, *data.task_results]:
+        setting = data.settings[row.label]
         about = {
             "name": setting.name,
             "varies": dict(setting.varies),
             "overrides": setting.overrides,
             "settings": without(setting.settings, {"results", "task"}),
             "identity": dict(setting.identity),
-            "provenance": {name: setting.settings["runtime"][name] for name in _RUNTIME}
-            | {name: row[name] for name in _PROVENANCE},
+            "provenance": {name: setting.settings["runtime"][name] for name in _RUNTIME} | dict(row.provenance),
             "measures": {},
         }
-        key = row["averaging"] if row["averaging"] in (MICRO, MACRO) else row["task"]
-        values = {name: _json(row[name]) for name in measures}
-        labels.setdefault(row["label"], about)["measures"][key] = values
+        key = row.task if row.averaging not in (MICRO, MACRO) else row.averaging
+        labels.setdefault(row.label, about)["measures"][key] = _further_measures(row)
     for label, tally in data.tallies.items():
         labels[label]["acceptance"] = tally.as_dict()
     return {"study": data.study.name, "axis": data.study.axis, "labels": labels}
 
 
-def _json(value: Any) -> Any:
-    """Return the value, or None if it is NaN or infinite, which JSON cannot hold."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _further_measures(row: Result) -> Row:
+    """Return the measures of a row that have no column in the CSV files. NaN, which JSON cannot hold, is None."""
+    values: Row = {"tasks": row.tasks, "difficulty": row.difficulty, "repeats": row.repeats}
+    for name, value in columns_of(vars(row.measures)).items():
+        if name not in CSV_COLUMNS:
+            values[name] = None if isinstance(value, float) and not math.isfinite(value) else value
+    return values
 
 
-def csv_text(table: pd.DataFrame) -> str:
-    """Return the table as CSV text with six significant digits. Missing values are empty cells."""
-    return table.to_csv(index=False, float_format="%.6g", lineterminator="\n")
+def is_stressed(results: Iterable[Result]) -> bool:
+    """Return whether a study compares several kinds or levels of stress (disturbed worlds, docs/stress.md)."""
+    return len({(row.stress, row.stress_level) for row in results}) > 1
 
 
-def is_number(value: Any) -> bool:
-    """Return whether a value is a real number other than NaN. Text, bool and None are not."""
-    return isinstance(value, Real) and not isinstance(value, bool) and not math.isnan(value)
+def summed_table(results: Iterable[Result]) -> pd.DataFrame:
+    """Pool a study's stressed episodes in three ways: by kind of stress, by level, and all together.
 
+    Each pooled row is compared with the baseline's episodes in the same worlds under the same stresses.
 
-def is_baseline(row: Row) -> bool:
-    """Return whether the row belongs to the baseline itself, which is not compared with anything."""
-    return bool(row["label"] == row["baseline"])
-
-
-def rows_of(table: pd.DataFrame, averaging: str | None = None) -> list[Row]:
-    """Return the rows of a table as dictionaries of column to value.
-
-    Args:
-        table: The table.
-        averaging: Keep only rows that pool all episodes (MICRO) or that average over difficulty groups (MACRO). None:
-            keep all rows.
+    Returns:
+        One row for each method and each way of pooling. `method` is the setting's label without stress. `sum` says what
+        was pooled, such as `push`, `level 2` or `all`. `label` consists of both. The further columns are those of a
+        study's table.
     """
-    rows = table if averaging is None else table[table["averaging"] == averaging]
-    return [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]
+    rows = [row for row in averaged(results) if row.stress != NO_STRESS]
+    reference = next((row.unstressed for row in rows if row.is_baseline), "")
+    kinds, levels = {row.stress for row in rows}, {f"level {row.stress_level}" for row in rows}
+    sums = []
+    for name in (*sorted(kinds), *sorted(levels), "all"):
+        methods: dict[str, list[Result]] = {}
+        for row in rows:
+            if name in (row.stress, f"level {row.stress_level}", "all"):
+                methods.setdefault(row.unstressed, []).append(row)
+        for method, pooled in methods.items():
+            about = {"study": rows[0].study, "label": f"{method} {name}", "method": method, "sum": name}
+            sums.append(columns_of({**about, "baseline": f"{reference} {name}", **_pooled(pooled)}))
+    return pd.DataFrame(sums)
 
 
-_COLUMNS = (
+def _pooled(rows: Sequence[Result]) -> dict[str, Any]:
+    """Return the success of several settings together, and how it compares with their baselines."""
+    episodes, successes = sum(row.episodes for row in rows), sum(row.measures.successes for row in rows)
+    counts = PairedCounts(*np.sum([row.measures.counts for row in rows], axis=0).tolist())
+    success = {"episodes": episodes, "successes": successes, "success": stats.wilson(successes, episodes)}
+    return success | compared(counts, stats.paired_difference(counts))
+
+
+_LATENCY_COLUMNS = (
     "study", "label", "method", "ar", "rollout.clock", "rollout.latency", "rollout.latency_ms", "rollout.profile",
     "rollout.ar_ms", "rollout.delay_compensation", "rollout.batch", "ar_latency_ms", "episodes", "felt_latency_ms",
     "felt_latency_steps", "held_share", "forwards_per_step", "successes", "success", "success_low", "success_high",
@@ -403,12 +458,16 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-def latency_table(table: pd.DataFrame) -> pd.DataFrame:
+def latency_table(results: Iterable[Result]) -> pd.DataFrame:
     """Return the rows of settings whose world goes on during a decode (`rollout.clock=real`).
 
     The baseline must have such a world, too. The added column `ar_latency_ms` is the mean latency of its decodes.
     """
-    rows = table[table["averaging"] == MICRO]
-    latencies = dict(zip(rows["label"], rows["felt_latency_ms"], strict=True))
-    rows = rows.assign(ar=rows["baseline"], ar_latency_ms=rows["baseline"].map(latencies))
-    return rows.loc[rows["felt_latency_ms"].map(is_number) & rows["ar_latency_ms"].map(is_number), list(_COLUMNS)]
+    rows = averaged(results)
+    latencies = {row.label: row.measures.felt_latency_ms for row in rows}
+    delayed = []
+    for row in rows:
+        of_baseline = latencies.get(row.baseline)
+        if is_number(row.measures.felt_latency_ms) and is_number(of_baseline):
+            delayed.append({**columns_of(vars(row)), "ar": row.baseline, "ar_latency_ms": of_baseline})
+    return pd.DataFrame(delayed, columns=list(_LATENCY_COLUMNS))

@@ -8,80 +8,49 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-
-import pandas as pd
 
 from kerv_cli.base.durations import count
-from kerv_cli.report.matched import SOLVED
-from kerv_cli.report.measures import MICRO, Row
+from kerv_cli.report.decide import POINTS, SOLVED, Choice, choose
+from kerv_cli.report.results import Result, averaged, is_number
 from kerv_cli.report.statistics import MOST_PAIRS
-from kerv_cli.report.tables import is_baseline, is_number, rows_of
 
 
-@dataclass(frozen=True)
-class Choice:
-    """Which setting to take, for one task or for all tasks together.
+def verdict_of(results: Sequence[Result], loss: float) -> tuple[str, bool]:
+    """Return a study's answer as a sentence for the report.
 
-    Attributes:
-        where: The task, or `all tasks`.
-        pairs: Number of pairs of the setting with the most pairs.
-        baseline_success: Success rate of the baseline.
-        front: Settings that no other setting beats in both speed and success, the fastest first.
-        chosen: Fastest setting that is shown to lose less success than the bound. Empty if there is none.
-        loss_at_most: Upper bound on the chosen setting's loss of success, in points, at 95 % confidence. NaN if no
-            setting is chosen.
-        candidate: Fastest setting that more pairs would show to lose less than the bound, if the rates stay the same.
-            Empty if there is none, or if a setting is chosen.
-        candidate_pairs: About how many pairs in all the candidate needs. NaN without a candidate.
-        tested: Number of settings that are tested for their loss of success: those that are faster than the baseline or
-            were not timed.
-        episode_speedup: Speed per episode of the chosen setting against the baseline. NaN if it was not timed.
-        episode_speedup_low: Lower end of its 95 % interval.
-        episode_speedup_high: Upper end of its 95 % interval.
-        runs: Number of runs that this interval covers.
+    Args:
+        results: The study's rows over all tasks.
+        loss: Largest acceptable loss of success against the baseline, in points (percentage points).
+
+    Returns:
+        The sentence, and whether a setting is shown both to be faster and to lose less than `loss`.
     """
-
-    where: str
-    pairs: int
-    baseline_success: float
-    front: tuple[str, ...]
-    chosen: str
-    loss_at_most: float
-    candidate: str
-    candidate_pairs: float
-    tested: int
-    episode_speedup: float
-    episode_speedup_low: float
-    episode_speedup_high: float
-    runs: int
-
-    @property
-    def is_shown(self) -> bool:
-        """Whether a setting is shown both to be faster and to lose less success than the bound."""
-        return bool(self.chosen) and self.episode_speedup_low > 1
-
-    @property
-    def is_unsolved(self) -> bool:
-        """Whether the baseline's success rate is too low for a recommendation."""
-        return self.baseline_success < SOLVED
-
-    def as_dict(self) -> Row:
-        """Return all fields by name, as JSON values. `front` becomes one text, joined by semicolons."""
-        return {**asdict(self), "front": ";".join(self.front)}
+    rows = averaged(results)
+    if not any(row.measures.pairs and not row.is_baseline for row in rows):
+        rates = ", ".join(f"{row.label} {POINTS * row.measures.success.value:.1f} %" for row in rows)
+        return f"success: {rates}.", False
+    if len(baselines_of(rows)) > 1:
+        return f"{under_conditions(rows)}.", False
+    found = choose("all tasks", rows, loss)
+    return f"{sentence(found, loss, rows[0].baseline)}.", found.is_shown
 
 
-def question(table: pd.DataFrame, loss: float) -> str:
+def baselines_of(rows: Sequence[Result]) -> list[str]:
+    """Return the labels of the settings that others are compared with, each once."""
+    return list(dict.fromkeys(row.baseline for row in rows))
+
+
+def question(results: Sequence[Result], loss: float) -> str:
     """Return the question that the study's verdict answers. Empty if nothing is compared.
 
     Args:
-        table: The study's table.
+        results: The study's rows over all tasks.
         loss: Largest acceptable loss of success, in points.
     """
-    baselines = table.loc[table["pairs"] > 0, "baseline"].unique()
+    baselines = baselines_of([row for row in results if row.measures.pairs])
     if len(baselines) > 1:
         return "Which settings succeed less or more often than the baseline under the same stress and clock?"
-    if not (table["label"] != table["baseline"]).any() or not len(baselines):
+    if not baselines or all(row.is_baseline for row in results):
         return ""
     return f"Which setting is faster than the baseline {baselines[0]} and loses less than {loss:g} points of success?"
 
@@ -130,12 +99,13 @@ def short_sentence(choice: Choice) -> str:
 
 def _speed(choice: Choice) -> str:
     """Return the clause that says how fast the chosen setting is."""
-    if not is_number(choice.episode_speedup):
+    speed = choice.episode_speedup
+    if not is_number(speed.value):
         return "; its speed was not measured"
     shown = "and is faster" if choice.is_shown else "but is not shown to be faster"
     runs = f"of {choice.runs} runs" if choice.runs > 2 else "of this run"
-    interval = f"({choice.episode_speedup_low:.2f}–{choice.episode_speedup_high:.2f} {runs})"
-    return f" {shown}: {choice.episode_speedup:.2f} {interval} times as fast per episode on this machine"
+    interval = f"({speed.low:.2f}–{speed.high:.2f} {runs})"
+    return f" {shown}: {speed.value:.2f} {interval} times as fast per episode on this machine"
 
 
 def _missing(choice: Choice) -> str:
@@ -150,36 +120,44 @@ def _missing(choice: Choice) -> str:
     return f"at these rates, {number} more pairs would show it for {choice.candidate}"
 
 
-def under_conditions(rows: Sequence[Row], baseline: str) -> str:
+def under_conditions(rows: Sequence[Result]) -> str:
     """Say which settings succeed less or more often than the baseline under the same stress and clock.
 
     Args:
         rows: The study's rows, pooled over tasks.
-        baseline: Name of the baseline's method.
     """
-    compared = [row for row in rows if row["pairs"] and not is_baseline(row)]
-    solved = [row for row in compared if (row["both"] + row["only_baseline"]) / row["pairs"] >= SOLVED]
-    less = [str(row["label"]) for row in solved if row["difference_high"] < 0]
-    more = [str(row["label"]) for row in solved if row["difference_low"] > 0]
+    method = next(row.method for row in rows if row.is_baseline)
+    less, more = [], []
+    failing: dict[str, None] = {}
+    for row in rows:
+        counts, difference = row.measures.counts, row.measures.difference
+        if row.is_baseline or not row.measures.pairs:
+            continue
+        if (counts.both + counts.only_baseline) / row.measures.pairs < SOLVED:
+            failing[row.baseline] = None
+        elif difference.high < 0:
+            less.append(row.label)
+        elif difference.low > 0:
+            more.append(row.label)
     text = (
-        f"under the same conditions, with 95 % confidence each, less successful than {baseline}: "
+        f"under the same conditions, with 95 % confidence each, less successful than {method}: "
         f"{'; '.join(less) or 'no setting'}. More successful: {'; '.join(more) or 'no setting'}"
     )
-    unsolved = dict.fromkeys(str(row["baseline"]) for row in compared if row not in solved)
-    return text + (f". These do not solve the tasks, nothing is compared: {'; '.join(unsolved)}" if unsolved else "")
+    return text + (f". These do not solve the tasks, nothing is compared: {'; '.join(failing)}" if failing else "")
 
 
-def caution(table: pd.DataFrame) -> str:
+def caution(results: Sequence[Result]) -> str:
     """Return one line that the reader should know before reading the numbers. Empty if there is nothing to say.
 
     It names policies that are given the positions of object and goal, and settings that verify nothing.
     """
-    rows = rows_of(table, MICRO)
-    privileged = sorted({str(row["policy.target"]) for row in rows if "privileged" in str(row["observation"])})
-    unverified = [
-        str(row["label"]) for row in rows if is_number(row["unverified_share"]) and row["unverified_share"] == 1
-    ]
-    clauses = [f"{', '.join(privileged)}: is given the positions of object and goal"] if privileged else []
+    privileged, unverified = set(), []
+    for row in averaged(results):
+        if "privileged" in row.observation:
+            privileged.add(str(row.settings["policy.target"]))
+        if row.measures.unverified_share == 1:
+            unverified.append(row.label)
+    clauses = [f"{', '.join(sorted(privileged))}: is given the positions of object and goal"] if privileged else []
     if unverified:
         clauses.append(f"{', '.join(unverified)}: nothing is verified")
     return "; ".join(clauses)

@@ -1,0 +1,238 @@
+"""The row of a study's table, from which CSV, JSON, terminal, page, board and verdict are made.
+
+docs/methods.md §7 explains the measures.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any
+
+import pandas as pd
+
+from kerv_cli.report.statistics import Estimate, PairedCounts
+
+Row = dict[str, Any]
+"""One row of a table as it is written: column name to value."""
+
+MICRO = "micro over tasks"
+MACRO = "macro over difficulty groups"
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What was measured of a group of episodes. A measure without data is NaN.
+
+    Attributes:
+        successes: Number of solved worlds. Repeats measure the same world again and are not counted.
+        success: Success rate.
+        time_per_step_ms: Inference time per control step.
+        time_per_episode_ms: Inference time per episode.
+        phases: Time per control step in milliseconds, by phase of a decode. Keys begin with `ms.`.
+        steps_to_success: Mean number of control steps of the episodes that succeeded.
+        path_m: Mean path of the end effector in the episodes that succeeded, metres.
+        jerk: Mean jerk of the end effector.
+        near_contact_failure: Share of the failures in which the hand came near the object.
+        latency_p50_ms: Median time of a decode.
+        latency_p95_ms: Time that the slowest 5 % of the decodes take at least.
+        latency_worst_ms: Time of the slowest decode.
+        AL: Acceptance length, tokens per verification.
+        accepted_per_round: Accepted draft tokens per verification.
+        AFEP: Mean position of a draft's first rejected token.
+        forwards_per_step: Target forwards per control step.
+        skip_rate: Share of decodes whose draft was executed without verification.
+        unverified_share: Share of executed tokens that the target did not verify.
+        compensation_rate: Share of decodes with compensated tokens.
+        retrieval_share: Share of decodes in which retrieval drafted.
+        deviation: Mean distance of the executed actions from those of AR.
+        felt_latency_ms: Mean time that the world went on during a decode.
+        felt_latency_steps: The same in control steps.
+        held_share: Share of control steps on a held action.
+        added: Values of the columns that plugins add, by name.
+        counts: Outcomes of the pairs with the baseline.
+        mcnemar_p: p-value of McNemar's exact test. NaN if there are no pairs.
+        difference: Success rate minus the baseline's.
+        margin: Loss of success below which a setting counts as non-inferior to the baseline.
+        non_inferior: Whether the loss is shown to be smaller than that.
+        pairs_to_settle: Number of pairs that would show it, see `statistics.pairs_to_settle`.
+        same_run: Whether the two episodes of every pair come from one run.
+        same_block: Share of pairs that were measured in one block (side by side in one process).
+        steps: Number of control steps.
+        decodes: Number of decodes.
+        deviation_samples: Number of decodes whose deviation was measured.
+        speedup: Speed per control step against the baseline, see `measures.speedups`.
+        episode_speedup: Speed per episode.
+        solved_speedup: Speed per episode, over the pairs that both solved.
+    """
+
+    successes: int
+    success: Estimate
+    time_per_step_ms: float
+    time_per_episode_ms: float
+    phases: Mapping[str, float]
+    steps_to_success: float
+    path_m: float
+    jerk: float
+    near_contact_failure: float
+    latency_p50_ms: float
+    latency_p95_ms: float
+    latency_worst_ms: float
+    AL: float
+    accepted_per_round: float
+    AFEP: float
+    forwards_per_step: float
+    skip_rate: float
+    unverified_share: float
+    compensation_rate: float
+    retrieval_share: float
+    deviation: float
+    felt_latency_ms: float
+    felt_latency_steps: float
+    held_share: float
+    added: Mapping[str, float]
+    counts: PairedCounts
+    mcnemar_p: float
+    difference: Estimate
+    margin: float
+    non_inferior: bool
+    pairs_to_settle: float
+    same_run: bool
+    same_block: float
+    steps: int
+    decodes: int
+    deviation_samples: int
+    speedup: Estimate
+    episode_speedup: Estimate
+    solved_speedup: Estimate
+
+    @property
+    def pairs(self) -> int:
+        """Number of pairs with the baseline."""
+        return int(sum(self.counts))
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether all episodes were timed."""
+        return is_number(self.time_per_step_ms)
+
+
+@dataclass(frozen=True)
+class Result:
+    """One row of a study's table: a setting, over all tasks or on one task.
+
+    Several different values are joined by semicolons.
+
+    Attributes:
+        study: Name of the study.
+        averaging: MICRO if all episodes are pooled, MACRO if difficulty groups are averaged, or `one task`.
+        label: Label of the setting.
+        series: Name that the settings along the study's axis share.
+        unstressed: Label of the same setting without stress.
+        method: Its decoding method.
+        task: Names of the tasks.
+        tasks: Number of tasks.
+        difficulty: Their difficulty groups.
+        seeds: Their seeds, as `seeds_text` writes them.
+        repeats: How often every episode was measured.
+        episodes: Number of episodes.
+        baseline: Label of the setting that it is compared with.
+        measures: What was measured.
+        runs: Number of runs that the intervals of speed cover.
+        overrides: Overrides of the setting, as typed.
+        settings: The setting, with dotted keys.
+        observation: What the target observes.
+        hashes: Hashes of weights and data, by column (`target_sha256`).
+        stress: Kind of stress, or `none`.
+        stress_level: Level of stress.
+        provenance: Machine, versions and the like, by column.
+        matched_success_speed: See `decide.with_matched_speed`.
+    """
+
+    study: str
+    averaging: str
+    label: str
+    series: str
+    unstressed: str
+    method: str
+    task: str
+    tasks: int
+    difficulty: str
+    seeds: str
+    repeats: int
+    episodes: int
+    baseline: str
+    measures: Measures
+    runs: int
+    overrides: str
+    settings: Mapping[str, Any]
+    observation: str
+    hashes: Mapping[str, str]
+    stress: str
+    stress_level: int
+    provenance: Mapping[str, str]
+    matched_success_speed: float = math.nan
+
+    @property
+    def is_baseline(self) -> bool:
+        """Whether the row belongs to the baseline itself, which is not compared with anything."""
+        return self.label == self.baseline
+
+
+def columns_of(values: Mapping[str, Any]) -> Row:
+    """Return the fields of a row as the columns of a table.
+
+    An `Estimate` becomes three columns: its name, and with the endings _low and _high its interval. `PairedCounts`
+    become their number `pairs` and one column per outcome. The keys of a mapping are columns.
+
+    Args:
+        values: Fields by name, such as `vars(result)`.
+    """
+    columns: Row = {}
+    for name, value in values.items():
+        if isinstance(value, Estimate):
+            columns |= {name: value.value, f"{name}_low": value.low, f"{name}_high": value.high}
+        elif isinstance(value, PairedCounts):
+            columns |= {"pairs": sum(value), **value._asdict()}
+        elif isinstance(value, Measures):
+            columns |= columns_of(vars(value))
+        elif isinstance(value, Mapping):
+            columns |= value
+        else:
+            columns[name] = value
+    return columns
+
+
+def frame_of(results: Iterable[Result]) -> pd.DataFrame:
+    """Return rows as a data frame. A missing value is NaN."""
+    return pd.DataFrame(columns_of(vars(row)) for row in results)
+
+
+def averaged(results: Iterable[Result], averaging: str = MICRO) -> list[Result]:
+    """Return the rows that pool all episodes (MICRO), or those that average over difficulty groups (MACRO)."""
+    return [row for row in results if row.averaging == averaging]
+
+
+def rows_of(table: pd.DataFrame, averaging: str | None = None) -> list[Row]:
+    """Return the rows of a data frame as dictionaries of column to value.
+
+    Args:
+        table: The data frame.
+        averaging: Keep only rows that pool all episodes (MICRO) or that average over difficulty groups (MACRO). None:
+            keep all rows.
+    """
+    rows = table if averaging is None else table[table["averaging"] == averaging]
+    records: list[Any] = rows.to_dict("records")
+    return records
+
+
+def csv_text(table: pd.DataFrame) -> str:
+    """Return a data frame as CSV text with six significant digits. Missing values are empty cells."""
+    return table.to_csv(index=False, float_format="%.6g", lineterminator="\n")
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a value is a real number other than NaN. Text, bool and None are not."""
+    return isinstance(value, Real) and not isinstance(value, bool) and not math.isnan(value)
