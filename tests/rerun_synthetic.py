@@ -14,8 +14,8 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.record import PHASES, DecodeRecord, EpisodeRecord, Round
-from kerv_cli.methods.kerv import CompensateSettings
-from kerv_cli.methods.kerv.prediction import Compensation, Hold, PredictionProposer
+from kerv_cli.methods.kerv import CompensateSettings, Compensation
+from kerv_cli.methods.kerv.prediction import Hold, PredictionProposer
 from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.methods.streak import AlwaysSkip
 from kerv_cli.report.viewing.viewer import read_chunks

@@ -23,7 +23,7 @@ from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.tree import ROOT, TokenTree
-from kerv_cli.methods.heisd.rules import GroupRule, HybridRule
+from kerv_cli.methods.heisd import GroupRule, HybridRule
 from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.worlds.metaworld.spec import SPEC
 

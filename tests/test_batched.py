@@ -20,7 +20,7 @@ from test_episode import settings
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.batched import BatchDecoder
-from kerv_cli.engine.chunk import EpisodeState
+from kerv_cli.engine.chunk import Follower
 from kerv_cli.engine.cost import Profile
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.parts import Fixed
@@ -170,7 +170,7 @@ def stubs():
 class Forwards(BatchDecoder):
     """Notes how many episodes each decode had."""
 
-    def decode(self, episodes: Sequence[EpisodeState], observations: Sequence[Observation]) -> list[Any]:
+    def decode(self, episodes: Sequence[Follower], observations: Sequence[Observation]) -> list[Any]:
         self.sizes.append(len(episodes))
         return super().decode(episodes, observations)
 

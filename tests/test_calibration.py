@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from command import told
 from conftest import refused
 from hypothesis import given
@@ -39,8 +38,8 @@ from kerv_cli.methods.calibration import (
     SkipSection,
     Variability,
 )
+from kerv_cli.methods.heisd.curvature import BoundaryRanges
 from kerv_cli.methods.heisd.datastore import Datastore
-from kerv_cli.methods.heisd.rules import BoundaryRanges
 from kerv_cli.methods.kerv.prediction import PREDICTORS, Noise
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.checkpoint import TargetDescription, read_target
@@ -192,7 +191,7 @@ def test_the_first_episodes_of_each_task_are_chosen(results):
 
 def test_variability_is_the_mean_difference_of_the_judged_tokens():
     """K by hand, in normalised action units; what is not judged does not count, nor does a strict DoF."""
-    chunk = Chunk(torch.zeros(1, 1, 8), 4, SPACE, None, Situation("t", ActionHistory(4)))  # type: ignore[arg-type]
+    chunk = Chunk(4, SPACE, Situation("t", ActionHistory(4)), None)  # type: ignore[arg-type]
 
     def play(start, drafted, target_tokens):
         played = Round("verify", "x", start, drafted, target_tokens, 0, 1, len(drafted), ())

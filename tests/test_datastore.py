@@ -23,7 +23,7 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.lab.database import Database
 from kerv_cli.methods.heisd.datastore import Datastore, Shard, check_seeds, prompt_key
-from kerv_cli.methods.heisd.rules import neighbour_tree
+from kerv_cli.methods.heisd.tree import neighbour_tree
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.checkpoint import TargetDescription, load_target
 from kerv_cli.training import datastore as datastore_build
@@ -179,7 +179,7 @@ def test_an_entry_is_found_by_its_own_observation(results, name):
         for step in (0, 4):
             state, images = shown.states[step], dict.fromkeys(target.cameras, shown.frames[step // 2])
             prompt = target.encode(Observation(state[:4], state, instruction, images))
-            neighbours = store.query(store.key_of(store.pooled(prompt, target).numpy()), "reach-v3", 3)
+            neighbours = store.query(store.key_of(prompt, target), "reach-v3", 3)
             assert (neighbours.seeds[0], neighbours.steps[0], neighbours.left[0]) == (1, step, LENGTHS[1] - step)
             assert neighbours.similarity[0] == pytest.approx(1.0, abs=1e-5)
             assert (np.diff(neighbours.similarity) <= 0).all()
@@ -242,7 +242,7 @@ def test_projected_keys_find_nearly_always_the_same_neighbour_in_a_smaller_file(
     shown, instruction = smooth("reach-v3", 1, LENGTHS[1], TAIL, 96), SPEC.task("reach").instruction
     with torch.inference_mode():  # what is looked up while decoding is projected, too
         prompt = target.encode(Observation(shown.states[2][:4], shown.states[2], instruction))
-    neighbours = short.query(short.key_of(short.pooled(prompt, target).numpy()), "reach-v3", 1)
+    neighbours = short.query(short.key_of(prompt, target), "reach-v3", 1)
     assert (neighbours.seeds[0], neighbours.steps[0]) == (1, 2)
     assert neighbours.similarity[0] == pytest.approx(1.0, abs=1e-5)
 

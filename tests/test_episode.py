@@ -19,7 +19,7 @@ from kerv_cli.engine.cost import Profile
 from kerv_cli.engine.record import PHASES, DecodeRecord, Delay, EpisodeRecord, Round
 from kerv_cli.episodes import policy as policies_of
 from kerv_cli.episodes import runner as run
-from kerv_cli.episodes.clock import RealClock, profiled, steps_of
+from kerv_cli.episodes.clock import RealClock, profiled, steps_during
 from kerv_cli.episodes.episode import run_episode
 from kerv_cli.episodes.rows import decodes_table, episode_row
 from kerv_cli.episodes.settings import RolloutSettings
@@ -207,10 +207,10 @@ def test_an_episode_can_end_while_the_policy_decodes():
 
 
 def test_rounding_up_ignores_float_noise_and_refuses_nonsense():
-    assert [steps_of(s, 80.0) for s in (0.0, 0.0001, 0.0125, 0.0126, 5 * 0.0125, 0.2)] == [0, 1, 1, 2, 5, 16]
+    assert [steps_during(s, 80.0) for s in (0.0, 0.0001, 0.0125, 0.0126, 5 * 0.0125, 0.2)] == [0, 1, 1, 2, 5, 16]
     for wrong in (-0.001, float("nan"), float("inf")):
         with pytest.raises(KervError):
-            steps_of(wrong, 80.0)
+            steps_during(wrong, 80.0)
 
 
 def test_chunk_drops_what_is_stale():
@@ -299,7 +299,7 @@ def test_ar_takes_what_was_asked_for_and_the_others_their_share(results):
     assert felt == pytest.approx([0.043 * (1 + h / 0.043) for h in host])  # the profile's AR takes 43 ms
     double = episode_of(results, "method=ar", *words[:3], "rollout.ar_ms=86").decodes[0]
     assert double.delay.seconds >= 2 * 0.043
-    assert steps_of(felt[0], 80.0) == ar.decodes[0].delay_steps
+    assert steps_during(felt[0], 80.0) == ar.decodes[0].delay_steps
 
 
 def test_a_profile_is_part_of_the_results_identity(results):

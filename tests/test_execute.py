@@ -14,6 +14,7 @@ import pytest
 import sqlalchemy as sa
 from command import refusal, told
 from conftest import python, raising, refused, until
+from examples.point_mass import SPEC as POINT_MASS
 from studies_synthetic import (
     count_calls,
     episode,
@@ -28,7 +29,7 @@ from studies_synthetic import (
 )
 
 from kerv_cli.base.errors import KervError, StorageError, UsageError
-from kerv_cli.base.registry import _PARTS, Part, parts
+from kerv_cli.base.registry import _PARTS, EnvironmentPart, parts
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.cli.common import progress_bar
 from kerv_cli.cli.studies import event_printer
@@ -417,7 +418,7 @@ settings: {short: world.horizon=30, long: world.horizon=60}
 
 def test_workers_run_each_episode_once_though_one_is_killed(tmp_path, monkeypatch):
     """A worker that dies is replaced, and the episode that it ran is repeated."""
-    part = Part("environment", "point-mass", "examples.point_mass:SPEC")
+    part = EnvironmentPart("point-mass", code=lambda: POINT_MASS)
     monkeypatch.setitem(_PARTS, "environment", {**parts("environment"), part.name: part})
     (tmp_path / "killing.py").write_text(KILLS_ITS_PROCESS_ONCE)
     (tmp_path / "armed").touch()

@@ -14,7 +14,7 @@ from rerun_synthetic import read_recording
 from kerv_cli.base import registry
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
-from kerv_cli.base.registry import Part
+from kerv_cli.base.registry import EnvironmentPart
 from kerv_cli.base.spaces import Observation
 from kerv_cli.episodes.episode import run_episode
 from kerv_cli.episodes.policy import ExpertDecoder, check
@@ -200,7 +200,7 @@ def test_what_ours_did_is_told_from_what_metaworlds_did():
 
 
 def test_an_episode_runs_and_is_recorded(tmp_path, monkeypatch):
-    part = Part("environment", POINT.name, "examples.point_mass:SPEC")
+    part = EnvironmentPart(POINT.name, code=lambda: POINT)
     monkeypatch.setitem(registry._PARTS, "environment", {**registry.parts("environment"), POINT.name: part})
     with POINT.open_world("push-point") as world:
         record = run_episode(world, ExpertDecoder(world.task), 100_000, CameraSettings(size=24))

@@ -22,7 +22,7 @@ TRIED = [(command, *re.findall(r"`(\w+)`", kind)) for kind, _, _, command in ROW
 def own_parts() -> dict[str, dict[str, Part]]:
     """kerv's parts, by kind and name."""
     return {
-        kind: {name: part for name, part in registry.parts(kind).items() if part.build.partition(".")[0] != "examples"}
+        kind: {name: part for name, part in registry.parts(kind).items() if not part.module.startswith("examples")}
         for kind in registry.kinds()
     }
 

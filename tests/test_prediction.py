@@ -18,12 +18,11 @@ from kerv_cli.engine.chunk import WINDOW, ActionHistory, Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import Proposer
-from kerv_cli.methods.kerv import CompensateSettings
+from kerv_cli.methods.kerv import CompensateSettings, Compensation
 from kerv_cli.methods.kerv.prediction import (
     FILTERS,
     HORIZON,
     PREDICTORS,
-    Compensation,
     Hold,
     Kalman,
     Linear,
@@ -56,7 +55,7 @@ PAST = history_of([0.1, 0.2, 0.3, 1.0], [0.2, 0.1, 0.3, 1.0])
 
 
 def chunk_with(history: ActionHistory) -> Chunk:
-    return Chunk(torch.zeros(1, 1, 8), N // D, SPACE, TARGET.new_cache(1, 4), Situation("t", history))
+    return Chunk(N // D, SPACE, Situation("t", history), None)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("known", range(N + 1))
@@ -94,8 +93,7 @@ def test_further_steps_are_predicted_from_the_accepted_prefix():
 def test_without_enough_history_the_target_decodes_on():
     chunk = chunk_with(history_of())
     chunk.tokens = [1, 2]
-    assert not compensation().close(chunk)
-    assert chunk.closed is None
+    assert compensation().rectify(chunk) is None
 
 
 def test_the_filter_rests_after_a_compensation():
@@ -104,7 +102,7 @@ def test_the_filter_rests_after_a_compensation():
     for _ in range(7):
         chunk = chunk_with(PAST)
         chunk.tokens = [1, 2]
-        closed.append(resting.close(chunk))
+        closed.append(resting.rectify(chunk) is not None)
         resting.next_decode()
     assert closed == [True, False, False, True, False, False, True]
     resting.reset()

@@ -18,9 +18,8 @@ from kerv_cli.engine.proposer import Proposer
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.early.drafter import EarlyProposer
-from kerv_cli.methods.heisd import SimilaritySkipSettings
+from kerv_cli.methods.heisd import HybridProposer, Random, RetrievalProposer, SimilaritySkipSettings, VerifySkip
 from kerv_cli.methods.heisd.datastore import Datastore, prompt_key
-from kerv_cli.methods.heisd.rules import HybridProposer, Random, RetrievalProposer, VerifySkip
 from kerv_cli.methods.kerv.prediction import Hold, Kalman, Linear, Noise, PredictionProposer
 from kerv_cli.methods.merged import MergedProposer
 from kerv_cli.targets.compact.target import CompactTarget
@@ -107,8 +106,7 @@ def test_every_proposer_is_lossless(name, seed, chunk, data):
 
 
 def test_a_prediction_counts_committed_steps_as_executed():
-    target = random_target(1, 1, 1, 4)
-    chunk = Chunk(torch.zeros(1, 1, 16), 4, SPACE, target.new_cache(1, 4), situation(np.random.default_rng(0), 5))
+    chunk = Chunk(4, SPACE, situation(np.random.default_rng(0), 5), None)  # type: ignore[arg-type]
     chunk.tokens = [10, 20, 30, 254, 40]
     proposer = PredictionProposer(Hold(HELD, minimum=1, horizon=4))
     assert proposer.chains(chunk, 7) == [[20, 30, 254, 10, 20, 30, 254]]

@@ -10,12 +10,24 @@ from conftest import refused
 from kerv_cli.base import registry
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.limits import check_settings
-from kerv_cli.base.registry import METHOD_KINDS, PREFILL, STATES, add, find, kinds, load, parts
+from kerv_cli.base.registry import (
+    METHOD_KINDS,
+    PREFILL,
+    STATES,
+    ProposerPart,
+    SkipPart,
+    ThresholdPart,
+    find,
+    kinds,
+    parts,
+)
+from kerv_cli.engine.parts import Skip
+from kerv_cli.methods.streak import AlwaysSkip, StreakSkip
 
 PLUGIN = """
 from dataclasses import dataclass
 
-from kerv_cli.base.registry import add
+from kerv_cli.base.registry import ProposerPart
 
 
 @dataclass
@@ -24,11 +36,11 @@ class Settings:
     width: int = 17
 
 
-add("proposer", "{name}", "{module}:build", Settings, when="prefill")
-
-
-def build(settings, context):
-    raise NotImplementedError
+@ProposerPart("{name}", Settings, when="prefill")
+class Mine:
+    @classmethod
+    def build(cls, settings, context):
+        raise NotImplementedError
 """
 
 
@@ -42,19 +54,24 @@ def shelf(monkeypatch):
 
 
 # kerv's own: which examples other test modules have registered by now depends on the order of collection
-EVERY = [(kind, name) for kind in kinds() for name, part in parts(kind).items() if "examples." not in part.build]
+EVERY = [(kind, name) for kind in kinds() for name, part in parts(kind).items() if "examples." not in part.module]
 
 
 def test_a_name_belongs_to_one_piece_of_code(shelf):
-    add("proposer", "mine", "one:build", when=PREFILL)
-    add("proposer", "mine", "one:build", colour=1, when=PREFILL)
+    ProposerPart("mine", when=PREFILL)(StreakSkip)
+    ProposerPart("mine", colour=1, when=PREFILL)(StreakSkip)
     assert find("proposer", "mine").colour == 1
-    with refused("proposer 'mine' is registered twice: one:build and two:build", error=UsageError):
-        add("proposer", "mine", "two:build", when=PREFILL)
+    with refused(
+        "proposer 'mine' is registered twice: ",
+        ":StreakSkip and ",
+        ":AlwaysSkip",
+        error=UsageError,
+    ):
+        ProposerPart("mine", when=PREFILL)(AlwaysSkip)
     with pytest.raises(UsageError):
-        add("proposer", "drafter", "elsewhere:build", when=STATES)
-    assert find("proposer", "drafter").build == "kerv_cli.methods.eagle.drafter:EagleDrafter.proposer"
-    add("threshold", "mine", "two:build")  # another kind: another name
+        ProposerPart("drafter", when=STATES)(AlwaysSkip)
+    assert find("proposer", "drafter").origin == "kerv_cli.methods.eagle:artifact"
+    ThresholdPart("mine")(AlwaysSkip)  # another kind: another name
     assert list(parts("proposer"))[-1] == "mine"  # in the order of registration
 
 
@@ -70,25 +87,35 @@ def test_an_unknown_name_lists_the_near_ones():
 def test_what_a_part_names_is_there(kind, name):
     part = find(kind, name)
     assert (part.kind, part.name) == (kind, name)
-    if part.build:
-        assert load(part.build) is not None
+    assert part.absent or callable(part.code)
     if kind in (*METHOD_KINDS, "datastore"):
         chosen = part.settings(kind=name)
         assert chosen.kind == name
-        assert isinstance(part.needs(chosen), tuple)
-        assert set(part.needs(chosen)) <= set(parts("artifact"))
+        assert isinstance(part.needed(chosen), tuple)
+        assert set(part.needed(chosen)) <= set(parts("artifact"))
         check_settings(chosen, kind)  # defaults are in range
 
 
 def test_every_proposer_says_when_it_can_draft():
-    assert {part.traits["when"] for part in parts("proposer").values()} == {PREFILL, STATES}
-    chains = {name for name, part in parts("proposer").items() if part.traits.get("chains")}
-    assert all(find("proposer", name).traits["when"] == PREFILL for name in chains)
+    assert {part.when for part in ProposerPart.every().values()} == {PREFILL, STATES}
+    assert {part.when for part in ProposerPart.every().values() if part.chains} == {PREFILL}
+
+
+@pytest.mark.usefixtures("shelf")
+def test_a_part_without_a_method_of_its_interface_is_refused_when_it_is_made():
+    with pytest.raises(UsageError, match="skip 'idler' lacks the method take"):
+
+        @SkipPart("idler")
+        class Idler(Skip):
+            pass
+
+    with pytest.raises(UsageError, match="skip 'idler' lacks the method build"):
+        SkipPart("idler")(object)
 
 
 @pytest.mark.usefixtures("shelf")
 def test_a_plugins_proposer_is_a_choice_like_any_other(tmp_path, monkeypatch):
-    (tmp_path / "my_parts.py").write_text(PLUGIN.format(name="mine", module="my_parts"))
+    (tmp_path / "my_parts.py").write_text(PLUGIN.format(name="mine"))
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv(registry.PLUGINS, "my_parts")
     registry.load_plugins.__wrapped__()
@@ -105,12 +132,16 @@ def test_a_plugins_proposer_is_a_choice_like_any_other(tmp_path, monkeypatch):
         ("collides", "collides.py:13: proposer 'drafter' is registered twice: kerv_cli.methods.eagle"),
         ("unfinished", "unfinished.py:2: SyntaxError: "),
         ("unknown", "unknown.py:1: NameError: name 'nothing' is not defined"),
+        ("misspelt", "misspelt.py:2: TypeError: SkipPart.__init__() got an unexpected keyword argument 'take_draft'"),
     ],
 )
 def test_a_plugin_that_does_not_work_gets_one_line(tmp_path, plugins, says):
-    (tmp_path / "collides.py").write_text(PLUGIN.format(name="drafter", module="collides"))
+    (tmp_path / "collides.py").write_text(PLUGIN.format(name="drafter"))
     (tmp_path / "unfinished.py").write_text("x = 1\ndef f(:\n")
     (tmp_path / "unknown.py").write_text("nothing\n")
+    (tmp_path / "misspelt.py").write_text(
+        "from kerv_cli.base.registry import SkipPart\nSkipPart('mine', take_draft=True).add()\n"
+    )
     path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
     done = process("-m", "kerv_cli", "rollout", "--cfg", PYTHONPATH=path, KERV_PLUGINS=plugins)
     assert done.returncode == 2
@@ -119,7 +150,7 @@ def test_a_plugin_that_does_not_work_gets_one_line(tmp_path, plugins, says):
 
 
 def test_an_installed_package_registers_by_an_entry_point(tmp_path, monkeypatch, shelf):
-    (tmp_path / "installed_parts.py").write_text(PLUGIN.format(name="installed", module="installed_parts"))
+    (tmp_path / "installed_parts.py").write_text(PLUGIN.format(name="installed"))
     monkeypatch.syspath_prepend(tmp_path)
 
     def entry_points(group):
@@ -127,4 +158,4 @@ def test_an_installed_package_registers_by_an_entry_point(tmp_path, monkeypatch,
 
     monkeypatch.setattr(registry, "entry_points", entry_points)
     registry.load_plugins.__wrapped__()
-    assert find("proposer", "installed").built.__self__.build == "installed_parts:build"
+    assert find("proposer", "installed").origin == "installed_parts:Mine"

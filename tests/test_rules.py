@@ -15,12 +15,12 @@ from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.limits import check_settings
 from kerv_cli.base.registry import find
-from kerv_cli.engine.chunk import Choice
+from kerv_cli.engine.decisions import Choice
 from kerv_cli.engine.parts import Boundary, Threshold
 from kerv_cli.engine.record import Round, path_length, variability
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.heisd.rules import STILL, BoundaryRanges, radius_of_curvature
+from kerv_cli.methods.heisd.curvature import STILL, BoundaryRanges, radius_of_curvature
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 WINDOW = 15
@@ -36,7 +36,7 @@ def boundary_of(kind: str, **values: Any) -> Boundary:
     calibration = SimpleNamespace(ranges={10: RANGES, WINDOW: RANGES}.__getitem__)
 
     def artifact(kind):
-        assert kind in part.needs(chosen)
+        assert kind in part.needed(chosen)
         return calibration
 
     built: Boundary = part.built(chosen, Context(None, artifact))  # type: ignore[arg-type]
@@ -291,8 +291,8 @@ def test_schedule_is_the_public_codes_and_open_loop():
 @pytest.mark.parametrize("kind", CLOSED_LOOP)
 def test_the_reference_level_is_the_tasks_where_none_is_given(kind):
     asked = find("threshold", kind).settings(kind=kind)
-    assert find("threshold", kind).needs(asked) == ("calibration",)
-    assert find("threshold", kind).needs(replace(asked, k_s=0.4)) == ()
+    assert find("threshold", kind).needed(asked) == ("calibration",)
+    assert find("threshold", kind).needed(replace(asked, k_s=0.4)) == ()
     for k in (0.0, 0.3, 2.0):
         assert radius_after(built(asked), k) == radius_after(threshold(kind, k_s=0.7), k)
     assert radius_after(built(asked), 0.5, 0.6) != radius_after(threshold(kind, k_s=0.05), 0.5, 0.6)

@@ -20,7 +20,7 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter, EagleNetwork
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
-from kerv_cli.methods.heisd.rules import HybridProposer, Random, RetrievalProposer
+from kerv_cli.methods.heisd import HybridProposer, Random, RetrievalProposer
 from kerv_cli.methods.jacobi import JacobiProposer
 from kerv_cli.methods.kerv.prediction import Hold, Kalman, Noise, PredictionProposer
 from kerv_cli.methods.merged import MergedProposer

@@ -1,7 +1,8 @@
 """Compose the settings of a command from `conf/`, method or study files, and overrides. Only this module uses Hydra.
 
-Overrides are `key=value` arguments. They are checked before torch or MuJoCo load. An error message is one line, and
-names the file and the line if the mistake is in a file.
+A file of conf/ is a mapping from keys to values. Overrides are `key=value` arguments in Hydra's grammar. They are
+checked before torch or MuJoCo load. An error message is one line. It names the file and the line of a mistake in a
+file.
 """
 
 from __future__ import annotations
@@ -21,13 +22,15 @@ from typing import Any, TypeVar, cast
 from kerv_cli.base.errors import UnknownName, UsageError, did_you_mean
 from kerv_cli.base.files import read_yaml_lines
 from kerv_cli.base.limits import check_settings, range_of
-from kerv_cli.base.registry import PREFILL, SETTINGS_GROUPS, Part, part_of, parts
+from kerv_cli.base.registry import PREFILL, SETTINGS_GROUPS, Part, ProposerPart, part_of, parts
 from kerv_cli.base.settings import choices_of
 
 T = TypeVar("T")
 
 PRESETS = ("method", "study")
 """Groups of conf/ whose files set several settings at once. Such a file is chosen by its name or by its path."""
+WHOLE = ("drafter",)
+"""Groups whose files set keys of the whole command, not only of the group."""
 MOST_POINTS = 10_000
 """Maximum number of combinations in a grid of settings."""
 
@@ -51,7 +54,9 @@ def conf_dir() -> Path:
 
 def groups() -> dict[str, list[str]]:
     """Return the names that can be chosen in each group of settings: {"method": ["ar", "spec_vla", …], …}."""
-    names = {d.name: {p.stem for p in d.glob("*.yaml")} for d in conf_dir().iterdir() if d.is_dir()}
+    names: dict[str, set[str]] = {}
+    for path in conf_dir().glob("*/*.yaml"):
+        names.setdefault(path.parent.name, set()).add(path.stem)
     for group in SETTINGS_GROUPS:
         names.setdefault(group, set()).update(_parts_of(group))
     return {group: sorted(names[group]) for group in sorted(names)}
@@ -64,7 +69,7 @@ def _parts_of(group: str) -> dict[str, Part]:
     """
     if group != "prefill_draft":
         return dict(parts(group))
-    return {name: part for name, part in parts("proposer").items() if part.traits.get("when") == PREFILL}
+    return {name: part for name, part in ProposerPart.every().items() if part.when == PREFILL}
 
 
 def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
@@ -79,7 +84,6 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
     Raises:
         UsageError: An override cannot be parsed, its key or a name is unknown, or its value is impossible.
     """
-    from hydra.errors import HydraException
     from omegaconf import OmegaConf
     from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException, ValidationError
 
@@ -110,7 +114,7 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
         key = key if key in typed else str(error.full_key)
         hint = did_you_mean(key, _keys(nodes)) or f"see 'kerv {command.replace('_', ' ')} --cfg' for the keys"
         raise UsageError(f"{places.get(key, '')}unknown key '{key}': {hint}", key) from error
-    except (HydraException, OmegaConfBaseException, ValueError, TypeError, RecursionError) as error:
+    except (OmegaConfBaseException, ValueError, TypeError, RecursionError) as error:
         key = getattr(error, "full_key", None) or key
         message = str(error).partition("\n")[0]
         if isinstance(error, ValidationError) and (at := _field(nodes, key)) is not None:
@@ -157,7 +161,9 @@ def preset_file(group: str, name: str) -> Path:
 
 
 def _read_preset(group: str, name: str) -> tuple[dict[str, str], list[tuple[str, Any]], dict[str, str]]:
-    """Read a method or study file.
+    """Read a method or study file: a mapping from keys to values, as they could be typed.
+
+    In a method file, `proposer: drafter` chooses a part. All other keys set values, as in `threshold.r: 5`.
 
     Args:
         group: `method` or `study`. Empty if the command has no such file. Then all three results are empty.
@@ -174,16 +180,15 @@ def _read_preset(group: str, name: str) -> tuple[dict[str, str], list[tuple[str,
         return {}, [], {}
     path = preset_file(group, name)
     content, lines = read_yaml_lines(path, f"{group}={path}")
-    prefix = "" if group == "method" else f"{group}."
-    choices, places = {}, {f"{prefix}{key}": f"{path}:{line}: " for key, line in lines.items()}
-    for index, choice in enumerate(content.pop("defaults", [])):
-        (key, part), *_ = choice.items() if isinstance(choice, dict) else [(str(choice), None)]
-        kind, place = key.removeprefix("override /"), f"{path}:{lines.get(f'defaults.{index}.{key}', 1)}: "
-        if kind not in SETTINGS_GROUPS or not isinstance(part, str):
-            raise UsageError(f"{place}write 'override /PART: NAME', PART is one of {', '.join(SETTINGS_GROUPS)}")
-        choices[kind], places[kind] = part, place
-    named = {group: path.stem} if group == "method" else {}
-    return choices, [(f"{prefix}{key}", value) for key, value in (content | named).items()], places
+    if group == "study":
+        values = [(f"study.{key}", value) for key, value in content.items()]
+        return {}, values, {f"study.{key}": f"{path}:{line}: " for key, line in lines.items()}
+    places = {key: f"{path}:{line}: " for key, line in lines.items()}
+    if "defaults" in content:
+        raise UsageError(f"{places['defaults']}a method's file has no defaults: write PART: NAME, as proposer: drafter")
+    choices = {key: value for key, value in content.items() if key in SETTINGS_GROUPS and isinstance(value, str)}
+    values = [(key, value) for key, value in content.items() if key not in choices]
+    return choices, [*values, ("method", path.stem)], places
 
 
 def _check(settings: Any) -> None:
@@ -222,10 +227,10 @@ def _parsed(override: str) -> Any:
 
 @functools.lru_cache(maxsize=256)
 def _composed(choices: tuple[tuple[str, str], ...], schema: type, conf: Path, artifacts: tuple[str, ...]) -> Any:
-    """Return the settings that Hydra composes for these choices. This takes 0.1 s, so the result is cached.
+    """Return the settings of a command with these choices, as a node of OmegaConf.
 
     Args:
-        choices: (group, name) pairs, such as ("method", "kerv"). Later ones override earlier ones.
+        choices: (group, name) pairs, such as ("policy", "vision"). Later ones override earlier ones.
         schema: Dataclass of the settings.
         conf: Folder of the configuration files.
         artifacts: Registered kinds of artifacts. The settings of a policy have a key for each of them.
@@ -233,36 +238,35 @@ def _composed(choices: tuple[tuple[str, str], ...], schema: type, conf: Path, ar
     Raises:
         UnknownName: A group has no such name.
     """
-    from hydra import compose as hydra_compose
-    from hydra import initialize_config_dir
-    from hydra.core.config_store import ConfigStore
-    from omegaconf import MISSING, OmegaConf
+    from omegaconf import OmegaConf
 
-    known = groups()
+    known, nodes = groups(), OmegaConf.structured(schema)
+    _open_mappings(nodes)
     for group, name in choices:
         if name not in known[group]:
             raise UnknownName(group, name, known[group])
-    store = ConfigStore.instance()
-    base = OmegaConf.structured(schema)
-    _open_mappings(base)
-    for group in set(SETTINGS_GROUPS) & set(base):
-        base[group] = MISSING  # the choice below decides which settings class a group has
-    store.store(name="base", node=base)
-    store.store(name="own", node={"defaults": ["base", *({group: name} for group, name in choices), "_self_"]})
-    for group in SETTINGS_GROUPS:
-        for name, part in _parts_of(group).items():
-            own_file = (conf / group / f"{name}.yaml").is_file()  # it includes the part's settings as base_<group>
-            _store_part(f"base_{group}" if own_file else group, name, part.settings)
-    with initialize_config_dir(str(conf), version_base="1.3"):
-        return hydra_compose("own")
+        part, values = _choice(group, name)
+        if part is not None:
+            nodes[group] = OmegaConf.structured(part.default)
+        for key, value in values:
+            OmegaConf.update(nodes, key, value, merge=True)
+    return nodes
 
 
-@functools.cache
-def _store_part(group: str, name: str, settings: type) -> None:
-    """Register the settings class of a part with Hydra, once per process."""
-    from hydra.core.config_store import ConfigStore
+def _choice(group: str, name: str) -> tuple[Part | None, list[tuple[str, Any]]]:
+    """Return the part that a name chooses in a group, if it chooses one, and the (key, value) pairs that its file sets.
 
-    ConfigStore.instance().store(group=group, name=name, node=settings(kind=name))
+    A file `conf/<group>/<name>.yaml` may continue another choice of its group, which it names with the key `base`.
+    """
+    parts_of_group = _parts_of(group) if group in SETTINGS_GROUPS else {}
+    path = conf_dir() / group / f"{name}.yaml"
+    if not path.is_file():
+        return parts_of_group[name], []
+    content, _ = read_yaml_lines(path, f"{group}={name}")
+    base = content.pop("base", None)
+    part, values = (parts_of_group.get(name), []) if base is None else _choice(group, base)
+    prefix = "" if group in WHOLE else f"{group}."
+    return part, [*values, *((f"{prefix}{key}", value) for key, value in content.items())]
 
 
 def _open_mappings(node: Any) -> None:
@@ -301,13 +305,13 @@ def as_overrides(*overrides: str, **settings: object) -> list[str]:
     For example `episodes=3, task=["reach", "push"], threshold={"r": 5}` gives `episodes=3`, `task=[reach,push]`,
     `threshold.r=5`.
     """
-
-    def typed(key: str, value: object) -> list[str]:
+    typed = list(overrides)
+    for key, value in settings.items():
         if isinstance(value, Mapping):
-            return [text for name, inner in value.items() for text in typed(f"{key}.{name}", inner)]
-        return [f"{key}={plain_text(value)}"]
-
-    return [*overrides, *(text for key, value in settings.items() for text in typed(key, value))]
+            typed += as_overrides(**{f"{key}.{name}": inner for name, inner in value.items()})
+        else:
+            typed.append(f"{key}={plain_text(value)}")
+    return typed
 
 
 def plain_text(value: object) -> str:

@@ -1,7 +1,10 @@
 """The registry of parts, by kind and name. Parts are proposers, artifacts, targets, environments, commands, ….
 
-A part's name, settings and required artifacts are known without importing torch or MuJoCo. Its `build` names the code
-that makes it, as `module:function` or `module:Class.method`. That module is imported when the part is built.
+A part is a class or function with a decorator, such as `@SkipPart("streak", StreakSkipSettings, takes_draft=True)`. The
+decorator states the name, the settings and further attributes. Error messages list parts in the order of registration.
+
+The modules that register kerv's own parts import neither torch nor MuJoCo. A part that needs them imports them when it
+is built.
 
 Plugins register parts of their own when they are imported. kerv imports the modules that installed packages name in the
 entry point group `kerv.parts`, and those in the environment variable KERV_PLUGINS (separated by commas).
@@ -15,22 +18,29 @@ import os
 import pkgutil
 import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, replace
 from importlib.metadata import entry_points
-from typing import Any
+from typing import Any, ClassVar, Literal, Self, TypeVar, cast
 
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
 
 PLUGINS = "KERV_PLUGINS"
 
-MODULES = (
-    "kerv_cli.worlds",
-    "kerv_cli.targets",
+MODULES: Mapping[str, tuple[str, ...]] = {
+    "command": (),  # the command line imports its commands itself
+    "environment": ("kerv_cli.worlds",),
+    "stress": ("kerv_cli.worlds.stress.kinds",),
+    "target": ("kerv_cli.targets",),
+}
+"""The modules that register kerv's own parts of a kind."""
+
+METHOD_MODULES = (
     "kerv_cli.methods.ar",
     "kerv_cli.methods.spec_vla",
     "kerv_cli.methods.eagle",
     "kerv_cli.methods.early",
     "kerv_cli.methods.scout",
+    "kerv_cli.methods.calibrated",
     "kerv_cli.methods.kerv",
     "kerv_cli.methods.parallel",
     "kerv_cli.methods.streak",
@@ -41,10 +51,7 @@ MODULES = (
     "kerv_cli.methods.merged",
     "kerv_cli.methods.certified",
 )
-"""Modules that register kerv's own parts when they are imported. They import neither torch nor MuJoCo.
-
-Error messages list parts in this order.
-"""
+"""The modules that register the parts of methods, that is, all kinds that are not in MODULES."""
 
 METHOD_KINDS = ("prefill_draft", "proposer", "acceptance", "threshold", "rectifier", "boundary", "skip")
 """The parts of a method, in the order in which a decode uses them."""
@@ -59,8 +66,11 @@ SETTINGS_GROUPS = (*PART_GROUPS, "drafter")
 DRAFTING = "draft"
 """Kind of cost of a proposer that drafts with a drafter layer of the target's shape (docs/measuring.md)."""
 
-PREFILL, STATES = "prefill", "states"
+PREFILL: Literal["prefill"] = "prefill"
+STATES: Literal["states"] = "states"
 """When a proposer can draft: before the prefill, or only after it, because it reads the target's hidden states."""
+
+C = TypeVar("C")
 
 
 @dataclass
@@ -72,101 +82,340 @@ class NoSettings:
 
 @dataclass(frozen=True)
 class Part:
-    """A registered part: one of the choices of its kind, such as the proposer `drafter`.
+    """A registered part, and the decorator that registers it: one of the choices of its kind.
+
+    A subclass for each kind adds attributes that other modules read.
 
     Args:
-        kind: proposer, acceptance, threshold, rectifier, boundary, skip, datastore, artifact, target, environment,
-            stress, column or command.
         name: The name by which it is chosen.
-        build: The code that makes it, as `module:function` or `module:Class.method`. For the parts of a method,
-            `methods/context.py` describes the arguments. Empty: choosing this name means having no such part.
         settings: Dataclass of its settings, with defaults and limits.
-        needs: Function of the part's settings. It returns the kinds of artifacts that must exist to use the part. For
-            an artifact, it returns the kinds of artifacts from which the artifact is made.
+        needs: Kinds of artifacts that must exist to use it, or a function of its settings that returns them. For an
+            artifact: kinds of artifacts from which it is made.
         colour: Colour in tables and plots, 0xRRGGBB. None: no colour of its own.
-        traits: Further properties that other modules read. docs/extending.md lists them.
+        code: The decorated class or function. None: choosing this name means having no such part, as in
+            `proposer=none`.
     """
 
-    kind: str
+    kind: ClassVar[str]
+    interface: ClassVar[tuple[str, ...]] = ()  # methods of the decorated class that kerv calls by name
+
     name: str
-    build: str = ""
     settings: type = NoSettings
-    needs: Callable[[Any], tuple[str, ...]] = lambda settings: ()
+    _: KW_ONLY
+    needs: tuple[str, ...] | Callable[[Any], tuple[str, ...]] = ()
     colour: int | None = None
-    traits: Mapping[str, Any] = field(default_factory=dict)
+    code: Any = None
+
+    def __call__(self, code: C) -> C:
+        """Register the part whose class or function is decorated. Return the class or function.
+
+        Raises:
+            UsageError: The class lacks methods of its interface, or another part has the name.
+        """
+        missing = {one for one in self.interface if not hasattr(code, one)}
+        missing |= getattr(code, "__abstractmethods__", frozenset())
+        if missing:
+            raise UsageError(f"{self.kind} '{self.name}' lacks the method {', '.join(sorted(missing))}")
+        replace(self, code=code).add()
+        return code
+
+    def add(self) -> None:
+        """Register the part. A module that is reloaded can register its parts again.
+
+        Raises:
+            UsageError: A part of the same kind and name, but with other code, is registered already.
+        """
+        same = _PARTS.setdefault(self.kind, {})
+        if self.name in same and same[self.name].origin != self.origin:
+            raise UsageError(
+                f"{self.kind} '{self.name}' is registered twice: {same[self.name].origin} and {self.origin}"
+            )
+        same[self.name] = self
+
+    @classmethod
+    def every(cls) -> Mapping[str, Self]:
+        """Return all registered parts of this class by name, in the order of registration."""
+        return {name: part for name, part in parts(cls.kind).items() if isinstance(part, cls)}
+
+    @classmethod
+    def find(cls, name: str, what: str = "") -> Self:
+        """Return a registered part of this kind.
+
+        Args:
+            name: Name of the part.
+            what: Text for the error message instead of the kind.
+
+        Raises:
+            UnknownName: No part of this kind has the name. The message suggests similar names.
+        """
+        return cast(Self, find(cls.kind, name, what))
+
+    @property
+    def module(self) -> str:
+        """Name of the module that contains its code. Empty for a name that means having no such part."""
+        return getattr(self.code, "__module__", "")
+
+    @property
+    def origin(self) -> str:
+        """Its code as text, `module:name`."""
+        return "" if self.code is None else f"{self.module}:{self.code.__qualname__}"
 
     @property
     def absent(self) -> bool:
         """Whether choosing this name means having no such part, as in `proposer=none`."""
-        return not self.build
+        return self.code is None
 
     @property
     def default(self) -> Any:
         """The part's default settings."""
         return self.settings(kind=self.name)
 
-    def built(self, *arguments: Any, **keywords: Any) -> Any:
-        """Import the code that makes the part, call it with these arguments, and return its result.
+    def needed(self, settings: Any) -> tuple[str, ...]:
+        """Return the kinds of artifacts that must exist to use the part with these settings."""
+        return self.needs(settings) if callable(self.needs) else self.needs
 
-        Return None if choosing the part means having none, as in `proposer=none`.
-        """
-        return load(self.build)(*arguments, **keywords) if self.build else None
+    def built(self, *arguments: Any) -> Any:
+        """Call the part's class or function, and return its result. None if choosing the part means having none."""
+        return None if self.code is None else self.code(*arguments)
 
 
 _PARTS: dict[str, dict[str, Part]] = {}
 
 
-def add(
-    kind: str,
-    name: str,
-    build: str = "",
-    settings: type = NoSettings,
-    needs: tuple[str, ...] | Callable[[Any], tuple[str, ...]] = (),
-    colour: int | None = None,
-    **traits: Any,
-) -> None:
-    """Register a part; see `Part`. A module that is reloaded can register its parts again.
+def _nothing_idle(settings: Any) -> dict[str, str]:
+    return {}
+
+
+@dataclass(frozen=True)
+class MethodPart(Part):
+    """A part of a decoding method. Its class has a class method `build` (`MethodPart` in `kerv_cli/engine/parts.py`).
 
     Args:
-        kind: Kind of part, such as `proposer`.
-        name: The name by which it is chosen.
-        build: The code that makes it, as `module:function`. Empty: the name means having no such part.
-        settings: Dataclass of its settings.
-        needs: Kinds of artifacts that must exist to use it, or a function of its settings that returns them.
-        colour: Colour in tables and plots, 0xRRGGBB.
-        **traits: Further properties that other modules read. docs/extending.md lists them.
-
-    Raises:
-        UsageError: A part of the same kind and name, but with a different `build`, is registered already.
+        idle: Function of the part's settings. It returns those without effect, each with the reason.
     """
-    same = _PARTS.setdefault(kind, {})
-    if name in same and same[name].build != build:
-        raise UsageError(f"{kind} '{name}' is registered twice: {same[name].build} and {build}")
-    same[name] = Part(kind, name, build, settings, needs if callable(needs) else lambda _: needs, colour, traits)
+
+    interface: ClassVar[tuple[str, ...]] = ("build",)
+    _: KW_ONLY
+    idle: Callable[[Any], Mapping[str, str]] = _nothing_idle
+
+    def built(self, settings: Any, context: Any) -> Any:
+        """Build the part. Return None if choosing it means having none, or if the method works without it.
+
+        Args:
+            settings: Settings of the part.
+            context: The `Context` (`kerv_cli/methods/context.py`): target, artifacts, task.
+        """
+        return None if self.code is None else self.code.build(settings, context)
 
 
-def add_drafter(
-    kind: str,
-    build: str,
-    settings: type,
-    proposer: type = NoSettings,
-    sees: bool = False,
-    colour: int | None = None,
-    **traits: Any,
-) -> None:
-    """Register both parts of a trained drafter: its artifact and its proposer.
+@dataclass(frozen=True)
+class ProposerPart(MethodPart):
+    """A proposer.
 
     Args:
-        kind: Name of the artifact and of the proposer. `kerv train drafter drafter=KIND` trains it.
-        build: Subclass of `TrainableDrafter` (`kerv_cli/methods/drafters.py`), as `module:Class`.
-        settings: Dataclass of the settings of its shapes and training.
-        proposer: Dataclass of the settings of its proposer.
+        when: PREFILL: it reads only the prompt, executed actions and committed tokens. STATES: it reads the target's
+            hidden states.
+        chains: Whether it drafts chains, so that `merged` and `skip=always` can use it.
+        drafts_whole_chunk: Whether it drafts every token of a chunk.
+        merged: Whether it merges chains of several proposers.
+        has_boundary: Whether a boundary chooses what drafts.
+        looks_up: Whether it searches a datastore.
+        cost: Which cost of a profile prices its draft. Empty: none.
+        measured_by: The method that measures this cost. Empty: none.
+    """
+
+    kind = "proposer"
+    _: KW_ONLY
+    when: Literal["prefill", "states"]
+    chains: bool = False
+    drafts_whole_chunk: bool = False
+    merged: bool = False
+    has_boundary: bool = False
+    looks_up: bool = False
+    cost: str = ""
+    measured_by: str = ""
+
+
+@dataclass(frozen=True)
+class DrafterPart(ProposerPart):
+    """A drafter with weights: an artifact, which `kerv train drafter drafter=NAME` trains, and a proposer.
+
+    The decorated function imports and returns the subclass of `TrainableDrafter` (`kerv_cli/methods/drafters.py`).
+    `settings` are those of the proposer.
+
+    Args:
+        trained: Dataclass of the settings of its shapes and training.
         sees: Whether it needs a target that reads images.
-        colour: Colour in tables and plots, 0xRRGGBB.
-        **traits: Further properties of the proposer. docs/extending.md lists them.
     """
-    add("artifact", kind, build, settings, sees=sees)
-    add("proposer", kind, f"{build}.proposer", proposer, (kind,), colour=colour, **traits)
+
+    interface: ClassVar[tuple[str, ...]] = ()
+    _: KW_ONLY
+    trained: type
+    sees: bool = False
+
+    def add(self) -> None:
+        """Register the artifact and the proposer."""
+        ArtifactPart(self.name, self.trained, sees=self.sees, code=self.code).add()
+        super().add()
+
+    def needed(self, settings: Any) -> tuple[str, ...]:
+        """Return the drafter's own kind of artifact."""
+        return (self.name,)
+
+    def built(self, settings: Any, context: Any) -> Any:
+        """Build the proposer; arguments as `MethodPart.built`."""
+        return self.code().proposer(settings, context)
+
+
+@dataclass(frozen=True)
+class AcceptancePart(MethodPart):
+    """An acceptance rule.
+
+    Args:
+        reads_threshold: Whether it has a radius.
+    """
+
+    kind = "acceptance"
+    _: KW_ONLY
+    reads_threshold: bool = True
+
+
+@dataclass(frozen=True)
+class ThresholdPart(MethodPart):
+    """A threshold.
+
+    Args:
+        batchable: Whether it works for several episodes at once.
+    """
+
+    kind = "threshold"
+    _: KW_ONLY
+    batchable: bool = False
+
+
+@dataclass(frozen=True)
+class RectifierPart(MethodPart):
+    """A rectifier."""
+
+    kind = "rectifier"
+
+
+@dataclass(frozen=True)
+class BoundaryPart(MethodPart):
+    """A boundary.
+
+    Args:
+        chooses: Whether it chooses what drafts for `proposer=hybrid`.
+    """
+
+    kind = "boundary"
+    _: KW_ONLY
+    chooses: bool = False
+
+
+@dataclass(frozen=True)
+class SkipPart(MethodPart):
+    """A skip rule.
+
+    Args:
+        takes_draft: Whether it executes the prefill draft.
+        merges: Whether the prefill draft may be merged from several proposers.
+        verifies: Whether it ever verifies a draft.
+        batchable: Whether it works for several episodes at once.
+    """
+
+    kind = "skip"
+    _: KW_ONLY
+    takes_draft: bool = False
+    merges: bool = False
+    verifies: bool = True
+    batchable: bool = False
+
+
+@dataclass(frozen=True)
+class SearchPart(Part):
+    """A search through a datastore. Its class is an `Index` (`kerv_cli/methods/heisd/__init__.py`)."""
+
+    kind = "datastore"
+
+
+@dataclass(frozen=True)
+class ArtifactPart(Part):
+    """A kind of artifact. The decorated function imports and returns the subclass of `Artifact`.
+
+    Args:
+        sees: Whether it needs a target that reads images.
+        by_task: Whether it contains numbers or data by task.
+        needs_task: Whether it can be used only for tasks that it contains.
+        names_more: Whether it names further artifacts that are needed.
+        described_by: File that describes it. Empty: `<kind>.json`.
+        study: Study that makes it. Empty: none.
+    """
+
+    kind = "artifact"
+    _: KW_ONLY
+    sees: bool = False
+    by_task: bool = False
+    needs_task: bool = False
+    names_more: bool = False
+    described_by: str = ""
+    study: str = ""
+
+    def built(self) -> Any:
+        """Return the kind of artifact, an instance of a subclass of `Artifact`."""
+        return self.code()()
+
+
+@dataclass(frozen=True)
+class TargetPart(Part):
+    """A family of targets. The decorated function loads a target from (folder, description, device, dtype).
+
+    Args:
+        importer: Function that `kerv build target` calls with its settings. None: targets of this family are trained.
+        check_weights: Function of a folder and its description. It checks weights that are elsewhere. None: the weights
+            are in the folder.
+        images_alone: Whether its targets read images but no state.
+    """
+
+    kind = "target"
+    _: KW_ONLY
+    importer: Callable[[Any], Any] | None = None
+    check_weights: Callable[[Any, Any], None] | None = None
+    images_alone: bool = False
+
+
+@dataclass(frozen=True)
+class EnvironmentPart(Part):
+    """An environment. The decorated function returns its `EnvironmentSpec`.
+
+    Args:
+        names: Function that returns the names of its suites and tasks without importing numpy. None: the specification
+            names them.
+    """
+
+    kind = "environment"
+    _: KW_ONLY
+    names: Callable[[], tuple[str, ...]] | None = None
+
+
+@dataclass(frozen=True)
+class StressPart(Part):
+    """A kind of stress. The decorated class is a `Stress` (`kerv_cli/worlds/stress/base.py`).
+
+    Args:
+        requires: What a world must allow for it, such as `actions`.
+    """
+
+    kind = "stress"
+    _: KW_ONLY
+    requires: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ColumnPart(Part):
+    """A column of tables. The decorated function turns the episodes of one setting, a data frame, into a number."""
+
+    kind = "column"
 
 
 def load(name: str) -> Any:
@@ -184,12 +433,7 @@ def load(name: str) -> Any:
 
 
 def find(kind: str, name: str, what: str = "") -> Part:
-    """Return a registered part.
-
-    Args:
-        kind: Kind of part, such as `proposer`.
-        name: Name of the part.
-        what: Text for the error message instead of the kind.
+    """Return a registered part of a kind; arguments otherwise as `Part.find`.
 
     Raises:
         UnknownName: No part of this kind has the name. The message suggests similar names.
@@ -220,27 +464,43 @@ def parts(kind: str) -> Mapping[str, Part]:
     """
     load_plugins()
     if kind == "drafter":
-        return {name: part for name, part in _PARTS["artifact"].items() if part.settings is not NoSettings}
+        return {name: part for name, part in parts("artifact").items() if part.settings is not NoSettings}
+    _load(kind)
     return _PARTS.get(kind, {})
 
 
 def kinds() -> tuple[str, ...]:
     """Return the kinds of all registered parts."""
     load_plugins()
+    _load_all()
     return tuple(_PARTS)
+
+
+def _load_all() -> None:
+    for kind in (*MODULES, *METHOD_KINDS):
+        _load(kind)
+
+
+@functools.cache
+def _load(kind: str) -> None:
+    for name in MODULES.get(kind, METHOD_MODULES):
+        importlib.import_module(name)
 
 
 @functools.cache
 def load_plugins() -> None:
-    """Register kerv's own parts, then those of plugins: installed packages and the modules in `KERV_PLUGINS`.
+    """Register the parts of plugins: of installed packages and of the modules in `KERV_PLUGINS`.
+
+    kerv's own parts come first, so that a plugin cannot take their names.
 
     Raises:
         UsageError: A plugin cannot be imported. The message names its file and line.
     """
-    for name in MODULES:
-        importlib.import_module(name)
     files = [name.strip() for name in os.environ.get(PLUGINS, "").split(",") if name.strip()]
-    for name in [*(entry.value for entry in entry_points(group="kerv.parts")), *files]:
+    plugins = [*(entry.value for entry in entry_points(group="kerv.parts")), *files]
+    if plugins:
+        _load_all()
+    for name in plugins:
         try:
             importlib.import_module(name)
         except Exception as error:

@@ -213,8 +213,6 @@ class ActionSpace:
         for name in ("names", "groups", "strict", "bins", "control_hz", *normalisation):
             mine, theirs = getattr(self, name), getattr(other, name)
             if mine != theirs:
-                if name == "groups":
-                    mine, theirs = ("+".join(f"{g.name} {g.size}" for g in x) for x in (mine, theirs))
                 raise CheckpointError(
                     f"{here} has an action space with {name} {_text(mine)}, {there} one with {_text(theirs)}: "
                     "they were made for different actions and cannot be used together"
@@ -233,8 +231,10 @@ def action_limits(low: np.ndarray, high: np.ndarray) -> tuple[tuple[float, ...],
 
 def _text(value: Any) -> str:
     if isinstance(value, tuple):
-        return ", ".join(f"{x:.6g}" if isinstance(x, float) else str(x) for x in value) or "none"
-    return str(value)
+        return ("+" if value and isinstance(value[0], Group) else ", ").join(map(_text, value)) or "none"
+    if isinstance(value, Group):
+        return f"{value.name} {value.size}"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import KervError
-from kerv_cli.base.registry import parts
+from kerv_cli.base.registry import ProposerPart
 from kerv_cli.bench.machine import Machine, measure_machine
 from kerv_cli.bench.model import Model, blank
 from kerv_cli.bench.physics import Sizes
@@ -250,11 +250,7 @@ def needs_of_draft(decoder: Any) -> tuple[float, float]:
 
 def source_methods() -> dict[str, str]:
     """Return by kind of draft the method that measures it: {"early": "early_unverified", …}."""
-    found = {}
-    for part in parts("proposer").values():
-        if "measured_by" in part.traits:
-            found[part.traits["cost"]] = part.traits["measured_by"]
-    return found
+    return {part.cost: part.measured_by for part in ProposerPart.every().values() if part.measured_by}
 
 
 def source_decoders(settings: BenchSettings) -> dict[str, Any]:

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from kerv_cli.engine.cost import Profile
 from kerv_cli.targets.openvla.config import TOWERS, Language, Tower
+
+if TYPE_CHECKING:
+    from kerv_cli.engine.cost import Profile
 
 _HALF = 2.0  # bytes of a bfloat16 number
 _TREE_WIDTH = 8  # nodes per level of the drafter's tree
@@ -271,6 +273,8 @@ class Shape:
 
 def priced(shape: Shape, device: Device, engine: Engine) -> Profile:
     """Return the cost of each phase of a decode of up to `CHUNK` tokens, as a profile that prices studies."""
+    from kerv_cli.engine.cost import Profile
+
     rows = {
         "encode": (1,),
         "prefill": (shape.prompt, *(shape.prompt + n for n in _ROWS)),

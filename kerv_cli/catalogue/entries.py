@@ -23,7 +23,7 @@ from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.files import read_mapping, read_text, sha256_of, storage_errors, sync, visible
 from kerv_cli.base.leftovers import clean, temporary_beside
 from kerv_cli.base.manifests import content_of
-from kerv_cli.base.registry import parts
+from kerv_cli.base.registry import ArtifactPart
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.lab.database import EPISODES, SETTINGS, STUDIES, WANTED, Database
@@ -43,7 +43,7 @@ _FILTERS = ("kind", "method", "task", "state", "since")
 
 def artifact_kinds() -> tuple[str, ...]:
     """Return the kinds of artifacts (weights and data), including those that plugins add."""
-    return ("demos", "target", *parts("artifact"))
+    return ("demos", "target", *ArtifactPart.every())
 
 
 @dataclass(frozen=True)
@@ -281,8 +281,8 @@ def _described(folder: Path, kind: str) -> dict[str, Any]:
 
 
 def _description(folder: Path, kind: str) -> Path:
-    part = parts("artifact").get(kind)
-    own = part.traits.get("described_by") if part is not None else "manifest.json" if kind == "demos" else None
+    part = ArtifactPart.every().get(kind)
+    own = part.described_by if part is not None else "manifest.json" if kind == "demos" else None
     return folder / (own or f"{kind}.json")
 
 

@@ -12,8 +12,7 @@ import typer
 from typer.core import TyperGroup
 
 from kerv_cli.base.errors import UnknownName
-from kerv_cli.base.registry import parts
-from kerv_cli.cli.command import CONTEXT, commands_below, summary_of, typer_command
+from kerv_cli.cli.command import CONTEXT, Command, commands_below, summary_of, typer_command
 from kerv_cli.cli.common import one_line_errors
 
 # importing a module registers its commands; this is the order in the help
@@ -46,8 +45,8 @@ class Commands(TyperGroup):
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return the command or the group of commands with this name. None if there is neither."""
         name = self.prefix + cmd_name
-        if name in parts("command"):
-            return typer_command(parts("command")[name])
+        if name in Command.every():
+            return typer_command(Command.every()[name])
         if not any(commands_below(f"{name} ")):
             return None
         family = Commands(name=cmd_name, help=FAMILIES.get(name), no_args_is_help=True, rich_markup_mode=None)
@@ -61,8 +60,8 @@ class Commands(TyperGroup):
             The command's name, the command, and the arguments after it.
         """
         name = " ".join(args[:2])
-        if self.prefix + name in parts("command"):
-            return name, typer_command(parts("command")[self.prefix + name]), args[2:]
+        if self.prefix + name in Command.every():
+            return name, typer_command(Command.every()[self.prefix + name]), args[2:]
         command = self.get_command(ctx, args[0])
         if command is None and not ctx.resilient_parsing:
             raise UnknownName(f"{self.prefix}command", args[0], self.list_commands(ctx))
@@ -74,7 +73,7 @@ class Commands(TyperGroup):
         for word in self.list_commands(ctx):
             name = self.prefix + word
             rows.append(
-                (word, summary_of(parts("command")[name]) if name in parts("command") else FAMILIES.get(name, ""))
+                (word, summary_of(Command.every()[name]) if name in Command.every() else FAMILIES.get(name, ""))
             )
         with formatter.section("Commands"):
             formatter.write_dl(rows)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.places import artifact
-from kerv_cli.base.registry import find, load, parts
+from kerv_cli.base.registry import TargetPart
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, print_figures
 from kerv_cli.cli.making import as_planned
@@ -27,14 +27,15 @@ def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
     """Make a target from a published checkpoint, which is not copied, or from a policy by enlarging its trunk."""
     if settings.grow.width:
         settings.family = "grown"
-    importers = {name: part for name, part in parts("target").items() if "importer" in part.traits}
-    if find("target", settings.family, "target family").name not in importers:
-        raise UsageError(f"family={settings.family}: only {', '.join(importers)} is imported, others are trained")
+    importer = TargetPart.find(settings.family, "target family").importer
+    if importer is None:
+        imported = ", ".join(name for name, part in TargetPart.every().items() if part.importer)
+        raise UsageError(f"family={settings.family}: only {imported} is imported, others are trained")
     from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import making
 
     with making(opened(settings.results), "target", artifact(settings.results, "target", settings.name)):
-        folder, figures = load(importers[settings.family].traits["importer"])(settings)
+        folder, figures = importer(settings)
     print_figures("target", figures, folder, as_json)
 
 

@@ -59,9 +59,6 @@ def success(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_
     """
     from kerv_cli.cli.studies import planned_study, print_settings, print_study_plan, run_study
     from kerv_cli.episodes.resolve import resolve
-    from kerv_cli.lab.database import opened
-    from kerv_cli.lab.runs import making
-    from kerv_cli.report.certificate import candidate_rows, certify, folder_of, planned_certificate, write
 
     of_test = [word for word in overrides if word.split("=")[0] in OF_TEST]
     of_study = [word for word in overrides if word not in of_test]
@@ -75,6 +72,11 @@ def success(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_
         typer.echo("\n".join([*(line for line in lines if line.split(":")[0] in OF_TEST), "---"]))
         print_settings(resolved)
         return
+    # these import torch, which --cfg and a mistyped key must not wait for
+    from kerv_cli.lab.database import opened
+    from kerv_cli.lab.runs import making
+    from kerv_cli.report.certificate import candidate_rows, certify, folder_of, planned_certificate, write
+
     folder = folder_of(resolved)
     planned = planned_study(resolved, ["calibrate", "success", *overrides])
     certificate = planned_certificate(resolved, planned.store, planned.study.episodes, settings)

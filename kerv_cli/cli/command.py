@@ -16,10 +16,10 @@ from __future__ import annotations
 import functools
 import inspect
 import re
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import Field, fields
+from collections.abc import Iterator, Mapping
+from dataclasses import KW_ONLY, Field, dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
@@ -27,57 +27,71 @@ from typer.core import TyperCommand
 from kerv_cli.base.config import compose, groups, plain_text
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.places import check_writable
-from kerv_cli.base.registry import NoSettings, Part, add, find, load, parts
+from kerv_cli.base.registry import NoSettings, Part
 from kerv_cli.base.settings import CommandSettings, choices_of
 from kerv_cli.cli.common import settings_yaml
 
-F = TypeVar("F", bound=Callable[..., None])
 
-
-def command(name: str, settings: type = CommandSettings, keys: str = "", **traits: Any) -> Callable[[F], F]:
-    """Decorate a function to make it the command `kerv NAME`. Its docstring becomes the help.
+@dataclass(frozen=True)
+class Command(Part):
+    """A command `kerv NAME`. Its function's docstring becomes the help.
 
     Args:
         name: Name of the command, such as `train target`.
         settings: Dataclass of its settings. NoSettings if it has none.
         keys: Names of the settings that `--help` lists, separated by spaces.
-        **traits: Optional properties:
-            examples: Command lines for the help.
-            names: Help text for arguments that are not `key=value`. Without it there are none.
-            typed: Maps a key as typed on the command line to the name of the setting, if the two differ.
-            writes: Whether the command writes to the results folder (default true). If so, kerv first checks that the
-                folder is writable.
-            each: Name of another command, whose settings can be typed, too, such as `rollout` for `sweep`.
+        examples: Command lines for the help.
+        names: Help text for arguments that are not `key=value`. Empty: there are none.
+        typed: Maps a key as typed on the command line to the name of the setting, if the two differ.
+        writes: Whether the command writes to the results folder. If so, kerv first checks that the folder is writable.
+        each: Name of another command, whose settings can be typed, too, such as `rollout` for `sweep`.
     """
 
-    def declare(run: F) -> F:
-        shown = re.sub(r"\bresults\b", "results store", keys)
-        add("command", name, f"{run.__module__}:{run.__name__}", settings, help=run.__doc__ or "", keys=shown, **traits)
-        return run
+    kind = "command"
+    settings: type = CommandSettings
+    _: KW_ONLY
+    keys: str = ""
+    examples: tuple[str, ...] = ()
+    names: str = ""
+    typed: Mapping[str, str] = field(default_factory=dict)
+    writes: bool = True
+    each: str = ""
 
-    return declare
+    @property
+    def help(self) -> str:
+        """The docstring of the command's function."""
+        return inspect.cleandoc(self.code.__doc__ or "")
+
+    @property
+    def shown(self) -> list[str]:
+        """Names of the settings that `--help` lists. `store` comes after `results`."""
+        return re.sub(r"\bresults\b", "results store", self.keys).split()
 
 
-def schemas_of(part: Part) -> list[type]:
-    """Return the dataclass of a command's settings. If its trait `each` names another command, add that one's."""
-    others = [find("command", part.traits["each"])] if "each" in part.traits else []
+command = Command
+"""The decorator that declares a command."""
+
+
+def schemas_of(part: Command) -> list[type]:
+    """Return the dataclass of a command's settings. If its attribute `each` names another command, add that one's."""
+    others = [Command.find(part.each)] if part.each else []
     return [one.settings for one in (part, *others)]
 
 
-def top_keys(part: Part) -> list[str]:
+def top_keys(part: Command) -> list[str]:
     """Return the names that an override of this command can begin with: `threshold` for `threshold.r=5`."""
     if part.settings is NoSettings:
         return []
     schemas = schemas_of(part)
     groups = [group for schema in schemas for group in choices_of(schema)]
     names = [at.name for schema in schemas for at in fields(schema)]
-    hidden = {key for key in part.traits.get("typed", {}).values() if "." not in key}
-    return [key for key in dict.fromkeys([*part.traits.get("typed", {}), *groups, *names]) if key not in hidden]
+    hidden = {key for key in part.typed.values() if "." not in key}
+    return [key for key in dict.fromkeys([*part.typed, *groups, *names]) if key not in hidden]
 
 
-def typer_command(part: Part) -> TyperCommand:
-    """Make a typer command from a registered command. This imports the module of its function."""
-    run = load(part.build)
+def typer_command(part: Command) -> TyperCommand:
+    """Make a typer command from a registered command."""
+    run = part.code
     parameters = inspect.signature(run, eval_str=True).parameters
     more = [one.replace(kind=one.KEYWORD_ONLY) for name, one in parameters.items() if name not in _ARGUMENTS]
 
@@ -96,7 +110,7 @@ def typer_command(part: Part) -> TyperCommand:
     options = [_option("typed", None, _typed_argument(part)), *cfg_option, *more]
     callback.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     single = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-    help = "\n\n".join(filter(None, (inspect.cleandoc(part.traits.get("help", "")), part.traits.get("names"))))
+    help = "\n\n".join(filter(None, (part.help, part.names)))
     single.command(part.name, cls=CommandWithSettings, help=help, context_settings=CONTEXT)(callback)
     made: Any = typer.main.get_command(single)
     made.part = part
@@ -124,9 +138,9 @@ def _option(name: str, default: object, annotation: object) -> inspect.Parameter
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
-def _typed_argument(part: Part) -> object:
+def _typed_argument(part: Command) -> object:
     """Return the type annotation of the one argument that takes all words except options. The help does not list it."""
-    metavar = "NAME" if "names" in part.traits else "KEY=VALUE"
+    metavar = "NAME" if part.names else "KEY=VALUE"
     argument = typer.Argument(metavar=metavar, hidden=True, autocompletion=complete)
     return Annotated[list[str] | None, argument]
 
@@ -136,7 +150,7 @@ def complete(ctx: typer.Context, incomplete: str) -> list[str]:
 
     bash passes `method`, `=` and `s` as three words, other shells pass one.
     """
-    part = parts("command")[" ".join(ctx.command_path.split()[1:])]
+    part = Command.find(" ".join(ctx.command_path.split()[1:]))
     keys, before = top_keys(part), [word for word in ctx.params.get("typed") or () if word != "="]
     if before and before[-1] in keys:
         return [name for name in _values(part, before[-1]) if name.startswith(incomplete)]
@@ -146,7 +160,7 @@ def complete(ctx: typer.Context, incomplete: str) -> list[str]:
     return [f"{key}={name}" for name in _values(part, key) if name.startswith(typed)]
 
 
-def _values(part: Part, key: str) -> list[str]:
+def _values(part: Command, key: str) -> list[str]:
     """Return the names that a setting can have as its value. Empty if its values are not names from a list."""
     if key == "task":
         from kerv_cli.worlds import task_names
@@ -161,7 +175,7 @@ def _values(part: Part, key: str) -> list[str]:
     return []
 
 
-def _split(part: Part, typed: list[str], named: bool) -> tuple[list[str], list[str]]:
+def _split(part: Command, typed: list[str], named: bool) -> tuple[list[str], list[str]]:
     """Split the arguments into overrides (`key=value`) and names.
 
     Args:
@@ -177,7 +191,7 @@ def _split(part: Part, typed: list[str], named: bool) -> tuple[list[str], list[s
     keys = set(top_keys(part))
     overrides = [one for one in typed if "=" in one and one.lstrip("+").partition("=")[0].split(".")[0] in keys]
     names = [one for one in typed if one not in overrides]
-    filters = set(re.findall(r"(\w+)=", part.traits["names"]))
+    filters = set(re.findall(r"(\w+)=", part.names))
     for name in names:
         key, equals, _ = name.partition("=")
         if equals and re.fullmatch(r"[\w.]+", key) and key not in filters and not Path(name).exists():
@@ -185,7 +199,7 @@ def _split(part: Part, typed: list[str], named: bool) -> tuple[list[str], list[s
     return overrides, names
 
 
-def _settings(part: Part, overrides: list[str], cfg: bool) -> Any:
+def _settings(part: Command, overrides: list[str], cfg: bool) -> Any:
     """Return the settings of a command. With --cfg print them and end the command instead.
 
     Args:
@@ -197,17 +211,18 @@ def _settings(part: Part, overrides: list[str], cfg: bool) -> Any:
         UsageError: An override is wrong, see `config.compose`.
         StorageError: The command writes to the results folder, which cannot be written.
     """
-    typed = part.traits.get("typed", {})
-    for key in (word.partition("=")[0] for word in overrides):
+    named: list[str] = []
+    for word in overrides:
+        key, equals, value = word.partition("=")
         own = key.rpartition(".")[2]
-        if own in typed and key not in typed and key.partition(".")[0] not in top_keys(part):
+        if own in part.typed and key not in part.typed and key.partition(".")[0] not in top_keys(part):
             raise UsageError(f"unknown key '{key}': did you mean {own}?", key)
-    pairs = [(typed.get(key, key), equals, value) for key, equals, value in (word.partition("=") for word in overrides)]
-    settings: Any = compose(part.name.replace(" ", "_"), ["".join(pair) for pair in pairs], part.settings)
+        named.append(f"{part.typed.get(key, key)}{equals}{value}")
+    settings: Any = compose(part.name.replace(" ", "_"), named, part.settings)
     if cfg:
         typer.echo(settings_yaml(settings), nl=False)
         raise typer.Exit(0)
-    if part.traits.get("writes", True) and hasattr(settings, "results"):
+    if part.writes and hasattr(settings, "results"):
         check_writable(settings.results)
     return settings
 
@@ -215,30 +230,30 @@ def _settings(part: Part, overrides: list[str], cfg: bool) -> Any:
 class CommandWithSettings(TyperCommand):
     """A typer command whose help also lists settings, subcommands and examples."""
 
-    part: Part
+    part: Command
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
         """Add the most used settings, the subcommands and the examples to the help."""
-        keys = [_row(self.part, key) for key in self.part.traits.get("keys", "").split()]
-        below = [part for name, part in parts("command").items() if name.startswith(f"{self.part.name} ")]
+        keys = [_row(self.part, key) for key in self.part.shown]
+        below = list(commands_below(f"{self.part.name} "))
         if keys:
             with formatter.section(f"Settings, with their defaults (all of them: kerv {self.part.name} --cfg)"):
                 formatter.write_dl(keys)
         if below:
             with formatter.section("Commands"):
                 formatter.write_dl([(part.name, summary_of(part)) for part in below])
-        if self.part.traits.get("examples"):
+        if self.part.examples:
             with formatter.section("Examples"):
-                for line in self.part.traits["examples"]:
+                for line in self.part.examples:
                     formatter.write(f"{'':{formatter.current_indent}}{line}\n")
 
 
-def summary_of(part: Part) -> str:
+def summary_of(part: Command) -> str:
     """Return the first sentence of a command's help, or its part before a semicolon."""
-    return re.split(r"[.;]\s", part.traits.get("help", "") + " ")[0]
+    return re.split(r"[.;]\s", part.help + " ")[0]
 
 
-def _row(part: Part, key: str) -> tuple[str, str]:
+def _row(part: Command, key: str) -> tuple[str, str]:
     """Return a line of the help about one setting.
 
     Args:
@@ -248,7 +263,7 @@ def _row(part: Part, key: str) -> tuple[str, str]:
     Returns:
         `key=default`, and the type with the description.
     """
-    name = part.traits.get("typed", {}).get(key, key)
+    name = part.typed.get(key, key)
     schema = next(schema for schema in schemas_of(part) if name.split(".")[0] in {at.name for at in fields(schema)})
     value: Any = _defaults(schema)
     for word in name.split("."):
@@ -273,6 +288,6 @@ def _type_name(at: Field[Any]) -> str:
     return {"str": "text", "bool": "true or false", "dict": "mapping", "float": "number"}.get(plain, plain)
 
 
-def commands_below(prefix: str) -> Iterator[Part]:
+def commands_below(prefix: str) -> Iterator[Command]:
     """Yield the commands whose names begin with `prefix`, such as `train `, in the order of registration."""
-    return (part for name, part in parts("command").items() if name.startswith(prefix))
+    return (part for name, part in Command.every().items() if name.startswith(prefix))

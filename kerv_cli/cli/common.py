@@ -183,10 +183,11 @@ def with_results(message: str, words: Iterable[str]) -> str:
     """
     from kerv_cli.base.registry import parts
 
-    where, known = results_word(words), parts("command")
+    where = results_word(words)
 
     def complete(found: re.Match[str]) -> str:
         quote, command = found.groups()
+        known = parts("command")  # only now: if a plugin cannot be imported, nothing is known
         typed = command.split()[1:]
         part = known.get(" ".join(typed[:2])) or known.get(typed[0])
         is_elsewhere = part is not None and hasattr(part.settings, "results") and "results=" not in command

@@ -11,7 +11,7 @@ import typer
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import Interrupted, KervError, UsageError
 from kerv_cli.base.settings import CommandSettings
-from kerv_cli.cli.command import command
+from kerv_cli.cli.command import Command, command
 from kerv_cli.cli.common import (
     AsJson,
     ShowPlan,
@@ -24,10 +24,7 @@ from kerv_cli.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from kerv_cli.catalogue.entries import RunEntry
-    from kerv_cli.cli.command import F
     from kerv_cli.report.results import Row
 
 
@@ -39,7 +36,7 @@ To = Annotated[str, typer.Option("--to", help="csv, parquet, db or trace.")]
 Folder = Annotated[Path | None, typer.Option("--dir", help="Folder to write to; default results/exports/FORMAT.")]
 
 
-def _command_on_runs(name: str, *examples: str) -> Callable[[F], F]:
+def _command_on_runs(name: str, *examples: str) -> Command:
     """Decorate a function to make it the command `kerv runs NAME`, whose arguments are names of runs."""
     return command(f"runs {name}", names=RUNS, keys="results", examples=examples, writes=name in ("rerun", "rm"))
 

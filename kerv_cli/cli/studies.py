@@ -59,7 +59,7 @@ def planned_study(resolved: ResolvedStudy, command: Sequence[str], is_rollout: b
     number = len(settings) * len(tasks) * resolved.first.episodes * resolved.study.repeats
     # printed before torch and the simulator load
     typer.echo(f"{what} of {whose} on {_few(tasks, 'tasks')}: {count(number, 'episode')}", err=True)
-    from kerv_cli.episodes.policy import unseen_tasks
+    from kerv_cli.episodes.tasks import unseen_tasks
     from kerv_cli.lab.database import opened
     from kerv_cli.lab.study import plan, plan_rollout
     from kerv_cli.worlds import spec_of

@@ -62,7 +62,7 @@ def sweep(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_js
 
 def _list_studies(as_json: bool) -> None:
     """Print the studies in conf/study and the number of episodes of each."""
-    from kerv_cli.episodes.policy import tasks_of
+    from kerv_cli.episodes.tasks import tasks_of
 
     rows = []
     for name in groups()["study"]:

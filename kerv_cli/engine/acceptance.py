@@ -6,10 +6,12 @@ Ties go to the path with the smaller summed distance to the target tokens, then 
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+from kerv_cli.engine.parts import Buildable
 from kerv_cli.engine.tree import ROOT, TokenTree
 
 if TYPE_CHECKING:
@@ -105,7 +107,7 @@ def nearest_child(tree: TokenTree, node: int, target_tokens: Sequence[int]) -> i
 
 
 @dataclass(frozen=True)
-class DistanceRule:
+class DistanceRule(Buildable):
     """Base class of acceptance rules: accepts a draft token if it is close enough to the target's token.
 
     Each DoF has its own limit.
@@ -113,13 +115,22 @@ class DistanceRule:
 
     space: ActionSpace
 
+    @classmethod
+    def build(cls, settings: Any, context: Any) -> Any:
+        """Return the rule for the target's action space. A subclass with settings overrides this."""
+        return cls(context.target.actions)
+
     def of_drafts_from(self, proposer: str) -> DistanceRule:
         """Return the rule that judges the drafts of the proposer with this name. This base class returns itself."""
         return self
 
+    def same_limits(self, r: int, strict: bool = True) -> tuple[int, ...]:
+        """Return r for every DoF (D,). With `strict`, 0 for strict DoFs, such as the gripper."""
+        return tuple(r * (not (strict and one)) for one in self.space.is_strict)
+
+    @abstractmethod
     def limits(self, r: int) -> tuple[int, ...]:
         """Return the largest accepted distance per DoF (D,) at acceptance radius `r`, both in bins."""
-        raise NotImplementedError
 
     def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
         """Return the longest accepted path, and the node that was rejected after it.

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.chunk import Chunk, EpisodeState
+from kerv_cli.engine.chunk import Chunk, Follower, TargetSide
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.engine.protocol import Cache, EncodesMany, Target
 from kerv_cli.engine.record import UNTIMED, DecodeRecord
@@ -35,12 +35,12 @@ class BatchDecoder:
         self.skip = decoder.parts.skip
         self._caches: dict[int, Cache] = {}
 
-    def new_episode(self) -> EpisodeState:
-        """Return a state for one more episode of the batch. It holds no actions or positions yet."""
-        return EpisodeState(self.target.actions, self.target.cameras)
+    def new_episode(self) -> Follower:
+        """Return what follows one more episode of the batch. It holds no actions or positions yet."""
+        return Follower(self.target.actions, self.target.cameras)
 
     @torch.inference_mode()
-    def decode(self, episodes: Sequence[EpisodeState], observations: Sequence[Observation]) -> list[DecodeRecord]:
+    def decode(self, episodes: Sequence[Follower], observations: Sequence[Observation]) -> list[DecodeRecord]:
         """Decode one observation per episode. Return one record per episode, with the actions to execute."""
         prompts = functools.cache(lambda: self._encode(observations))  # encoded only if some part reads a prompt
 
@@ -48,27 +48,20 @@ class BatchDecoder:
             return prompts()[i]
 
         steps, space, cache = self.decoder.steps, self.target.actions, self.decoder.cache
-        chunks = [
-            Chunk(
-                functools.partial(prompt, i),
-                steps,
-                space,
-                cache,
-                episode.situation,
-                self.limits,
-                observation=observations[i],
-            )
-            for i, episode in enumerate(episodes)
-        ]
-        verified = [chunk for chunk in chunks if not self._skips(chunk)]
+        chunks = []
+        for i, episode in enumerate(episodes):
+            target = TargetSide(functools.partial(prompt, i), cache)
+            chunk = Chunk(steps, space, episode.situation, target, self.limits, observation=observations[i])
+            if self.skip is not None:
+                cache.length = 0
+                chunk.take(self.skip.take(chunk))
+            chunks.append(chunk)
+        verified = [chunk for chunk in chunks if chunk.remaining]
         for chunk, tokens in zip(verified, self._tokens(verified), strict=True):
             for token in tokens:
                 chunk.commit_token(token)
-        return [chunk.record(chunk.actions(), math.nan, dict(UNTIMED)) for chunk in chunks]
-
-    def _skips(self, chunk: Chunk) -> bool:
-        chunk.cache.length = 0
-        return self.skip is not None and self.skip.take(chunk)
+        similarity = self.decoder.parts.similarity
+        return [chunk.record(chunk.actions(), math.nan, dict(UNTIMED), similarity(chunk)) for chunk in chunks]
 
     def _encode(self, observations: Sequence[Observation]) -> list[Tensor]:
         """Return each prompt's embeddings (1, P, E).
@@ -82,9 +75,9 @@ class BatchDecoder:
     def _tokens(self, chunks: Sequence[Chunk]) -> list[list[int]]:
         """Decode N tokens per chunk greedily. Chunks with equally long prompts are decoded together, unpadded."""
         tokens: dict[int, list[int]] = {}
-        for length in dict.fromkeys(chunk.prompt_length for chunk in chunks):
-            group = [i for i, chunk in enumerate(chunks) if chunk.prompt_length == length]
-            prompt = torch.cat([chunks[i].prompt for i in group])
+        for length in dict.fromkeys(chunk.target.prompt_length for chunk in chunks):
+            group = [i for i, chunk in enumerate(chunks) if chunk.target.prompt_length == length]
+            prompt = torch.cat([chunks[i].target.prompt for i in group])
             decoded, _ = greedy(self.target, prompt, self._cache(len(group)), self._size)
             tokens |= zip(group, decoded.tolist(), strict=True)
         return [tokens[i] for i in range(len(chunks))]

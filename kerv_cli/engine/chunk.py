@@ -1,4 +1,4 @@
-"""The chunk of actions that a decode fills, and what a decoder remembers of the running episode.
+"""The chunk of actions that a decode fills, and the running episode.
 
 Shapes: D degrees of freedom of an action, N tokens of a chunk, P prompt tokens, E width of the target.
 """
@@ -8,21 +8,25 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from kerv_cli.base.errors import UsageError
+from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation
-from kerv_cli.engine.draft import check_tokens
-from kerv_cli.engine.protocol import Cache
+from kerv_cli.engine.decisions import Choice, Rectified, SkipDecision
 from kerv_cli.engine.record import PARALLEL, DecodeRecord, Round, variability
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from kerv_cli.engine.protocol import Cache
 
 WINDOW = 10  # number of past actions that a prediction reads (KERV's action context AC)
 
 
-def steps_of(chunk: int, trained: int) -> int:
+def chunk_steps(chunk: int, trained: int) -> int:
     """Return the number of control steps to decode at once.
 
     Args:
@@ -74,8 +78,12 @@ class Situation:
     path: list[np.ndarray] = field(default_factory=list)
 
 
-class EpisodeState:
-    """What a decoder remembers of the running episode: its actions and its positions."""
+class Follower:
+    """Is told about an episode: its start, every executed action and its end.
+
+    Attributes:
+        situation: The running episode so far.
+    """
 
     def __init__(self, space: ActionSpace, cameras: tuple[str, ...]) -> None:
         self.space, self.cameras = space, cameras
@@ -119,38 +127,61 @@ class Rejection:
     target: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True)
-class Choice:
-    """Decision of a boundary (docs/methods.md §4.4): whether retrieval or the drafter drafts the next chunk."""
+@dataclass(eq=False)
+class TargetSide:
+    """What the target holds for one chunk: the prompt, the cache, and hidden states.
 
-    mode: str  # the proposer's name
-    metric: float | None = None  # F (docs/methods.md §4.4); None if the decision does not use it
+    The cache holds the prompt and the committed tokens, except those that the target has not read yet (`uncached`).
+
+    Attributes:
+        encode: Function that encodes the observation.
+        cache: Keys and values of the prompt and of committed tokens.
+        hidden: Hidden states after the prefill, (1, P + c − 1, E) if it committed c tokens. None before the prefill.
+    """
+
+    encode: Callable[[], Tensor]
+    cache: Cache
+    hidden: Tensor | None = None
+
+    @cached_property
+    def prompt(self) -> Tensor:
+        """The prompt's embeddings (1, P, E).
+
+        They are computed when first read. So skipped chunks need not pay for encoding.
+        """
+        return self.encode()
+
+    @property
+    def prompt_length(self) -> int:
+        """Number of prompt tokens P. Reading it encodes the prompt."""
+        return self.prompt.shape[1]
+
+    def uncached(self, tokens: Sequence[int]) -> list[int]:
+        """Return those of the committed `tokens` that the target has not read yet. Empty before the prefill.
+
+        Usually this is only the newest token. After a rectifier has filled a control step, it may be several.
+        """
+        return list(tokens[self.cache.length - self.prompt_length :]) if tokens else []
 
 
 @dataclass(eq=False)
 class Chunk:
-    """The N tokens of one decode, filled step by step.
+    """The ledger of one decode: N tokens, and the rounds that committed them.
 
-    Parts of a method may read this object, and change it only through its methods. The target's cache holds the prompt
-    and the committed tokens, except those that the target has not read yet (`uncached`). Usually only the newest token
-    is uncached. After a rectifier has filled a control step, several may be.
+    Parts of a method read this object. They return what they found, and the decoder writes it down here.
     """
 
-    encoding: Tensor | Callable[[], Tensor]  # the prompt, or a function that encodes it
     steps: int  # H, control steps
     space: ActionSpace
-    cache: Cache
     situation: Situation
+    target: TargetSide
     limits: tuple[int, ...] = ()  # largest accepted distance per DoF, bins; early drafters choose their tokens by it
     choice: Choice | None = None  # None: the method has no boundary
     observation: Observation | None = None
     tokens: list[int] = field(default_factory=list)  # committed
     rounds: list[Round] = field(default_factory=list)
     rejection: Rejection = Rejection()  # of the last round's verification
-    # the target's hidden states after the prefill, (1, P + c − 1, E) if it committed c tokens
-    hidden: Tensor = field(default_factory=lambda: torch.empty(0))
     forwards: int = 0
-    similarity: float | None = None  # cosine of the best match in the datastore, if it was searched
     reason: str | None = None  # as in `DecodeRecord`
     closed: np.ndarray | None = None  # (steps, D) normalised actions, if a rectifier ended the chunk
     filled: dict[int, float] = field(default_factory=dict)  # index -> normalised value that a rectifier predicted
@@ -164,26 +195,6 @@ class Chunk:
     def size(self) -> int:
         """Number of tokens N in the complete chunk."""
         return self.steps * self.space.dofs
-
-    @property
-    def prompt(self) -> Tensor:
-        """The prompt's embeddings (1, P, E).
-
-        They are computed when first read. So skipped chunks need not pay for encoding.
-        """
-        if not isinstance(self.encoding, Tensor):
-            self.encoding = self.encoding()
-        return self.encoding
-
-    @property
-    def prompt_length(self) -> int:
-        """Number of prompt tokens P. Reading it encodes the prompt."""
-        return self.prompt.shape[1]
-
-    @property
-    def uncached(self) -> list[int]:
-        """Committed tokens that the target has not read yet. Empty before the prefill."""
-        return self.tokens[self.cache.length - self.prompt_length :] if self.tokens else []
 
     @property
     def remaining(self) -> int:
@@ -251,54 +262,45 @@ class Chunk:
         mode, start = "decode" if self.tokens else "prefill", len(self.tokens)
         self.commit(Round(mode, start=start, target_tokens=(token,), committed=1), [token])
 
-    def commit_at_once(self, tokens: Sequence[int]) -> None:
-        """Commit all N tokens of a parallel target, which computes them in one forward."""
-        self.commit(Round(PARALLEL, target_tokens=tuple(tokens), committed=self.size), tokens)
-
-    def skip(self, tokens: Sequence[int], proposer: str) -> None:
-        """Complete the chunk with the N tokens of a draft, without verification.
-
-        Args:
-            tokens: The draft.
-            proposer: Name of the proposer that drafted it.
+    def take(self, decision: SkipDecision) -> None:
+        """Note the decision of a skip rule, and commit the tokens that it took.
 
         Raises:
-            KervError: A token is out of range.
+            KervError: There are fewer than N tokens, or a drafted token is out of range.
         """
+        self.reason, tokens, proposer = decision.reason, decision.tokens, decision.proposer
+        if tokens is None:
+            return
+        if len(tokens) < self.size:
+            raise KervError(f"the skip rule took {len(tokens)} tokens of '{proposer}': a chunk has {self.size}")
+        if proposer == PARALLEL:
+            self.commit(Round(PARALLEL, target_tokens=tuple(tokens), committed=self.size), tokens)
+            return
         check_tokens(np.asarray(tokens), self.space.tokens, proposer)
         self.tokens = list(tokens[: self.size])
         drafted = tuple(self.tokens)
         self.rounds.append(Round("skip", proposer, drafted=drafted, accepted=self.size, committed=self.size))
 
-    def close(self, values: np.ndarray, with_target_token: bool) -> None:
-        """End the chunk with these actions, which are partly predicted. Later control steps are dropped.
+    def rectify(self, found: Rectified, with_target_token: bool) -> None:
+        """Commit predicted values.
+
+        The robot executes them as they are. If decoding continues, the target reads the tokens that are nearest to
+        them.
 
         Args:
-            values: Normalised actions (steps, D): first the values of the committed tokens, then predicted values.
+            found: What the rectifier predicted.
             with_target_token: Whether the target's token at the rejected position stays committed.
         """
-        self._remove_bonus(with_target_token)
-        del self.tokens[values.size :]
-        self.closed = values
-
-    def fill(self, values: np.ndarray, with_target_token: bool) -> None:
-        """Commit predicted values up to the end of a control step. Decoding continues with the next step.
-
-        The robot executes the values as they are. The target reads the tokens that are nearest to them.
-
-        Args:
-            values: Normalised actions (steps, D): first the values of the committed tokens, then predicted values.
-            with_target_token: Whether the target's token at the rejected position stays committed.
-        """
-        self._remove_bonus(with_target_token)
-        start = len(self.tokens)
-        self.filled |= dict(enumerate(values.flatten()[start:].tolist(), start))
-        self.tokens += self.space.bins_of(values).flatten()[start:].tolist()
-
-    def _remove_bonus(self, with_target_token: bool) -> None:
         if not with_target_token:
             del self.tokens[-1]
             self.rounds[-1] = replace(self.rounds[-1], committed=self.rounds[-1].accepted)
+        values, start = found.values, len(self.tokens)
+        if found.ends:
+            del self.tokens[values.size :]
+            self.closed = values
+            return
+        self.filled |= dict(enumerate(values.flatten()[start:].tolist(), start))
+        self.tokens += self.space.bins_of(values).flatten()[start:].tolist()
 
     def actions(self) -> np.ndarray:
         """Return the actions (steps, D) of the complete chunk, float32, environment units."""
@@ -308,24 +310,24 @@ class Chunk:
             values[list(self.filled)] = list(self.filled.values())
         return self.space.unnormalise(values.reshape(-1, self.dofs)).astype(np.float32)
 
-    def record(self, actions: np.ndarray, seconds: float, phases: dict[str, float]) -> DecodeRecord:
+    def record(
+        self, actions: np.ndarray, seconds: float, phases: dict[str, float], similarity: float | None = None
+    ) -> DecodeRecord:
         """Return the record of the complete chunk. The arguments are attributes of `DecodeRecord`."""
-        modes = [one.mode for one in self.rounds]
-        drafters = (one.mode if one.mode in ("skip", PARALLEL) else one.proposer for one in self.rounds)
         return DecodeRecord(
             tokens=tuple(self.tokens),
             actions=actions,
             size=self.size,
             forwards=self.forwards,
             rounds=tuple(self.rounds),
-            mode=next((name for name in drafters if name != "none"), "ar"),
+            mode=next(filter(None, (one.drafter for one in self.rounds)), "ar"),
             seconds=seconds,
             phases=phases,
             compensated=self.compensated,
             filled=tuple(self.filled),
             variability=self.variability,
-            skipped="skip" in modes,
-            similarity=self.similarity,
+            skipped=any(one.mode == "skip" for one in self.rounds),
+            similarity=similarity,
             metric=self.choice.metric if self.choice is not None else None,
             reason=self.reason,
         )
@@ -342,3 +344,19 @@ def deviation(space: ActionSpace, actions: np.ndarray, autoregressive: np.ndarra
     """
     gap = space.normalise(actions) - space.normalise(autoregressive[: len(actions)])
     return float(np.abs(gap).mean())
+
+
+def check_tokens(tokens: np.ndarray, vocabulary: int, proposer: str) -> None:
+    """Refuse drafted tokens that are out of range.
+
+    Args:
+        tokens: (n,) integers.
+        vocabulary: Number of action tokens.
+        proposer: Name of the proposer, for the error message.
+
+    Raises:
+        KervError: A token is negative, or not below `vocabulary`.
+    """
+    if tokens.size and not (tokens.min() >= 0 and tokens.max() < vocabulary):
+        wrong = next(token for token in tokens.tolist() if not 0 <= token < vocabulary)
+        raise KervError(f"the proposer '{proposer}' drafted token {wrong}: tokens are 0 to {vocabulary - 1}")

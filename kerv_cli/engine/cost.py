@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import read_json
-from kerv_cli.base.registry import DRAFTING, parts
+from kerv_cli.base.registry import DRAFTING, ProposerPart
 from kerv_cli.engine.record import PARALLEL, DecodeRecord
 
 FORWARDS = ("encode", "prefill", "verify", "feed", DRAFTING, "tree")
@@ -39,9 +40,9 @@ def source_costs() -> dict[str, list[str]]:
     The drafts of all other proposers keep the time that was recorded for them.
     """
     costs: dict[str, list[str]] = {}
-    for name, part in parts("proposer").items():
-        if "cost" in part.traits:
-            costs.setdefault(part.traits["cost"], []).append(name)
+    for name, part in ProposerPart.every().items():
+        if part.cost:
+            costs.setdefault(part.cost, []).append(name)
     return costs
 
 
@@ -200,7 +201,7 @@ def work_of(
     }
     sources = {kind: np.bincount(decode, np.isin(proposer, names), decodes) > 0 for kind, names in costs.items()}
     for kind, names in costs.items():
-        if any(parts("proposer")[name].traits.get("looks_up") for name in names):
+        if any(ProposerPart.find(name).looks_up for name in names):
             sources[kind] |= looked_up
     return Work(
         calls={kind: of_kind for kind, of_kind in found.items() if len(of_kind.decode)},
@@ -212,13 +213,10 @@ def work_of(
 
 def work_of_record(decode: DecodeRecord) -> Work:
     """Return what a single decode computed (forwards, drafts, other seconds), from its record."""
-    return work_of(
-        {name: np.array([getattr(one, name) for one in decode.rounds]) for name in COUNTED},
-        np.array([len(decode.rounds)]),
-        {name: np.array([decode.phases.get(name, float(name == "vision"))]) for name in READ_PHASES},
-        np.array([decode.similarity is not None]),
-        decode.size or len(decode.tokens),
-    )
+    columns = {name: np.array(list(map(attrgetter(name), decode.rounds))) for name in COUNTED}
+    phases = {name: np.array([decode.phases.get(name, float(name == "vision"))]) for name in READ_PHASES}
+    searched = np.array([decode.similarity is not None])
+    return work_of(columns, np.array([len(decode.rounds)]), phases, searched, decode.size or len(decode.tokens))
 
 
 def prices(work: Work, profile: Profile) -> np.ndarray:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.acceptance import Accepted, DistanceRule, StrictRule
-from kerv_cli.engine.chunk import Chunk, EpisodeState, Rejection, deviation, steps_of
+from kerv_cli.engine.chunk import Chunk, Follower, Rejection, TargetSide, chunk_steps, deviation
 from kerv_cli.engine.draft import EMPTY, Draft
 from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold
 from kerv_cli.engine.proposer import Proposer
@@ -40,6 +40,14 @@ class Parts:
     boundary: Boundary | None = None  # chooses between retrieval and drafter
     skip: Skip | None = None  # may execute a draft without verification
 
+    def similarity(self, chunk: Chunk) -> float | None:
+        """Return the cosine of the best match in the datastore. None if no part searched it for this chunk."""
+        for part in (self.skip, self.prefill_draft, self.proposer):
+            found = None if part is None else part.similarity(chunk)
+            if found is not None:
+                return found
+        return None
+
 
 class Verified(NamedTuple):
     """Result of one verification, a forward of the target over a draft of n nodes.
@@ -59,8 +67,8 @@ class Verified(NamedTuple):
     levels: int
 
 
-class ActionDecoder(EpisodeState):
-    """Decodes actions from observations, and remembers the running episode."""
+class ActionDecoder(Follower):
+    """Decodes actions from observations, and follows the running episode."""
 
     @abstractmethod
     def decode(self, observation: Observation) -> DecodeRecord:
@@ -84,12 +92,13 @@ class Decoder(ActionDecoder):
         super().__init__(target.actions, target.cameras)
         self.target, self.parts = target, parts or Parts()
         self.predicts = target if isinstance(target, PredictsTokens) else None
-        self.steps = steps_of(chunk, target.chunk)
+        self.steps = chunk_steps(chunk, target.chunk)
         self.acceptance: DistanceRule = self.parts.acceptance or StrictRule(target.actions)
         self.threshold: Threshold = self.parts.threshold or Fixed(0)
         size = self.steps * target.actions.dofs
-        nodes = max(p.nodes if p is not None else 0 for p in (self.parts.prefill_draft, self.parts.proposer))
-        self.cache = target.new_cache(1, target.max_prompt + size + max(nodes, size) + 1)
+        proposers = filter(None, (self.parts.prefill_draft, self.parts.proposer))
+        nodes = max(size, *(proposer.nodes for proposer in proposers), 0)
+        self.cache = target.new_cache(1, target.max_prompt + size + nodes + 1)
         self.decodes = 0  # in this episode
         self.deviation_every = 0  # every this many decodes, measure the deviation from autoregressive actions; 0: never
 
@@ -137,7 +146,7 @@ class Decoder(ActionDecoder):
         self.threshold.update(variability(chunk.rounds, self.space, measure))
         if self.parts.rectifier is not None:
             self.parts.rectifier.next_decode()
-        record = chunk.record(actions, stopwatch.stop(), stopwatch.phases)
+        record = chunk.record(actions, stopwatch.stop(), stopwatch.phases, self.parts.similarity(chunk))
         self.decodes += 1
         if not self.deviation_every or self.decodes % self.deviation_every:
             return record
@@ -174,10 +183,10 @@ class Decoder(ActionDecoder):
         chunk, skip = self._new_chunk(prompt, observation), self.parts.skip
         stopwatch.lap("propose")
         if skip is not None:
-            taken = skip.take(chunk)
+            chunk.take(skip.take(chunk))
             stopwatch.lap(skip.phase)
-            if taken:
-                return chunk
+        if not chunk.remaining:
+            return chunk
         self.round(chunk, stopwatch)
         while chunk.remaining:
             (self.round if self.parts.proposer else self.decode_plainly)(chunk, stopwatch)
@@ -188,7 +197,8 @@ class Decoder(ActionDecoder):
         if boundary is not None:
             choice = boundary.choose(np.array(self.situation.path))
         limits = self.acceptance.limits(self.threshold.radius())
-        return Chunk(prompt, self.steps, self.space, self.cache, self.situation, limits, choice, observation)
+        target = TargetSide(prompt if callable(prompt) else lambda: prompt, self.cache)
+        return Chunk(self.steps, self.space, self.situation, target, limits, choice, observation)
 
     def round(self, chunk: Chunk, stopwatch: Stopwatch) -> None:
         """Run one round: propose, verify, accept, commit, rectify.
@@ -207,7 +217,7 @@ class Decoder(ActionDecoder):
         stopwatch.lap("accept")
         hidden = self.rectify(chunk, hidden, stopwatch)
         if is_first:
-            chunk.hidden = hidden
+            chunk.target.hidden = hidden
         if proposer is None or chunk.remaining < 2:
             return
         if is_first:
@@ -223,7 +233,7 @@ class Decoder(ActionDecoder):
         """
         tokens = None
         if isinstance(self.target, ContinuesGreedily):
-            tokens = self.target.continue_greedily(chunk.tokens[-1], chunk.remaining, chunk.cache)
+            tokens = self.target.continue_greedily(chunk.tokens[-1], chunk.remaining, chunk.target.cache)
         tokens = self.forward_singly(chunk, stopwatch) if tokens is None else tokens
         stopwatch.lap("verify")
         for token in tokens:
@@ -236,11 +246,12 @@ class Decoder(ActionDecoder):
         Each token stays on the device as the input of the next forward. The CPU reads all tokens after the last
         forward.
         """
-        target, first = self.target, chunk.cache.length
+        target, cache = self.target, chunk.target.cache
+        first = cache.length
         positions = torch.arange(first, first + chunk.remaining, device=target.device).split(1)
         tokens = [upload(chunk.tokens[-1:], target.device)]
         for position in positions:
-            hidden = target.forward(target.embed(tokens[-1][None]), position, chunk.cache)
+            hidden = target.forward(target.embed(tokens[-1][None]), position, cache)
             tokens.append(target.head(hidden)[0].argmax(-1))
             stopwatch.lap("verify")
         return torch.cat(tokens[1:]).tolist()
@@ -267,16 +278,16 @@ class Decoder(ActionDecoder):
         In the first round, the tokens that are not in the cache are the prompt. Later they are the last committed
         token, or the tokens that a rectifier has filled.
         """
-        target, cache, uncached = self.target, chunk.cache, chunk.uncached
-        before = len(uncached) or chunk.prompt_length
+        target, cache, uncached = self.target, chunk.target.cache, chunk.target.uncached(chunk.tokens)
+        before = len(uncached) or chunk.target.prompt_length
         positions, seen = draft.positions(cache.length, before, target.device), draft.visible(before)
         x = draft.tokens_after(uncached, target.device) if uncached or len(draft) else None
         if x is not None and uncached and self.predicts is not None:
             found, hidden = self.predicts.predict(x, positions, cache, seen)
             predicted = found[before - 1 :]
         else:
-            x = chunk.prompt if x is None else target.embed(x[None])
-            x = x if uncached or not len(draft) else torch.cat([chunk.prompt, x], 1)
+            x = chunk.target.prompt if x is None else target.embed(x[None])
+            x = x if uncached or not len(draft) else torch.cat([chunk.target.prompt, x], 1)
             hidden = target.forward(x, positions, cache, seen)
             predicted = target.head(hidden[0, before - 1 :]).argmax(-1)
         # the only place in a round where the CPU waits for the GPU
@@ -333,7 +344,7 @@ class Decoder(ActionDecoder):
             verified: Result of the verification.
             rows: Indices of the accepted nodes.
         """
-        cache, hidden = chunk.cache, verified.hidden
+        cache, hidden = chunk.target.cache, verified.hidden
         end, before = cache.length - len(verified.tree), hidden.shape[1] - len(verified.tree)
         if rows == list(range(len(rows))):  # the first nodes of a chain are already in their places
             cache.length = end + len(rows)
@@ -361,9 +372,11 @@ class Decoder(ActionDecoder):
             return hidden
         # a full chunk whose last token is the target's is complete, unless the rectifier may not use that token
         if chunk.remaining or not rectifier.uses_target_token:
-            rectifier.close(chunk)
+            found = rectifier.rectify(chunk)
+            if found is not None:
+                chunk.rectify(found, rectifier.uses_target_token)
         stopwatch.lap("rectify")
-        if chunk.remaining and len(chunk.uncached) > 1:
+        if chunk.remaining and len(chunk.target.uncached(chunk.tokens)) > 1:
             hidden = torch.cat([hidden, self.commit(chunk, self.verify(chunk, EMPTY), Accepted((), None), None)], 1)
             stopwatch.lap("verify")
         return hidden

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from kerv_cli.base.errors import KervError
+from kerv_cli.engine.chunk import check_tokens
 from kerv_cli.engine.transfer import upload
 from kerv_cli.engine.tree import ROOT, TokenTree
 
@@ -160,22 +161,6 @@ def _vector(numbers: Sequence[int]) -> Tensor:
 
 
 EMPTY = Draft.of(())
-
-
-def check_tokens(tokens: np.ndarray, vocabulary: int, proposer: str) -> None:
-    """Refuse drafted tokens that are out of range.
-
-    Args:
-        tokens: (n,) integers.
-        vocabulary: Number of action tokens.
-        proposer: Name of the proposer, for the error message.
-
-    Raises:
-        KervError: A token is negative, or not below `vocabulary`.
-    """
-    if tokens.size and not (tokens.min() >= 0 and tokens.max() < vocabulary):
-        wrong = next(token for token in tokens.tolist() if not 0 <= token < vocabulary)
-        raise KervError(f"the proposer '{proposer}' drafted token {wrong}: tokens are 0 to {vocabulary - 1}")
 
 
 def ancestors_of(parents: Sequence[int]) -> np.ndarray:

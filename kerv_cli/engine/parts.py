@@ -6,15 +6,34 @@ Proposers are in `proposer.py`, acceptance rules in `acceptance.py`. This file i
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from kerv_cli.engine.chunk import Choice, Chunk
+    from kerv_cli.engine.chunk import Chunk
+    from kerv_cli.engine.decisions import Choice, Rectified, SkipDecision
 
 
-class Threshold(Protocol):
+class Buildable(ABC):  # noqa: B024 - its subclasses are the interfaces
+    """Base of all parts of a method. kerv builds a part with `build`."""
+
+    def __init__(self, settings: Any = None, context: Any = None) -> None:
+        """Keep the settings. A subclass whose constructor takes other arguments overrides `build`.
+
+        Args:
+            settings: Settings of the part.
+            context: The `Context` (`kerv_cli/methods/context.py`): target, artifacts, task, parts built so far.
+        """
+        self.settings = settings
+
+    @classmethod
+    def build(cls, settings: Any, context: Any) -> Any:
+        """Return the part that these settings choose; arguments as the constructor. None: the method needs no part."""
+        return cls(settings, context)
+
+
+class Threshold(Buildable):
     """Chooses the acceptance radius r of every decode (docs/methods.md §3.2).
 
     r is the largest accepted distance, in bins, between a draft token and the target's token.
@@ -23,6 +42,7 @@ class Threshold(Protocol):
     def reset(self) -> None:
         """Start a new episode."""
 
+    @abstractmethod
     def radius(self) -> int:
         """Return the radius r for the next decode, in bins."""
 
@@ -35,29 +55,26 @@ class Threshold(Protocol):
         """
 
 
-class Fixed:
+class Fixed(Threshold):
     """A threshold that keeps one radius r for all decodes (Spec-VLA)."""
 
     def __init__(self, r: int) -> None:
         self.r = r
 
-    def reset(self) -> None:
-        """Do nothing: the acceptance radius r is constant."""
-
     def radius(self) -> int:
         """Return the constant radius r, in bins."""
         return self.r
 
-    def update(self, variability: float | None) -> None:
-        """Do nothing: r is constant."""
 
+class Rectifier(Buildable):
+    """Completes a chunk with a prediction after a draft token was rejected (docs/methods.md §3.1).
 
-class Rectifier(Protocol):
-    """Completes a chunk with a prediction after a draft token was rejected (docs/methods.md §3.1)."""
+    Attributes:
+        uses_target_token: Whether the target's own token at the rejected position is executed. Else the rectifier
+            predicts it, too.
+    """
 
-    @property
-    def uses_target_token(self) -> bool:
-        """Whether the target's own token at the rejected position is executed. Else the rectifier predicts it, too."""
+    uses_target_token = True
 
     def reset(self) -> None:
         """Start a new episode."""
@@ -65,21 +82,20 @@ class Rectifier(Protocol):
     def next_decode(self) -> None:
         """Count a decode that has ended. A rectifier may pause for some decodes after it has predicted values."""
 
-    def close(self, chunk: Chunk) -> bool:
-        """Fill the rejected control step with predicted values, if they can be predicted.
-
-        The rectifier calls either `Chunk.close`, which drops the later control steps, or `Chunk.fill`, after which the
-        target decodes the later steps.
+    @abstractmethod
+    def rectify(self, chunk: Chunk) -> Rectified | None:
+        """Predict the missing values of the rejected control step.
 
         Returns:
-            Whether the step was filled. If not, the target decodes on after its own token at the rejected position.
+            The predicted values. None if they cannot be predicted: then the target decodes on after its own token at
+            the rejected position.
         """
 
 
-class Boundary(ABC):
+class Boundary(Buildable):
     """Decides whether retrieval or the drafter drafts the next chunk (docs/methods.md §4.4)."""
 
-    def reset(self, task: str, seed: int) -> None:  # noqa: B027 - most boundaries draw no random numbers
+    def reset(self, task: str, seed: int) -> None:
         """Start a new episode of `task` with this seed."""
 
     @abstractmethod
@@ -91,22 +107,26 @@ class Boundary(ABC):
         """
 
 
-class Skip(ABC):
+class Skip(Buildable):
     """Decides before the target runs whether a draft is executed without verification (docs/methods.md §4.3)."""
 
     phase = "propose"  # entry of `PHASES` that the time of `take` counts for
 
-    def begin(self, task: str, seed: int) -> None:  # noqa: B027 - most rules keep nothing between decodes
+    def begin(self, task: str, seed: int) -> None:
         """Start a new episode of `task` with this seed."""
 
-    def finish(self, success: bool) -> None:  # noqa: B027
+    def finish(self, success: bool) -> None:
         """End the episode. `success` says whether the task was solved."""
 
     @abstractmethod
-    def take(self, chunk: Chunk) -> bool:
-        """Complete the chunk with an unverified draft, if the rule allows that. Return whether it did."""
+    def take(self, chunk: Chunk) -> SkipDecision:
+        """Decide about a chunk before the target runs."""
 
-    def verified(self, chunk: Chunk) -> None:  # noqa: B027
+    def similarity(self, chunk: Chunk) -> float | None:
+        """Return the cosine of the best match in the datastore, as `Proposer.similarity`."""
+        return None
+
+    def verified(self, chunk: Chunk) -> None:
         """Learn how the target judged the prefill draft.
 
         Called after the prefill of each chunk that `take` did not complete.

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
+
+from kerv_cli.engine.parts import Buildable
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -12,7 +15,7 @@ if TYPE_CHECKING:
     from kerv_cli.engine.draft import Draft
 
 
-class Proposer:
+class Proposer(Buildable):
     """Base class of proposers: drafts a tree of tokens that continue the committed ones.
 
     Attributes:
@@ -29,9 +32,13 @@ class Proposer:
     def begin(self, chunk: Chunk) -> None:
         """Begin a chunk. Called after its prefill has committed the first tokens."""
 
+    def similarity(self, chunk: Chunk) -> float | None:
+        """Return the cosine of the best match in the datastore. None if it was not searched for this chunk."""
+        return None
+
+    @abstractmethod
     def propose(self, chunk: Chunk, depth: int) -> Draft:
         """Return a draft with at most `depth` tokens on any path. It may be empty."""
-        raise NotImplementedError
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
         """Learn from a round that has ended.
@@ -59,9 +66,9 @@ class ChainProposer(Proposer):
         chains = self.chains(chunk, depth)
         return Draft.of(chains[0]) if chains else EMPTY
 
+    @abstractmethod
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         """Return token sequences that continue the committed tokens, best first, at most `depth` tokens each."""
-        raise NotImplementedError
 
     def is_sure(self, chunk: Chunk) -> bool:
         """Return whether the proposer expects its best chain to be accepted whole. False for this base class."""

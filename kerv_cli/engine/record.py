@@ -55,6 +55,13 @@ class Round:
     levels: int = 0
 
     @property
+    def drafter(self) -> str:
+        """The proposer, or the mode of a round without verification: skip or parallel. Empty if nothing drafted."""
+        if self.mode in ("skip", PARALLEL):
+            return self.mode
+        return "" if self.proposer == "none" else self.proposer
+
+    @property
     def is_verification(self) -> bool:
         """Whether the target verified a draft in this round."""
         return self.tree_size > 0 and self.mode != "skip"
@@ -145,7 +152,7 @@ class Measure:
 
 MEAN = Measure()
 """The measure that `DecodeRecord.variability` holds."""
-MEASURES = tuple(Measure(accepted, total) for accepted in (False, True) for total in (False, True))
+MEASURES = MEAN, Measure(total=True), Measure(accepted=True), Measure(accepted=True, total=True)
 
 
 def variability(rounds: Sequence[Round], space: ActionSpace, measure: Measure = MEAN) -> float | None:

@@ -5,8 +5,10 @@ A token is *reached* if the target accepted all tokens before it in its draft.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -52,8 +54,9 @@ class Tally:
     @classmethod
     def of_records(cls, decodes: Iterable[DecodeRecord], dofs: int) -> Tally:
         """Count the verifications of some decodes, of actions with `dofs` DoFs."""
-        rounds = [one for decode in decodes for one in decode.rounds if one.is_verification]
-        numbers = [(one.start, len(one.drafted), one.accepted, one.tree_size) for one in rounds]
+        rounds = itertools.chain.from_iterable(decode.rounds for decode in decodes)
+        verified = filter(attrgetter("is_verification"), rounds)
+        numbers = [(one.start, len(one.drafted), one.accepted, one.tree_size) for one in verified]
         start, judged, accepted, nodes = np.array(numbers, int).reshape(-1, 4).T
         return cls.of(start, judged, accepted, nodes, dofs)
 
@@ -94,7 +97,10 @@ class Tally:
 
 def rates(reached: np.ndarray, accepted: np.ndarray) -> list[float | None]:
     """Return accepted ÷ reached of each place. None for a place that no draft reached."""
-    return [b / a if a else None for a, b in zip(reached.tolist(), accepted.tolist(), strict=True)]
+    quotients: list[float | None] = (accepted / np.maximum(reached, 1)).tolist()
+    for place in np.flatnonzero(reached == 0):
+        quotients[place] = None
+    return quotients
 
 
 def _sum(first: np.ndarray, second: np.ndarray) -> np.ndarray:

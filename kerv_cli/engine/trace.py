@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -144,10 +145,14 @@ def grouped(decodes: Sequence[TracedDecode]) -> Iterator[tuple[str, int, list[Tr
 
 def work_of_trace(decodes: Sequence[TracedDecode], tokens: int) -> Work:
     """Return what decodes of `tokens` tokens computed: forwards, drafts, other seconds."""
-    rounds = [_counted(one) for decode in decodes for one in decode.rounds]
-    columns = {name: np.array([one[name] for one in rounds]) for name in COUNTED}
-    phases = {name: np.array([one.seconds.get(name, 0.0) for one in decodes]) for name in READ_PHASES}
-    phases["vision"] = np.array([float(one.encoded) for one in decodes])
+    rounds: list[Mapping[str, str | int]] = []
+    phases = {name: np.zeros(len(decodes)) for name in READ_PHASES}
+    for number_, decode in enumerate(decodes):
+        rounds += map(_counted, decode.rounds)
+        for name in READ_PHASES:
+            phases[name][number_] = decode.seconds.get(name, 0.0)
+        phases["vision"][number_] = decode.encoded
+    columns = {name: np.array(list(map(itemgetter(name), rounds))) for name in COUNTED}
     counts, searched = np.array([len(one.rounds) for one in decodes]), np.array([one.searched for one in decodes])
     return work_of(columns, counts, phases, searched, tokens)
 

@@ -35,8 +35,8 @@ def read(*parts: Tensor) -> list[np.ndarray]:
     Returns:
         One array per vector.
     """
-    together = parts[0]
+    sizes, together = [part.shape[0] for part in parts], parts[0]
     if len(parts) > 1:
         mixed = len({part.dtype for part in parts}) > 1
-        together = torch.cat([part.double() for part in parts] if mixed else list(parts))
-    return [vector.numpy() for vector in together.cpu().split([part.shape[0] for part in parts])]
+        together = torch.cat([*map(Tensor.double, parts)] if mixed else parts)
+    return [vector.numpy() for vector in together.cpu().split(sizes)]

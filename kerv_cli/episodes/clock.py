@@ -32,7 +32,7 @@ Latency = Callable[[DecodeRecord], float]
 """Function that takes a decode's record and returns the seconds from its observation to its first action."""
 
 
-def steps_of(seconds: float, control_hz: float) -> int:
+def steps_during(seconds: float, control_hz: float) -> int:
     """Convert a latency to control steps, rounded up. Rounding errors just above a whole number are ignored.
 
     Args:
@@ -69,7 +69,7 @@ class RealClock:
             KervError: The latency is negative or not finite.
         """
         seconds = self.latency(decode)
-        steps = self.expected = steps_of(seconds, self.space.control_hz)
+        steps = self.expected = steps_during(seconds, self.space.control_hz)
         stale = min(steps, len(decode.actions) - 1) if self.compensation == CHUNK else 0
         return Delay(seconds, steps, observed, dropped=stale)
 
@@ -98,7 +98,7 @@ def check(settings: RolloutSettings, spec: EnvironmentSpec, target: TargetDescri
         )
     if timing.latency != CONSTANT:
         return
-    late = steps_of(timing.latency_ms / 1000.0, spec.actions.control_hz)
+    late = steps_during(timing.latency_ms / 1000.0, spec.actions.control_hz)
     horizon = spec.control_steps(settings.world.horizon)
     if late >= horizon:
         raise UsageError(
@@ -171,7 +171,8 @@ def _open_profile(settings: RolloutSettings) -> Profile:
         profile = read_profile(path)
     except CheckpointError as error:
         raise UsageError(f"rollout.profile={name}: {error}") from error
-    costs = {part.traits.get("cost") for part in Method.of(settings).parts.values()}
+    method = Method.of(settings)
+    costs = method.prefill_draft.cost, method.proposer.cost
     drafter = (DRAFTING, "feed") if DRAFTING in costs else ()
     if lacks := profile.lacks(("encode", "prefill", "verify", *drafter)):
         raise UsageError(f"rollout.profile={name}: {path} has no phase '{lacks[0]}', which this method needs")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.chunk import EpisodeState
+from kerv_cli.engine.chunk import Follower
 from kerv_cli.engine.decoder import ActionDecoder
 from kerv_cli.engine.record import DecodeRecord, Delay, EpisodeRecord
 from kerv_cli.episodes.clock import RealClock
@@ -46,7 +46,7 @@ class _Execution:
     Before the first chunk the robot stands still.
     """
 
-    def __init__(self, world: World, follower: EpisodeState, camera: CameraSettings | None) -> None:
+    def __init__(self, world: World, follower: Follower, camera: CameraSettings | None) -> None:
         self.world, self.follower, self.camera = world, follower, camera
         self.chunk: deque[np.ndarray] = deque()
         self.last = world.spec.standstill(world.gripper)
@@ -133,7 +133,7 @@ def run_episode(
 
 def episode(
     world: World,
-    follower: EpisodeState,
+    follower: Follower,
     seed: int,
     camera: CameraSettings | None = None,
     clock: RealClock | None = None,
@@ -141,8 +141,8 @@ def episode(
     """Run one episode like `run_episode`, but let the caller decode.
 
     The generator yields an observation; send it the record of the decode. At the end it returns the episode's record.
-    `follower` is told about the start, every executed action and the end. It is the decoder itself, or the
-    state that a batch decoder keeps for this episode. `run_episode` describes the other arguments.
+    `follower` is the decoder itself, or what a batch decoder keeps for this episode. `run_episode` describes the other
+    arguments.
     """
     began = time.perf_counter()
     world.reset(seed)

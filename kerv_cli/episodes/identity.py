@@ -19,8 +19,9 @@ from typing import Any
 import kerv_cli
 from kerv_cli.base import registry
 from kerv_cli.base.errors import KervError
-from kerv_cli.base.registry import METHOD_KINDS, PART_GROUPS, part_of
+from kerv_cli.base.registry import METHOD_KINDS, PART_GROUPS, AcceptancePart, ArtifactPart
 from kerv_cli.episodes.settings import CONSTANT, PROFILE, WAITS, RolloutSettings, TimingSettings, settings_from
+from kerv_cli.methods.compose import Method
 from kerv_cli.methods.settings import EXPERT
 
 ENGINE = 1
@@ -196,22 +197,20 @@ def _idle_timing(timing: TimingSettings) -> dict[str, str]:
 
 def idle_keys(settings: RolloutSettings) -> dict[str, str]:
     """Return the keys of settings that have no effect in this combination, each with the reason."""
-    method = settings.parts()
-    parts = {kind: part_of(kind, method[kind].kind) for kind in METHOD_KINDS}
-    draft, proposer, skip, acceptance = (parts[k] for k in ("prefill_draft", "proposer", "skip", "acceptance"))
+    method = Method.of(settings)
+    draft, proposer, skip = method.prefill_draft, method.proposer, method.skip
+    acceptance = AcceptancePart.find(settings.acceptance.kind)
     idle: dict[str, str] = {}
     if proposer.absent and draft.absent:
         idle |= dict.fromkeys(("acceptance", "threshold", "rectifier"), f"method {settings.method} drafts nothing")
-    elif not skip.traits.get("verifies", True) and (draft.traits.get("drafts_whole_chunk") or proposer.absent):
+    elif not skip.verifies and (draft.drafts_whole_chunk or proposer.absent):
         idle["rectifier"] = f"skip={skip.name} verifies nothing, so nothing is rejected"
-    elif not acceptance.traits.get("reads_threshold", True):
+    elif not acceptance.reads_threshold:
         idle["threshold"] = f"acceptance={acceptance.name} has no threshold"
-    for kind, part in parts.items():
-        if "idle" in part.traits:
-            idle |= {f"{kind}.{name}": reason for name, reason in part.traits["idle"](method[kind]).items()}
-    needed = {need for kind, part in parts.items() for need in part.needs(method[kind])}
-    artifacts = registry.parts("artifact")
-    if not any(artifacts[kind].traits.get("names_more") for kind in needed):
+    for kind, part in method.parts.items():
+        idle |= {f"{kind}.{name}": reason for name, reason in part.idle(method.settings[kind]).items()}
+    needed, artifacts = set(method.needs), ArtifactPart.every()
+    if not any(artifacts[kind].names_more for kind in needed):
         for kind in artifacts.keys() - needed:
             idle[f"policy.artifacts.{kind}"] = f"method {settings.method} reads no {kind}"
     for group in PART_GROUPS[len(METHOD_KINDS) :]:
@@ -276,9 +275,12 @@ class _Essential(ast.NodeTransformer):
 
 
 def _of_plugins() -> Iterator[tuple[str, Path]]:
-    kinds = set(registry.kinds()) - {"command"}
-    modules = {part.build.partition(":")[0] for kind in kinds for part in registry.parts(kind).values()}
-    for name in sorted(module for module in modules if module and not module.startswith("kerv_cli.")):
+    modules: set[str] = set()
+    for kind in set(registry.kinds()) - {"command"}:
+        for part in registry.parts(kind).values():
+            if not part.absent and not part.module.startswith("kerv_cli."):
+                modules |= {part.module, part.code().__module__} if isinstance(part, ArtifactPart) else {part.module}
+    for name in sorted(modules):
         spec = importlib.util.find_spec(name)
         if spec is not None and spec.origin is not None:
             yield name, Path(spec.origin)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
 
 import numpy as np
 import torch
@@ -17,13 +16,12 @@ from kerv_cli.engine.stopwatch import Stopwatch
 from kerv_cli.episodes import clock
 from kerv_cli.episodes.clock import RealClock
 from kerv_cli.episodes.identity import OBSERVATION
-from kerv_cli.episodes.settings import DEFAULT_TASKS, WAITS, RolloutSettings
+from kerv_cli.episodes.settings import WAITS, RolloutSettings
+from kerv_cli.episodes.tasks import tasks_of
 from kerv_cli.methods.artifacts import Artifacts, Use
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.settings import EXPERT, MethodSettings
-from kerv_cli.targets.checkpoint import TargetDescription, described
-from kerv_cli.targets.folders import find_target
-from kerv_cli.worlds import resolve_tasks, spec_of
+from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.views import frame_shape
 
@@ -77,40 +75,6 @@ def check(settings: RolloutSettings) -> dict[str, str]:
     observation = str(target.settings.get(OBSERVATION, "vision"))
     observation = PRIVILEGED if observation == "state" else observation
     return {**hashes, **clock.profile_identity(settings), OBSERVATION: observation}
-
-
-def tasks_of(settings: RolloutSettings) -> tuple[str, ...]:
-    """Return the full names of a rollout's tasks. By default they are the tasks that its target was trained on.
-
-    Raises:
-        UnknownName: A task does not exist.
-        CheckpointError: The target's description is damaged.
-    """
-    return resolve_tasks(settings.task or list(trained_tasks(settings)) or DEFAULT_TASKS)
-
-
-def trained_tasks(settings: RolloutSettings) -> tuple[str, ...]:
-    """Return the full names of the tasks that a rollout's target was trained on.
-
-    Empty for the expert, for a target that does not name its tasks, and for a missing target (`check` reports that).
-
-    Raises:
-        CheckpointError: The target's description is damaged.
-    """
-    if settings.policy.kind == EXPERT:
-        return ()
-    try:
-        folder = find_target(settings.results, settings.policy.target)
-    except UsageError:
-        return ()
-    names = described(folder, "target", TargetDescription).tasks
-    return resolve_tasks(names) if names else ()
-
-
-def unseen_tasks(settings: RolloutSettings, tasks: Iterable[str]) -> list[str]:
-    """Return the tasks that the target was not trained on. Empty if the target does not name its training tasks."""
-    trained = trained_tasks(settings)
-    return [task for task in tasks if trained and task not in trained]
 
 
 def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:

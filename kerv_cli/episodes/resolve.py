@@ -13,8 +13,8 @@ from kerv_cli.base.files import read_yaml_lines
 from kerv_cli.base.limits import check_label
 from kerv_cli.base.registry import METHOD_KINDS
 from kerv_cli.episodes.identity import flat, without_effect
-from kerv_cli.episodes.policy import tasks_of, trained_tasks
 from kerv_cli.episodes.settings import RolloutSettings, StudySettings, SweepSettings
+from kerv_cli.episodes.tasks import tasks_of, trained_tasks
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
 
 MOST_SEEDS = 10_000

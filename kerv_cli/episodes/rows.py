@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from kerv_cli.base.registry import parts
+from kerv_cli.base.registry import ProposerPart
 from kerv_cli.engine.record import PHASES, DecodeRecord, Delay, EpisodeRecord, Round
 
 INT, FLOAT, TEXT, FLAG = pa.int64(), pa.float64(), pa.string(), pa.bool_()
@@ -45,8 +45,8 @@ def _attributes(*names: str, kind: pa.DataType = INT) -> Fields:
 
 
 def _looks_up(proposer: str) -> bool:
-    part = parts("proposer").get(proposer)
-    return part is not None and bool(part.traits.get("looks_up"))
+    part = ProposerPart.every().get(proposer)
+    return part is not None and part.looks_up
 
 
 _EPISODE: Fields = {

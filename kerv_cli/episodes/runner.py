@@ -17,7 +17,7 @@ import numpy as np
 
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.batched import BatchDecoder
-from kerv_cli.engine.chunk import EpisodeState
+from kerv_cli.engine.chunk import Follower
 from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
 from kerv_cli.episodes.episode import episode, run_episode
@@ -150,7 +150,7 @@ def run_together(
 
 
 def _one_after_another(
-    state: EpisodeState, waiting: list[Request[K]], ended: list[EpisodeEnd[K]], open_world: OpenWorld
+    state: Follower, waiting: list[Request[K]], ended: list[EpisodeEnd[K]], open_world: OpenWorld
 ) -> Generator[Observation, DecodeRecord, None]:
     """Run waiting episodes one after another, until none is left.
 
@@ -158,7 +158,7 @@ def _one_after_another(
     send it the record of the decode.
 
     Args:
-        state: The decoder's state for this place of the batch, reused by each episode.
+        state: Follows the episodes of this place of the batch, one after another.
         waiting: Requests that have not begun. If possible, the next one has the same task as the last.
         ended: Each request is appended when it ends, with the record of its episode or its error.
         open_world: Opens a world for a task.

@@ -13,8 +13,9 @@
     certified                   ours: such drafts, on tasks for which a certificate limits the loss of success
     sp_vla                      SP-VLA: a regression replaces the target while the motion is fast
 
-Each file above, and the `__init__.py` of each folder, contains settings and registrations. It imports neither torch nor
-numpy when it is loaded.
+Each file above, and the `__init__.py` of each folder, contains the parts of its family, with their settings. It imports
+neither torch nor numpy when it is loaded. A drafter's network, and whatever else needs them, is in a file of its own,
+which is imported when the part is built.
 
 `compose.py` builds a decoder from a method's parts. `context.py` is the context in which a part is built.
 `artifacts.py` finds, checks and loads files. `drafters.py` is the base of drafters with weights. `calibration.py` is

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from kerv_cli.base.registry import PREFILL, add
+from kerv_cli.base.registry import PREFILL, BoundaryPart, ProposerPart, RectifierPart, SkipPart
 
-add("proposer", "none", colour=0x6E7B8B, when=PREFILL)
-add("rectifier", "reinfer")  # the target decodes on
-add("boundary", "always")  # the method has one proposer
-add("skip", "none", batchable=True)
+ProposerPart("none", colour=0x6E7B8B, when=PREFILL).add()
+RectifierPart("reinfer").add()  # the target decodes on
+BoundaryPart("always").add()  # the method has one proposer
+SkipPart("none", batchable=True).add()

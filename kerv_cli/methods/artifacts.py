@@ -16,7 +16,7 @@ from kerv_cli.base.files import sha256_of
 from kerv_cli.base.limits import check_name
 from kerv_cli.base.manifests import check_files, read_file
 from kerv_cli.base.places import artifact_or_path
-from kerv_cli.base.registry import find
+from kerv_cli.base.registry import ArtifactPart
 from kerv_cli.base.runtime import DTYPES
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.protocol import Target
@@ -252,7 +252,7 @@ class Artifacts:
         self.results, self.policy, self.search, self.device, self.dtype = results, policy, search, device, dtype
         for kind, name in policy.artifacts.items():
             if name is not None:  # stored settings may list kinds of a plugin that is missing now
-                find("artifact", kind, "policy.artifacts")
+                ArtifactPart.find(kind, "policy.artifacts")
         self.folder = find_target(results, policy.target)
 
     @functools.cached_property
@@ -346,7 +346,8 @@ def kind_of(name: str) -> Artifact[Any]:
     Raises:
         UnknownName: No kind of artifact has this name.
     """
-    return find("artifact", name).built()
+    kind: Artifact[Any] = ArtifactPart.find(name).built()
+    return kind
 
 
 @functools.lru_cache(maxsize=16)

@@ -14,7 +14,7 @@ from kerv_cli.base.errors import CheckpointError
 from kerv_cli.engine.record import MEAN, Measure
 from kerv_cli.methods.artifacts import Artifact, MadeFor, Use, check_sources
 from kerv_cli.methods.heisd import FusedBoundarySettings
-from kerv_cli.methods.heisd.rules import BoundaryRanges
+from kerv_cli.methods.heisd.curvature import BoundaryRanges
 from kerv_cli.methods.kerv import KinematicThresholdSettings
 from kerv_cli.methods.kerv.prediction import Noise
 

@@ -5,18 +5,29 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import check_settings
-from kerv_cli.base.registry import METHOD_KINDS, PREFILL, Part, part_of
-from kerv_cli.engine.chunk import steps_of
-from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.engine.protocol import Target
+from kerv_cli.base.registry import (
+    METHOD_KINDS,
+    PREFILL,
+    BoundaryPart,
+    MethodPart,
+    ProposerPart,
+    SkipPart,
+    ThresholdPart,
+    part_of,
+)
+from kerv_cli.engine.chunk import chunk_steps
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.parallel import check_parallel, is_parallel
 from kerv_cli.methods.settings import MethodSettings
-from kerv_cli.targets.checkpoint import TargetDescription
+
+if TYPE_CHECKING:
+    from kerv_cli.engine.decoder import Decoder
+    from kerv_cli.engine.protocol import Target
+    from kerv_cli.targets.checkpoint import TargetDescription
 
 
 @dataclass(frozen=True)
@@ -39,19 +50,36 @@ class Method:
         return cls(settings.parts(), settings.chunk, settings.method)
 
     @functools.cached_property
-    def parts(self) -> dict[str, Part]:
+    def parts(self) -> dict[str, MethodPart]:
         """The registered parts, by kind, for all kinds in METHOD_KINDS.
 
         Raises:
             UnknownName: The settings name a part that does not exist.
         """
-        return {kind: part_of(kind, self.settings[kind].kind) for kind in METHOD_KINDS}
+        return {kind: cast(MethodPart, part_of(kind, self.settings[kind].kind)) for kind in METHOD_KINDS}
 
     @property
     def needs(self) -> tuple[str, ...]:
         """The kinds of artifacts that the parts need, such as `drafter`, without repetitions."""
-        kinds = (need for kind, part in self.parts.items() for need in part.needs(self.settings[kind]))
+        kinds: list[str] = []
+        for kind, part in self.parts.items():
+            kinds += part.needed(self.settings[kind])
         return tuple(dict.fromkeys(kinds))
+
+    @property
+    def prefill_draft(self) -> ProposerPart:
+        """The part that drafts before the prefill."""
+        return ProposerPart.find(self.settings["prefill_draft"].kind, "prefill_draft.kind")
+
+    @property
+    def proposer(self) -> ProposerPart:
+        """The part that drafts after the prefill."""
+        return ProposerPart.find(self.settings["proposer"].kind, "proposer.kind")
+
+    @property
+    def skip(self) -> SkipPart:
+        """The part that executes drafts without verification."""
+        return SkipPart.find(self.settings["skip"].kind, "skip.kind")
 
     def check(self, target: Target | TargetDescription, batch: int = 1) -> None:
         """Refuse parts that do not work together or with the target, and numbers out of range. Loads no weights.
@@ -68,7 +96,7 @@ class Method:
             if not isinstance(self.settings[kind], part.settings):
                 raise UsageError(f"{kind}.kind={part.name}: choose {kind}={part.name}, each has settings of its own")
             check_settings(self.settings[kind], kind)
-        steps_of(self.chunk, target.chunk)
+        chunk_steps(self.chunk, target.chunk)
         self._check_drafts()
         check_parallel(self.parts, is_parallel(target))
         self._check_skip()
@@ -80,13 +108,14 @@ class Method:
         A boundary that chooses between retrieval and the drafter needs a proposer that has both. Such a proposer needs
         such a boundary. A prefill draft must not need the target's hidden states, which exist only after the prefill.
         """
-        proposer, boundary, draft = (self.parts[kind] for kind in ("proposer", "boundary", "prefill_draft"))
-        if bool(proposer.traits.get("has_boundary")) != bool(boundary.traits.get("chooses")):
+        proposer, draft = self.proposer, self.prefill_draft
+        boundary = BoundaryPart.find(self.settings["boundary"].kind)
+        if proposer.has_boundary != boundary.chooses:
             raise UsageError(
                 f"proposer={proposer.name} with boundary={boundary.name}: "
-                + ("name a boundary that chooses" if proposer.traits.get("has_boundary") else "nothing to choose from")
+                + ("name a boundary that chooses" if proposer.has_boundary else "nothing to choose from")
             )
-        if draft.traits["when"] != PREFILL:
+        if draft.when != PREFILL:
             raise UsageError(
                 f"prefill_draft={draft.name}: it reads the target's states, which come after the prefill; use it as "
                 f"proposer={draft.name}"
@@ -94,9 +123,8 @@ class Method:
 
     def _check_skip(self) -> None:
         """Check that the prefill draft is a whole chunk, if the skip rule may execute it without verification."""
-        skip, draft = self.parts["skip"], self.parts["prefill_draft"]
-        joined = skip.traits.get("merges") and draft.traits.get("merged")
-        if skip.traits.get("takes_draft") and not draft.traits.get("chains") and not joined:
+        skip, draft = self.skip, self.prefill_draft
+        if skip.takes_draft and not draft.chains and not (skip.merges and draft.merged):
             raise UsageError(
                 f"skip={skip.name} with prefill_draft={draft.name}: it executes a draft from before the prefill"
             )
@@ -105,13 +133,13 @@ class Method:
         """Check that the method can decode several episodes together, if `batch` is not 1."""
         if batch == 1:
             return
-        draft, proposer, skip, threshold = (self.parts[k] for k in ("prefill_draft", "proposer", "skip", "threshold"))
-        is_used = draft.absent or skip.traits.get("takes_draft")
-        if not (proposer.absent and skip.traits.get("batchable") and is_used):
+        draft, skip, threshold = self.prefill_draft, self.skip, ThresholdPart.find(self.settings["threshold"].kind)
+        is_used = draft.absent or skip.takes_draft
+        if not (self.proposer.absent and skip.batchable and is_used):
             raise UsageError(
                 f"rollout.batch={batch}: method={self.name} decodes one episode at a time. Leave rollout.batch out"
             )
-        if not draft.absent and not threshold.traits.get("batchable"):
+        if not draft.absent and not threshold.batchable:
             raise UsageError(f"rollout.batch={batch}: threshold={threshold.name} follows one episode. Use another")
 
     def decoder(self, target: Target, artifact: Callable[[str], Any], task: str = "") -> Decoder:
@@ -126,6 +154,8 @@ class Method:
             UsageError: The parts cannot work together or with the target, or a number is out of range.
             CheckpointError: An artifact is missing or belongs to another target.
         """
+        from kerv_cli.engine.decoder import Decoder, Parts
+
         self.check(target)
         context = Context(target, artifact, task, method=self.settings, chunk=self.chunk)
         for kind, part in self.parts.items():

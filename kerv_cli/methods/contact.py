@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import MOST_BINS, number
-from kerv_cli.base.registry import add
+from kerv_cli.base.registry import ThresholdPart
+from kerv_cli.engine.parts import Threshold
 from kerv_cli.methods.kerv import RadiusRange, nearest
 
 if TYPE_CHECKING:
@@ -24,7 +25,8 @@ class ContactThresholdSettings(RadiusRange):
     near: float = number(0.1, above=0, most=100)  # metres
 
 
-class Contact:
+@ThresholdPart("contact", ContactThresholdSettings)
+class Contact(Threshold):
     """The acceptance radius r is r_min at the object, r_max from a distance `near` on, and linear between.
 
     The distance is that of the last observation that the policy encoded, in the decode before. The first decode of an
@@ -52,9 +54,3 @@ class Contact:
         seen, s = self.target.hand_and_object, self.settings
         distance = float((seen[0] - seen[1]).norm()) if seen is not None else 0.0
         return nearest(s.r_min + (s.r_max - s.r_min) * min(1.0, distance / s.near))
-
-    def update(self, variability: float | None) -> None:
-        """Do nothing: the radius depends on the observation alone."""
-
-
-add("threshold", "contact", f"{__name__}:Contact", ContactThresholdSettings)

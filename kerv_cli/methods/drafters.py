@@ -19,7 +19,7 @@ from kerv_cli.methods.artifacts import Artifact, Artifacts, MadeFor, removal
 from kerv_cli.methods.context import Context
 from kerv_cli.targets import checkpoint
 from kerv_cli.targets.compact.packable import load_packed
-from kerv_cli.targets.observations import Rows, split, steps_of
+from kerv_cli.targets.observations import Rows, observed_steps, split
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.files import DemoEpisode
 
@@ -72,7 +72,7 @@ def evenly(steps: np.ndarray, share: float) -> np.ndarray:
 class TrainableDrafter(Artifact[DrafterDescription]):
     """Base class of the drafters that are trained, such as the early drafter. A subclass is one kind of drafter.
 
-    The subclass defines the network, its training and its proposer. `registry.add_drafter` registers it. A trained
+    The subclass defines the network, its training and its proposer. `DrafterPart` registers it. A trained
     drafter is a folder with the weights in safetensors and a description `<kind>.json`.
 
     Attributes:
@@ -119,7 +119,7 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         parts: list[Decodes] = []
         for index in range(count):
             episode = dataset.load(index)
-            steps = evenly(steps_of(episode, sees), share)
+            steps = evenly(observed_steps(episode, sees), share)
             shared = {"episodes": index, "perturbed": episode.perturbed}
             columns = {name: torch.full((len(steps),), value) for name, value in shared.items()}
             parts.append(self.decoded(target, episode, steps, dataset.manifest.observation, columns))

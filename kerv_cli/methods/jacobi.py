@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from kerv_cli.base.limits import MOST_TOKENS, number
-from kerv_cli.base.registry import STATES, add
+from kerv_cli.base.registry import STATES, ProposerPart
 from kerv_cli.engine.proposer import ChainProposer
 
 if TYPE_CHECKING:
@@ -25,6 +25,8 @@ class JacobiProposerSettings:
     depth: int = number(0, 0, MOST_TOKENS)  # number of tokens guessed at once; 0: all remaining tokens
 
 
+# without `chains`, because its first guess is made only after the prefill
+@ProposerPart("jacobi", JacobiProposerSettings, colour=0x8A7FD4, when=STATES)
 class JacobiProposer(ChainProposer):
     """Guesses the remaining tokens of a chunk. After each forward, the target's tokens become the next guess.
 
@@ -69,8 +71,3 @@ class JacobiProposer(ChainProposer):
         """
         accepted = len(chunk.tokens) - first - 2
         self.guess = [*target_tokens[accepted + 1 :], *self.guess[len(target_tokens) - 1 :]]
-
-
-# it has no trait `chains`, because its first guess is made only after the prefill
-_BUILD = "kerv_cli.methods.jacobi:JacobiProposer.build"
-add("proposer", "jacobi", _BUILD, JacobiProposerSettings, colour=0x8A7FD4, when=STATES)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import MOST_TOKENS, number
-from kerv_cli.base.registry import PREFILL, add, find
+from kerv_cli.base.registry import PREFILL, ProposerPart
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.tree import merge
 from kerv_cli.methods.heisd import RetrievalProposerSettings
@@ -43,16 +43,22 @@ class MergedProposerSettings:
         if not self.sources:
             raise UsageError("merged: name at least one of sources")
         for name in (*self.sources, *self.fallback):
-            if not find("proposer", name, "source of a merged draft").traits.get("chains"):
+            if not ProposerPart.find(name, "source of a merged draft").chains:
                 raise UsageError(f"source '{name}' of a merged draft: it does not draft whole chunks from the prompt")
 
 
 def needs_of_sources(settings: MergedProposerSettings) -> tuple[str, ...]:
     """Return the kinds of artifacts that the proposers in `sources` and `fallback` need, without repetitions."""
-    sources = [find("proposer", name) for name in (*settings.sources, *settings.fallback)]
-    return tuple(dict.fromkeys(kind for part in sources for kind in part.needs(part.default)))
+    kinds: list[str] = []
+    for name in (*settings.sources, *settings.fallback):
+        part = ProposerPart.find(name)
+        kinds += part.needed(part.default)
+    return tuple(dict.fromkeys(kinds))
 
 
+@ProposerPart(
+    "merged", MergedProposerSettings, needs=needs_of_sources, colour=0xCC79A7, when=PREFILL, merged=True, cost="early"
+)
 class MergedProposer(ChainProposer):
     """Merges the drafts of several proposers into one prefix tree of at most `nodes` nodes.
 
@@ -75,19 +81,23 @@ class MergedProposer(ChainProposer):
         """Build the part that the setting `proposer=merged` chooses."""
 
         def source(name: str) -> ChainProposer:
-            part = find("proposer", name)
-            source_settings: Any = part.default
+            part = ProposerPart.find(name)
+            source_settings = part.default
             if isinstance(source_settings, RetrievalProposerSettings):
                 source_settings = RetrievalProposerSettings(neighbours=settings.neighbours, nodes=settings.nodes)
             return part.built(source_settings, context)
 
-        sources, fallback = ([source(name) for name in names] for names in (settings.sources, settings.fallback))
-        return cls(sources, settings.nodes, fallback)
+        return cls([*map(source, settings.sources)], settings.nodes, [*map(source, settings.fallback)])
 
     def reset(self) -> None:
         """Begin an episode, for all proposers."""
         for source in (*self.sources, *self.fallback):
             source.reset()
+
+    def similarity(self, chunk: Chunk) -> float | None:
+        """Return the similarity that a source found, if one searched a datastore."""
+        found = [source.similarity(chunk) for source in (*self.sources, *self.fallback)]
+        return next((value for value in found if value is not None), None)
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
         """Return one prefix tree of all drafts, of at most `depth` tokens per path."""
@@ -108,9 +118,7 @@ class MergedProposer(ChainProposer):
         sources = list(self.sources)
         if not any(source.is_sure(chunk) for source in sources):
             sources += self.fallback
-        return [chain for source in sources for chain in source.chains(chunk, depth)]
-
-
-_BUILD = "kerv_cli.methods.merged:MergedProposer.build"
-_parts = (_BUILD, MergedProposerSettings, needs_of_sources)
-add("proposer", "merged", *_parts, colour=0xCC79A7, when=PREFILL, merged=True, cost="early")
+        chains: list[list[int]] = []
+        for source in sources:
+            chains += source.chains(chunk, depth)
+        return chains

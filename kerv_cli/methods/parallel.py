@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.registry import NoSettings, Part, add
+from kerv_cli.base.registry import NoSettings, Part, SkipPart
+from kerv_cli.engine.decisions import SkipDecision
 from kerv_cli.engine.parts import Skip
 
 if TYPE_CHECKING:
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from kerv_cli.methods.context import Context
 
 
+@SkipPart("parallel", colour=0x17BECF, verifies=False, batchable=True)
 class ParallelPass(Skip):
     """Decodes all tokens of a chunk in one bidirectional forward of a parallel target.
 
@@ -32,11 +34,12 @@ class ParallelPass(Skip):
         """Build the part that the setting `skip=parallel` chooses."""
         return cls(context.target)
 
-    def take(self, chunk: Chunk) -> bool:
-        """Commit all tokens of the chunk after one forward of the target. Return True."""
-        hidden = self.target.parallel_pass(chunk.prompt, chunk.cache)
-        chunk.commit_at_once(self.target.head(hidden[0, : chunk.size]).argmax(-1).tolist())
-        return True
+    def take(self, chunk: Chunk) -> SkipDecision:
+        """Decode all tokens of the chunk in one forward of the target."""
+        from kerv_cli.engine.record import PARALLEL
+
+        hidden = self.target.parallel_pass(chunk.target.prompt, chunk.target.cache)
+        return SkipDecision(self.target.head(hidden[0, : chunk.size]).argmax(-1).tolist(), PARALLEL)
 
 
 def is_parallel(target: object) -> bool:
@@ -74,9 +77,3 @@ def native_decoder(target: Any) -> Decoder:
     from kerv_cli.engine.decoder import Decoder, Parts
 
     return Decoder(target, Parts(skip=ParallelPass(target)) if is_parallel(target) else None)
-
-
-_BUILD = "kerv_cli.methods.parallel:ParallelPass.build"
-add(
-    "skip", "parallel", _BUILD, colour=0x17BECF, parallel=True, verifies=False, batchable=True
-)  # a parallel target's own decoding

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import number
-from kerv_cli.base.registry import add
+from kerv_cli.base.registry import SkipPart
+from kerv_cli.engine.decisions import SkipDecision
 from kerv_cli.engine.parts import Skip
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ class SpeedSkipSettings:
             raise UsageError(f"skip.v_min={self.v_min:g} skip.v_max={self.v_max:g}: v_min must not be above v_max")
 
 
+@SkipPart("speed", SpeedSkipSettings, colour=0x8C6D31)
 class SpeedSkip(Skip):
     """SP-VLA: executes a predicted chunk if the hand is fast and the target decoded enough of the last actions.
 
@@ -68,27 +70,19 @@ class SpeedSkip(Skip):
         self.decoded.clear()
         self.executed, self.by_target = 0, True
 
-    def take(self, chunk: Chunk) -> bool:
-        """Fill the chunk with the prediction, if the hand is fast and the target decoded enough of the last actions.
-
-        Returns:
-            Whether the chunk was filled.
-        """
+    def take(self, chunk: Chunk) -> SkipDecision:
+        """Take the prediction, if the hand is fast and the target decoded enough of the last actions."""
         executed = len(chunk.situation.path) - 1
         self.decoded.extend([self.by_target] * (executed - self.executed))
         self.executed = executed
         predicted = self.ridge.predict(chunk.situation.history.values(), chunk.steps)
         self.by_target = predicted is None or not self._is_intuitive(chunk.situation, chunk.space.control_hz)
         if predicted is None or self.by_target:
-            return False
-        chunk.skip(chunk.space.bins_of(predicted).flatten().tolist(), self.ridge.name)
-        return True
+            return SkipDecision()
+        return SkipDecision(chunk.space.bins_of(predicted).flatten().tolist(), self.ridge.name)
 
     def _is_intuitive(self, situation: Situation, control_hz: float) -> bool:
         """Return whether the hand is fast enough, and the target decoded more than `share` of the last actions."""
         speed = control_hz * math.dist(situation.path[-1], situation.path[-2])
         s = self.settings
         return s.v_min <= speed <= s.v_max and sum(self.decoded) > s.share * s.buffer
-
-
-add("skip", "speed", "kerv_cli.methods.sp_vla:SpeedSkip.build", SpeedSkipSettings, colour=0x8C6D31)

@@ -6,15 +6,18 @@ Spec-VLA's drafter is in the folder `eagle`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from kerv_cli.base.limits import MOST_BINS, number
-from kerv_cli.base.registry import NoSettings, add
+from kerv_cli.base.registry import AcceptancePart, ThresholdPart
 from kerv_cli.engine.acceptance import DistanceRule, StrictRule
 from kerv_cli.engine.parts import Fixed
 
 if TYPE_CHECKING:
     from kerv_cli.methods.context import Context
+
+
+AcceptancePart("strict", reads_threshold=False)(StrictRule)
 
 
 @dataclass
@@ -25,6 +28,7 @@ class RelaxedAcceptanceSettings:
     strict_dofs: bool = True  # true: strict DoFs, such as the gripper, must be equal (ours); false: r for all (paper)
 
 
+@AcceptancePart("relaxed", RelaxedAcceptanceSettings)
 @dataclass(frozen=True)
 class RelaxedRule(DistanceRule):
     """Accepts a draft token if it is at most r bins from the target's token.
@@ -36,18 +40,13 @@ class RelaxedRule(DistanceRule):
     strict_dofs: bool = True
 
     @classmethod
-    def build(cls, settings: RelaxedAcceptanceSettings, context: Context) -> RelaxedRule:
+    def build(cls, settings: Any, context: Context) -> RelaxedRule:
         """Build the part that the setting `acceptance=relaxed` chooses."""
         return cls(context.target.actions, settings.strict_dofs)
 
     def limits(self, r: int) -> tuple[int, ...]:
         """Return the largest accepted distance of each of the D DoFs, in bins: r, or 0 for strict DoFs."""
-        return tuple(0 if self.strict_dofs and strict else r for strict in self.space.is_strict)
-
-
-def strict(settings: NoSettings, context: Context) -> StrictRule:
-    """Build acceptance=strict: a draft token must equal the target's, so decoding is lossless."""
-    return StrictRule(context.target.actions)
+        return self.same_limits(r, self.strict_dofs)
 
 
 @dataclass
@@ -58,17 +57,16 @@ class FixedThresholdSettings:
     r: int = number(9, 0, MOST_BINS)  # largest accepted distance to the target's token, bins
 
 
-def fixed(settings: FixedThresholdSettings, context: Context) -> Fixed:
-    """Build the part that the setting `threshold=fixed` chooses.
+@ThresholdPart("fixed", FixedThresholdSettings, batchable=True)
+class FixedThreshold(Fixed):
+    """The part that the setting `threshold=fixed` chooses."""
 
-    Raises:
-        UsageError: The radius is larger than the distance of any two tokens.
-    """
-    context.check_radius("r", settings.r)
-    return Fixed(settings.r)
+    @classmethod
+    def build(cls, settings: FixedThresholdSettings, context: Context) -> FixedThreshold:
+        """Build the threshold.
 
-
-_FILE = "kerv_cli.methods.spec_vla:"
-add("acceptance", "strict", _FILE + "strict", reads_threshold=False)
-add("acceptance", "relaxed", _FILE + "RelaxedRule.build", RelaxedAcceptanceSettings)
-add("threshold", "fixed", _FILE + "fixed", FixedThresholdSettings, batchable=True)
+        Raises:
+            UsageError: The radius is larger than the distance of any two tokens.
+        """
+        context.check_radius("r", settings.r)
+        return cls(settings.r)

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from kerv_cli.base.limits import number
-from kerv_cli.base.registry import NoSettings, add
+from kerv_cli.base.registry import NoSettings, SkipPart
+from kerv_cli.engine.decisions import SkipDecision
 from kerv_cli.engine.parts import Skip
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ class StreakSkipSettings:
     tolerance: float = number(0.05, 0)
 
 
+@SkipPart("streak", StreakSkipSettings, colour=0xE8C547, takes_draft=True, merges=True)
 class StreakSkip(Skip):
     """Executes drafts without verification, as long as verified drafts agree with the target.
 
@@ -66,21 +68,14 @@ class StreakSkip(Skip):
         """Begin an episode: allow `opening` decodes without verification."""
         self.allowed = self.left = self.settings.opening
 
-    def take(self, chunk: Chunk) -> bool:
-        """Fill the chunk with the draft, unverified, if one more such decode is allowed and the draft has all N tokens.
-
-        Returns:
-            Whether the chunk was filled.
-        """
+    def take(self, chunk: Chunk) -> SkipDecision:
+        """Take the draft, unverified, if one more such decode is allowed and the draft has all N tokens."""
         chains = self.source.chains(chunk, chunk.size)
         self.chain = tuple(chains[0]) if chains else ()
-        trusted = self.left > 0 and len(self.chain) == chunk.size
-        chunk.reason = TRUSTED if trusted else STREAK
-        if not trusted:
-            return False
+        if not self.left or len(self.chain) < chunk.size:
+            return SkipDecision(reason=STREAK)
         self.left -= 1
-        chunk.skip(self.chain, self.source.name)
-        return True
+        return SkipDecision(self.chain, self.source.name, TRUSTED)
 
     def verified(self, chunk: Chunk) -> None:
         """Double the number of decodes allowed without verification if the verified draft agrees; else set it to 0."""
@@ -102,6 +97,7 @@ class StreakSkip(Skip):
         return tolerance > 0 and chunk.distance(self.chain[: len(targets)], targets) <= tolerance
 
 
+@SkipPart("always", takes_draft=True, verifies=False, batchable=True)
 class AlwaysSkip(Skip):
     """Executes every draft without verification. If there is no draft of a whole chunk, the target decodes."""
 
@@ -113,19 +109,9 @@ class AlwaysSkip(Skip):
         """Build the part that the setting `skip=always` chooses."""
         return cls(context.built["prefill_draft"])
 
-    def take(self, chunk: Chunk) -> bool:
-        """Fill the chunk with the draft, without verification, if the draft has all N tokens.
-
-        Returns:
-            Whether the chunk was filled.
-        """
+    def take(self, chunk: Chunk) -> SkipDecision:
+        """Take the draft, without verification, if it has all N tokens."""
         chains = self.source.chains(chunk, chunk.size)
         if not chains or len(chains[0]) < chunk.size:
-            return False
-        chunk.skip(chains[0], self.source.name)
-        return True
-
-
-_FILE = "kerv_cli.methods.streak:"
-add("skip", "streak", _FILE + "StreakSkip.build", StreakSkipSettings, colour=0xE8C547, takes_draft=True, merges=True)
-add("skip", "always", _FILE + "AlwaysSkip.build", takes_draft=True, verifies=False, batchable=True)
+            return SkipDecision()
+        return SkipDecision(chains[0], self.source.name)

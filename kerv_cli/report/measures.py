@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from kerv_cli.base.registry import Part, parts
+from kerv_cli.base.registry import ColumnPart
 from kerv_cli.engine.record import PHASES
 from kerv_cli.report import statistics as stats
 from kerv_cli.report.results import MACRO, MICRO, Measures
@@ -247,9 +247,9 @@ def _means(episodes: pd.DataFrame, by: list[str]) -> pd.DataFrame:
     return means
 
 
-def registered_columns() -> Mapping[str, Part]:
+def registered_columns() -> Mapping[str, ColumnPart]:
     """Return the table columns that plugins add, by name.
 
-    The `build` function of each computes the column's value from the episodes of a setting.
+    The function of each computes the column's value from the episodes of a setting.
     """
-    return parts("column")
+    return ColumnPart.every()

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from kerv_cli.base.errors import KervError, UsageError
-from kerv_cli.base.registry import find
+from kerv_cli.base.registry import ArtifactPart, TargetPart
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.engine.protocol import Target
@@ -67,8 +67,8 @@ class Policy:
         self.identity = self.artifacts.check(self.method.needs, use)
         self.interface = self._interface(spec)
         self.range = self._range()
-        self.by_task = not self.task and bool(self._artifacts_with("by_task"))
-        if self.by_task and settings.protocol != VLA_EVAL and self._artifacts_with("needs_task"):
+        self.by_task = not self.task and bool(self._by_task())
+        if self.by_task and settings.protocol != VLA_EVAL and any(part.needs_task for part in self._by_task()):
             raise UsageError(
                 f"method={settings.method}: its calibration or drafts differ between tasks: name one with task=NAME"
             )
@@ -87,7 +87,7 @@ class Policy:
             cameras=tuple(description.cameras),
             size=int(description.settings.get("image_size", 0)) if description.cameras else 0,
             privileged=not description.cameras and description.observation.state > 0,
-            images_alone=bool(find("target", description.family).traits.get("images_alone")),
+            images_alone=TargetPart.find(description.family).images_alone,
             gripper=self.settings.gripper,
             grip=tuple(spec.grip) if spec else (),
         )
@@ -104,13 +104,10 @@ class Policy:
         low, high = (np.array(ends)[: None if interface.privileged else len(names)] for ends in stored)
         return StateRange(low, high, names, self.settings.margin)
 
-    def _artifacts_with(self, trait: str) -> list[str]:
-        """Return the kinds of the method's artifacts (trained or calibrated files) that have a trait in the registry.
-
-        Args:
-            trait: Name of the trait, a further property such as `by_task`.
-        """
-        return sorted(kind for kind in self.method.needs if find("artifact", kind).traits.get(trait))
+    def _by_task(self) -> list[ArtifactPart]:
+        """Return those kinds of the method's artifacts that contain numbers or data by task."""
+        parts = [ArtifactPart.find(kind) for kind in sorted(self.method.needs)]
+        return [part for part in parts if part.by_task]
 
     def _any_task(self) -> str:
         """Return a task with which a decoder can be built, for warming up.
@@ -119,7 +116,7 @@ class Policy:
         """
         if not self.by_task or self.settings.protocol != VLA_EVAL:
             return self.task
-        artifact = self.artifacts.load(self._artifacts_with("by_task")[0])
+        artifact = self.artifacts.load(self._by_task()[0].name)
         return next(iter(artifact.tasks), "")
 
     def lend_decoder(self, task: str) -> Decoder:

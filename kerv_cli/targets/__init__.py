@@ -1,22 +1,55 @@
-"""Register kerv's own families of targets: compact, grown and OpenVLA."""
+"""Register kerv's own families of targets: compact, grown and OpenVLA. Each function imports what it calls."""
 
 from __future__ import annotations
 
-from kerv_cli.base.registry import add
+from typing import Any
 
-add("target", "compact", "kerv_cli.targets.compact.folder:build")
-add(
-    "target",
-    "grown",
-    "kerv_cli.targets.grown:build",
-    weights="kerv_cli.targets.grown:check_weights",
-    importer="kerv_cli.targets.grown:grow",
-)
-add(
-    "target",
-    "openvla",
-    "kerv_cli.targets.openvla.target:build",
-    weights="kerv_cli.targets.openvla.target:check_weights",
-    importer="kerv_cli.targets.openvla.target:import_checkpoint",
-    images_alone=True,  # reads no state
-)
+from kerv_cli.base.registry import TargetPart
+
+
+@TargetPart("compact")
+def compact(*arguments: Any) -> Any:
+    """Load a compact target; see `compact.folder.build`."""
+    from kerv_cli.targets.compact.folder import build
+
+    return build(*arguments)
+
+
+def _grow(settings: Any) -> Any:
+    from kerv_cli.targets.grown import grow
+
+    return grow(settings)
+
+
+def _check_grown(*arguments: Any) -> None:
+    from kerv_cli.targets.grown import check_weights
+
+    check_weights(*arguments)
+
+
+@TargetPart("grown", importer=_grow, check_weights=_check_grown)
+def grown(*arguments: Any) -> Any:
+    """Load a grown target; see `grown.build`."""
+    from kerv_cli.targets.grown import build
+
+    return build(*arguments)
+
+
+def _import_openvla(settings: Any) -> Any:
+    from kerv_cli.targets.openvla.target import import_checkpoint
+
+    return import_checkpoint(settings)
+
+
+def _check_openvla(*arguments: Any) -> None:
+    from kerv_cli.targets.openvla.target import check_weights
+
+    check_weights(*arguments)
+
+
+@TargetPart("openvla", importer=_import_openvla, check_weights=_check_openvla, images_alone=True)  # reads no state
+def openvla(*arguments: Any) -> Any:
+    """Load an OpenVLA target; see `openvla.target.build`."""
+    from kerv_cli.targets.openvla.target import build
+
+    return build(*arguments)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import read_mapping, sha256_of, write_bytes, write_folder, write_json
 from kerv_cli.base.manifests import read
-from kerv_cli.base.registry import find, load, parts
+from kerv_cli.base.registry import TargetPart
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 
 if TYPE_CHECKING:  # torch is imported where weights are read or written: a description is read without it
@@ -349,13 +349,13 @@ def load_state(module: nn.Module, folder: Path, kind: str) -> None:
 def read_target(folder: Path) -> TargetDescription:
     """Return the description of a target and check its weights; errors as `read_description`.
 
-    A family of targets whose weights are not in the target's folder registers a check of its own as the trait
-    `weights`. This is a function of the folder and the description.
+    A family of targets whose weights are not in the target's folder registers a check of its own
+    (`TargetPart.check_weights`).
     """
     description = described(folder, "target", TargetDescription)
-    family = parts("target").get(description.family)
-    if family is not None and "weights" in family.traits:
-        load(family.traits["weights"])(folder, description)
+    family = TargetPart.every().get(description.family)
+    if family is not None and family.check_weights is not None:
+        family.check_weights(folder, description)
     else:
         check_weights(folder, "target", description.sha256)
     return description
@@ -379,5 +379,5 @@ def load_target(folder: Path, device: str = "cpu", dtype: torch.dtype | None = N
     import torch
 
     description = read_target(folder)
-    part = find("target", description.family, "target family")
+    part = TargetPart.find(description.family, "target family")
     return part.built(folder, description, device, dtype or torch.float32), description

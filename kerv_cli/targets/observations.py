@@ -100,7 +100,7 @@ def read_observations(
         CheckpointError: The images have a different size than the policy takes.
     """
     sees, frames = settings.observation == "vision", None
-    steps = steps_of(episode, sees)[chosen]
+    steps = observed_steps(episode, sees)[chosen]
     if sees:
         check_frames(episode, settings.image_size)
         assert isinstance(episode.frames, EncodedFrames)
@@ -131,7 +131,7 @@ def read_chunks(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarr
     return np.stack([episode.labels[t : t + chunk] for t in steps])
 
 
-def steps_of(episode: DemoEpisode, sees: bool) -> np.ndarray:
+def observed_steps(episode: DemoEpisode, sees: bool) -> np.ndarray:
     """Return the control steps (n,) that a policy can be trained on.
 
     Args:

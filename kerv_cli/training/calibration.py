@@ -38,8 +38,8 @@ from kerv_cli.methods.calibration import (
     Variability,
 )
 from kerv_cli.methods.compose import Method
+from kerv_cli.methods.heisd.curvature import BoundaryRanges
 from kerv_cli.methods.heisd.datastore import Datastore
-from kerv_cli.methods.heisd.rules import BoundaryRanges
 from kerv_cli.methods.kerv.prediction import FILTERS, Noise, kalman_weights
 from kerv_cli.targets.folders import check_not_shipped
 from kerv_cli.targets.observations import check_tail, observations_of

@@ -33,7 +33,7 @@ from kerv_cli.methods.heisd.datastore import (
     prompt_key,
 )
 from kerv_cli.targets.folders import check_not_shipped
-from kerv_cli.targets.observations import observations_of, prompts_of, read_chunks, steps_of
+from kerv_cli.targets.observations import observations_of, observed_steps, prompts_of, read_chunks
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import demos_for
 from kerv_cli.training.making import Begin, quietly
@@ -173,7 +173,7 @@ def entries_of(target: Any, episode: DemoEpisode, space: ObservationSpace, key: 
         The values of each column, one row per entry. The column `keys` holds the encoded observations, and `tokens` the
         expert's next H undisturbed actions.
     """
-    steps = steps_of(episode, bool(target.cameras))
+    steps = observed_steps(episode, bool(target.cameras))
     tokens = target.actions.encode(read_chunks(episode, steps, target.chunk)).reshape(len(steps), -1)
     observations = observations_of(target, episode, steps, space)
     size = -(-len(steps) // -(-len(steps) // BATCH))  # equal batches

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.base.registry import find, parts
+from kerv_cli.base.registry import ArtifactPart
 from kerv_cli.catalogue.entries import state_of
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings
@@ -69,7 +69,7 @@ def plan(settings: PrepareSettings, database: Database) -> list[Step]:
                 command = (*command, f"train.steps={settings.steps}")
             number = compose("train_drafter", command[2:], TrainDrafterSettings).train.steps
         steps.append(Step(kind, _state(artifacts, database, kind, kinds), command, number))
-    if any(step.state != THERE and not find("artifact", step.kind).traits.get("study") for step in steps):
+    if any(step.state != THERE and not ArtifactPart.find(step.kind).study for step in steps):
         demos_for(settings, description, database)
     return steps
 
@@ -91,15 +91,15 @@ def needs(methods: tuple[str, ...], sees: bool, runnable: bool = True) -> tuple[
     for name in methods:
         if name not in names:
             raise UnknownName("method", name, names)
-    artifacts = parts("artifact")
-    seeing = {kind for kind, part in artifacts.items() if part.traits.get("sees")}
+    artifacts = ArtifactPart.every()
+    seeing = {kind for kind, part in artifacts.items() if part.sees}
     kinds: set[str] = set()
     for name in methods or names:
         method = Method.of(compose("rollout", [f"method={name}"], RolloutSettings))
         if methods and not sees and seeing & set(method.needs):
             raise UsageError(f"for={name}: it needs a target that sees, this one reads the state")
         kinds |= set(method.needs)
-    studies = {kind: part.traits["study"] for kind, part in artifacts.items() if "study" in part.traits}
+    studies = {kind: part.study for kind, part in artifacts.items() if part.study}
     if sees and runnable:
         for kind in kinds & set(studies):
             for settings in resolve([f"study={studies[kind]}"]).settings.values():
@@ -110,7 +110,7 @@ def needs(methods: tuple[str, ...], sees: bool, runnable: bool = True) -> tuple[
         kinds -= set(studies)
     order: list[str] = []
     for name, part in artifacts.items():
-        order += [*part.needs(None), name]
+        order += [*part.needed(None), name]
     return tuple(kind for kind in dict.fromkeys(order) if kind in kinds and kind_of(kind).command)
 
 

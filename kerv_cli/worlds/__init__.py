@@ -1,7 +1,7 @@
 """Find environments, their tasks and suites (named groups of tasks) by name.
 
-This package registers Meta-World, LIBERO and the kinds of stress. Importing it loads nothing heavy: numpy is imported
-with an environment's specification, and the simulator with its world.
+This package registers Meta-World and LIBERO. Importing it loads nothing heavy: numpy is imported with an environment's
+specification, and the simulator with its world.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.registry import add, load, parts
+from kerv_cli.base.registry import EnvironmentPart
 
 if TYPE_CHECKING:
     from kerv_cli.worlds.settings import WorldSettings
@@ -22,7 +22,7 @@ W = TypeVar("W", bound="WorldSettings")
 
 def specs() -> Mapping[str, EnvironmentSpec]:
     """Return the specifications of all registered environments, by name."""
-    return {name: load(part.build) for name, part in parts("environment").items()}
+    return {name: part.built() for name, part in EnvironmentPart.every().items()}
 
 
 def spec_of(task: str) -> EnvironmentSpec:
@@ -91,11 +91,11 @@ def stands_for_tasks(name: str) -> bool:
 
 def task_names() -> Iterator[str]:
     """Yield the suites and tasks of all environments, for shell completion."""
-    for part in parts("environment").values():
-        if "names" in part.traits:  # `module:tuple`, importable without numpy
-            yield from load(part.traits["names"])
+    for part in EnvironmentPart.every().values():
+        if part.names is not None:
+            yield from part.names()
         else:
-            spec = load(part.build)
+            spec = part.built()
             yield from (*spec.suites, *spec.tasks)
 
 
@@ -114,16 +114,29 @@ def settled(world: W, spec: EnvironmentSpec) -> W:
     return replace(world, camera=camera, horizon=spec.control_steps(world.horizon))
 
 
-add("environment", "metaworld", "kerv_cli.worlds.metaworld.spec:SPEC", names="kerv_cli.worlds.metaworld.tasks:NAMES")
-add("environment", "libero", "kerv_cli.worlds.libero.spec:SPEC", names="kerv_cli.worlds.libero.tasks:NAMES")
-for _name, _class, _needed in (
-    ("push", "kinds:Push", ("actions", "position")),
-    ("actuation", "kinds:Actuation", ("actions",)),
-    ("sensor", "kinds:Sensor", ("images",)),
-    ("light", "kinds:Light", ("model",)),
-    ("colour", "kinds:Colour", ("model",)),
-    ("camera", "kinds:CameraJitter", ("model",)),
-    ("object", "kinds:Objects", ("model", "range")),
-):
-    add("stress", _name, f"kerv_cli.worlds.stress.{_class}", needed=_needed)
-add("stress", "none", needed=())
+def _metaworld_names() -> tuple[str, ...]:
+    from kerv_cli.worlds.metaworld.tasks import NAMES
+
+    return NAMES
+
+
+def _libero_names() -> tuple[str, ...]:
+    from kerv_cli.worlds.libero.tasks import NAMES
+
+    return NAMES
+
+
+@EnvironmentPart("metaworld", names=_metaworld_names)
+def metaworld() -> EnvironmentSpec:
+    """Import the specification of Meta-World."""
+    from kerv_cli.worlds.metaworld.spec import SPEC
+
+    return SPEC
+
+
+@EnvironmentPart("libero", names=_libero_names)
+def libero() -> EnvironmentSpec:
+    """Import the specification of LIBERO."""
+    from kerv_cli.worlds.libero.spec import SPEC
+
+    return SPEC

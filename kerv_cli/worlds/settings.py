@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import choice, number, setting
-from kerv_cli.base.registry import find
+from kerv_cli.base.registry import StressPart
 from kerv_cli.base.settings import CommandSettings
 
 EVALUATION_SEED = 100_000
@@ -59,8 +59,9 @@ class StressSettings:
             UnknownName: There is no such kind.
             UsageError: There is a level without a kind.
         """
-        find("stress", self.kind, f"{prefix}kind")
-        if self.kind == "none" and self.level:
+        if self.kind != "none":  # else the kinds, which import numpy, are not loaded
+            StressPart.find(self.kind, f"{prefix}kind")
+        elif self.level:
             raise UsageError(f"{prefix}level={self.level} without {prefix}kind: name what to disturb")
 
 

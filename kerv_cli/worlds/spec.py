@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.limits import check_settings
-from kerv_cli.base.registry import find, load
+from kerv_cli.base.registry import StressPart, load
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
 from kerv_cli.worlds.settings import CameraSettings, StressSettings
 from kerv_cli.worlds.stress.base import NO_STRESS, Stress
@@ -191,7 +191,7 @@ class EnvironmentSpec:
             return
         offered = load(self.world_class).stressable if self.world_class else frozenset()
         offered |= {"position"} & {group.name for group in self.actions.groups}
-        for need in find("stress", settings.kind).traits["needed"]:
+        for need in StressPart.find(settings.kind).requires:
             if need not in offered:
                 why = _LACKS[need] if self.world_class else "it is a recording"
                 raise UsageError(f"world.stress.kind={settings.kind}: not possible in {self.name}: {why}")

@@ -2,25 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from kerv_cli.base.registry import NoSettings, add
+from kerv_cli.base.registry import AcceptancePart
 from kerv_cli.engine.acceptance import DistanceRule
 
-if TYPE_CHECKING:
-    from kerv_cli.methods.context import Context
 
-
+@AcceptancePart("position")
 class PositionOnly(DistanceRule):
     """Accepts the longest path within its limits, as its base does; another rule overrides `judge`."""
 
     def limits(self, r: int) -> tuple[int, ...]:
         free = range(self.space.dofs)[self.space.dofs_of("position")]
         return tuple(r if dof in free else 0 for dof in range(self.space.dofs))
-
-
-def build(settings: NoSettings, context: Context) -> PositionOnly:
-    return PositionOnly(context.target.actions)
-
-
-add("acceptance", "position", f"{__name__}:build")

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from kerv_cli.base.limits import number
-from kerv_cli.base.registry import add
+from kerv_cli.base.registry import BoundaryPart
+from kerv_cli.engine.decisions import Choice
 from kerv_cli.engine.parts import Boundary
-
-if TYPE_CHECKING:
-    from kerv_cli.engine.chunk import Choice
-    from kerv_cli.methods.context import Context
 
 
 @dataclass
@@ -24,18 +20,7 @@ class HeightSettings:
     metres: float = number(0.1, -10, 10)
 
 
+@BoundaryPart("height", HeightSettings, chooses=True)
 class Height(Boundary):
-    def __init__(self, metres: float) -> None:
-        self.metres = metres
-
     def choose(self, path: np.ndarray) -> Choice:
-        from kerv_cli.engine.chunk import Choice  # imports torch
-
-        return Choice("retrieval" if len(path) and path[-1][2] > self.metres else "drafter")
-
-
-def build(settings: HeightSettings, context: Context) -> Height:
-    return Height(settings.metres)
-
-
-add("boundary", "height", f"{__name__}:build", HeightSettings, chooses=True)
+        return Choice("retrieval" if len(path) and path[-1][2] > self.settings.metres else "drafter")

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from kerv_cli.base.registry import add
+from kerv_cli.base.registry import ColumnPart
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
+@ColumnPart("longest_episode")
 def longest(episodes: pd.DataFrame) -> float:
     """episodes: a setting's, with the columns of `EPISODE_SCHEMA` (`kerv_cli/episodes/rows.py`)."""
     return float(episodes["steps"].max())
-
-
-add("column", "longest_episode", f"{__name__}:longest")

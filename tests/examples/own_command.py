@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import typer
 
 from kerv_cli.base.limits import choice, number
-from kerv_cli.base.registry import add
 from kerv_cli.base.settings import TaskSettings
+from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, end_with_json
 from kerv_cli.worlds.settings import EVALUATION_SEED
 
@@ -21,8 +21,14 @@ class SeedsSettings(TaskSettings):
     use: str = choice("evaluation", "evaluation", "demonstrations", help="what the seeds are for")
 
 
+@command(
+    "seeds",
+    SeedsSettings,
+    keys="task episodes use",
+    examples=("kerv seeds task=reach", "kerv seeds use=demonstrations episodes=10 --json"),
+)
 def seeds(settings: SeedsSettings, as_json: AsJson = False) -> None:
-    """What `kerv seeds` does with its settings, which are composed and checked."""
+    """Print the seeds of a task's episodes."""
     from kerv_cli.worlds import resolve_tasks
 
     first = EVALUATION_SEED if settings.use == "evaluation" else 0
@@ -31,14 +37,3 @@ def seeds(settings: SeedsSettings, as_json: AsJson = False) -> None:
         end_with_json(numbers)
     for task, one in numbers.items():
         typer.echo(f"{task}: {one[0]} to {one[-1]}")
-
-
-add(
-    "command",
-    "seeds",
-    f"{__name__}:seeds",
-    SeedsSettings,
-    help="Print the seeds of a task's episodes.",
-    keys="task episodes use",
-    examples=("kerv seeds task=reach", "kerv seeds use=demonstrations episodes=10 --json"),
-)

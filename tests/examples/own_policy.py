@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from kerv_cli.base.places import artifact
-from kerv_cli.base.registry import add
+from kerv_cli.base.registry import TargetPart
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.targets.checkpoint import TargetDescription, load_state, save_module, target_fields
 from kerv_cli.targets.settings import BuildTargetSettings
@@ -85,11 +85,9 @@ def write(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
     return folder, {"action tokens": policy.actions.tokens}
 
 
+@TargetPart("own", importer=write)
 def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> OwnPolicy:
     """What every command calls that decodes."""
     policy = OwnPolicy(description.actions)
     load_state(policy, folder, "target")
     return policy
-
-
-add("target", "own", f"{__name__}:build", importer=f"{__name__}:write")

@@ -6,34 +6,26 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kerv_cli.base.registry import PREFILL, NoSettings, add
+from kerv_cli.base.registry import NoSettings
+from kerv_cli.methods.kerv import PredictorPart
 
 if TYPE_CHECKING:
     from kerv_cli.methods.context import Context
-    from kerv_cli.methods.kerv.prediction import PredictionProposer
 
 
+@PredictorPart("mean")
 class Mean:
     name = "mean"
 
     def __init__(self, held: np.ndarray) -> None:
         self.held = held
 
+    @classmethod
+    def build(cls, settings: NoSettings, context: Context) -> Mean:
+        return cls(context.target.actions.is_strict)
+
     def predict(self, history: np.ndarray, steps: int) -> np.ndarray | None:
         """history (m, D) in [-1, 1], oldest first -> (steps, D); strict DoFs keep their last value."""
         if not len(history):
             return None
         return np.tile(np.where(self.held, history[-1], history[-2:].mean(0)), (steps, 1))
-
-
-def build(settings: NoSettings, context: Context) -> Mean:
-    return Mean(context.target.actions.is_strict)
-
-
-def propose(settings: NoSettings, context: Context) -> PredictionProposer:
-    from kerv_cli.methods.kerv.prediction import PredictionProposer
-
-    return PredictionProposer(build(settings, context))
-
-
-add("proposer", "mean", f"{__name__}:propose", when=PREFILL, chains=True, predictor=f"{__name__}:build")

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kerv_cli.base.limits import number
-from kerv_cli.base.registry import PREFILL, add_drafter
+from kerv_cli.base.registry import PREFILL, DrafterPart
 
 
 @dataclass
@@ -30,12 +30,8 @@ class FollowDrafterSettings:
     share: float = number(1.0, above=0, most=1)  # of every episode, from its beginning, is learned from
 
 
-add_drafter(
-    "follow",
-    "examples.own_proposer_table:FollowDrafter",
-    FollowDrafterSettings,
-    FollowSettings,
-    colour=0x7A9E2F,
-    when=PREFILL,
-    chains=True,
-)
+@DrafterPart("follow", FollowSettings, trained=FollowDrafterSettings, colour=0x7A9E2F, when=PREFILL, chains=True)
+def follow() -> type:
+    from examples.own_proposer_table import FollowDrafter
+
+    return FollowDrafter

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from kerv_cli.base.registry import NoSettings, add
+from kerv_cli.base.registry import SkipPart
+from kerv_cli.engine.decisions import SkipDecision
 from kerv_cli.engine.parts import Skip
 
 if TYPE_CHECKING:
@@ -13,24 +14,18 @@ if TYPE_CHECKING:
     from kerv_cli.methods.context import Context
 
 
+@SkipPart("every_second", takes_draft=True)  # refused without an in-prefill draft
 class EverySecond(Skip):
-    def __init__(self, source: ChainProposer) -> None:
-        self.source, self.trusts = source, False
+    def __init__(self, settings: object, context: Context) -> None:
+        self.source: ChainProposer = context.built["prefill_draft"]
+        self.trusts = False
 
     def begin(self, task: str, seed: int) -> None:
         self.trusts = False
 
-    def take(self, chunk: Chunk) -> bool:
+    def take(self, chunk: Chunk) -> SkipDecision:
         chains = self.source.chains(chunk, chunk.size)
-        taken = self.trusts and bool(chains) and len(chains[0]) == chunk.size
         self.trusts = not self.trusts
-        if taken:
-            chunk.skip(chains[0], self.source.name)
-        return taken
-
-
-def build(settings: NoSettings, context: Context) -> EverySecond:
-    return EverySecond(context.built["prefill_draft"])
-
-
-add("skip", "every_second", f"{__name__}:build", takes_draft=True)  # refused without an in-prefill draft
+        if self.trusts or not chains or len(chains[0]) < chunk.size:
+            return SkipDecision()  # the target decodes
+        return SkipDecision(chains[0], self.source.name)

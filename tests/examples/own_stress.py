@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from kerv_cli.base.registry import add
+from kerv_cli.base.registry import StressPart
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.worlds.stress.base import Array, Stress
 
 
+@StressPart("drift", requires=("actions",))
 class Drift(Stress):
     kind = "drift"
     levels = (0.05, 0.1, 0.2, 0.4)  # of half a DoF's range
@@ -21,6 +22,3 @@ class Drift(Stress):
 
     def act(self, action: Array, step: int) -> Array:
         return np.clip(action + self._offset, self._low, self._high)
-
-
-add("stress", "drift", f"{__name__}:Drift", needed=("actions",))

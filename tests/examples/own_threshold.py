@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from kerv_cli.base.limits import number
-from kerv_cli.base.registry import add
+from kerv_cli.base.registry import ThresholdPart
+from kerv_cli.engine.parts import Threshold
 
 if TYPE_CHECKING:
     from kerv_cli.methods.context import Context
@@ -21,10 +22,10 @@ class GrowingSettings:
     most: int = number(9, 0, 254)
 
 
-class Growing:
-    """The `Threshold` protocol of `kerv_cli/engine/parts.py`."""
-
-    def __init__(self, settings: GrowingSettings) -> None:
+@ThresholdPart("growing", GrowingSettings)
+class Growing(Threshold):
+    def __init__(self, settings: GrowingSettings, context: Context) -> None:
+        context.check_radius("most", settings.most)
         self.settings, self.decodes = settings, 0
 
     def reset(self) -> None:
@@ -35,11 +36,3 @@ class Growing:
 
     def update(self, variability: float | None) -> None:
         self.decodes += 1
-
-
-def build(settings: GrowingSettings, context: Context) -> Growing:
-    context.check_radius("most", settings.most)
-    return Growing(settings)
-
-
-add("threshold", "growing", f"{__name__}:build", GrowingSettings)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kerv_cli.base.registry import add
+from kerv_cli.base.registry import EnvironmentPart
 from kerv_cli.base.spaces import ActionSpace, Group, Observation, ObservationSpace, Place
 from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import EnvironmentSpec, Seeds, World
@@ -37,7 +37,7 @@ SPEC = EnvironmentSpec(
     world_class=f"{__name__}:PointWorld",
     expert_class=f"{__name__}:PointExpert",
 )
-add("environment", SPEC.name, f"{__name__}:SPEC")
+EnvironmentPart(SPEC.name)(lambda: SPEC)
 
 
 class PointWorld(World):

@@ -6,10 +6,18 @@ A certificate states that on its tasks a skip rule loses little of the success o
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import number
-from kerv_cli.base.registry import PREFILL, add, find, part_of
+from kerv_cli.base.registry import PREFILL, ArtifactPart, ProposerPart, SkipPart
+from kerv_cli.methods.streak import StreakSkip, StreakSkipSettings
+
+if TYPE_CHECKING:
+    from kerv_cli.engine.parts import Skip
+    from kerv_cli.engine.proposer import Proposer
+    from kerv_cli.methods.certified.certificate import Certificate
+    from kerv_cli.methods.context import Context
 
 
 @dataclass
@@ -38,42 +46,80 @@ class ScopedSettings:
             UsageError: `outside` cannot draft whole chunks before the prefill.
             UnknownName: No proposer has the name `outside`.
         """
-        outside = find("proposer", self.outside, "prefill_draft.outside")
-        if not (outside.traits.get("merged") or outside.traits.get("chains")):
+        outside = ProposerPart.find(self.outside, "prefill_draft.outside")
+        if not (outside.merged or outside.chains):
             raise UsageError(
                 f"prefill_draft.outside={outside.name}: it does not draft whole chunks from the prompt; set "
                 "prefill_draft.outside=merged, or a source of merged drafts, e.g. early"
             )
 
 
-def _needs(settings: ScopedSettings) -> tuple[str, ...]:
+@ArtifactPart("certificate", sees=True, by_task=True, names_more=True, study="certify")
+def artifact() -> type:
+    """Import the kind of artifact `certificate`."""
+    from kerv_cli.methods.certified.certificate import CertificateArtifact
+
+    return CertificateArtifact
+
+
+def covering(context: Context) -> Certificate | None:
+    """Return the certificate if it covers the decoder's task, else None.
+
+    A decoder has one task, so this is checked once, when the decoder is built.
+    """
+    certificate: Certificate = context.artifact("certificate")
+    return certificate if context.task in certificate.tasks else None
+
+
+def needs_outside(settings: ScopedSettings) -> tuple[str, ...]:
     """Return the kinds of artifacts needed: the certificate, and what the proposer for other tasks (`outside`) needs.
 
     The certificate itself lists what the certified proposer needs (`CertificateArtifact.needs`).
     """
-    outside = part_of("prefill_draft", settings.outside)
-    return "certificate", *outside.needs(outside.default)
+    outside = ProposerPart.find(settings.outside)
+    return "certificate", *outside.needed(outside.default)
 
 
-_CERTIFICATE = "kerv_cli.methods.certified.certificate:"
+@ProposerPart("scoped", ScopedSettings, needs=needs_outside, when=PREFILL, chains=True)
+class Scoped:
+    """On the certificate's tasks, the certified proposer. On other tasks, the proposer `outside`."""
 
-add(
-    "artifact",
-    "certificate",
-    _CERTIFICATE + "CertificateArtifact",
-    sees=True,
-    by_task=True,
-    names_more=True,
-    study="certify",
-)
-add("proposer", "scoped", _CERTIFICATE + "scoped", ScopedSettings, _needs, when=PREFILL, chains=True)
-add(
-    "skip",
-    "certified",
-    _CERTIFICATE + "certified",
-    CertifiedSkipSettings,
-    needs=("certificate",),
-    colour=0x2E8B57,
-    takes_draft=True,
-    merges=True,
-)
+    @staticmethod
+    def build(settings: ScopedSettings, context: Context) -> Proposer:
+        """Build the proposer for the decoder's task."""
+        certificate = covering(context)
+        if certificate is not None and certificate.certified is not None:
+            source = certificate.certified.source
+        else:
+            source = ProposerPart.find(settings.outside).default
+        proposer: Proposer = ProposerPart.find(source.kind).built(source, context)
+        return proposer
+
+
+@SkipPart("certified", CertifiedSkipSettings, needs=("certificate",), colour=0x2E8B57, takes_draft=True, merges=True)
+class CertifiedSkip:
+    """On the certificate's tasks, the certified rule. On other tasks, a streak."""
+
+    @staticmethod
+    def build(settings: CertifiedSkipSettings, context: Context) -> Skip | None:
+        """Build the rule for the decoder's task.
+
+        Returns:
+            The skip rule. None if the certificate covers the task but no rule was certified: then every draft is
+            verified.
+
+        Raises:
+            UsageError: The method, the number format or the chunk length is not the certified one.
+        """
+        certificate = covering(context)
+        if certificate is None:
+            return StreakSkip.build(StreakSkipSettings(most=settings.most), context)
+        if certificate.certified is None:
+            return None
+        certificate.check_method(context.method, str(context.target.dtype).removeprefix("torch."))
+        chunk = context.chunk or context.target.chunk
+        if chunk != certificate.chunk:
+            raise UsageError(f"skip=certified with chunk={chunk}: the certificate is of {certificate.chunk}")
+        rule = certificate.certified.rule
+        skip: Skip = SkipPart.find(rule.kind).built(rule, context)
+        return skip

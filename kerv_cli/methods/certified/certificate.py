@@ -1,8 +1,4 @@
-"""The certificate of success, and the skip rule and the proposer that apply it (docs/methods.md §4.6, ours).
-
-A certificate covers some tasks. A decoder has one task. Whether the certificate covers this task is checked once, when
-the decoder is built.
-"""
+"""The certificate of success: what a test of skip rules found, and the file that records it (docs/methods.md §4.6)."""
 
 from __future__ import annotations
 
@@ -16,12 +12,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import part_of
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.engine.parts import Skip
-from kerv_cli.engine.proposer import Proposer
 from kerv_cli.methods.artifacts import Artifact, MadeFor, Use
-from kerv_cli.methods.certified import CertifiedSkipSettings, ScopedSettings
-from kerv_cli.methods.context import Context
-from kerv_cli.methods.streak import StreakSkip, StreakSkipSettings
 
 
 @dataclass(frozen=True)
@@ -97,8 +88,11 @@ class Attempt:
     @property
     def seeds_served(self) -> set[int]:
         """Seeds of the test's episodes, as numbers."""
-        ends = ([int(end) for end in part.split("-")] for part in self.seeds.split(";"))
-        return {seed for part in ends for seed in range(part[0], part[-1] + 1)}
+        seeds: set[int] = set()
+        for part in self.seeds.split(";"):
+            first, _, last = part.partition("-")
+            seeds.update(range(int(first), int(last or first) + 1))
+        return seeds
 
 
 @dataclass(frozen=True)
@@ -268,45 +262,4 @@ class CertificateArtifact(Artifact[Certificate]):
         if description.certified is None:
             return ()
         source = description.certified.source
-        return part_of("prefill_draft", source.kind).needs(source)
-
-
-def covering(context: Context) -> Certificate | None:
-    """Return the certificate if it covers the decoder's task, else None."""
-    certificate: Certificate = context.artifact("certificate")
-    return certificate if context.task in certificate.tasks else None
-
-
-def scoped(settings: ScopedSettings, context: Context) -> Proposer:
-    """Build prefill_draft=scoped: on the certificate's tasks the certified proposer, else the proposer `outside`."""
-    certificate = covering(context)
-    if certificate is not None and certificate.certified is not None:
-        source = certificate.certified.source
-    else:
-        source = part_of("prefill_draft", settings.outside).default
-    return part_of("prefill_draft", source.kind).built(source, context)
-
-
-def certified(settings: CertifiedSkipSettings, context: Context) -> Skip | None:
-    """Build skip=certified: the certified rule on the certificate's tasks, else a streak.
-
-    A streak executes drafts without verification, as long as verified drafts agree with the target
-    (docs/methods.md §4.5).
-
-    Returns:
-        The skip rule. None if the certificate covers the task but no rule was certified: then every draft is verified.
-
-    Raises:
-        UsageError: The method, the number format or the chunk length is not the certified one.
-    """
-    certificate = covering(context)
-    if certificate is None:
-        return StreakSkip.build(StreakSkipSettings(most=settings.most), context)
-    if certificate.certified is None:
-        return None
-    certificate.check_method(context.method, str(context.target.dtype).removeprefix("torch."))
-    chunk = context.chunk or context.target.chunk
-    if chunk != certificate.chunk:
-        raise UsageError(f"skip=certified with chunk={chunk}: the certificate is of {certificate.chunk}")
-    rule = certificate.certified.rule
-    return part_of("skip", rule.kind).built(rule, context)
+        return part_of("prefill_draft", source.kind).needed(source)

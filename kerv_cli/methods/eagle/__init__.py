@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kerv_cli.base.limits import MOST_TOKENS, choice, number
-from kerv_cli.base.registry import DRAFTING, STATES, add_drafter
+from kerv_cli.base.registry import DRAFTING, STATES, DrafterPart
 
 
 @dataclass
@@ -41,13 +41,17 @@ def only_of_trees(settings: DrafterProposerSettings, *names: str) -> dict[str, s
     return dict.fromkeys(names, "a chain is a single path") if settings.shape == "chain" else {}
 
 
-add_drafter(
+@DrafterPart(
     "drafter",
-    "kerv_cli.methods.eagle.drafter:EagleDrafter",
-    DrafterSettings,
     DrafterProposerSettings,
+    trained=DrafterSettings,
     colour=0x56B4E9,
     when=STATES,
     cost=DRAFTING,
     idle=lambda settings: only_of_trees(settings, "top_k", "nodes"),
 )
+def artifact() -> type:
+    """Import the kind of drafter `drafter`."""
+    from kerv_cli.methods.eagle.drafter import EagleDrafter
+
+    return EagleDrafter

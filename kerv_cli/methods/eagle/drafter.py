@@ -133,7 +133,9 @@ class DrafterProposer(Proposer):
 
     def begin(self, chunk: Chunk) -> None:
         """Let the drafter read the prompt: run it over the prompt's embeddings and the prefill's hidden states."""
-        self.observe(torch.cat([chunk.prompt[:, 1:], self.embed(chunk.tokens)], 1), chunk.hidden, 0)
+        hidden = chunk.target.hidden
+        assert hidden is not None, "the prefill comes first"
+        self.observe(torch.cat([chunk.target.prompt[:, 1:], self.embed(chunk.tokens)], 1), hidden, 0)
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
         """Return a chain, or a dynamic tree if `top_k` is above 1, of at most `depth` tokens per path."""
@@ -149,7 +151,7 @@ class DrafterProposer(Proposer):
             hidden: (1, T, E) the target's hidden states of the chunk's tokens first … first + T − 1.
             target_tokens: Not used.
         """
-        self.observe(self.embed(chunk.tokens[first + 1 :]), hidden, chunk.prompt_length + first)
+        self.observe(self.embed(chunk.tokens[first + 1 :]), hidden, chunk.target.prompt_length + first)
 
     def embed(self, tokens: list[int]) -> Tensor:
         """Return the target's embeddings of T tokens, (1, T, E)."""

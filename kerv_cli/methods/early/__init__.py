@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kerv_cli.base.limits import number
-from kerv_cli.base.registry import PREFILL, add_drafter
+from kerv_cli.base.registry import PREFILL, DrafterPart
 
 
 @dataclass
@@ -19,10 +19,9 @@ class EarlySettings:
     samples: int = number(100_000, 1, 10**8)  # maximum number of observations whose greedy decodes it is trained on
 
 
-add_drafter(
+@DrafterPart(
     "early",
-    "kerv_cli.methods.early.drafter:EarlyDrafter",
-    EarlySettings,
+    trained=EarlySettings,
     colour=0xD4A6C8,
     when=PREFILL,
     chains=True,
@@ -30,3 +29,8 @@ add_drafter(
     cost="early",
     measured_by="early_unverified",
 )
+def artifact() -> type:
+    """Import the kind of drafter `early`."""
+    from kerv_cli.methods.early.drafter import EarlyDrafter
+
+    return EarlyDrafter

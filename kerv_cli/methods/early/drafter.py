@@ -209,8 +209,8 @@ class EarlyProposer(ChainProposer):
             (N + 1,): the N tokens, then the estimated probability that all of them are accepted.
         """
         if self.compiled is not None:
-            return self.compiled(torch.tensor([[radius]]), chunk.prompt)[0][0]
-        return self.early.draft(self.target.pooled(chunk.prompt), radius)[0]
+            return self.compiled(torch.tensor([[radius]]), chunk.target.prompt)[0][0]
+        return self.early.draft(self.target.pooled(chunk.target.prompt), radius)[0]
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         """Return one chain: up to `depth` drafted tokens after the chunk's committed tokens."""

@@ -7,17 +7,82 @@ verification.
 
 from __future__ import annotations
 
+import zlib
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, number
-from kerv_cli.base.registry import DRAFTING, PREFILL, STATES, add
+from kerv_cli.base.registry import (
+    DRAFTING,
+    PREFILL,
+    STATES,
+    AcceptancePart,
+    ArtifactPart,
+    BoundaryPart,
+    ProposerPart,
+    SearchPart,
+    SkipPart,
+)
+from kerv_cli.engine.acceptance import Accepted, DistanceRule, accept_by_group
+from kerv_cli.engine.decisions import Choice, SkipDecision
+from kerv_cli.engine.parts import Boundary, Skip
+from kerv_cli.engine.proposer import ChainProposer, Proposer
+from kerv_cli.engine.tree import TokenTree
 from kerv_cli.methods.eagle import DrafterProposerSettings, only_of_trees
+from kerv_cli.methods.spec_vla import RelaxedRule
+
+if TYPE_CHECKING:
+    import numpy as np
+    from torch import Tensor
+
+    from kerv_cli.engine.chunk import Chunk
+    from kerv_cli.engine.draft import Draft
+    from kerv_cli.engine.protocol import ReadableTarget
+    from kerv_cli.methods.context import Context
+    from kerv_cli.methods.heisd.curvature import BoundaryRanges
+    from kerv_cli.methods.heisd.datastore import Datastore, Neighbours
 
 MANIFEST = "manifest.json"
-_DATASTORE, _RULES = "kerv_cli.methods.heisd.datastore:", "kerv_cli.methods.heisd.rules:"
+LEAST = 3  # minimum number of positions for a curvature
 
 
 # --- the datastore and its proposer (§4.1, §4.2)
+
+
+@ArtifactPart("datastore", by_task=True, needs_task=True, described_by=MANIFEST)
+def artifact() -> type:
+    """Import the kind of artifact `datastore`."""
+    from kerv_cli.methods.heisd.datastore import DatastoreArtifact
+
+    return DatastoreArtifact
+
+
+class Index(ABC):
+    """A search for stored rows with keys most similar to a given key. The rows found are then ranked exactly.
+
+    Its constructor takes the `Datastore` and the settings of the search.
+    """
+
+    @abstractmethod
+    def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
+        """Return the row numbers of the task's k most similar entries, and perhaps of more, in ascending order.
+
+        Args:
+            key: (d,) float32, the key to compare with.
+            task: Full name of the task.
+            k: Number of rows wanted.
+            without: Seed of an episode to leave out. None: use all episodes.
+        """
+
+
+@SearchPart("exact")
+def exact(store: Datastore, settings: Any) -> Index:
+    """Search by comparing the key with all entries of the task: datastore=exact, the default."""
+    from kerv_cli.methods.heisd.datastore import ExactIndex
+
+    return ExactIndex(store, settings)
 
 
 @dataclass
@@ -29,11 +94,8 @@ class RetrievalProposerSettings:
     nodes: int = number(50, 1, MOST_TOKENS)  # maximum number of tree nodes
 
 
-add("artifact", "datastore", _DATASTORE + "DatastoreArtifact", by_task=True, needs_task=True, described_by=MANIFEST)
-add(
-    "proposer",
+@ProposerPart(
     "retrieval",
-    _RULES + "RetrievalProposer.build",
     RetrievalProposerSettings,
     needs=("datastore",),
     colour=0x009E73,
@@ -44,7 +106,50 @@ add(
     cost="retrieval",
     measured_by="retrieval_unverified",
 )
-add("datastore", "exact", _DATASTORE + "ExactIndex")
+class RetrievalProposer(ChainProposer):
+    """Drafts the task's most similar stored chunks, merged into one tree (docs/methods.md §4.2).
+
+    Args:
+        datastore: The stored chunks.
+        target: The target, which encodes the observations.
+        neighbours: Number of stored chunks in the tree.
+        nodes: Maximum number of nodes of the tree.
+    """
+
+    name = "retrieval"
+
+    def __init__(self, datastore: Datastore, target: ReadableTarget, neighbours: int, nodes: int) -> None:
+        self.datastore, self.target, self.count, self.nodes = datastore, target, neighbours, nodes
+        self._nearest: tuple[Chunk, Neighbours] | None = None
+
+    @classmethod
+    def build(cls, settings: RetrievalProposerSettings | HybridProposerSettings, context: Context) -> RetrievalProposer:
+        """Build the part that proposer=retrieval chooses, or that proposer=hybrid contains."""
+        return cls(context.artifact("datastore"), context.target, settings.neighbours, settings.nodes)
+
+    def neighbours(self, chunk: Chunk) -> Neighbours:
+        """Return the stored entries most similar to the chunk's observation. The search runs once per chunk."""
+        if self._nearest is None or self._nearest[0] is not chunk:
+            key = self.datastore.key_of(chunk.target.prompt, self.target)
+            self._nearest = chunk, self.datastore.query(key, chunk.situation.task, self.count)
+        return self._nearest[1]
+
+    def similarity(self, chunk: Chunk) -> float | None:
+        """Return the cosine of the most similar stored entry, if the datastore was searched for this chunk."""
+        searched = self._nearest is not None and self._nearest[0] is chunk
+        return float(self.neighbours(chunk).similarity[0]) if searched else None
+
+    def propose(self, chunk: Chunk, depth: int) -> Draft:
+        """Return the most similar stored chunks, as one tree of at most `depth` tokens per path."""
+        from kerv_cli.methods.heisd.tree import neighbour_tree
+
+        chunks = self.neighbours(chunk).chunks[:, : chunk.size]
+        return neighbour_tree(chunks, len(chunk.tokens), chunk.space, self.nodes, depth)
+
+    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        """Return one chain per stored chunk: its tokens after the committed tokens. The most similar chunk is first."""
+        start = len(chunk.tokens)
+        return self.neighbours(chunk).chunks[:, start : min(chunk.size, start + depth)].tolist()
 
 
 @dataclass
@@ -59,10 +164,8 @@ class HybridProposerSettings(DrafterProposerSettings):
     neighbours: int = number(3, 1, MOST_TOKENS)  # retrieval: number of stored chunks in the tree
 
 
-add(
-    "proposer",
+@ProposerPart(
     "hybrid",
-    _RULES + "HybridProposer.build",
     HybridProposerSettings,
     needs=("drafter", "datastore"),
     when=STATES,
@@ -70,6 +173,42 @@ add(
     cost=DRAFTING,
     idle=lambda settings: only_of_trees(settings, "top_k"),  # `nodes` also limits the tree of stored chunks
 )
+class HybridProposer(Proposer):
+    """HeiSD: drafts by retrieval or with the drafter, as the boundary chooses for each chunk (docs/methods.md §4.4).
+
+    Attributes:
+        name: Name of the proposer that drafts the current chunk.
+    """
+
+    def __init__(self, drafter: Proposer, retrieval: Proposer) -> None:
+        self.proposers: dict[str, Proposer] = {"drafter": drafter, "retrieval": retrieval}
+        self.nodes = max(drafter.nodes, retrieval.nodes)
+        self.chosen, self.name = drafter, drafter.name
+
+    @classmethod
+    def build(cls, settings: HybridProposerSettings, context: Context) -> HybridProposer:
+        """Build the hybrid proposer, which `proposer=hybrid` chooses."""
+        drafter = ProposerPart.find("drafter").built(settings, context)
+        return cls(drafter, RetrievalProposer.build(settings, context))
+
+    def begin(self, chunk: Chunk) -> None:
+        """Select the proposer that the boundary chose for this chunk, and let it begin the chunk."""
+        assert chunk.choice is not None, "a hybrid proposer needs a boundary"
+        self.chosen = self.proposers[chunk.choice.mode]
+        self.name = self.chosen.name
+        self.chosen.begin(chunk)
+
+    def similarity(self, chunk: Chunk) -> float | None:
+        """Return the similarity that the retrieval found."""
+        return self.proposers["retrieval"].similarity(chunk)
+
+    def propose(self, chunk: Chunk, depth: int) -> Draft:
+        """Return the draft of the selected proposer."""
+        return self.chosen.propose(chunk, depth)
+
+    def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
+        """Let the selected proposer learn from the round; arguments as `Proposer.committed`."""
+        self.chosen.committed(chunk, first, hidden, target_tokens)
 
 
 # --- which drafts are good enough (§2.1)
@@ -87,6 +226,46 @@ class SequenceAcceptanceSettings:
     token_limit: int = number(15, 0, MOST_BINS)  # largest accepted distance of one token, bins
 
 
+@AcceptancePart("sequence", SequenceAcceptanceSettings, reads_threshold=False)
+@dataclass(frozen=True)
+class GroupRule(DistanceRule):
+    """Accepts or rejects each kinematic group (position, rotation, gripper) of a control step as a whole.
+
+    Strict DoFs, such as the gripper, must equal the target's tokens.
+
+    Attributes:
+        group_limit: Largest accepted sum of a group's distances to the target's tokens, in bins.
+        token_limit: Largest accepted distance of one token, in bins.
+    """
+
+    group_limit: int
+    token_limit: int
+
+    @classmethod
+    def build(cls, settings: SequenceAcceptanceSettings, context: Context) -> GroupRule:
+        """Build the part that the setting `acceptance=sequence` chooses."""
+        return cls(context.target.actions, settings.group_limit, settings.token_limit)
+
+    def limits(self, r: int) -> tuple[int, ...]:
+        """Return the largest accepted distance of each of the D DoFs, in bins: `token_limit`, or 0 for strict DoFs.
+
+        The radius `r` is not used.
+        """
+        return self.same_limits(self.token_limit)
+
+    def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
+        """Return the longest accepted path of whole groups.
+
+        Args:
+            tree: The draft tree.
+            target_tokens: The target's prediction after the last committed token, then after each node.
+            start: Number of committed tokens. A node at depth d is token start + d of the chunk.
+            r: Not used.
+        """
+        limits, bounds = self.limits(r), self.space.bounds
+        return accept_by_group(tree, target_tokens, start, limits, group_limit=self.group_limit, bounds=bounds)
+
+
 @dataclass
 class HybridAcceptanceSettings(SequenceAcceptanceSettings):
     """HeiSD: judge retrieved drafts by acceptance=sequence, and all other drafts by acceptance=relaxed."""
@@ -95,11 +274,82 @@ class HybridAcceptanceSettings(SequenceAcceptanceSettings):
     strict_dofs: bool = True  # relaxed: whether strict DoFs, such as the gripper, must match (ours); public code: false
 
 
-add("acceptance", "sequence", _RULES + "GroupRule.build", SequenceAcceptanceSettings, reads_threshold=False)
-add("acceptance", "hybrid", _RULES + "by_proposer", HybridAcceptanceSettings)
+@AcceptancePart("hybrid", HybridAcceptanceSettings)
+@dataclass(frozen=True, kw_only=True)
+class HybridRule(RelaxedRule):
+    """Accepts retrieved drafts by kinematic group, and all other drafts token by token within a radius.
+
+    Attributes:
+        retrieved: The rule for retrieved drafts.
+    """
+
+    retrieved: GroupRule
+
+    @classmethod
+    def build(cls, settings: HybridAcceptanceSettings, context: Context) -> HybridRule:
+        """Build the part that the setting `acceptance=hybrid` chooses."""
+        return cls(context.target.actions, settings.strict_dofs, retrieved=GroupRule.build(settings, context))
+
+    def of_drafts_from(self, proposer: str) -> DistanceRule:
+        """Return the rule for the drafts of the proposer with this name."""
+        return self.retrieved if proposer == "retrieval" else self
 
 
 # --- who drafts for the hybrid proposer (§4.4)
+#
+# A boundary looks at the hand's last measured positions: R is their radius of curvature, D the length of their path. A
+# straight, fast path (large R, large D) repeats demonstrated motion, so retrieval drafts. A curved or slow path is
+# precise work, for which the drafter is better.
+
+
+@dataclass
+class RandomBoundarySettings:
+    """Choose retrieval or the drafter at random: a baseline for boundary=fused."""
+
+    kind: str = "random"
+    p: float = number(0.5, 0, 1)  # probability of retrieval
+    seed: int = number(0, 0, 2**32 - 1)
+
+
+@BoundaryPart("random", RandomBoundarySettings, chooses=True)
+class Random(Boundary):
+    """Chooses retrieval with probability p, else the drafter: a baseline that does not look at the path.
+
+    With p = 1 retrieval drafts all chunks, with p = 0 the drafter drafts all. An episode's random numbers depend only
+    on the boundary's seed, the task's full name and the episode's seed.
+    """
+
+    def __init__(self, p: float, seed: int = 0) -> None:
+        self.p, self.seed = p, seed
+        self.reset("", 0)
+
+    @classmethod
+    def build(cls, settings: RandomBoundarySettings, context: Context) -> Random:
+        """Build the part that the setting `boundary=random` chooses."""
+        return cls(settings.p, settings.seed)
+
+    def reset(self, task: str, seed: int) -> None:
+        """Begin an episode: seed the random numbers."""
+        import numpy as np
+
+        self.random = np.random.default_rng([self.seed, zlib.crc32(task.encode()), seed])
+
+    def choose(self, path: np.ndarray) -> Choice:
+        """Choose retrieval with probability p, else the drafter. The path is not used."""
+        return Choice("retrieval" if self.random.random() < self.p else "drafter")
+
+
+class Always(Random):
+    """Makes the same choice for every chunk: boundary=always_retrieval or boundary=always_drafter."""
+
+    @classmethod
+    def build(cls, settings: Any, context: Context) -> Always:
+        """Build the boundary that `settings.kind` names."""
+        return cls(float(settings.kind == "always_retrieval"))
+
+
+BoundaryPart("always_retrieval", chooses=True)(Always)
+BoundaryPart("always_drafter", chooses=True)(Always)
 
 
 @dataclass
@@ -116,27 +366,47 @@ class FusedBoundarySettings:
     f_star: float | None = number(None, 0, 1)  # the limit F* itself, in place of a quantile (ours)
 
 
-@dataclass
-class RandomBoundarySettings:
-    """Choose retrieval or the drafter at random: a baseline for boundary=fused."""
-
-    kind: str = "random"
-    p: float = number(0.5, 0, 1)  # probability of retrieval
-    seed: int = number(0, 0, 2**32 - 1)
-
-
-for _name in ("always_retrieval", "always_drafter"):
-    add("boundary", _name, _RULES + "Random.always", chooses=True)
-add(
-    "boundary",
+@BoundaryPart(
     "fused",
-    _RULES + "Fused.build",
     FusedBoundarySettings,
-    ("calibration",),
+    needs=("calibration",),
     chooses=True,
     idle=lambda settings: {} if settings.f_star is None else {"quantile": "boundary.f_star names the limit"},
 )
-add("boundary", "random", _RULES + "Random.build", RandomBoundarySettings, chooses=True)
+@dataclass(frozen=True)
+class Fused(Boundary):
+    """Chooses retrieval if F ≥ F*. F is the weighted sum of the path's radius of curvature and length, both scaled.
+
+    With fewer than three positions it chooses the drafter.
+
+    Attributes:
+        ranges: Ranges that scale radius and length.
+        alpha: Weight of the radius. The length has the weight 1 − alpha.
+        window: Number of newest positions to look at.
+        f_star: The limit F*.
+    """
+
+    ranges: BoundaryRanges
+    alpha: float
+    window: int
+    f_star: float
+
+    @classmethod
+    def build(cls, settings: FusedBoundarySettings, context: Context) -> Fused:
+        """Build the part that the setting `boundary=fused` chooses."""
+        ranges = context.calibration.ranges(settings.window)
+        f_star = settings.f_star
+        if f_star is None:
+            f_star = ranges.limit(settings.quantile, settings.alpha)
+        return cls(ranges, settings.alpha, settings.window, f_star)
+
+    def choose(self, path: np.ndarray) -> Choice:
+        """Choose retrieval or the drafter from the newest `window` positions of the path (m, 3), in metres."""
+        points = path[-self.window :]
+        if len(points) < LEAST:
+            return Choice("drafter")
+        metric = self.ranges.of_path(points, self.alpha)
+        return Choice("retrieval" if metric >= self.f_star else "drafter", metric)
 
 
 # --- which retrieved chunks are executed without verification (§4.3)
@@ -160,4 +430,72 @@ def needs_of_similarity(settings: SimilaritySkipSettings) -> tuple[str, ...]:
     return ("datastore", "calibration") if settings.s_min is None else ("datastore",)
 
 
-add("skip", "similarity", _RULES + "VerifySkip.build", SimilaritySkipSettings, needs_of_similarity, colour=0xF0E442)
+@SkipPart("similarity", SimilaritySkipSettings, needs=needs_of_similarity, colour=0xF0E442)
+class VerifySkip(Skip):
+    """Executes the most similar stored chunk without verification if its similarity is at least s_min.
+
+    At most `max_skips` chunks in a row are executed without verification. If the method has a boundary, the boundary
+    must choose retrieval. Once a stored episode has been executed to its end, none of its chunks is executed without
+    verification again in the same episode of the robot.
+
+    With `up` or `down` above 0, s_min changes after each episode. A failure raises it by `up` times the calibrated
+    range (high − low), a success lowers it by `down` times the range. Then results depend on the order of the episodes.
+    """
+
+    def __init__(
+        self, settings: SimilaritySkipSettings, retrieval: RetrievalProposer, levels: tuple[float, float, float]
+    ) -> None:
+        """Start with the calibrated s_min.
+
+        Args:
+            settings: Settings of skip=similarity.
+            retrieval: Finds the most similar stored chunks.
+            levels: The task's (low, s_min, high), as cosines. s_min may change after each episode, between low and
+                high.
+        """
+        self.settings, self.retrieval = settings, retrieval
+        self.low, self.s_min, self.high = levels
+        self.in_a_row = 0
+        self.ended: set[int] = set()  # seeds of stored episodes that were executed to their end
+
+    @classmethod
+    def build(cls, settings: SimilaritySkipSettings, context: Context) -> VerifySkip:
+        """Build skip=similarity. If the method's proposer also retrieves, the search runs only once for both."""
+        proposer: Proposer | None = context.built["proposer"]
+        retrieval = proposer.proposers["retrieval"] if isinstance(proposer, HybridProposer) else proposer
+        if not isinstance(retrieval, RetrievalProposer):
+            retrieval = RetrievalProposer(context.artifact("datastore"), context.target, neighbours=1, nodes=1)
+        if settings.s_min is not None:
+            return cls(settings, retrieval, (settings.s_min,) * 3)
+        manifest = retrieval.datastore.manifest
+        return cls(settings, retrieval, context.calibration.skip_levels(context.task, manifest.content))
+
+    def begin(self, task: str, seed: int) -> None:
+        """Begin an episode: count skips from 0, and forget which stored episodes were executed to their end."""
+        self.in_a_row = 0
+        self.ended.clear()
+
+    def finish(self, success: bool) -> None:
+        """End an episode: raise s_min, the similarity needed to skip, after a failure; lower it after a success."""
+        span = self.high - self.low
+        s_min = self.s_min + span * (-self.settings.down if success else self.settings.up)
+        self.s_min = min(self.high, max(self.low, s_min))
+
+    def similarity(self, chunk: Chunk) -> float | None:
+        """Return the similarity that the retrieval found."""
+        return self.retrieval.similarity(chunk)
+
+    def take(self, chunk: Chunk) -> SkipDecision:
+        """Take the most similar stored chunk, if it may be executed without verification."""
+        if chunk.choice is not None and chunk.choice.mode != "retrieval":
+            self.in_a_row = 0
+            return SkipDecision()
+        neighbours = self.retrieval.neighbours(chunk)
+        seed = int(neighbours.seeds[0])
+        if neighbours.similarity[0] < self.s_min or self.in_a_row >= self.settings.max_skips or seed in self.ended:
+            self.in_a_row = 0
+            return SkipDecision()
+        self.in_a_row += 1
+        if neighbours.left[0] <= chunk.steps:
+            self.ended.add(seed)
+        return SkipDecision(neighbours.chunks[0].tolist(), self.retrieval.name)

@@ -19,19 +19,20 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.base import registry
 from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.manifests import content_of
+from kerv_cli.base.registry import SearchPart
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.protocol import ReadableTarget
+from kerv_cli.engine.transfer import read
 from kerv_cli.methods.artifacts import Artifact, Artifacts
-from kerv_cli.methods.heisd import MANIFEST
+from kerv_cli.methods.heisd import MANIFEST, Index
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.worlds import spec_of
 
@@ -145,20 +146,6 @@ def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
             )
 
 
-class Index(Protocol):
-    """A search for stored rows with keys most similar to a given key. The function `best` then ranks the rows found."""
-
-    def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return the row numbers of the task's k most similar entries, and perhaps of more, in ascending order.
-
-        Args:
-            key: (d,) float32, the key to compare with.
-            task: Full name of the task.
-            k: Number of rows wanted.
-            without: Seed of an episode to leave out. None: use all episodes.
-        """
-
-
 def best(vectors: np.ndarray, rows: np.ndarray, key: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the k rows most similar to a key, and their similarities.
 
@@ -179,7 +166,7 @@ def best(vectors: np.ndarray, rows: np.ndarray, key: np.ndarray, k: int) -> tupl
     return rows[order], scores[order]
 
 
-class ExactIndex:
+class ExactIndex(Index):
     """datastore=exact, the default: compare the key with all entries of the task, in this process."""
 
     def __init__(self, store: Datastore, settings: object) -> None:
@@ -225,7 +212,7 @@ class Datastore:
     def index(self) -> Index:
         """The search for similar keys that the setting `datastore=` chooses."""
         kind = self.search.kind if self.search else "exact"
-        index: Index = registry.find("datastore", kind, "datastore.kind").built(self, self.search)
+        index: Index = SearchPart.find(kind, "datastore.kind").built(self, self.search)
         return index
 
     @functools.cached_property
@@ -269,21 +256,16 @@ class Datastore:
         """Full names of the tasks that have entries."""
         return self.shards
 
-    def pooled(self, prompt: Tensor, target: ReadableTarget) -> Tensor:
-        """Average the prompt's tokens over each segment that keys are made from. `key_of` turns the result into a key.
+    def key_of(self, prompt: Tensor, target: ReadableTarget) -> np.ndarray:
+        """Return the search key (d,) float32 of an observation, on the CPU.
 
         Args:
             prompt: (1, P, E) encoded prompt.
             target: The target that encoded it.
-
-        Returns:
-            (S · E,) float32 for S segments, with the norm 1, on the target's device.
         """
-        return prompt_key(prompt, target, self.manifest.key)[0]
-
-    def key_of(self, pooled: np.ndarray) -> np.ndarray:
-        """Return the search key (d,) float32: the result of `pooled`, projected if the datastore has a projection."""
-        return pooled if self.projection is None else projected(pooled[None], self.projection)[0]
+        (pooled,) = read(prompt_key(prompt, target, self.manifest.key)[0])
+        key = pooled.astype(np.float32, copy=False)
+        return key if self.projection is None else projected(key[None], self.projection)[0]
 
     def query(self, key: np.ndarray, task: str, k: int, without: int | None = None) -> Neighbours:
         """Return the k entries of a task that are most similar to a key, or all entries if there are fewer.

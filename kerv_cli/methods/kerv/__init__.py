@@ -3,54 +3,78 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import KW_ONLY, dataclass
+from typing import TYPE_CHECKING, Any, Literal
 
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, choice, number
-from kerv_cli.base.registry import PREFILL, NoSettings, Part, add, parts
+from kerv_cli.base.registry import PREFILL, NoSettings, ProposerPart, RectifierPart, ThresholdPart
+from kerv_cli.engine.decisions import Rectified
+from kerv_cli.engine.parts import Rectifier, Threshold
 
 if TYPE_CHECKING:
+    from kerv_cli.engine.chunk import Chunk
     from kerv_cli.engine.record import Measure
     from kerv_cli.methods.context import Context
+    from kerv_cli.methods.kerv.prediction import Predictor
 
-_PREDICTION = "kerv_cli.methods.kerv.prediction:"
-
-_sources = ("drafter", "datastore")  # the calibration has a section for each
-add(
-    "artifact",
-    "calibration",
-    "kerv_cli.methods.calibration:CalibrationArtifact",
-    needs=_sources,
-    by_task=True,
-    needs_task=True,
-)
 
 # --- predictors, and proposers that draft with them (§3.1, §6)
 
-for _name, _fitted, _colour in (
-    ("hold", False, 0xE69F00),
-    ("linear", False, 0x0072B2),
-    ("kalman", True, 0xD55E00),  # Kalman filters need the noise that `kerv calibrate` fitted
-    ("damped", True, 0xA0522D),
-    ("walk", False, 0x999933),
-):
-    _drafts = (_PREDICTION + "PredictionProposer.build", NoSettings, ("calibration",) if _fitted else ())
-    _predictor = _PREDICTION + "predictor_of"
-    add("proposer", _name, *_drafts, colour=_colour, when=PREFILL, chains=True, predictor=_predictor)
+
+@dataclass(frozen=True)
+class PredictorPart(ProposerPart):
+    """A predictor of the next actions: it drafts as a proposer, and `rectifier.predictor` fills in with it.
+
+    The decorated class has a `name`, a method `predict` (`Predictor` in `prediction.py`), and a class method `build`.
+    """
+
+    _: KW_ONLY
+    when: Literal["prefill", "states"] = PREFILL
+    chains: bool = True
+
+    def built(self, settings: Any, context: Any) -> Any:
+        """Build the proposer that drafts with the predictor; arguments as `MethodPart.built`."""
+        from kerv_cli.methods.kerv.prediction import PredictionProposer
+
+        return PredictionProposer(self.predictor(context))
+
+    def predictor(self, context: Context) -> Predictor:
+        """Build the predictor with its default settings."""
+        built: Predictor = self.code.build(self.default, context)
+        return built
+
+
+class Predictors:
+    """kerv's own predictors."""
+
+    @staticmethod
+    def build(settings: NoSettings, context: Context) -> Predictor:
+        """Build the predictor with the name `settings.kind`."""
+        from kerv_cli.methods.kerv.prediction import predictor_of
+
+        return predictor_of(settings.kind, context)
+
+
+_noise = ("calibration",)  # Kalman filters need the noise that `kerv calibrate` fitted
+PredictorPart("hold", colour=0xE69F00)(Predictors)
+PredictorPart("linear", colour=0x0072B2)(Predictors)
+PredictorPart("kalman", needs=_noise, colour=0xD55E00)(Predictors)
+PredictorPart("damped", needs=_noise, colour=0xA0522D)(Predictors)
+PredictorPart("walk", colour=0x999933)(Predictors)
 
 ACCEPTED = "accepted"
 DRAFT = "draft"
 """Value of `rectifier.predictor` that fills with the rejected draft instead of a kinematic prediction."""
 
 
-def find_predictor(name: str) -> Part:
-    """Return the registered proposer that has the kinematic predictor of this name, such as `kalman`.
+def find_predictor(name: str) -> PredictorPart:
+    """Return the predictor of this name, such as `kalman`.
 
     Raises:
         UnknownName: No predictor has this name.
     """
-    predictors = {key: part for key, part in parts("proposer").items() if "predictor" in part.traits}
+    predictors = PredictorPart.every()
     if name not in predictors:
         raise UnknownName("rectifier.predictor", name, [*predictors, DRAFT])
     return predictors[name]
@@ -90,11 +114,58 @@ class CompensateSettings:
 
 def needs_of_compensation(settings: CompensateSettings) -> tuple[str, ...]:
     """Return the kinds of artifacts that the predictor needs."""
-    return () if settings.predictor == DRAFT else find_predictor(settings.predictor).needs(None)
+    return () if settings.predictor == DRAFT else find_predictor(settings.predictor).needed(settings)
 
 
-_compensation = (_PREDICTION + "Compensation.build", CompensateSettings)
-add("rectifier", "compensate", *_compensation, needs_of_compensation)
+@RectifierPart("compensate", CompensateSettings, needs=needs_of_compensation)
+class Compensation(Rectifier):
+    """KERV: after a rejection, keeps the accepted tokens and predicts the rest of that control step.
+
+    These settings change it:
+
+    - `use_target_token` (ours): also keep the target's token at the rejected position, which is already computed.
+    - `drop` (ours): end the chunk after the predicted steps. Otherwise the target decodes the later steps.
+    - `steps` (the paper's predict length PL): how many control steps to fill.
+    - `hold_strict` (ours): strict DoFs, such as the gripper, keep their last value. Otherwise they are predicted, too.
+    - `predictor=draft` (ours): fill with the rejected draft's remaining tokens first. A draft was made from the
+      observation, a prediction only from past actions.
+    - `rest`: in how many decodes after each compensation nothing is compensated.
+    """
+
+    def __init__(self, settings: CompensateSettings, predictor: Predictor) -> None:
+        self.settings, self.predictor = settings, predictor
+        self.uses_target_token = settings.use_target_token
+        self.resting = 0
+
+    @classmethod
+    def build(cls, settings: CompensateSettings, context: Context) -> Compensation:
+        """Build the part that the setting `rectifier=compensate` chooses."""
+        name = "hold" if settings.predictor == DRAFT else settings.predictor
+        predictor = find_predictor(name).predictor(context)
+        return cls(settings, predictor if settings.hold_strict else predictor.released())
+
+    def reset(self) -> None:
+        """Begin an episode: compensation is allowed at once."""
+        self.resting = 0
+
+    def next_decode(self) -> None:
+        """Count a finished decode. The setting `rest` needs the count."""
+        self.resting = max(0, self.resting - 1)
+
+    def rectify(self, chunk: Chunk) -> Rectified | None:
+        """Predict the missing values of the rejected control step, unless the rectifier rests."""
+        from kerv_cli.methods.kerv.prediction import assemble
+
+        if self.resting:
+            return None
+        tokens = chunk.tokens if self.settings.use_target_token else chunk.tokens[:-1]
+        drafted = chunk.rejection.draft if self.settings.predictor == DRAFT else ()
+        values = assemble(tokens, chunk, self.predictor, self.settings, drafted)
+        if values is None or (not self.settings.drop and values.size <= len(tokens)):
+            return None
+        # + 1, because `next_decode` also counts the decode that compensated
+        self.resting = self.settings.rest + 1
+        return Rectified(values, self.settings.drop)
 
 
 # --- thresholds: the acceptance radius r in bins (§3.2). It is stored as a real number and rounded for use
@@ -168,7 +239,8 @@ def needs_of_variability(settings: KinematicThresholdSettings) -> tuple[str, ...
     return ("calibration",) if settings.k_s is None else ()
 
 
-class Kinematic:
+@ThresholdPart("kinematic", KinematicThresholdSettings, needs=needs_of_variability)
+class Kinematic(Threshold):
     """KERV: the acceptance radius r follows the variability K, the mean distance of draft tokens to target tokens.
 
     r = r_min + (r_max − r_min) · exp(−(K / K_S)^φ). K was measured in the last decode that compared drafts. K_S is the
@@ -229,6 +301,7 @@ class Kinematic:
         return self.falling(variability)
 
 
+@ThresholdPart("change", KinematicThresholdSettings, needs=needs_of_variability)
 class Change(Kinematic):
     """KERV, read with a signed change: the acceptance radius r shrinks if the variability K grows, else it grows.
 
@@ -242,6 +315,7 @@ class Change(Kinematic):
         return self.r - math.copysign(self.settings.r_max - self.falling(abs(change)), change)
 
 
+@ThresholdPart("offset", KinematicThresholdSettings, needs=needs_of_variability)
 class Offset(Kinematic):
     """KERV, read as its README says: r = r_min + (r_max − r_min) · exp(−(|ΔK| / K_S)^φ).
 
@@ -255,6 +329,7 @@ class Offset(Kinematic):
         return self.falling(abs(variability - self.last))
 
 
+@ThresholdPart("quoted", KinematicThresholdSettings, needs=needs_of_variability)
 class Quoted(Kinematic):
     """KERV's formula as printed (arXiv 2603.01581): r ← min(r + (r_max − r_min) · exp(−(|ΔK| / K_S)^φ), r_max).
 
@@ -270,7 +345,8 @@ class Quoted(Kinematic):
         return self.r + self.falling(abs(variability - self.last)) - self.settings.r_min
 
 
-class Schedule:
+@ThresholdPart("schedule", ScheduleThresholdSettings)
+class Schedule(Threshold):
     """The acceptance radius falls with the number t of decodes in the episode. The motion is not used.
 
     r(t) = r_min + (r_max − r_min) · exp(−(t / τ)^φ). The default settings are those of KERV's public code:
@@ -311,11 +387,3 @@ def falling(low: float, high: float, x: float, phi: float) -> float:
 def nearest(r: float) -> int:
     """Round a radius to whole bins, halves up."""
     return math.floor(r + 0.5)
-
-
-_kinematic = (KinematicThresholdSettings, needs_of_variability)
-add("threshold", "kinematic", f"{__name__}:Kinematic", *_kinematic)
-add("threshold", "offset", f"{__name__}:Offset", *_kinematic)
-add("threshold", "change", f"{__name__}:Change", *_kinematic)
-add("threshold", "quoted", f"{__name__}:Quoted", *_kinematic)
-add("threshold", "schedule", f"{__name__}:Schedule", ScheduleThresholdSettings)

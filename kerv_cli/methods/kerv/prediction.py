@@ -12,16 +12,18 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.registry import NoSettings, load
-from kerv_cli.engine.chunk import WINDOW, Chunk
+from kerv_cli.engine.chunk import WINDOW
 from kerv_cli.engine.proposer import ChainProposer
-from kerv_cli.methods.context import Context
-from kerv_cli.methods.kerv import DRAFT, CompensateSettings, find_predictor
+
+if TYPE_CHECKING:
+    from kerv_cli.engine.chunk import Chunk
+    from kerv_cli.methods.context import Context
+    from kerv_cli.methods.kerv import CompensateSettings
 
 MINIMUM = 4  # minimum number of past actions; longer windows were not measurably better on the demonstrations
 HORIZON = 8  # number of control steps ahead for which weights are computed
@@ -151,8 +153,10 @@ class Predictor:
 
     def _table(self, window: int) -> np.ndarray:
         """Return the weights (D, horizon, window) of all DoFs, for this number of past actions."""
-        last = Predictor.weights(self, 0, window)
-        return np.stack([last if self.held[dof] else self.weights(dof, window) for dof in range(self.dofs)])
+        tables = np.tile(Predictor.weights(self, 0, window), (self.dofs, 1, 1))
+        for dof in np.flatnonzero(~self.held):
+            tables[dof] = self.weights(int(dof), window)
+        return tables
 
     def predict(self, history: np.ndarray, steps: int) -> np.ndarray | None:
         """Predict the next actions.
@@ -272,12 +276,12 @@ FILTERS = ("kalman", "damped")
 PREDICTORS = {kind.name: kind for kind in (Hold, Linear, Kalman, Damped, Walk)}
 
 
-def predictor_of(settings: NoSettings, context: Context) -> Predictor:
-    """Return the predictor with the name `settings.kind`. It can predict all control steps of a chunk.
+def predictor_of(name: str, context: Context) -> Predictor:
+    """Return the predictor with this name. It can predict all control steps of a chunk.
 
     The noise of a Kalman filter comes from the calibration.
     """
-    kind, held, horizon = PREDICTORS[settings.kind], context.target.actions.is_strict, context.target.chunk
+    kind, held, horizon = PREDICTORS[name], context.target.actions.is_strict, context.target.chunk
     if kind.name not in FILTERS:
         return kind(held, minimum=kind.least, horizon=horizon)
     fitted = context.calibration
@@ -293,11 +297,6 @@ class PredictionProposer(ChainProposer):
     def __init__(self, predictor: Predictor) -> None:
         self.name, self.predictor = predictor.name, predictor
 
-    @classmethod
-    def build(cls, settings: NoSettings, context: Context) -> PredictionProposer:
-        """Build proposer=hold, linear, kalman, damped or walk."""
-        return cls(predictor_of(settings, context))
-
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         """Return one chain of up to `depth` predicted tokens, or no chain if the history is too short."""
         whole = len(chunk.tokens) // chunk.dofs
@@ -308,63 +307,6 @@ class PredictionProposer(ChainProposer):
             return []
         tokens: list[int] = chunk.space.bins_of(predicted).flatten().tolist()
         return [tokens[len(chunk.tokens) - whole * chunk.dofs :][:depth]]
-
-
-class Compensation:
-    """KERV: after a rejection, keeps the accepted tokens and predicts the rest of that control step.
-
-    These settings change it:
-
-    - `use_target_token` (ours): also keep the target's token at the rejected position, which is already computed.
-    - `drop` (ours): end the chunk after the predicted steps. Otherwise the target decodes the later steps.
-    - `steps` (the paper's predict length PL): how many control steps to fill.
-    - `hold_strict` (ours): strict DoFs, such as the gripper, keep their last value. Otherwise they are predicted, too.
-    - `predictor=draft` (ours): fill with the rejected draft's remaining tokens first. A draft was made from the
-      observation, a prediction only from past actions.
-    - `rest`: in how many decodes after each compensation nothing is compensated.
-    """
-
-    def __init__(self, settings: CompensateSettings, predictor: Predictor) -> None:
-        self.settings, self.predictor = settings, predictor
-        self.resting = 0
-
-    @classmethod
-    def build(cls, settings: CompensateSettings, context: Context) -> Compensation:
-        """Build the part that the setting `rectifier=compensate` chooses."""
-        name = Hold.name if settings.predictor == DRAFT else settings.predictor
-        predictor: Predictor = load(find_predictor(name).traits["predictor"])(NoSettings(name), context)
-        return cls(settings, predictor if settings.hold_strict else predictor.released())
-
-    @property
-    def uses_target_token(self) -> bool:
-        """Whether the target's token at the rejected position stays committed."""
-        return self.settings.use_target_token
-
-    def reset(self) -> None:
-        """Begin an episode: compensation is allowed at once."""
-        self.resting = 0
-
-    def next_decode(self) -> None:
-        """Count a finished decode. The setting `rest` needs the count."""
-        self.resting = max(0, self.resting - 1)
-
-    def close(self, chunk: Chunk) -> bool:
-        """Fill the rejected control step, if its missing values can be predicted.
-
-        Returns:
-            Whether the step was filled. If not, the target decodes on after its own token at the rejected position.
-        """
-        if self.resting:
-            return False
-        tokens = chunk.tokens if self.settings.use_target_token else chunk.tokens[:-1]
-        drafted = chunk.rejection.draft if self.settings.predictor == DRAFT else ()
-        values = assemble(tokens, chunk, self.predictor, self.settings, drafted)
-        if values is None or (not self.settings.drop and values.size <= len(tokens)):
-            return False
-        (chunk.close if self.settings.drop else chunk.fill)(values, self.settings.use_target_token)
-        # + 1, because `next_decode` also counts the decode that compensated
-        self.resting = self.settings.rest + 1
-        return True
 
 
 def assemble(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kerv_cli.base.limits import number
-from kerv_cli.base.registry import PREFILL, add_drafter
+from kerv_cli.base.registry import PREFILL, DrafterPart
 from kerv_cli.methods.early import EarlySettings
 
 
@@ -22,10 +22,9 @@ class ScoutSettings(EarlySettings):
     word_width: int = number(32, 1, 4096, help="width of the word embeddings")
 
 
-add_drafter(
+@DrafterPart(
     "scout",
-    "kerv_cli.methods.scout.drafter:ScoutDrafter",
-    ScoutSettings,
+    trained=ScoutSettings,
     sees=True,
     colour=0x7BC8A4,
     when=PREFILL,
@@ -34,3 +33,8 @@ add_drafter(
     cost="scout",
     measured_by="scout_unverified",
 )
+def artifact() -> type:
+    """Import the kind of drafter `scout`."""
+    from kerv_cli.methods.scout.drafter import ScoutDrafter
+
+    return ScoutDrafter

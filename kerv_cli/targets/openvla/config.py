@@ -10,18 +10,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.files import read_json, read_mapping
 from kerv_cli.base.manifests import read
-from kerv_cli.base.spaces import ActionSpace, Group
+
+if TYPE_CHECKING:
+    from kerv_cli.base.spaces import ActionSpace
 
 SHAPES = "vision_shapes"
 """Field of `config.json` with the shape of each vision tower. Published checkpoints do not have it."""
 CONFIG, STATISTICS = "config.json", "dataset_statistics.json"
 DOFS = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
-GROUPS = (Group("position", 3), Group("rotation", 3), Group("gripper", 1))
 
 
 @dataclass(frozen=True)
@@ -217,7 +218,10 @@ def action_space(shape: Shape, bounds: Bounds, like: ActionSpace | None, control
     Raises:
         CheckpointError: The statistics have a different number of DoFs, or the same percentiles for a DoF.
     """
-    space = like or ActionSpace(DOFS, GROUPS, DOFS[-1:], control_hz, (-1.0,) * 7, (1.0,) * 7)
+    from kerv_cli.base.spaces import ActionSpace, Group
+
+    groups = (Group("position", 3), Group("rotation", 3), Group("gripper", 1))
+    space = like or ActionSpace(DOFS, groups, DOFS[-1:], control_hz, (-1.0,) * 7, (1.0,) * 7)
     mask = bounds.mask or (True,) * len(bounds.q01)
     if not len(bounds.q01) == len(bounds.q99) == len(mask) == space.dofs:
         raise CheckpointError(

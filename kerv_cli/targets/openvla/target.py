@@ -26,7 +26,7 @@ from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import write_json
 from kerv_cli.base.manifests import read
 from kerv_cli.base.places import artifact
-from kerv_cli.base.registry import find, load
+from kerv_cli.base.registry import EnvironmentPart
 from kerv_cli.base.runtime import DTYPES, set_up
 from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.engine.transfer import upload
@@ -232,7 +232,7 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
         check_installed()
     source = Path(settings.checkpoint).expanduser().resolve()
     shape = read_shape(source)
-    spec = None if settings.environment is None else load(find("environment", settings.environment).build)
+    spec = None if settings.environment is None else EnvironmentPart.find(settings.environment).built()
     statistics, bounds = read_statistics(source, settings.statistics)
     actions = action_space(shape, bounds, spec.actions if spec else None, settings.control_hz)
     prompt = Prompter(source, shape, settings.prompt, settings.prompt_tokens).ids("move")

@@ -6,13 +6,12 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import read_mapping, sha256_of
 from kerv_cli.base.manifests import read
-from kerv_cli.base.registry import add, parts
+from kerv_cli.base.registry import EnvironmentPart
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.worlds import stands_for_tasks
 from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames, load_episode
@@ -27,9 +26,6 @@ OnProgress = Callable[[int, int], object]
 
 FORMAT = 2
 """Version of the manifest's format."""
-
-SPECS = SimpleNamespace()
-"""Environments that exist only as recorded datasets: one attribute per specification, see `_build_of`."""
 
 
 @dataclass(frozen=True)
@@ -120,14 +116,8 @@ def register_recorded(
     tasks = {task: Task(task, instruction, "recorded") for task, instruction in instructions.items()}
     suites = {name.upper(): tuple(tasks)}
     spec = EnvironmentSpec(name, actions, observation, tasks, suites, 10_000, (camera,))
-    add("environment", name, _build_of(name))
-    setattr(SPECS, _build_of(name).rpartition(".")[2], spec)
+    EnvironmentPart(name)(lambda: spec)
     return spec
-
-
-def _build_of(name: str) -> str:
-    """Return the `build` of a recorded environment. Its attribute of SPECS is an identifier, whatever the name is."""
-    return f"{__name__}:SPECS.recorded_{name.encode().hex()}"
 
 
 def check_recorded(name: str) -> None:
@@ -136,8 +126,8 @@ def check_recorded(name: str) -> None:
     Raises:
         UsageError: Another environment has the name.
     """
-    part = parts("environment").get(name)
-    if part is not None and part.build != _build_of(name):
+    part = EnvironmentPart.every().get(name)
+    if part is not None and part.module != __name__:
         raise UsageError(
             f"'{name}' is an environment of kerv: choose another name=, or set environment={name} if the data were "
             "recorded in it"

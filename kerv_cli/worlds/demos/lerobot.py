@@ -26,7 +26,7 @@ from PIL import Image
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
 from kerv_cli.base.files import read_mapping, regular, write_folder, write_json
 from kerv_cli.base.places import as_path
-from kerv_cli.base.registry import find, load
+from kerv_cli.base.registry import EnvironmentPart
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, action_limits
 from kerv_cli.worlds.demos.dataset import (
     FORMAT,
@@ -412,7 +412,7 @@ def _world_of(source: Source, settings: DemosImportSettings) -> EnvironmentSpec 
     """
     if not settings.environment:
         return None
-    spec: EnvironmentSpec = load(find("environment", settings.environment).build)
+    spec: EnvironmentSpec = EnvironmentPart.find(settings.environment).built()
     spec.camera_name(source.camera)
     ours, theirs = (spec.actions.dofs, spec.actions.control_hz), (len(source.names(ACTION, "")), source.info["fps"])
     if ours != theirs:

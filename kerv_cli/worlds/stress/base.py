@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from kerv_cli.base.registry import find
+from kerv_cli.base.registry import StressPart
 from kerv_cli.worlds.settings import StressSettings
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ def build(settings: StressSettings) -> Stress:
     """
     if not settings.active:
         return NO_STRESS
-    stress: Stress = find("stress", settings.kind).built(settings.level)
+    stress: Stress = StressPart.find(settings.kind).built(settings.level)
     return stress
 
 

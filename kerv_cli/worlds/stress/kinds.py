@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
-from scipy.spatial.transform import Rotation
 
+from kerv_cli.base.registry import StressPart
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.worlds.stress.base import Array, Model, ModelChanges, Stress, factor_or_inverse, robot_roots
 from kerv_cli.worlds.vectors import unit_vector
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 WIDE = 0.35
 """A fixed geom (shape) is scenery if it is a plane, or if its bounding sphere has at least this radius in metres."""
 _FROM_MATERIAL = 0.5, 0.5, 0.5, 1.0  # rgba of a geom that takes its colour from its material
 
 
+@StressPart("light", requires=("model",))
 class Light(Stress):
     """All lights are brighter or darker, and lamps (lights with a place in the scene) shine from other directions.
 
@@ -44,6 +49,7 @@ class Light(Stress):
                 vector[:] = sum((turn * vector).T)  # not `turn @ vector`: OpenBLAS rounds differently on different CPUs
 
 
+@StressPart("colour", requires=("model",))
 class Colour(Stress):
     """Floor, walls and table get random colours, one per body. Sky, robot and objects keep theirs.
 
@@ -68,6 +74,7 @@ class Colour(Stress):
             model.geom_rgba[geom] = rgba
 
 
+@StressPart("camera", requires=("model",))
 class CameraJitter(Stress):
     """Every camera of the model is slightly moved and turned.
 
@@ -82,6 +89,8 @@ class CameraJitter(Stress):
         metres, degrees = self.amount
         random = self.generator()
         changes.keep(model.cam_pos, model.cam_quat)
+        from scipy.spatial.transform import Rotation
+
         for camera in range(model.ncam):
             model.cam_pos[camera] += unit_vector(random, 3) * metres
             turn = _random_turn(random, degrees)  # relative to the camera's own axes
@@ -90,6 +99,8 @@ class CameraJitter(Stress):
 
 
 def _random_turn(random: np.random.Generator, degrees: float) -> Rotation:
+    from scipy.spatial.transform import Rotation
+
     return Rotation.from_rotvec(unit_vector(random, 3) * np.deg2rad(degrees))
 
 
@@ -106,6 +117,7 @@ def scenery_of(model: Model) -> list[int]:
     return [g for g in large if fixed(int(model.geom_bodyid[g]))]
 
 
+@StressPart("object", requires=("model", "range"))
 class Objects(Stress):
     """Objects have another size, mass and friction, and start in a wider range.
 
@@ -226,6 +238,7 @@ class Bursts:
         return runs, begins
 
 
+@StressPart("push", requires=("actions", "position"))
 class Push(Stress):
     """Bursts that push the hand in a random direction at full speed. Rotation and gripper are not changed.
 
@@ -256,6 +269,7 @@ class Push(Stress):
         return executed
 
 
+@StressPart("actuation", requires=("actions",))
 class Actuation(Stress):
     """Noise, wrong gains, and bursts in which one DoF is stuck.
 
@@ -296,6 +310,7 @@ class Actuation(Stress):
         return executed
 
 
+@StressPart("sensor", requires=("images",))
 class Sensor(Stress):
     """Images are noisy and blurred, or repeated. Recorded images and the state are not changed.
 
@@ -319,6 +334,8 @@ class Sensor(Stress):
 
         Repeated calls in the same control step use the same random numbers.
         """
+        from scipy.ndimage import gaussian_filter
+
         noise, blur, dropped = self.amount
         random = self.generator(camera, step)
         if random.random() < dropped and camera in self._last:
@@ -328,3 +345,6 @@ class Sensor(Stress):
         blurred += random.standard_normal(image.shape, dtype=np.float32) * noise
         self._last[camera] = np.clip(np.rint(blurred), 0, 255).astype(np.uint8)
         return self._last[camera]
+
+
+StressPart("none", requires=()).add()

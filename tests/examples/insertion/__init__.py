@@ -8,7 +8,7 @@ importable.
 
 from __future__ import annotations
 
-from kerv_cli.base.registry import add
+from kerv_cli.base.registry import EnvironmentPart
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, Place
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.task import Task
@@ -45,4 +45,4 @@ SPEC = EnvironmentSpec(
     packages=("mujoco",),
     grip=(0.0, 1.0),
 )
-add("environment", SPEC.name, f"{__name__}:SPEC")
+EnvironmentPart(SPEC.name)(lambda: SPEC)

@@ -1,0 +1,46 @@
+"""What the parts of a method return to the decoder. This file imports nothing heavy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy as np
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Decision of a boundary (docs/methods.md §4.4): whether retrieval or the drafter drafts the next chunk."""
+
+    mode: str  # the proposer's name
+    metric: float | None = None  # F (docs/methods.md §4.4); None if the decision does not use it
+
+
+class Rectified(NamedTuple):
+    """What a rectifier predicted after a rejection.
+
+    Attributes:
+        values: Normalised actions (steps, D): first the values of the committed tokens, then predicted values.
+        ends: Whether the chunk ends with these actions, so that later control steps are dropped. Else the target
+            decodes the later steps.
+    """
+
+    values: np.ndarray
+    ends: bool = True
+
+
+class SkipDecision(NamedTuple):
+    """What a skip rule decides about a chunk.
+
+    Attributes:
+        tokens: The N tokens of the chunk, which are executed without verification. None: the target decodes.
+        proposer: Name of the proposer that drafted them. PARALLEL (`record.py`): a parallel target computed them.
+        reason: Why, as in `DecodeRecord`. None: the rule states no reason.
+    """
+
+    tokens: Sequence[int] | None = None
+    proposer: str = ""
+    reason: str | None = None
