@@ -19,6 +19,7 @@ from command import kerv
 from studies_synthetic import swept, threshold_study
 
 from kerv_cli.catalogue.entries import find_runs, matching
+from kerv_cli.catalogue.labels import labels_in
 from kerv_cli.lab.database import EPISODES, RUNS, WANTED, opened
 from kerv_cli.lab.runs import INTERRUPTED, Run
 from kerv_cli.lab.study import EpisodeRunner
@@ -92,6 +93,33 @@ def test_a_finished_training_stays_finished_while_it_is_repeated_and_after_that_
     with contextlib.suppress(KeyboardInterrupt), Run(database, *longer):
         raise KeyboardInterrupt
     assert training()["state"] == "interrupted"
+
+
+def test_labels_are_listed_shown_exported_and_removed(copy):
+    (name,), where = [run["id"] for run in listed(copy, "method=ar")], f"results={copy}"
+    works("runs", "label", name, "tag=paper,final", "note=figure 3, bottom", where)
+    assert [run["id"] for run in listed(copy, "tag=final")] == [name]
+    assert listed(copy, "tag=fin") == []
+    assert "figure 3, bottom" in works("runs", "show", name, where)
+    works("runs", "export", name, where)
+    exported = pd.read_csv(copy / f"exports/csv/{name}.csv")
+    assert (set(exported["tag"]), set(exported["note"])) == ({"paper,final"}, {"figure 3, bottom"})
+    works("runs", "label", name, "tag=", where)
+    assert listed(copy, "method=ar")[0]["labels"] == {"note": "figure 3, bottom"}
+    assert f"'kerv runs label {name} tag=baseline" in kerv("runs", "label", name, where, code=2).stderr
+    works("runs", "rm", name, "--yes", where)
+    assert labels_in(opened(copy)) == {}
+
+
+def test_a_run_is_watched_until_it_ends(copy, monkeypatch):
+    with contextlib.ExitStack() as stack:
+        record = stack.enter_context(Run(opened(copy), "target", "nano-state", ["train", "target"], total=20))
+        record.beat(5, 40)
+        monkeypatch.setattr("kerv_cli.cli.runs.time.sleep", lambda seconds: stack.close())
+        lines = works("runs", "watch", f"results={copy}").splitlines()
+    assert re.fullmatch(r"target/nano-state, running, 5 of 40, about \d+ s left", lines[0])
+    assert lines[1:] == ["target/nano-state, complete"]
+    assert works("runs", "watch", f"results={copy}") == f"nothing runs in {copy}\n"
 
 
 def test_runs_are_listed_and_filtered(results):

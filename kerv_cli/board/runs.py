@@ -69,7 +69,7 @@ def show_runs(request: Request) -> Response:
 
 def _agrees(run: RunEntry, asked: dict[str, str]) -> bool:
     is_in_state = STATES.get(asked["state"], lambda run: True)
-    words = " ".join((run.id, run.kind, *run.methods, *run.tasks)).lower()
+    words = " ".join((run.id, run.kind, *run.methods, *run.tasks, *run.labels.values())).lower()
     return asked["kind"] in ("", run.kind) and is_in_state(run) and asked["text"].strip().lower() in words
 
 

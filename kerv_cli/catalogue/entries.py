@@ -25,6 +25,7 @@ from kerv_cli.base.leftovers import clean, temporary_beside
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.registry import ArtifactPart
 from kerv_cli.base.settings import CommandSettings
+from kerv_cli.catalogue.labels import labels_in, set_labels
 from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.lab.database import EPISODES, SETTINGS, STUDIES, WANTED, Database
 from kerv_cli.lab.plan import ALL, Episode
@@ -38,7 +39,7 @@ LAST = "last"
 """Stands for the newest entry, as an argument of commands."""
 _STUDIES = (SWEEP, ROLLOUT, IMPORT)
 _STATES = ("complete", "begun", "damaged", "step ", "running", "interrupted", "failed")
-_FILTERS = ("kind", "method", "task", "state", "since")
+_FILTERS = ("kind", "method", "task", "state", "since", "tag")
 
 
 def artifact_kinds() -> tuple[str, ...]:
@@ -68,6 +69,7 @@ class RunEntry:
         sha256: Hash by which other artifacts refer to it.
         made_from: Hashes of the artifacts that it was made from, by kind. If settings of a study use different
             artifacts of a kind, the key of the second and later ones is `KIND of LABEL`, with the label of the setting.
+        labels: What people wrote about it, by kind: `tag` and `note`.
     """
 
     id: str
@@ -86,6 +88,12 @@ class RunEntry:
     command: tuple[str, ...] = ()
     sha256: str = ""
     made_from: dict[str, str] = field(default_factory=dict)
+    labels: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def tags(self) -> list[str]:
+        """The words of its label `tag`."""
+        return [tag for tag in self.labels.get("tag", "").split(",") if tag]
 
     @property
     def command_line(self) -> str:
@@ -135,7 +143,9 @@ def find_runs(database: Database) -> list[RunEntry]:
             entry = replace(entry, left=time_left(row), message=row.message)
         if entry is not None:
             made[entry.id] = replace(entry, command=row.command)
-    return sorted([*runs, *made.values()], key=lambda run: (run.started, run.id), reverse=True)
+    labels = labels_in(database)
+    labelled = [replace(run, labels=labels.get(run.id, {})) for run in (*runs, *made.values())]
+    return sorted(labelled, key=lambda run: (run.started, run.id), reverse=True)
 
 
 def find_run(database: Database, name: str, exact: bool = False) -> RunEntry:
@@ -168,9 +178,9 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
 
     Args:
         runs: Entries to choose from.
-        filters: The value of each filter, by the filter's name. `kind` is a whole kind. `method` and `task` are names,
-            or patterns such as `drawer*`. `state` is the beginning of a state, and `since` the earliest start
-            (ISO 8601).
+        filters: The value of each filter, by the filter's name. `kind` is a whole kind. `method`, `task` and `tag`
+            are names, or patterns such as `drawer*`. `state` is the beginning of a state, and `since` the earliest
+            start (ISO 8601).
 
     Raises:
         UnknownName: A filter, kind or state does not exist.
@@ -193,6 +203,7 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
             run.kind == filters.get("kind", run.kind)
             and ("method" not in filters or bool(fnmatch.filter(run.methods, filters["method"])))
             and ("task" not in filters or f"{task}-v3" in run.tasks or bool(fnmatch.filter(run.tasks, task)))
+            and ("tag" not in filters or bool(fnmatch.filter(run.tags, filters["tag"])))
             and run.state.startswith(state)
             and run.started >= since
         )
@@ -407,6 +418,7 @@ def remove(run: RunEntry, database: Database) -> None:
             sync(run.folder.parent)
     if run.has_episodes:
         store_of(run, database).remove()
+    set_labels(database, run.id, {})
     forget(database, run.kind, run.id if run.has_episodes else run.id.removeprefix(f"{run.kind}/"))
     shutil.rmtree(gone, ignore_errors=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -29,7 +30,10 @@ if TYPE_CHECKING:
 
 
 RUNS = "NAME: runs (id, a unique part of it, or last) and results=DIR."
-FILTERS = "NAME: kind=, method=, task=, state=, since= and results=DIR narrow the list."
+FILTERS = "NAME: kind=, method=, task=, state=, since=, tag= and results=DIR narrow the list."
+WORDS = (
+    "NAME: a run (id, a unique part of it, or last), tag= (several: tag=a,b), note= and results=DIR. Empty: removed."
+)
 
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask; names must be whole.")]
 To = Annotated[str, typer.Option("--to", help="csv, parquet, db or trace.")]
@@ -81,20 +85,18 @@ def list_(settings: CommandSettings, names: list[str], as_json: AsJson = False) 
         return
     rows = [
         (run.id, run.kind, run.started.replace("T", " ")[:16], run.state, _few(run.methods), _few(run.tasks),
-         run.episodes or "", _headline(run))
+         run.episodes or "", _success(run), ", ".join(run.tags))
         for run in runs
     ]  # fmt: skip
-    print_table(("run", "kind", "started, UTC", "state", "methods", "tasks", "episodes", "figure"), rows)
+    print_table(("run", "kind", "started, UTC", "state", "methods", "tasks", "episodes", "success", "tag"), rows)
 
 
 def _few(names: tuple[str, ...]) -> str:
     return ", ".join(names[:3]) + (f" +{len(names) - 3}" if len(names) > 3 else "")
 
 
-def _headline(run: RunEntry) -> str:
-    if "success" in run.figures:
-        return f"success {run.figures['success']:.0%}"
-    return f"score {run.figures['score']:.4g}" if "score" in run.figures else ""
+def _success(run: RunEntry) -> str:
+    return f"{run.figures['success']:.0%}" if "success" in run.figures else ""
 
 
 def _entry_row(run: RunEntry) -> dict[str, object]:
@@ -122,6 +124,7 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
         end_with_json({**_entry_row(run), "made_from": origin, "bytes": size, "settings": rows})
     line = run.command_line or "unknown"
     lines = {"run": run.id, "kind": run.kind, "state": run.state, "started": run.started, "folder": run.folder}
+    lines |= run.labels
     parts = {"made from": ", ".join(f"{kind} {name}" for kind, name in origin.items())} if origin else {}
     words = "command" if run.has_episodes else "made by"
     for name, value in (lines | {"size": f"{size / 1e6:.1f} MB", words: line} | parts).items():
@@ -130,6 +133,64 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
         console().print(SummaryTable([row for row in data.results if row.label in labels]))
     elif run.figures:
         print_table(("measure", "value"), ((name, f"{value:.4g}") for name, value in run.figures.items()))
+
+
+@command(
+    "runs label",
+    names=WORDS,
+    keys="results",
+    examples=("kerv runs label last tag=baseline", 'kerv runs label main tag=paper,final note="figure 3"'),
+)
+def label(settings: CommandSettings, names: list[str]) -> None:
+    """Write tags and a note to a run. `kerv runs list tag=…`, the board and exports show them."""
+    from kerv_cli.catalogue.entries import find_run
+    from kerv_cli.catalogue.labels import LABELS, set_labels
+    from kerv_cli.lab.database import opened
+
+    changes = dict(word.partition("=")[::2] for word in names if word.startswith(tuple(f"{one}=" for one in LABELS)))
+    (name,) = _run_names([word for word in names if word.partition("=")[0] not in changes])
+    if not changes:
+        raise UsageError(f"write tag= or note=, as in 'kerv runs label {name} tag=baseline'")
+    database = opened(settings.results)
+    run = find_run(database, name)
+    set_labels(database, run.id, run.labels | changes)
+    typer.echo(", ".join([run.id, *(f"{kind} {text}" for kind, text in (run.labels | changes).items() if text)]))
+
+
+@command(
+    "runs watch",
+    names="NAME: a run (id, or a unique part of it) and results=DIR. Without a name: all that run.",
+    keys="results",
+    examples=("kerv runs watch", "kerv runs watch main"),
+    writes=False,
+)
+def watch(settings: CommandSettings, names: list[str]) -> None:
+    """Follow what runs, from any terminal, until it ends: how far it is, and how long it takes."""
+    from kerv_cli.catalogue.entries import find_run, find_runs
+    from kerv_cli.lab.database import opened
+    from kerv_cli.lab.runs import BEAT_SECONDS
+
+    database, shown = opened(settings.results), dict[str, str]()
+    chosen = find_run(database, _run_names(names)[0]).id if names else ""
+    while True:
+        runs = {run.id: run for run in find_runs(database) if chosen in ("", run.id)}
+        running = [name for name, run in runs.items() if run.is_running]
+        for name in dict.fromkeys([*shown, *running]):
+            line = (
+                ", ".join(filter(None, (name, runs[name].state, runs[name].left)))
+                if name in runs
+                else f"{name} is gone"
+            )
+            if shown.get(name) != line:
+                typer.echo(line)
+            shown[name] = line
+        if not running:
+            break
+        time.sleep(BEAT_SECONDS)
+    if not shown:
+        typer.echo(
+            f"nothing runs in {settings.results}" if not chosen else f"{chosen} does not run: {runs[chosen].state}"
+        )
 
 
 @_command_on_runs("compare", "kerv runs compare main:ar main:kerv", "kerv runs compare main last")

@@ -48,11 +48,14 @@ def export(run: RunEntry, database: Database, to: str, folder: Path) -> list[Pat
     if to == "db":
         return [export_database(store, folder / run.id)]
     if to == "parquet":
-        return _to_parquet(store, folder / run.id)
+        return _to_parquet(store, folder / run.id, run.labels)
     if to == "trace":
         return [_to_trace(store, folder / f"{run.id}.jsonl")]
     path = folder / f"{run.id}.csv"
-    write_text(path, csv_text(_episodes(store).drop(columns=["episode", "decode_seconds", "initial_state"])))
+    write_text(
+        path,
+        csv_text(_episodes(store).assign(**run.labels).drop(columns=["episode", "decode_seconds", "initial_state"])),
+    )
     return [path]
 
 
@@ -64,15 +67,16 @@ def _episodes(store: StudyStore) -> pd.DataFrame:
     return frame
 
 
-def _to_parquet(store: StudyStore, folder: Path) -> list[Path]:
-    """Write all episodes of a study to episodes.parquet and all its decodes to decodes.parquet."""
+def _to_parquet(store: StudyStore, folder: Path, labels: Mapping[str, str]) -> list[Path]:
+    """Write all episodes of a study, with the run's labels, to episodes.parquet and all decodes to decodes.parquet."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     frame, keys = _episodes(store), ["label", "task", "seed", "repeat"]
     episodes, decodes = folder / "episodes.parquet", folder / "decodes.parquet"
     with atomic_path(episodes) as path:
-        table = pa.Table.from_pandas(frame.drop(columns=["episode", "decode_seconds"]), preserve_index=False)
+        labelled = frame.assign(**labels).drop(columns=["episode", "decode_seconds"])
+        table = pa.Table.from_pandas(labelled, preserve_index=False)
         pq.write_table(table, path, compression="zstd")
     schema = pa.schema([*(table.schema.field(key) for key in keys), *DECODE_SCHEMA])
     with atomic_path(decodes) as path, pq.ParquetWriter(path, schema, compression="zstd") as writer:
