@@ -195,13 +195,14 @@ class Imitation:
 
     @contextlib.contextmanager
     def precision(self) -> Iterator[None]:
-        """Compute in bfloat16 inside this context, if `train.bf16` is set and the device is a GPU or a CPU with AMX.
+        """Compute in bfloat16 inside this context, if `train.bf16` is set and the device multiplies bfloat16 numbers.
 
-        Other CPUs are slower in bfloat16. With AMX, attention runs without a fused kernel, because the fused kernel's
-        backward pass takes four times as long.
+        A GPU does, and a CPU with AMX or AVX512-BF16. Other CPUs are slower in bfloat16. On a CPU attention then runs
+        without a fused kernel, because the fused kernel's backward pass takes four times as long.
         """
         gpu = self.device.type != "cpu"
-        bf16 = self.settings.bf16 and (gpu or torch.cpu._is_amx_tile_supported())
+        multiplies = gpu or torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported()
+        bf16 = self.settings.bf16 and multiplies
         kernels = [SDPBackend.MATH]
         if gpu or not bf16:
             kernels += [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION]

@@ -49,7 +49,7 @@ class TrainSettings:
     validate_every: int = number(2_000, 1, 10**9, help="steps between two validations")
     closed_loop: int = number(0, 0, 100_000, help="simulated episodes per task at every validation; 0: none")
     seed: int = number(0, 0, 2**31 - 1, help="seed of the initial weights and of the order of samples")
-    bf16: bool = setting(True, "train in bfloat16 on a GPU or a CPU with AMX; other CPUs use float32")
+    bf16: bool = setting(True, "train in bfloat16 on a GPU or a CPU with AMX or AVX512-BF16; else float32")
     stored: str = choice("float32", "float32", "float16", "int8", help="number format of the weights on disk")
 
 
