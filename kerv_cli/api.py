@@ -26,7 +26,7 @@ from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import ROLLOUT, StudyStore
 from kerv_cli.lab.study import plan, plan_rollout, run
 from kerv_cli.report.report import report as write_reports
-from kerv_cli.report.results import Row, averaged, frame_of, rows_of
+from kerv_cli.report.results import Row, averaged, frame_of
 from kerv_cli.report.tables import load_study as load_data
 from kerv_cli.report.viewing import save_recording
 from kerv_cli.serve.interface import Message
@@ -79,7 +79,8 @@ class Study:
 
     def episodes(self) -> list[Row]:
         """Return the rows of the table `episodes` as dictionaries. It raises the same errors as `to_pandas`."""
-        return rows_of(self.to_pandas("episodes"))
+        rows: list[Any] = self.to_pandas("episodes").to_dict("records")
+        return rows
 
     def report(self) -> list[Path]:
         """Write the tables, plots and page of a sweep, as `kerv report` does. Return their paths.

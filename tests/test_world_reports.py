@@ -16,7 +16,7 @@ from kerv_cli.lab.plan import Setting
 from kerv_cli.lab.work import RunEpisode
 from kerv_cli.report.plots import latency_figure, study_figures
 from kerv_cli.report.report import report
-from kerv_cli.report.results import averaged, columns_of, rows_of
+from kerv_cli.report.results import averaged, columns_of
 from kerv_cli.report.statistics import PairedCounts
 from kerv_cli.report.summary import summary_frame
 from kerv_cli.report.tables import is_stressed, latency_table, load_study, summed_table
@@ -83,7 +83,7 @@ def test_the_figure_has_a_panel_per_kind_and_a_line_per_method(stressed_results)
 
 def test_sums_count_every_stressed_world_once(stressed_results):
     """20 seeds x 2 tasks; level 4 of a push fails half of everything, level 4 of light half of what is bold."""
-    found = {row["label"]: row for row in rows_of(summed_table(stressed_results))}
+    found = {row["label"]: row for row in summed_table(stressed_results).to_dict("records")}
     sums = ["light", "push", "level 1", "level 4", "all"]
     assert list(found) == [f"{name} {one}" for one in sums for name in ("ar", "bold")]
     counted = {one: (found[f"bold {one}"]["successes"], found[f"bold {one}"]["episodes"]) for one in sums}

@@ -126,9 +126,9 @@ def find_runs(database: Database) -> list[RunEntry]:
             finished.add((row.kind, row.name, row.command))
     runs = _studies(database, rows)
     folder, kinds = database.results / "artifacts", artifact_kinds()
-    for place in (database.results / "studies", database.results / "rollouts", *(folder / kind for kind in kinds)):
+    for parent in (database.results / "studies", database.results / "rollouts", *(folder / kind for kind in kinds)):
         with contextlib.suppress(OSError):
-            clean(place)  # what killed commands left there
+            clean(parent)  # what killed commands left there
     made = {run.id: run for kind in kinds for run in _artifacts(folder / kind, kind)}
     for (kind, name), row in rows.items():
         if kind in _STUDIES:

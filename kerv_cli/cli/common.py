@@ -32,6 +32,8 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON o
 def end_with_json(value: object, code: int = 0) -> NoReturn:
     """Print a value as indented JSON and end the command. NaN and infinity, which JSON cannot express, become null.
 
+    A data frame becomes a list of its rows.
+
     Args:
         value: The value to print.
         code: Exit code of the command.
@@ -45,6 +47,8 @@ def _plain(value: object) -> object:
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
+    if hasattr(value, "to_dict"):  # a data frame
+        return _plain(value.to_dict("records"))
     if hasattr(value, "item"):  # a number of numpy
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):

@@ -36,7 +36,6 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
     from kerv_cli.catalogue.imports import database_in, import_databases
     from kerv_cli.lab.database import opened
     from kerv_cli.lab.store import StudyStore
-    from kerv_cli.report.results import rows_of
     from kerv_cli.report.summary import SummaryTable
     from kerv_cli.report.tables import load_study
 
@@ -58,7 +57,7 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
     name, notes = import_evaluations(database, paths, settings.name, settings.labels, settings.baseline, words)
     data = load_study(StudyStore(database, name))
     if as_json:
-        end_with_json({"study": name, "notes": notes, "settings": rows_of(data.table)})
+        end_with_json({"study": name, "notes": notes, "settings": data.table})
     for line in notes:
         typer.echo(line)
     console().print(SummaryTable(data.results))

@@ -84,7 +84,6 @@ def report(
 def _as_json(reports: list[Report]) -> dict[str, object]:
     """Return what reports contain, as JSON values."""
     from kerv_cli.report.reprice import prices_table
-    from kerv_cli.report.results import rows_of
 
     files, priced = [], []
     studies, acceptance = {}, {}
@@ -92,28 +91,27 @@ def _as_json(reports: list[Report]) -> dict[str, object]:
         name, data = one.data.study.name, one.data
         files += one.files
         priced += one.priced
-        studies[name] = rows_of(data.table)
+        studies[name] = data.table
         acceptance[name] = {label: tally.as_dict() for label, tally in data.tallies.items()}
     content: dict[str, object] = {"files": files, "studies": studies, "acceptance": acceptance}
-    return content | ({"priced": rows_of(prices_table(priced))} if priced else {})
+    return content | ({"priced": prices_table(priced)} if priced else {})
 
 
 def _print_choice(database: Database, study: str | None, loss: float, as_json: bool) -> None:
     """Print which setting to use in the chosen study, or in each study with results."""
-    from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.decide import choices
-    from kerv_cli.report.report import names_to_report
+    from kerv_cli.report.report import to_report
     from kerv_cli.report.tables import load_study
     from kerv_cli.report.verdict import sentence, short_sentence
 
     answers = {}
-    for name in names_to_report(database, study):
-        data = load_study(StudyStore(database, name))
+    for store in to_report(database, study):
+        data = load_study(store)
         whole, *tasks = choices(data.results, data.task_results, loss)
-        answers[name] = [choice.as_dict() for choice in (whole, *tasks)]
+        answers[store.name] = [choice.as_dict() for choice in (whole, *tasks)]
         if not as_json:
             front = f", not beaten in speed and success at once: {', '.join(whole.front)}"
-            typer.echo(f"{name}{front if whole.front else ''}")
+            typer.echo(f"{store.name}{front if whole.front else ''}")
             typer.echo(f"  {sentence(whole, loss, data.study.baseline)}")
             for choice in tasks:
                 typer.echo(f"  {short_sentence(choice)}")

@@ -64,14 +64,14 @@ def rollout(
 
 
 def _print_rollout(store: StudyStore, as_json: bool, where: str) -> None:
-    from kerv_cli.report.results import MICRO, rows_of
+    from kerv_cli.report.results import averaged, frame_of
     from kerv_cli.report.summary import SummaryTable, setting_tables
     from kerv_cli.report.tables import load_study
 
     data = load_study(store)
     if as_json:
-        end_with_json({"run": store.name, "folder": store.root, "settings": rows_of(data.table, MICRO),
-                       "tasks": rows_of(data.per_task), "recordings": store.recordings})  # fmt: skip
+        end_with_json({"run": store.name, "folder": store.root, "settings": frame_of(averaged(data.results)),
+                       "tasks": data.per_task, "recordings": store.recordings})  # fmt: skip
     if len(data.study.labels) > 1:
         console().print(SummaryTable(data.results))
     else:

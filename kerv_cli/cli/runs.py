@@ -109,7 +109,6 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
     from kerv_cli.catalogue.entries import disk_bytes, find_runs, parents, store_of
     from kerv_cli.lab.database import opened
     from kerv_cli.report.compare import compared_runs
-    from kerv_cli.report.results import rows_of
     from kerv_cli.report.summary import SummaryTable
     from kerv_cli.report.tables import load_study
 
@@ -120,8 +119,9 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
     labels = [side.label for side in chosen]
     size, origin = disk_bytes(run.folder), parents(run, find_runs(database))
     if as_json:
-        rows = [] if data is None else rows_of(data.table[data.table["label"].isin(labels)])
-        end_with_json({**_entry_row(run), "made_from": origin, "bytes": size, "settings": rows})
+        content = {**_entry_row(run), "made_from": origin, "bytes": size}
+        content["settings"] = [] if data is None else data.table[data.table["label"].isin(labels)]
+        end_with_json(content)
     line = run.command_line or "unknown"
     lines = {"run": run.id, "kind": run.kind, "state": run.state, "started": run.started, "folder": run.folder}
     lines |= run.labels

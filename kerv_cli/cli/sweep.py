@@ -79,7 +79,6 @@ def _list_studies(as_json: bool) -> None:
 
 def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, planned: Plan, as_json: bool) -> None:
     """Print the results of a sweep and end the command, with exit code 1 if episodes failed."""
-    from kerv_cli.report.results import rows_of
     from kerv_cli.report.tables import load_study
 
     if outcome.detached:
@@ -94,8 +93,8 @@ def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, planned: Plan, as_
         one = failure.episodes[0]
         typer.echo(f"kerv: {one.setting.label} on {one.task}: {failure.reason}", err=True)
     if as_json:
-        rows = [] if data is None else rows_of(data.table)
-        content = {"study": store.name, "folder": store.root, "episodes": counts, "settings": rows}
+        content = {"study": store.name, "folder": store.root, "episodes": counts}
+        content["settings"] = [] if data is None else data.table
         end_with_json({**content, "recordings": store.recordings}, code=int(bool(failed)))
     if data is not None:
         print_study(data)

@@ -73,7 +73,7 @@ def study_parts(
         "suite": _suite(rows),
         "charts": [figure.to_dict() for figure in figures.values()],
         "has_bounds": "_tradeoff" in figures,
-        "has_places": "_acceptance" in figures,
+        "has_acceptance": "_acceptance" in figures,
         "tasks": _by_task(data.task_results),
         "episodes": "",  # the board gives the address of the page of episodes
         "machines": repriced_summary(priced) if priced else None,

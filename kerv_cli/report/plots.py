@@ -91,7 +91,7 @@ def _drawn(results: Sequence[Result]) -> pd.DataFrame:
 
 
 def with_lines(rows: pd.DataFrame, axis: str) -> pd.DataFrame:
-    """Add the columns `line` (name of the line that joins a setting's point to others) and `x` (its place on the axis).
+    """Add the columns `line` (name of the line that joins a setting's point to others) and `x` (its value on the axis).
 
     Settings that differ only in the value of `axis` are on one line. A setting whose value is no number, or that is
     alone on its line, gets a line of its own and no x.

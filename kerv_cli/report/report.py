@@ -28,21 +28,22 @@ from kerv_cli.report.tables import (
 )
 
 
-def names_to_report(database: Database, study: str | None) -> list[str]:
-    """Return the names of the studies to report.
+def to_report(database: Database, study: str | None) -> list[StudyStore]:
+    """Return the studies to report.
 
     Args:
         database: The database.
-        study: Name of one study. None: every study that has at least one episode.
+        study: Name of one study. None: every study that has at least one episode, sorted by name.
 
     Raises:
         UsageError: No study has an episode.
     """
-    present = [] if study else [one for one in studies(database) if one.kind != ROLLOUT and one.counts()[0]]
-    names = [study] if study else sorted(store.name for store in present)
-    if not names:
+    if study:
+        return [StudyStore(database, study)]
+    stores = [one for one in studies(database) if one.kind != ROLLOUT and one.counts()[0]]
+    if not stores:
         raise UsageError(f"no study in {database.results} has an episode: run `kerv sweep study=demo`")
-    return names
+    return sorted(stores, key=lambda one: one.name)
 
 
 @dataclass(frozen=True)
@@ -92,8 +93,8 @@ def report(
         given = f"on={','.join(on)}" if on else f"baseline={baseline}"
         raise UsageError(f"{given}: name the study with study=NAME")
     profiles, reports = open_profiles(database.results, on), []
-    for name in names_to_report(database, study):
-        data = load_study(StudyStore(database, name))
+    for store in to_report(database, study):
+        data = load_study(store)
         if baseline:
             data = data.compared_with(baseline)
         priced = repriced(data, profiles) if profiles else own_prices(data)
@@ -154,22 +155,18 @@ def refusals(results: Sequence[Result]) -> list[str]:
         results: The study's rows over all tasks.
     """
     clauses = []
-    commits = split_values(row.provenance["git_commit"] for row in results)
-    if any(commit.endswith("+changes") or commit in ("none", "") for commit in commits):
+    values = {}
+    for column in ("git_commit", "host", "device_name", "engine"):
+        values[column] = split_values(row.provenance[column] for row in results)
+    if any(commit.endswith("+changes") or commit in ("none", "") for commit in values["git_commit"]):
         clauses.append("some episodes were computed by code that is not committed")
-    several = {"git_commit": "commits", "host": "machines", "device_name": "devices", "engine": "engines"}
-    for column, what in several.items():
-        values = split_values(row.provenance[column] for row in results)
-        if len(values) > 1:
-            clauses.append(f"its episodes are from {len(values)} {what}")
-    apart: dict[str, dict[str, None]] = {"in one run with": {}, "in turn with": {}}
-    for row in results:
-        if not row.is_baseline and row.measures.pairs:
-            if not row.measures.same_run:
-                apart["in one run with"][row.label] = None
-            if row.measures.same_block < 1:
-                apart["in turn with"][row.label] = None
-    for what, labels in apart.items():
+    for found, what in zip(values.values(), ("commits", "machines", "devices", "engines"), strict=True):
+        if len(found) > 1:
+            clauses.append(f"its episodes are from {len(found)} {what}")
+    compared = [row for row in results if not row.is_baseline and row.measures.pairs]
+    other_run = dict.fromkeys(row.label for row in compared if not row.measures.same_run)
+    not_in_turn = dict.fromkeys(row.label for row in compared if row.measures.same_block < 1)
+    for labels, what in ((other_run, "in one run with"), (not_in_turn, "in turn with")):
         if labels:
             clauses.append(f"not measured {what} the baseline: {', '.join(labels)}")
     return clauses

@@ -50,11 +50,16 @@ class NamedProfile:
     profile: Profile
 
     @property
+    def is_projected(self) -> bool:
+        """Whether the costs were computed, not measured."""
+        return bool(self.profile.about.get("projected"))
+
+    @property
     def title(self) -> str:
         """Target, device and, of computed costs, the engine. Ends in "projected" if the costs were not measured."""
         about = self.profile.about
         names = [str(about[key]) for key in ("target", "device_name", "engine") if about.get(key)]
-        return ", ".join(names or [self.name]) + (", projected" if about.get("projected") else "")
+        return ", ".join(names or [self.name]) + (", projected" if self.is_projected else "")
 
     @property
     def encoders(self) -> dict[str, Profile]:
@@ -117,28 +122,15 @@ class Priced:
     @property
     def columns(self) -> Row:
         """The row of `prices_table`."""
-        result, estimated, measured = self.result, self.measures, self.result.measures
-        return columns_of(
-            {
-                "study": result.study,
-                "label": result.label,
-                "baseline": result.baseline,
-                "on": self.machine.name,
-                "machine": self.machine.title,
-                "projected": bool(self.machine.profile.about.get("projected")),
-                "episode_speedup": estimated.episode_speedup,
-                "speedup": estimated.speedup,
-                "time_per_episode_ms": estimated.time_per_episode_ms,
-                "time_per_step_ms": estimated.time_per_step_ms,
-                "latency_p95_ms": estimated.latency_p95_ms,
-                "encoders": self.encoders,
-                "measured_episode_speedup": measured.episode_speedup,
-                "measured_speedup": measured.speedup,
-                "measured_on": result.provenance["device_name"],
-                "episodes": result.episodes,
-                "pairs": estimated.pairs,
-            }
-        )
+        result, of, measured = self.result, self.measures, self.result.measures
+        machine = {"on": self.machine.name, "machine": self.machine.title, "projected": self.machine.is_projected}
+        speeds = {"episode_speedup": of.episode_speedup, "speedup": of.speedup}
+        times = {name: getattr(of, name) for name in ("time_per_episode_ms", "time_per_step_ms", "latency_p95_ms")}
+        before: Row = {"measured_episode_speedup": measured.episode_speedup, "measured_speedup": measured.speedup}
+        before["measured_on"] = result.provenance["device_name"]
+        about = {"study": result.study, "label": result.label, "baseline": result.baseline, **machine}
+        counts = {"episodes": result.episodes, "pairs": of.pairs}
+        return columns_of({**about, **speeds, **times, **self.encoders, **before, **counts})
 
 
 def prices_table(priced: Iterable[Priced]) -> pd.DataFrame:

@@ -215,19 +215,6 @@ def averaged(results: Iterable[Result], averaging: str = MICRO) -> list[Result]:
     return [row for row in results if row.averaging == averaging]
 
 
-def rows_of(table: pd.DataFrame, averaging: str | None = None) -> list[Row]:
-    """Return the rows of a data frame as dictionaries of column to value.
-
-    Args:
-        table: The data frame.
-        averaging: Keep only rows that pool all episodes (MICRO) or that average over difficulty groups (MACRO). None:
-            keep all rows.
-    """
-    rows = table if averaging is None else table[table["averaging"] == averaging]
-    records: list[Any] = rows.to_dict("records")
-    return records
-
-
 def csv_text(table: pd.DataFrame) -> str:
     """Return a data frame as CSV text with six significant digits. Missing values are empty cells."""
     return table.to_csv(index=False, float_format="%.6g", lineterminator="\n")

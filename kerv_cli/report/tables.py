@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow.compute as pc
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.engine.tally import Tally
@@ -19,7 +20,6 @@ from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, flat
 from kerv_cli.lab.plan import Episode, Setting, Study, seeds_text
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report import statistics as stats
-from kerv_cli.report.acceptance import tally_of
 from kerv_cli.report.decide import with_matched_speed
 from kerv_cli.report.measures import Speeds, compared, measure, paired, speedups
 from kerv_cli.report.results import MACRO, MICRO, Result, Row, averaged, columns_of, frame_of, is_number
@@ -46,6 +46,7 @@ _PROVENANCE = (
 
 
 NO_STRESS = "none"
+_AT_ONCE = 200  # episodes in memory at a time
 _ONE_STATE = ("code", "git_commit", "device_name")
 """Columns in which runs must agree, to be averaged."""
 
@@ -126,7 +127,7 @@ class StudyData:
 
     @functools.cached_property
     def tallies(self) -> dict[str, Tally]:
-        """How many draft tokens were accepted, by place, for each setting that verified drafts. Reads all decodes."""
+        """How many draft tokens were accepted, for each setting that verified drafts. Reads all decodes."""
         episodes, tallies = self.episodes.groupby("label")["episode"], {}
         for label in self.labels:
             tally = tally_of(self.store, episodes.get_group(label).tolist())
@@ -252,6 +253,33 @@ def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
     return episodes.assign(**added).astype(dict.fromkeys(texts, object))
 
 
+def tally_of(store: StudyStore, episodes: Sequence[int]) -> Tally | None:
+    """Count the verifications of some episodes of one setting. None if their decodes verified no draft.
+
+    Args:
+        store: The study.
+        episodes: Row numbers of the episodes.
+    """
+    total = None
+    for first in range(0, len(episodes), _AT_ONCE):
+        part = list(episodes[first : first + _AT_ONCE])
+        rounds = store.decodes(part, ("rounds",))["rounds"].combine_chunks().flatten()
+        is_verification = pc.and_(pc.greater(rounds.field("tree_size"), 0), pc.not_equal(rounds.field("mode"), "skip"))
+        rounds = rounds.filter(is_verification)
+        if not len(rounds):
+            continue
+        start, accepted, nodes = (rounds.field(name).to_numpy() for name in ("start", "accepted", "tree_size"))
+        judged = pc.list_value_length(rounds.field("drafted")).to_numpy().astype(np.int64)
+        tally = Tally.of(start, judged, accepted, nodes, _dofs(store, part[0]))
+        total = tally if total is None else total + tally
+    return total
+
+
+def _dofs(store: StudyStore, episode: int) -> int:
+    """Return the number of DoFs of an episode's actions."""
+    return len(store.decodes([episode], ("actions",))["actions"][0].as_py()[0])
+
+
 def difficulty_of(task: str) -> str:
     """Return the task's difficulty group, or `other` if no environment has the task."""
     return next((spec.tasks[task].difficulty for spec in specs().values() if task in spec.tasks), "other")
@@ -272,12 +300,12 @@ def _results(data: StudyData, averaging: str, by_task: bool = False) -> list[Res
     indices = data.episodes.groupby(by).indices
     texts = _texts_of(data.episodes)
 
-    def place(group: Any) -> tuple[str, int]:
+    def order(group: Any) -> tuple[str, int]:
         task, label = group if by_task else ("", group)
         return task, data.labels.index(label)
 
     results = []
-    groups: list[Any] = sorted(indices, key=place)
+    groups: list[Any] = sorted(indices, key=order)
     for group in groups:
         values = {name: pd.unique(column[indices[group]]) for name, column in texts.items()}
         label = group[1] if by_task else group
@@ -381,7 +409,7 @@ def further_of(data: StudyData) -> dict[str, Any]:
         - `identity`: hashes of weights and data
         - `provenance`: executor, machine, versions and the like
         - `measures`: for each averaging and each task, the measures that have no column in the CSV files
-        - `acceptance`: how many draft tokens were accepted, by place, over all tasks; only if drafts were verified
+        - `acceptance`: how many draft tokens were accepted, over all tasks; only if drafts were verified
     """
     labels: dict[str, Any] = {}
     for row in [*data.results, *data.task_results]:
