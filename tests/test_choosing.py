@@ -11,7 +11,7 @@ import pytest
 from kerv_cli.report.decide import choices, pareto, safest_first, with_matched_speed
 from kerv_cli.report.results import MICRO, Measures, Result
 from kerv_cli.report.statistics import NO_ESTIMATE, Estimate, PairedCounts, paired_difference, pairs_to_settle, wilson
-from kerv_cli.report.verdict import sentence, short_sentence
+from kerv_cli.report.verdict import episodes_to_settle, order_of, sentence, short_sentence
 
 T = TypeVar("T", Measures, Result)
 UNKNOWN = {"str": "", "int": 0, "bool": False, "float": math.nan, "Estimate": NO_ESTIMATE}
@@ -39,7 +39,7 @@ def row(
         counts=counts,
         difference=paired_difference(counts),
     )
-    about = {"averaging": MICRO, "task": "all", "runs": 1, "method": method}
+    about = {"averaging": MICRO, "task": "all", "tasks": 1, "runs": 1, "method": method}
     return with_fields(Result, label=label, baseline="ar", measures=measures, **about)
 
 
@@ -103,12 +103,23 @@ def test_nothing_is_recommended_where_the_baseline_does_not_solve_the_tasks():
     assert "does not solve" in short_sentence(reach)
 
 
+def test_the_order_by_speed_says_which_neighbours_cannot_be_told_apart():
+    by_speed = [("c", Estimate(1.5, 1.4, 1.6)), ("b", Estimate(1.1, 0.9, 1.3)), ("a", NO_ESTIMATE)]
+    assert order_of(by_speed) == "c > b ≈ a (≈: these episodes cannot tell the two apart)"
+    assert order_of(by_speed[:1]) == "c"
+    assert order_of([]) == ""
+
+
 def test_what_is_not_shown_yet_says_how_many_pairs_more_would_do(rows):
     """Of r = 9, the fastest that may be non-inferior: nothing after r = 20 is, which loses more than the bound."""
     found = choices(rows, [], 2.0)[0]
     assert (found.chosen, found.candidate) == ("", "r=9")
     assert found.candidate_pairs == pairs_to_settle(PairedCounts(188, 2, 2, 8), 0.02) > 200
-    assert "more pairs would show it for r=9" in sentence(found, 2.0, "ar")
+    said = sentence(found, 2.0, "ar")
+    assert "r=9 is the fastest setting that may keep the success: 1.50 (1.40–1.60 of this run) times as fast" in said
+    assert said.endswith("more pairs would show it for r=9")
+    assert episodes_to_settle(rows, 2.0) == math.ceil(found.candidate_pairs)
+    assert episodes_to_settle(rows, 4.0) == 0, "a setting is named already"
     slower = choices(only(rows, "ar", "slow"), [], 2.0)[0]
     assert sentence(slower, 2.0, "ar") == "no setting is shown to be faster per episode than ar (200 pairs)"
     far = replace(found, candidate_pairs=110_128.0)

@@ -300,6 +300,14 @@ def test_repeats_are_paired_with_their_own(tmp_path):
     assert row["speedup"] == row["speedup_low"] == row["speedup_high"] == pytest.approx(2.0)
 
 
+def test_neighbours_in_the_order_of_speed_are_compared_with_each_other(data):
+    (first, speed), (second, _), *_ = data.by_speed
+    against = next(row for row in data.compared_with(second).results if row.label == first)
+    assert (speed.low, speed.high) == (against.measures.episode_speedup.low, against.measures.episode_speedup.high)
+    assert [label for label, _ in data.by_speed][-1] != first
+    assert math.isnan(data.by_speed[-1][1].value)
+
+
 def printed(results: Sequence[Result], width: int = 80, everything: bool = False) -> list[str]:
     console = Console(width=width, file=io.StringIO(), record=True)
     console.print(SummaryTable(results, everything, "--all"))

@@ -225,7 +225,7 @@ def print_prices(priced: Sequence[Priced]) -> None:
 
     if priced:
         summary = repriced_summary(priced)
-        summary = summary.filter(regex="setting|per episode")  # the page has the speeds per step
+        summary = summary.filter(regex="setting|per episode$")  # the page has the speeds per step and by encoder
         print_table(summary.columns, summary.itertuples(index=False), ASSUMES)
 
 
@@ -236,10 +236,16 @@ def print_verdict(data: StudyData, loss: float) -> None:
         data: The study.
         loss: Largest loss of success that is accepted, percentage points.
     """
-    from kerv_cli.report.verdict import verdict_of
+    from kerv_cli.report.verdict import caution, episodes_to_settle, order_of, verdict_of
 
     store = data.store
+    if order := order_of(data.by_speed):
+        typer.echo(f"by speed per episode: {order}")
+    if note := caution(data.results):
+        typer.echo(f"note: {note}")
     typer.echo(f"verdict: {verdict_of(data.results, loss)[0]}")
+    if store.kind == "sweep" and (episodes := episodes_to_settle(data.results, loss)):
+        typer.echo(f"settle it: {store.sweep_command(f'episodes={episodes}')}")
     typer.echo(f"page: {store.root / 'report.html'}")
     typer.echo(f"browse: kerv board{results_word(store.database.words)}")
     recordings = store.recordings

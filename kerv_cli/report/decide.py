@@ -36,7 +36,8 @@ class Choice:
         candidate_pairs: About how many pairs in all the candidate needs. NaN without a candidate.
         tested: Number of settings that are tested for their loss of success: those that are faster than the baseline or
             were not timed.
-        episode_speedup: Speed per episode of the chosen setting against the baseline. NaN if it was not timed.
+        episode_speedup: Speed per episode of the chosen setting, or else of the candidate, against the baseline. NaN if
+            it was not timed.
         runs: Number of runs that its interval covers.
     """
 
@@ -114,7 +115,13 @@ def _with_candidate(undecided: Choice, order: Sequence[Result], loss: float) -> 
     candidate = _fastest([row for row in order if row.label in reached])
     if candidate is None:
         return undecided
-    return replace(undecided, candidate=candidate.label, candidate_pairs=reached[candidate.label])
+    return replace(
+        undecided,
+        candidate=candidate.label,
+        candidate_pairs=reached[candidate.label],
+        episode_speedup=candidate.measures.episode_speedup,
+        runs=candidate.runs,
+    )
 
 
 def safest_first(rows: Iterable[Result]) -> list[Result]:

@@ -15,12 +15,13 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from kerv_cli.episodes.identity import NOT_DETERMINING, without
+from kerv_cli.lab.store import SWEEP
 from kerv_cli.report.plots import about, acceptance_figure, latency_figure, library, study_figures
 from kerv_cli.report.reprice import ASSUMES, Priced, repriced_summary
 from kerv_cli.report.results import MACRO, Result, is_number
 from kerv_cli.report.summary import MAIN, MISSING, NOTE, SPEEDS, of_runs, summary_frame
 from kerv_cli.report.tables import StudyData, differences, flatten, latency_table
-from kerv_cli.report.verdict import caution, question, verdict_of
+from kerv_cli.report.verdict import caution, episodes_to_settle, order_of, question, verdict_of
 from kerv_cli.report.viewing.film import animation, film_of
 
 LOSS = 3.0
@@ -53,6 +54,7 @@ def study_parts(
     """
     store, rows = data.store, data.results
     answer, is_shown = verdict_of(rows, loss)
+    more = episodes_to_settle(rows, loss)
     first, results, figures = rows[0].provenance, str(store.database.results), figures_of(data, loss)
     return {
         "name": store.name,
@@ -62,6 +64,8 @@ def study_parts(
         "question": question(rows, loss),
         "verdict": answer[:1].upper() + answer[1:],
         "is_shown": is_shown,
+        "order": order_of(data.by_speed),
+        "settles": store.sweep_command(f"episodes={more}") if more and store.kind == SWEEP else "",
         "caution": caution(rows),
         "wanted": len(data.study.episodes),
         "missing": len(data.absent),

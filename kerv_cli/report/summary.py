@@ -93,10 +93,10 @@ def cells_of(row: Result) -> dict[str, str]:
     return {
         "setting": row.label,
         "success": interval(of.success, ".0f", " %", 100.0),
-        DIFFERENCE: interval(of.difference, "+.0f", "", 100.0, " to ") if is_compared else "",
         SPEEDS["episode_speedup"]: _speed(row, of.episode_speedup),
-        "slowest 5 % of decodes, ms": number(of.latency_p95_ms),
+        DIFFERENCE: interval(of.difference, "+.0f", "", 100.0, " to ") if is_compared else "",
         "tokens unverified": share(of.unverified_share),
+        "slowest 5 % of decodes, ms": number(of.latency_p95_ms),
         SPEEDS["speedup"]: _speed(row, of.speedup),
         "a decode takes, ms": number(of.felt_latency_ms),
         "steps on a held action": share(of.held_share),
@@ -188,11 +188,11 @@ def _heading(name: str) -> str:
 
 
 def _parts(frame: pd.DataFrame, width: int) -> Iterator[pd.DataFrame]:
-    """Cut a table into parts that fit into `width` characters. The first part has at least the main columns."""
+    """Cut a table into parts that fit into `width` characters. The first part has at least name, success and speed."""
     widths = {name: 2 + max(map(len, [*_heading(name).split("\n"), *frame[name]])) for name in frame.columns}
     label = min(widths["setting"], 2 + max(_LABEL, *map(len, " ".join(frame["setting"]).split())))
-    part = list(frame.columns[:MAIN])
-    for name in frame.columns[MAIN:]:
+    part = list(frame.columns[:3])
+    for name in frame.columns[3:]:
         if label + sum(widths[one] for one in part[1:]) + widths[name] > width:
             yield frame[part]
             part = ["setting"]

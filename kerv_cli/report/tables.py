@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import json
 import math
 import re
@@ -124,6 +125,28 @@ class StudyData:
     def pairs(self) -> pd.DataFrame:
         """Episodes of each setting, paired with those of the setting that it is compared with (`measures.paired`)."""
         return paired(self.episodes, self.references)
+
+    @functools.cached_property
+    def by_speed(self) -> list[tuple[str, stats.Estimate]]:
+        """The timed settings, the fastest per episode first, each with its speed per episode against the next.
+
+        Empty if the settings run under several conditions, or if fewer than two were timed.
+        """
+        timed: dict[str, float] = {}
+        for row in averaged(self.results):
+            speed = 1.0 if row.is_baseline else row.measures.episode_speedup.value
+            if not math.isnan(speed):
+                timed[row.label] = speed
+        order = sorted(timed, key=timed.__getitem__, reverse=True)
+        if len(order) < 2 or len(set(self.references.values())) > 1:
+            return []
+        next_ones = dict(itertools.pairwise(order))
+        runs = [speedups(paired(run, next_ones), ["label"], MICRO) for run in self.runs or (self.episodes,)]
+        found = []
+        for label in order:
+            several = [run.get(label, Speeds()).episode_speedup for run in runs]
+            found.append((label, stats.over_runs(several, self.same_pairs) if self.runs else several[0]))
+        return found
 
     @functools.cached_property
     def tallies(self) -> dict[str, Tally]:

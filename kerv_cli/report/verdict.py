@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from kerv_cli.base.durations import count
 from kerv_cli.report.decide import POINTS, SOLVED, Choice, choose
 from kerv_cli.report.results import Result, averaged, is_number
-from kerv_cli.report.statistics import MOST_PAIRS
+from kerv_cli.report.statistics import MOST_PAIRS, Estimate
 
 
 def verdict_of(results: Sequence[Result], loss: float) -> tuple[str, bool]:
@@ -70,7 +70,41 @@ def sentence(choice: Choice, loss: float, baseline: str) -> str:
         return f"{choice.chosen} {bound} (95 % confidence, {choice.pairs} pairs){_speed(choice)}"
     if not choice.tested:
         return f"no setting is shown to be faster per episode than {baseline} ({choice.pairs} pairs)"
-    return f"{count(choice.pairs, 'pair')} cannot show a setting that is faster and {bound}; {_missing(choice)}"
+    pairs = count(choice.pairs, "pair")
+    if not choice.candidate:
+        return f"{pairs} cannot show a setting that is faster and {bound}; {_missing(choice)}"
+    factor = f": {_factor(choice)}" if is_number(choice.episode_speedup.value) else ""
+    fastest = f"{choice.candidate} is the fastest setting that may keep the success{factor}"
+    return f"{fastest}. {pairs} cannot show that it {bound}; {_missing(choice)}"
+
+
+def order_of(by_speed: Sequence[tuple[str, Estimate]]) -> str:
+    """Return the settings in the order of their speed per episode, and which neighbours cannot be told apart.
+
+    Args:
+        by_speed: The settings, the fastest first, each with its speed against the next.
+    """
+    text = ""
+    for label, speed in by_speed[:-1]:
+        text += f"{label} {'>' if speed.low > 1 else '≈'} "
+    apart = " (≈: these episodes cannot tell the two apart)" if "≈" in text else ""
+    return f"{text}{by_speed[-1][0]}{apart}" if by_speed else ""
+
+
+def episodes_to_settle(results: Sequence[Result], loss: float) -> int:
+    """Return about how many episodes per task would let the verdict name a setting.
+
+    0 if it names one already, or if more episodes would not help.
+
+    Args:
+        results: The study's rows over all tasks.
+        loss: Largest acceptable loss of success, in points.
+    """
+    rows = averaged(results)
+    if len(baselines_of(rows)) > 1:
+        return 0
+    pairs = choose("all tasks", rows, loss).candidate_pairs
+    return math.ceil(pairs / rows[0].tasks) if pairs <= MOST_PAIRS else 0
 
 
 def unsolved(baseline: str, success: float) -> str:
@@ -99,13 +133,18 @@ def short_sentence(choice: Choice) -> str:
 
 def _speed(choice: Choice) -> str:
     """Return the clause that says how fast the chosen setting is."""
-    speed = choice.episode_speedup
-    if not is_number(speed.value):
+    if not is_number(choice.episode_speedup.value):
         return "; its speed was not measured"
     shown = "and is faster" if choice.is_shown else "but is not shown to be faster"
+    return f" {shown}: {_factor(choice)}"
+
+
+def _factor(choice: Choice) -> str:
+    """Return the speed of the chosen setting, or of the candidate, with its interval."""
+    speed = choice.episode_speedup
     runs = f"of {choice.runs} runs" if choice.runs > 2 else "of this run"
-    interval = f"({speed.low:.2f}–{speed.high:.2f} {runs})"
-    return f" {shown}: {speed.value:.2f} {interval} times as fast per episode on this machine"
+    interval = f"({speed.low:.2f}–{speed.high:.2f} {runs})" if is_number(speed.low) else f"({runs})"
+    return f"{speed.value:.2f} {interval} times as fast per episode on this machine"
 
 
 def _missing(choice: Choice) -> str:
