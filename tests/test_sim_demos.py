@@ -3,8 +3,10 @@
 import hashlib
 import json
 import shutil
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.observations import Observations, read_observations
 from kerv_cli.worlds.demos.dataset import DemoDataset, DemoManifest
-from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames, load_episode, save_episode
+from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames, StreamedFrames, load_episode, save_episode
 from kerv_cli.worlds.demos.recording import DemoConfig, Perturbation, is_perturbed, record
 from kerv_cli.worlds.metaworld.spec import SPEC
 from kerv_cli.worlds.settings import CameraSettings
@@ -194,6 +196,21 @@ def two(tmp_path):
     paths = [tmp_path / f"{seed}.safetensors" for seed in range(2)]
     written = [episode(path, seed, 5 + seed) for seed, path in enumerate(paths)]
     return written, [load_episode(path) for path in paths]
+
+
+def test_an_episode_is_written_image_by_image(tmp_path):
+    """A long episode of large images would otherwise take more memory than a robot's computer has."""
+    made = replace(episode(tmp_path / "whole", 0), frame_steps=np.arange(60))
+    pixels = np.random.default_rng(0).integers(0, 255, (SIZE, SIZE, 3), dtype=np.uint8)
+    streamed: Any = StreamedFrames((60, SIZE, SIZE, 3), (np.roll(pixels, shift, 0) for shift in range(60)))
+    tracemalloc.start()
+    try:
+        save_episode(tmp_path / "long", replace(made, frames=streamed))
+        assert tracemalloc.get_traced_memory()[1] < (tmp_path / "long").stat().st_size / 3
+    finally:
+        tracemalloc.stop()
+    assert np.array_equal(load_episode(tmp_path / "long").frames[59], np.roll(pixels, 59, 0))
+    assert {path.name for path in tmp_path.iterdir()} == {"whole", "long"}
 
 
 def test_pixels_are_those_that_were_written(two):

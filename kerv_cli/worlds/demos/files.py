@@ -9,7 +9,9 @@ import contextlib
 import io
 import json
 import os
+import shutil
 import struct
+import tempfile
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -79,17 +81,12 @@ class DemoEpisode:
 def save_episode(path: Path, episode: DemoEpisode) -> None:
     """Write an episode to a file, atomically.
 
-    The PNG files of all images are stored end to end in one tensor. Another tensor holds their n + 1 offsets.
+    The PNG files of all images are stored end to end in one tensor. Another tensor holds their n + 1 offsets. Memory
+    holds one image at a time: the PNG files wait in a temporary file until their sizes are known.
 
     Raises:
         StorageError: Writing failed.
     """
-    pictures = [encode_png(frame) for frame in episode.frames]
-    tensors = {
-        "png": np.zeros(0, np.uint8),  # the pictures follow, without a copy of all of them
-        "png_offsets": np.cumsum([0, *map(len, pictures)], dtype=np.int64),
-        **{name: getattr(episode, attribute) for attribute, name in _ARRAYS.items()},
-    }
     height, width = episode.frames.shape[1:3]
     metadata = {
         "format": FORMAT,
@@ -98,13 +95,24 @@ def save_episode(path: Path, episode: DemoEpisode) -> None:
         "perturbed": str(episode.perturbed).lower(),
         "steps": str(episode.steps),
         "frame_size": str(height),
-        # no width for square frames: older files have none, and equal episodes must have equal bytes
-        **({"frame_width": str(width)} if width != height else {}),
     }
-    # Not safetensors' save_file: on a full disk it raises its own type of error.
-    head = _with_pictures(save(tensors, metadata=metadata), sum(map(len, pictures)))
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        file.writelines([head, *pictures])
+    if width != height:  # older files have no width, and equal episodes must have equal bytes
+        metadata["frame_width"] = str(width)
+    with (
+        atomic_path(path) as temporary,
+        temporary.open("wb") as file,
+        tempfile.TemporaryFile(dir=path.parent) as pictures,
+    ):
+        sizes = [pictures.write(encode_png(frame)) for frame in episode.frames]
+        tensors = {
+            "png": np.zeros(0, np.uint8),  # the pictures follow
+            "png_offsets": np.cumsum([0, *sizes], dtype=np.int64),
+            **{name: getattr(episode, attribute) for attribute, name in _ARRAYS.items()},
+        }
+        # Not safetensors' save_file: on a full disk it raises its own type of error.
+        file.write(_with_pictures(save(tensors, metadata=metadata), sum(sizes)))
+        pictures.seek(0)
+        shutil.copyfileobj(pictures, file)
 
 
 def _with_pictures(data: bytes, size: int) -> bytes:
