@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -88,17 +89,10 @@ def part_rows(estimates: Sequence[Estimate]) -> list[Row]:
             taken.append(f"{1e3 * seconds:.3g}")
             shares.append(f"{100 * seconds / one.seconds:.0f} %")
             bounds.append(bound)
-        rows.append(_part_row(name, taken, shares, bounds))
-    return [*rows, _part_row("all", [f"{1e3 * one.seconds:.3g}" for one in estimates], [""], [""])]
-
-
-def _part_row(name: str, taken: Sequence[str], shares: Sequence[str], bounds: Sequence[str]) -> Row:
-    return {
-        "one action under AR": name,
-        "ms": _beside(taken),
-        "share": _beside(shares),
-        "bound": _beside(bounds),
-    }
+        row = {"one action under AR": name, "ms": _beside(taken), "share": _beside(shares), "bound": _beside(bounds)}
+        rows.append(row)
+    whole = _beside([f"{1e3 * one.seconds:.3g}" for one in estimates])
+    return [*rows, {"one action under AR": "all", "ms": whole, "share": "", "bound": ""}]
 
 
 def family_rows(estimates: Sequence[Estimate]) -> list[Row]:
@@ -134,6 +128,30 @@ def _numbers(answers: Iterable[Answer], name: str, none: str = "–") -> str:
 def _beside(texts: Sequence[str]) -> str:
     """Return cells side by side, or one if all are equal."""
     return texts[0] if len(set(texts)) == 1 else " / ".join(texts)
+
+
+def trace_row(found: Mapping[str, Any]) -> dict[str, object]:
+    """Return a row about a setting of a trace, from `traced.price` or `traced.choose_length`."""
+    if "best" not in found:
+        row: dict[str, object] = {name: found[name] for name in ("setting", "tokens", "episodes", "decodes")}
+        for name in ("decode", "episode"):
+            row[f"ms per {name}"] = f"{found[f'ms_per_{name}']:.4g}"
+        return row | {"speed against AR": _speed(found)}
+    lengths, sure = found["speeds"], found["sure"]
+    return {
+        "setting": found["setting"],
+        "tokens": found["tokens"],
+        "fastest length": found["best"],
+        "speed against AR": _speed(lengths[found["best"]]),
+        "fastest of resamples": "–" if math.isnan(sure) else f"{100 * sure:.0f} %",
+        "by length": ", ".join(f"{one['length']}: {one['speed']:.2f}" for one in lengths[1:]),
+    }
+
+
+def _speed(found: Mapping[str, float]) -> str:
+    """Return a speed as text, with its interval if there is one."""
+    interval = "" if math.isnan(found["low"]) else f" ({found['low']:.2f}–{found['high']:.2f})"
+    return f"{found['speed']:.2f}{interval}"
 
 
 def sentence(estimates: Sequence[Estimate]) -> str:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -24,62 +23,13 @@ CANNOT = (
 )
 
 
-class Speed(NamedTuple):
-    """A speed against AR, and the 95 % interval of resampled episodes. NaN: there is one episode."""
+def price(trace: Sequence[TracedDecode], costs: Costs) -> list[dict[str, Any]]:
+    """Return what the decodes of each setting of a trace cost.
 
-    speed: float
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        """Return it as text."""
-        return f"{self.speed:.2f}" + ("" if np.isnan(self.low) else f" ({self.low:.2f}–{self.high:.2f})")
-
-
-@dataclass(frozen=True)
-class TracePrice:
-    """What the decodes of a setting cost.
-
-    Attributes:
-        setting: Name of the setting.
-        tokens: N, number of tokens of a chunk.
-        decodes: Number of decodes.
-        episodes: Number of episodes.
-        seconds: Seconds of all decodes.
-        speed: Against AR decodes of as many tokens at the same costs.
-    """
-
-    setting: str
-    tokens: int
-    decodes: int
-    episodes: int
-    seconds: float
-    speed: Speed
-
-    @property
-    def document(self) -> dict[str, Any]:
-        """Its figures, for JSON."""
-        return {
-            "setting": self.setting,
-            "tokens": self.tokens,
-            "episodes": self.episodes,
-            "decodes": self.decodes,
-            "ms_per_decode": 1e3 * self.seconds / self.decodes,
-            "ms_per_episode": 1e3 * self.seconds / self.episodes,
-            **self.speed._asdict(),
-        }
-
-    @property
-    def cells(self) -> dict[str, object]:
-        """Its figures, for a table."""
-        values = self.document
-        times = {f"ms per {name}": f"{values[f'ms_per_{name}']:.4g}" for name in ("decode", "episode")}
-        counts = {name: values[name] for name in ("setting", "tokens", "episodes", "decodes")}
-        return {**counts, **times, "speed against AR": self.speed}
-
-
-def price(trace: Sequence[TracedDecode], costs: Costs) -> list[TracePrice]:
-    """Return what each setting of a trace costs.
+    Returns:
+        For each setting and chunk length: the numbers of episodes and decodes, milliseconds per decode and per episode,
+        and the speed against AR decodes of as many tokens at the same costs, with the 95 % interval of resampled
+        episodes (NaN if there is one episode).
 
     Raises:
         UsageError: The profile lacks a cost, or has costs for shorter chunks only.
@@ -94,7 +44,10 @@ def price(trace: Sequence[TracedDecode], costs: Costs) -> list[TracePrice]:
         seconds, counts = np.bincount(episode, of_decode), np.bincount(episode)
         alone = counts * costs.profile.decode(tokens)
         (speed,), _ = _resampled(len(counts), partial(_ratio, alone, seconds))
-        found.append(TracePrice(name, tokens, len(decodes), len(counts), float(seconds.sum()), speed))
+        row = {"setting": name, "tokens": tokens, "episodes": len(counts), "decodes": len(decodes)}
+        row["ms_per_decode"] = 1e3 * float(seconds.sum()) / len(decodes)
+        row["ms_per_episode"] = 1e3 * float(seconds.sum()) / len(counts)
+        found.append(row | speed)
     return found
 
 
@@ -108,7 +61,9 @@ def _numbers(decodes: Sequence[TracedDecode]) -> np.ndarray:
     return np.array([names[one.episode] for one in decodes])
 
 
-def _resampled(episodes: int, speeds_of: Callable[[np.ndarray], Sequence[float]]) -> tuple[list[Speed], float]:
+def _resampled(
+    episodes: int, speeds_of: Callable[[np.ndarray], Sequence[float]]
+) -> tuple[list[dict[str, float]], float]:
     """Return speeds with their intervals over episodes that are drawn with replacement.
 
     Args:
@@ -116,75 +71,46 @@ def _resampled(episodes: int, speeds_of: Callable[[np.ndarray], Sequence[float]]
         speeds_of: Numbers of episodes -> speeds.
 
     Returns:
-        The speeds, and the share of the draws whose fastest one is the fastest of all episodes, too. NaN: one episode.
+        The speeds with their 95 % intervals, and the share of the draws whose fastest one is the fastest of all
+        episodes, too. Intervals and share are NaN if there is one episode.
     """
-    speeds = speeds_of(np.arange(episodes))
-    if episodes < 2:
-        return [Speed(one, np.nan, np.nan) for one in speeds], np.nan
-    random = np.random.default_rng(_SEED)
-    drawn = np.array([speeds_of(random.integers(episodes, size=episodes)) for _ in range(_RESAMPLES)])
-    low, high = np.quantile(drawn, (0.025, 0.975), axis=0).tolist()
-    same = float(np.mean(drawn.argmax(1) == np.argmax(speeds)))
-    return [Speed(*one) for one in zip(speeds, low, high, strict=True)], same
+    speeds, same = speeds_of(np.arange(episodes)), np.nan
+    low = high = [np.nan] * len(speeds)
+    if episodes > 1:
+        random = np.random.default_rng(_SEED)
+        drawn = np.array([speeds_of(random.integers(episodes, size=episodes)) for _ in range(_RESAMPLES)])
+        low, high = np.quantile(drawn, (0.025, 0.975), axis=0).tolist()
+        same = float(np.mean(drawn.argmax(1) == np.argmax(speeds)))
+    names = ("speed", "low", "high")
+    return [dict(zip(names, one, strict=True)) for one in zip(speeds, low, high, strict=True)], same
 
 
-@dataclass(frozen=True)
-class Lengths:
-    """How fast chains of each length would have been.
-
-    Attributes:
-        setting: Name of the setting.
-        tokens: N, number of tokens of a chunk.
-        speeds: Speed against AR by length, 0 (AR) … the longest recorded one.
-        sure: Share of the resampled episodes in which the fastest length is the fastest, too.
-    """
-
-    setting: str
-    tokens: int
-    speeds: Sequence[Speed]
-    sure: float
-
-    @property
-    def best(self) -> int:
-        """The fastest length."""
-        return int(np.argmax([one.speed for one in self.speeds]))
-
-    @property
-    def document(self) -> dict[str, Any]:
-        """The lengths, for JSON."""
-        speeds = [{"length": length, **one._asdict()} for length, one in enumerate(self.speeds)]
-        return {"setting": self.setting, "tokens": self.tokens, "best": self.best, "sure": self.sure, "speeds": speeds}
-
-    @property
-    def cells(self) -> dict[str, object]:
-        """The lengths, for a table."""
-        each = ", ".join(f"{length}: {one.speed:.2f}" for length, one in enumerate(self.speeds) if length)
-        sure = "–" if np.isnan(self.sure) else f"{100 * self.sure:.0f} %"
-        about = {"setting": self.setting, "tokens": self.tokens, "fastest length": self.best}
-        return {**about, "speed against AR": self.speeds[self.best], "fastest of resamples": sure, "by length": each}
-
-
-def choose_length(trace: Sequence[TracedDecode], costs: Costs) -> list[Lengths]:
+def choose_length(trace: Sequence[TracedDecode], costs: Costs) -> list[dict[str, Any]]:
     """Return how fast chains of each length would have been, for each setting of a trace that drafts chains.
 
     A draft's i-th token is accepted with the share of recorded drafts that were at least i tokens long, accepted before
     it, and accepted there, too. Chains inside a prefill do not count.
+
+    Returns:
+        For each setting and chunk length: the fastest length of chains, the share of the resampled episodes in which it
+        is the fastest, too, and the speed against AR of each length, 0 (AR) … the longest recorded one.
 
     Raises:
         UsageError: The trace has no chain, or the profile lacks a cost.
     """
     found = []
     for name, tokens, decodes in grouped(trace):
-        tried, accepted = _places(decodes)
+        tried, accepted = _counts(decodes)
         if not len(tried):
             continue
         check_tokens(costs.engine, costs.profile, tokens)
         if lacks := costs.profile.lacks(["draft", "feed", "verify"]):
             raise UsageError(f"on={costs.engine}: no cost of '{lacks[0]}'")
         plans = [Decodes(costs.profile, tokens, Drafts(length)) for length in range(tried.shape[1] + 1)]
-
-        speeds = partial(_speeds, plans, tried, accepted)
-        found.append(Lengths(name, tokens, *_resampled(len(tried), speeds)))
+        speeds, sure = _resampled(len(tried), partial(_speeds, plans, tried, accepted))
+        best = int(np.argmax([one["speed"] for one in speeds]))
+        lengths = [{"length": length, **one} for length, one in enumerate(speeds)]
+        found.append({"setting": name, "tokens": tokens, "best": best, "sure": sure, "speeds": lengths})
     if not found:
         raise UsageError("choose=draft: the trace has no drafted chain outside of a prefill")
     return found
@@ -196,24 +122,22 @@ def _speeds(plans: Sequence[Decodes], tried: np.ndarray, accepted: np.ndarray, c
     return [plan.speed(chances) for plan in plans]
 
 
-def _places(decodes: Sequence[TracedDecode]) -> tuple[np.ndarray, np.ndarray]:
-    """Count, for every episode and every place of a drafted chain, how often it was tried and accepted.
+def _counts(decodes: Sequence[TracedDecode]) -> tuple[np.ndarray, np.ndarray]:
+    """Count, for every episode and every position in a drafted chain, how often it was tried and accepted.
 
     Returns:
         Two arrays (episodes, longest chain). Empty if there is no chain.
     """
-    chains = [
-        (number, one.drafted, one.accepted)
-        for number, decode in zip(_numbers(decodes), decodes, strict=True)
-        for one in decode.rounds
-        if one.drafted and one.start and not one.depth and one.mode == "forward"
-    ]
+    chains = []
+    for number, decode in zip(_numbers(decodes), decodes, strict=True):
+        drafts = [one for one in decode.rounds if one.drafted and one.start and not one.depth and one.mode == "forward"]
+        chains += [(number, one.drafted, one.accepted) for one in drafts]
     if not chains:
         return np.zeros((0, 0)), np.zeros((0, 0))
-    number, drafted, taken = np.array(chains).T
-    places = np.arange(drafted.max())
-    tried = (places <= taken[:, None]) & (places < drafted[:, None])
-    counts = [np.zeros((number.max() + 1, len(places))) for _ in range(2)]
-    for count, values in zip(counts, (tried, places < taken[:, None]), strict=True):
-        np.add.at(count, number, values)
-    return counts[0], counts[1]
+    numbers, drafted, taken = np.array(chains).T
+    positions = np.arange(drafted.max())
+    tried = np.zeros((numbers.max() + 1, len(positions)))
+    accepted = np.zeros_like(tried)
+    np.add.at(tried, numbers, (positions <= taken[:, None]) & (positions < drafted[:, None]))
+    np.add.at(accepted, numbers, positions < taken[:, None])
+    return tried, accepted

@@ -96,6 +96,7 @@ def _trace(settings: EstimateSettings, as_json: bool) -> None:
     """Price a trace on each machine, or say which length of chains would have been the fastest there."""
     from kerv_cli.base.places import as_path
     from kerv_cli.bench.described import described
+    from kerv_cli.bench.tables import trace_row
     from kerv_cli.bench.traced import CANNOT, choose_length, price
     from kerv_cli.engine.trace import read_trace
 
@@ -106,8 +107,8 @@ def _trace(settings: EstimateSettings, as_json: bool) -> None:
     for title, costs in _costs(settings, None if settings.on else described(settings)):
         machine = {"machine": title, "engine": costs.engine}
         for one in answer(trace, costs):
-            documents.append({**machine, **one.document})
-            rows.append({**machine, **one.cells})
+            documents.append(machine | one)
+            rows.append(machine | trace_row(one))
     if as_json:
         end_with_json({"rows": documents, "note": CANNOT})
     print_rows(rows, settings.trace)

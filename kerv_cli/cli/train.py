@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -24,15 +26,9 @@ from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
 def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Train a target policy on demonstrations by behaviour cloning."""
     typer.echo(f"target {settings.name}: {settings.train.steps} steps", err=True)
-    from kerv_cli.lab.database import opened
-    from kerv_cli.report.plots import save_curves
     from kerv_cli.training.target import train_target
 
-    database = opened(settings.results)
-    with as_planned(database, plan, as_json) as begin:
-        folder, metrics = train_target(settings, database, begin)
-        plot = save_curves(folder)
-    _print(folder, metrics, plot, as_json)
+    _train(train_target, settings, plan, as_json)
 
 
 @command(
@@ -47,19 +43,20 @@ def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJso
 def drafter(settings: TrainDrafterSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Train a drafter to imitate a target's greedy decodes. drafter=NAME chooses its kind, such as early."""
     typer.echo(f"drafter={settings.drafter.kind} of {settings.policy.target}: {settings.train.steps} steps", err=True)
+    from kerv_cli.training.drafter import train_drafter
+
+    _train(train_drafter, settings, plan, as_json)
+
+
+def _train(train: Callable[..., tuple[Path, dict[str, float]]], settings: Any, plan: bool, as_json: bool) -> None:
+    """Train, and print the metrics of the best weights, and where they and the curves are."""
     from kerv_cli.lab.database import opened
     from kerv_cli.report.plots import save_curves
-    from kerv_cli.training.drafter import train_drafter
 
     database = opened(settings.results)
     with as_planned(database, plan, as_json) as begin:
-        folder, metrics = train_drafter(settings, database, begin)
+        folder, metrics = train(settings, database, begin)
         plot = save_curves(folder)
-    _print(folder, metrics, plot, as_json)
-
-
-def _print(folder: Path, metrics: dict[str, float], plot: Path, as_json: bool) -> None:
-    """Print the metrics of the best weights, and where they and the curves are."""
     if as_json:
         end_with_json({"folder": folder, "best": metrics, "curves": plot})
     print_figures("best checkpoint", metrics, folder)

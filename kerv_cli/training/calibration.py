@@ -115,7 +115,14 @@ def calibrate(
         missing.append("datastore")
     old: Calibration | None = artifacts.load("calibration") if settings.complete else None
     check_replaceable(path, old, "datastore" not in missing)
-    stage = begin("calibration", path.parent, plan_of(settings, path, len(chosen), len(tasks), missing), 0)
+    without = f"; without {' and '.join(missing)}" if missing else ""
+    plan = (
+        f"predictors fitted on {count(len(chosen), 'demonstration')} of {count(len(tasks), 'task')}; "
+        f"{settings.decodes} decodes per task; boundary over {', '.join(map(str, settings.boundary_windows))} "
+        f"positions{without}"
+    )
+
+    stage = begin("calibration", path.parent, f"{path}: {plan}", 0)
 
     with stage("reading demonstrations") as progress:
         windows = read_windows(dataset, chosen, target.actions, settings.window, target.chunk, progress)
@@ -168,16 +175,6 @@ def check_replaceable(path: Path, old: Calibration | None, with_store: bool) -> 
     lacks_skip = path.is_file() and read_mapping(path).get("skip") is None
     if old is None and not (with_store and lacks_skip):
         check_not_shipped(path, "policy.artifacts.calibration")
-
-
-def plan_of(settings: CalibrateSettings, path: Path, episodes: int, tasks: int, missing: Sequence[str]) -> str:
-    """Return one line that `--plan` prints: the file, numbers of demonstrations and decodes, what is missing."""
-    without = f"; without {' and '.join(missing)}" if missing else ""
-    return (
-        f"{path}: predictors fitted on {count(episodes, 'demonstration')} of {count(tasks, 'task')}; "
-        f"{settings.decodes} decodes per task; "
-        f"boundary over {', '.join(map(str, settings.boundary_windows))} positions{without}"
-    )
 
 
 def presample(

@@ -77,21 +77,28 @@ def build_datastore(
     check_replaceable(folder)
     chosen, seeds = first_episodes(dataset, tasks, settings.episodes)
     check_seeds(seeds, dataset.path)
-    stage = begin("datastore", folder, plan_of(dataset, chosen, artifacts.folder, settings.key, folder), 0)
+    indices = [*itertools.chain(*chosen.values())]
+    steps = sum(dataset.episodes[index].steps for index in indices)
+    plan = (
+        f"{count(len(indices), 'demonstration')} of {count(len(tasks), 'task')}, {steps} control steps, through "
+        f"{artifacts.folder}, keys from {' + '.join(settings.key)}"
+    )
 
+    stage = begin("datastore", folder, f"{folder}: {plan}", 0)
     parts: list[dict[str, np.ndarray]] = []
     shards: dict[str, Shard] = {}
-    rows, total = 0, sum(map(len, chosen.values()))
+    rows, space = 0, dataset.manifest.observation
     with stage("encoding demonstrations") as progress:
-        for name, indices in chosen.items():
+        for name, episodes in chosen.items():
             first = rows
-            for index in indices:
-                episode, space = dataset.load(index), dataset.manifest.observation
-                parts.append(entries_of(artifacts.target, episode, space, settings.key))
+            for index in episodes:
+                parts.append(entries_of(artifacts.target, dataset.load(index), space, settings.key))
                 rows += len(parts[-1]["step"])
-                progress(len(parts), total)
+                progress(len(parts), len(indices))
             shards[name] = Shard((first, rows), tuple(seeds[name]))
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    columns = {}
+    for name in parts[0]:
+        columns[name] = np.concatenate([part[name] for part in parts])
     files = contents_of(columns, shards, settings.components, settings.half)
 
     def write(new: Path) -> None:
@@ -148,17 +155,6 @@ def first_episodes(
     return chosen, seeds
 
 
-def plan_of(
-    dataset: DemoDataset, chosen: Mapping[str, Sequence[int]], target: Path, key: Sequence[str], folder: Path
-) -> str:
-    """Return one line that `--plan` prints: episodes, tasks, target and folder."""
-    episodes = [dataset.episodes[index] for index in itertools.chain(*chosen.values())]
-    return (
-        f"{folder}: {count(len(episodes), 'demonstration')} of {count(len(chosen), 'task')}, "
-        f"{sum(episode.steps for episode in episodes)} control steps, through {target}, keys from {' + '.join(key)}"
-    )
-
-
 @torch.inference_mode()
 def entries_of(target: Any, episode: DemoEpisode, space: ObservationSpace, key: Sequence[str]) -> dict[str, np.ndarray]:
     """Make the entries of an episode: one for every observation.
@@ -205,7 +201,7 @@ def contents_of(
         files[PROJECTION] = vectors[:, np.argsort(-values)[:components]].astype(np.float32)
         keys = projected(keys, files[PROJECTION])
     files[VECTORS] = keys.astype(np.float16 if half else np.float32)
-    counts = [last - first for first, last in (shard.rows for shard in shards.values())]
+    counts = np.diff([shard.rows for shard in shards.values()])[:, 0]
     task = np.repeat(np.arange(len(shards), dtype=np.int32), counts)
     table = {
         "task": pa.DictionaryArray.from_arrays(task, [*shards]),

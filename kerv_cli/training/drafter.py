@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from kerv_cli.base.runtime import set_up
 from kerv_cli.lab.database import Database
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.drafters import TrainableDrafter
-from kerv_cli.targets.checkpoint import TargetDescription, load_target
+from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.folders import check_not_shipped
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_tasks, demos_for
@@ -61,9 +60,17 @@ def train_drafter(settings: TrainDrafterSettings, database: Database, begin: Beg
     if tasks:
         check_tasks(dataset, tasks)
         dataset = replace(dataset, episodes=[episode for episode in dataset.episodes if episode.task in tasks])
-    identity = identity_of(train, dataset, **greedy_decodes(settings, description, tasks))
+    shape = asdict(settings.drafter)
+    imitated = {"drafter": shape, "target": description.sha256, "task": list(tasks)}
+    if settings.runtime.dtype != "float32":  # left out, so that trainings from before it counted can be resumed
+        imitated["dtype"] = settings.runtime.dtype
+    identity = identity_of(train, dataset, **imitated)
     refuse_other(folder, identity, drafter.kind, f"policy.artifacts.{drafter.kind}")
-    stage = begin(drafter.kind, folder, plan_of(settings, drafter, artifacts.folder, folder), train.steps)
+    layers = f"{shape['layers']}-layer " if "layers" in shape else ""
+    samples = f", greedy decodes of {shape['samples']} observations" if "samples" in shape else ""
+    plan = f"{layers}{drafter.noun} of {artifacts.folder}{samples}, {train.steps} steps of {train.batch}"
+
+    stage = begin(drafter.kind, folder, f"{folder}: {plan}", train.steps)
     device, dtype = set_up(settings.runtime)
     with without_subnormals():
         with stage("the target's greedy decodes") as progress:
@@ -85,8 +92,7 @@ def train_drafter(settings: TrainDrafterSettings, database: Database, begin: Beg
         def save(network: Any, metrics: Metrics) -> None:
             figures = figures_of(dataset, network, metrics)
             provenance = provenance_of("kerv train drafter", settings, device, **figures)
-            shape, made_for = asdict(settings.drafter), MadeFor.of(description)
-            drafter.save(folder, network, made_for, provenance, train.stored, settings=shape)
+            drafter.save(folder, network, MadeFor.of(description), provenance, train.stored, settings=shape)
 
         with stage("training the drafter") as progress:
             return folder, fit(network, loss, validate, save, train, folder, identity, progress)
@@ -105,21 +111,3 @@ def drafter_of(settings: TrainDrafterSettings) -> TrainableDrafter:
     refuse_unused(settings.train, OF_TARGETS, ": only the training of a target has this setting")
     drafter: TrainableDrafter = part.built()
     return drafter
-
-
-def greedy_decodes(settings: TrainDrafterSettings, target: TargetDescription, tasks: Sequence[str]) -> dict[str, Any]:
-    """Return what determines the weights beside the demonstrations and the optimisation.
-
-    The number format float32 is left out, so that trainings from before it counted can be resumed.
-    """
-    own = {"drafter": asdict(settings.drafter), "target": target.sha256, "task": list(tasks)}
-    dtype = settings.runtime.dtype
-    return own if dtype == "float32" else {**own, "dtype": dtype}
-
-
-def plan_of(settings: TrainDrafterSettings, drafter: TrainableDrafter, target: Path, folder: Path) -> str:
-    """Return one line that `--plan` prints: target, number of observations, number of steps and folder."""
-    shape, train = asdict(settings.drafter), settings.train
-    layers = f"{shape['layers']}-layer " if "layers" in shape else ""
-    samples = f", greedy decodes of {shape['samples']} observations" if "samples" in shape else ""
-    return f"{folder}: {layers}{drafter.noun} of {target}{samples}, {train.steps} steps of {train.batch}"

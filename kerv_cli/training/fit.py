@@ -126,16 +126,16 @@ class State:
         """Do one optimiser step on one batch, and return its loss and the other metrics to log.
 
         Raises:
-            KervError: The loss is not finite.
+            KervError: The loss or another metric is not finite.
         """
         settings = self.settings
         for group in self.optimiser.param_groups:
             group["lr"] = settings.lr * schedule(self.step, settings)
-        scalar, metrics = loss(self.step)
+        scalar, further = loss(self.step)
+        metrics = {"loss": scalar.item(), **further}
+        check_finite(metrics, self.step)
         self.optimiser.zero_grad(set_to_none=True)
         scalar.backward()
-        metrics = {"loss": scalar.item(), **metrics}
-        check_finite({"loss": metrics["loss"]}, self.step)
         nn.utils.clip_grad_norm_(self.network.parameters(), settings.clip)
         self.optimiser.step()
         decay = min(settings.ema, (1 + self.step) / (10 + self.step))
@@ -244,27 +244,12 @@ def batches(count: int, settings: TrainSettings, weights: Tensor | None = None) 
 
     def draw(step: int) -> Tensor:
         generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + step)
-        return draw_samples(count, settings.batch, generator, cumulative)
+        if cumulative is None:
+            return torch.randint(count, (settings.batch,), generator=generator)
+        numbers = torch.rand(settings.batch, generator=generator, dtype=torch.float64) * cumulative[-1]
+        return torch.searchsorted(cumulative, numbers, right=True).clamp_(max=count - 1)
 
     return draw
-
-
-def draw_samples(count: int, size: int, generator: torch.Generator, cumulative: Tensor | None = None) -> Tensor:
-    """Draw the sample indices of a batch, with replacement.
-
-    Args:
-        count: Number of samples.
-        size: Number of indices to draw.
-        generator: Source of randomness.
-        cumulative: (count,) float64, cumulative sum of the samples' weights. None: all samples are equally likely.
-
-    Returns:
-        (size,) int64.
-    """
-    if cumulative is None:
-        return torch.randint(count, (size,), generator=generator)
-    numbers = torch.rand(size, generator=generator, dtype=torch.float64) * cumulative[-1]
-    return torch.searchsorted(cumulative, numbers, right=True).clamp_(max=count - 1)
 
 
 def schedule(step: int, settings: TrainSettings) -> float:

@@ -75,7 +75,14 @@ def train_target(settings: TrainTargetSettings, database: Database, begin: Begin
     identity = identity_of(train, dataset, target=shapes, tasks=tasks, views=dataset.views, **origin)
     refuse_other(folder, identity, "target", "name")
 
-    stage = begin("target", folder, plan_of(settings, dataset, tasks, init, folder), train.steps)
+    episodes = sum(episode.task in tasks for episode in dataset.episodes)
+    start = f", starting from {init}" if init else ""
+    plan = (
+        f"{settings.target.size} on {settings.target.observation}, {count(episodes, 'demonstration')} of "
+        f"{count(len(tasks), 'task')}, {count(train.steps, 'step')} of {train.batch} samples{start}"
+    )
+
+    stage = begin("target", folder, f"{folder}: {plan}", train.steps)
     device, _ = set_up(settings.runtime)
     with without_subnormals():
         with stage("reading demonstrations") as progress:
@@ -185,19 +192,6 @@ def fitting(
         shown = "the policy would be shown"
         return seen_by(dataset, world.camera.name, shown, "set world.camera.name, or record again")
     return dataset
-
-
-def plan_of(
-    settings: TrainTargetSettings, dataset: DemoDataset, tasks: tuple[str, ...], init: Path | None, folder: Path
-) -> str:
-    """Return one line that `--plan` prints: demonstrations, tasks, number of steps and folder."""
-    target, train = settings.target, settings.train
-    episodes = sum(episode.task in tasks for episode in dataset.episodes)
-    start = f", starting from {init}" if init else ""
-    return (
-        f"{folder}: {target.size} on {target.observation}, {count(episodes, 'demonstration')} of "
-        f"{count(len(tasks), 'task')}, {count(train.steps, 'step')} of {train.batch} samples{start}"
-    )
 
 
 def load_training(
