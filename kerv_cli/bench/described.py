@@ -108,7 +108,7 @@ def language_of(weights: float) -> Language:
     logarithmic scale. A layer's feed-forward part is 8/3 as wide as its hidden states, as in Llama. The width follows
     from the number of weights.
     """
-    sizes, layers, vocabularies = (np.array(column, float) for column in zip(*PUBLISHED.values(), strict=True))
+    sizes, layers, vocabularies = np.array([*PUBLISHED.values()]).T
     at = math.log(weights)
     depth = round(float(np.interp(at, np.log(sizes), layers))) if weights >= SMALL else 8
     vocabulary = round(float(np.interp(at, np.log(sizes), vocabularies))) if weights >= SMALL else 256

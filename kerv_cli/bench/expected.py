@@ -7,6 +7,7 @@ drafts is given, or read from a published table. Nothing is run, and this module
 from __future__ import annotations
 
 import csv
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -65,7 +66,7 @@ class Means(NamedTuple):
 
     def plus(self, other: Means) -> Means:
         """Return the means if `other` follows."""
-        return Means(*(x + y for x, y in zip(self, other, strict=True)))
+        return Means(*map(operator.add, self, other))
 
     @property
     def accepted_each(self) -> float:

@@ -284,10 +284,9 @@ def priced(shape: Shape, device: Device, engine: Engine) -> Profile:
         "tree": _ROWS[1:4],
         **dict.fromkeys(shape.parts, (1,)),
     }
-    phases = {
-        kind: (counts, tuple(engine.seconds(shape.needs(kind, n), device) for n in counts))
-        for kind, counts in rows.items()
-    }
+    phases = {}
+    for kind, counts in rows.items():
+        phases[kind] = counts, tuple(engine.seconds(shape.needs(kind, n), device) for n in counts)
     return Profile(shape.prompt, phases, CHUNK, {"target": shape.name, "device_name": device.title})
 
 

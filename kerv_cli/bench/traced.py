@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -57,8 +58,8 @@ def _ratio(one: np.ndarray, other: np.ndarray, chosen: np.ndarray) -> list[float
 
 def _numbers(decodes: Sequence[TracedDecode]) -> np.ndarray:
     """Return the number of each decode's episode, from 0, (decodes,)."""
-    names = {name: index for index, name in enumerate(dict.fromkeys(one.episode for one in decodes))}
-    return np.array([names[one.episode] for one in decodes])
+    numbers: dict[str, int] = {}
+    return np.array([numbers.setdefault(one.episode, len(numbers)) for one in decodes])
 
 
 def _resampled(
@@ -108,8 +109,8 @@ def choose_length(trace: Sequence[TracedDecode], costs: Costs) -> list[dict[str,
             raise UsageError(f"on={costs.engine}: no cost of '{lacks[0]}'")
         plans = [Decodes(costs.profile, tokens, Drafts(length)) for length in range(tried.shape[1] + 1)]
         speeds, sure = _resampled(len(tried), partial(_speeds, plans, tried, accepted))
-        best = int(np.argmax([one["speed"] for one in speeds]))
         lengths = [{"length": length, **one} for length, one in enumerate(speeds)]
+        best = max(lengths, key=itemgetter("speed"))["length"]
         found.append({"setting": name, "tokens": tokens, "best": best, "sure": sure, "speeds": lengths})
     if not found:
         raise UsageError("choose=draft: the trace has no drafted chain outside of a prefill")

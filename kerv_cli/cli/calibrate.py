@@ -60,20 +60,21 @@ def success(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_
     from kerv_cli.cli.studies import planned_study, print_settings, print_study_plan, run_study
     from kerv_cli.episodes.resolve import resolve
 
-    of_test = [word for word in overrides if word.split("=")[0] in OF_TEST]
-    of_study = [word for word in overrides if word not in of_test]
+    of_test, of_study = [], []
+    for word in overrides:
+        (of_test if word.split("=")[0] in OF_TEST else of_study).append(word)
     if not any(word.startswith("study=") for word in of_study):
-        of_study = [f"study={CalibrateSuccessSettings.groups['study']}", *of_study]
-    results = [word for word in of_study if word.startswith("results=")]
-    settings = compose("calibrate_success", [*of_test, *results], CalibrateSuccessSettings)
+        of_study.insert(0, f"study={CalibrateSuccessSettings.groups['study']}")
     resolved = resolve(of_study)
+    settings = compose("calibrate_success", of_test, CalibrateSuccessSettings)
     if cfg:
-        lines = settings_yaml(settings).splitlines()
-        typer.echo("\n".join([*(line for line in lines if line.split(":")[0] in OF_TEST), "---"]))
+        for line in settings_yaml(settings).splitlines():
+            if line.split(":")[0] in OF_TEST:
+                typer.echo(line)
+        typer.echo("---")
         print_settings(resolved)
         return
     # these import torch, which --cfg and a mistyped key must not wait for
-    from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import making
     from kerv_cli.report.certificate import candidate_rows, certify, folder_of, planned_certificate, write
 
@@ -83,7 +84,7 @@ def success(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_
     if plan:
         print_study_plan(planned, as_json)
         return
-    with making(opened(settings.results), "certificate", folder):
+    with making(planned.store.database, "certificate", folder):
         if run_study(planned).failed:
             raise typer.Exit(1)
         certificate = certify(certificate, planned.store, planned.study.episodes, resolved.study.baseline)

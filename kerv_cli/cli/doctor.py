@@ -136,7 +136,9 @@ def _rendering(spec: EnvironmentSpec, settings: DoctorSettings) -> str:
         world.reset(settings.seed)
         world.frame()
         began = time.perf_counter()
-        spread = [int(world.frame().std()) for _ in range(20)][-1]
+        for _ in range(20):
+            frame = world.frame()
+            spread = int(frame.std())
         milliseconds = 1000 * (time.perf_counter() - began) / 20
     need(spread, f"{backend} draws empty frames: set MUJOCO_GL=osmesa and run 'kerv doctor' again")
     says = f"{backend}, {milliseconds:.1f} ms a frame at {settings.world.camera.size}x{settings.world.camera.size}"

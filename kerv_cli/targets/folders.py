@@ -86,10 +86,11 @@ def check_not_shipped(path: Path, word: str) -> None:
 
 def target_names(results: str) -> list[str]:
     """Return the names of all targets: the shipped and unpacked policies, then those in the results folder."""
-    policies = shipped_dir(), results_dir(results) / "pretrained"
-    shipped = sorted(path.parts[-3] for folder in policies for path in folder.glob("[!.]*/target/target.json"))
-    stored = sorted(path.parent.name for path in (results_dir(results) / "artifacts/target").glob("[!.]*/target.json"))
-    return list(dict.fromkeys([*shipped, *stored]))
+    folder, shipped = results_dir(results), []
+    for policies in (shipped_dir(), folder / "pretrained"):
+        shipped += [path.parts[-3] for path in policies.glob("[!.]*/target/target.json")]
+    stored = [path.parent.name for path in folder.glob("artifacts/target/[!.]*/target.json")]
+    return list(dict.fromkeys([*sorted(shipped), *sorted(stored)]))
 
 
 def beside(target: Path, kind: str) -> Path:

@@ -76,8 +76,9 @@ def grow_stack(stack: LayerStack, shape: GrowSettings, layers: int) -> None:
             f"grow.width={shape.width} with {shape.heads} heads: a head's channels must be a multiple of {channels}"
         )
     generator, like = torch.Generator().manual_seed(0), stack.weight
-    new = [_grown_layer(old[i] if i < len(old) else None, stack, shape, generator) for i in range(layers)]
-    stack.layers = nn.ModuleList(layer.to(like.device, like.dtype) for layer in new).eval().requires_grad_(False)
+    before = [*old, *[None] * (layers - len(old))]
+    new = nn.ModuleList(_grown_layer(layer, stack, shape, generator) for layer in before)
+    stack.layers = new.to(like.device, like.dtype).eval().requires_grad_(False)
     stack.width, stack.heads, stack.depth = shape.width, shape.heads, layers
     stack.rotary = Rotary(shape.width // shape.heads).to(like.device, like.dtype)
 

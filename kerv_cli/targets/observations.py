@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from typing import Any, Self, TypeVar
 
 import numpy as np
@@ -40,15 +40,16 @@ class Rows:
 
     def where(self, chosen: Tensor) -> Self:
         """Return the rows that are selected by a boolean mask (n,) or by indices."""
-        return type(self)(*(None if x is None else x[chosen] for x in vars(self).values()))
+        columns = {name: x for name, x in vars(self).items() if x is not None}
+        return replace(self, **{name: x[chosen] for name, x in columns.items()})
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
         """Return the rows of all `parts`, one after the other."""
-        return cls(*(_joined([getattr(part, field.name) for part in parts]) for field in fields(cls)))
+        return cls(*map(_joined, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
-def _joined(column: list[Any]) -> Any:
+def _joined(column: tuple[Any, ...]) -> Any:
     if isinstance(column[0], EncodedFrames):
         return EncodedFrames.joined(column)
     return None if column[0] is None else torch.cat(column)

@@ -290,8 +290,8 @@ def completed(old: Calibration, new: Calibration) -> Calibration:
     noise = {}
     for kind in FILTERS:
         known, found = old.noise[kind], new.noise[kind]
-        columns = zip(astuple(known), astuple(found), strict=True)
-        noise[kind] = Noise(*(tuple(np.where(known.q, a, b).tolist()) for a, b in columns))
+        columns = np.where(known.q, astuple(known), astuple(found))  # q, r and damping
+        noise[kind] = Noise(*map(tuple, columns.tolist()))
     variability = dict(new.variability)
     for task, row in old.variability.items():
         measured = new.variability[task].levels if task in new.variability else {}
@@ -370,13 +370,13 @@ def read_windows(
     Raises:
         KervError: A task has no episode that is longer than the window.
     """
-    counts = dict.fromkeys((dataset.episodes[index].task for index in chosen), 0)
+    counts: dict[str, int] = {}
     parts, paths = [], []
     for done, index in enumerate(chosen, 1):
         episode = dataset.load(index)
         parts.append(episode_windows(episode, actions, window, horizon))
         paths.append(episode.end_effector.copy())
-        counts[episode.task] += bool(len(parts[-1]))
+        counts[episode.task] = counts.get(episode.task, 0) + bool(len(parts[-1]))
         progress(done, len(chosen))
     if short := [task for task, count in counts.items() if not count]:
         raise KervError(f"{', '.join(short)}: no episode is longer than a window of {window}")
@@ -398,8 +398,7 @@ def choose_episodes(dataset: DemoDataset, tasks: Sequence[str], limit: int) -> l
     check_tasks(dataset, tasks)
     chosen: list[int] = []
     for task in tasks:
-        episodes = [index for index, entry in enumerate(dataset.episodes) if entry.task == task]
-        chosen += episodes[: limit or None]
+        chosen += dataset.of_tasks(task)[: limit or None]
     return chosen
 
 

@@ -147,11 +147,11 @@ def first_episodes(
         tasks: Full names of the tasks.
         limit: Maximum number of episodes per task; 0: all.
     """
-    entries, chosen, seeds = dataset.episodes, {}, {}
-    by_seed = sorted(range(len(entries)), key=lambda index: entries[index].seed)
+    chosen, seeds = {}, {}
     for task in tasks:
-        chosen[task] = [index for index in by_seed if entries[index].task == task][: limit or None]
-        seeds[task] = [entries[index].seed for index in chosen[task]]
+        by_seed = sorted(dataset.of_tasks(task), key=lambda index: dataset.episodes[index].seed)
+        chosen[task] = by_seed[: limit or None]
+        seeds[task] = [dataset.episodes[index].seed for index in chosen[task]]
     return chosen, seeds
 
 

@@ -59,7 +59,7 @@ def train_drafter(settings: TrainDrafterSettings, database: Database, begin: Beg
     tasks = resolve_tasks(settings.task) if settings.task else ()
     if tasks:
         check_tasks(dataset, tasks)
-        dataset = replace(dataset, episodes=[episode for episode in dataset.episodes if episode.task in tasks])
+        dataset = replace(dataset, episodes=[dataset.episodes[index] for index in dataset.of_tasks(*tasks)])
     shape = asdict(settings.drafter)
     imitated = {"drafter": shape, "target": description.sha256, "task": list(tasks)}
     if settings.runtime.dtype != "float32":  # left out, so that trainings from before it counted can be resumed

@@ -76,7 +76,7 @@ def load_samples(
     Raises:
         CheckpointError: An episode has too few actions of the expert, or images of another size.
     """
-    chosen = [i for i, entry in enumerate(dataset.episodes) if entry.task in task_names]
+    chosen = dataset.of_tasks(*task_names)
     parts = []
     for number, index in enumerate(chosen):
         episode = dataset.load(index)
@@ -265,14 +265,16 @@ class Imitation:
             "token_accuracy": float((distance == 0).float().mean()),
             f"within_{WITHIN}": float((distance <= WITHIN).float().mean()),
             "action_l1": float(error.mean()),
-            **{f"l1_{name}": float(e) for name, e in zip(actions.names, error, strict=True)},
         }
+        for name, one in zip(actions.names, error, strict=True):
+            metrics[f"l1_{name}"] = float(one)
         if self.learns_places:
             medians = torch.cat(offsets).median(0).values.tolist()
             names = [place.name.replace(" ", "_") for place in module.observation.places]
             if self.settings.places == "path":
                 names = [f"waypoint_{number}" for number in range(1, len(names) + 1)]
-            metrics |= {f"{name}_error_cm": 100 * e for name, e in zip(names, medians, strict=True)}
+            for name, median in zip(names, medians, strict=True):
+                metrics[f"{name}_error_cm"] = 100 * median
         if self.closed_loop is not None:
             metrics["closed_loop_success"] = self.closed_loop(module)
             metrics["score"] += 10 * metrics["closed_loop_success"]
@@ -320,8 +322,10 @@ def continued_target(settings: TargetSettings, init: CompactTarget, camera: str)
         camera: Camera of the new target. Several views are joined by `+`.
     """
     target = CompactTarget(replace(settings), init.actions, init.observation, init.words, camera)
-    fresh = {k: v for k, v in target.state_dict().items() if k == "queries"}
-    weights = {**fresh, **{k: v for k, v in init.state_dict().items() if k in target.state_dict()}}
+    new, old = target.state_dict(), init.state_dict()
+    weights = {name: old[name] for name in old.keys() & new.keys()}
+    if "queries" in new:
+        weights.setdefault("queries", new["queries"])
     if target.cameras:
         for view in range(len(init.encoders) - 1, len(target.encoders) - 1):
             weights |= {f"further_views.{view}.{k}": v for k, v in init.vision.state_dict().items()}

@@ -75,7 +75,7 @@ def train_target(settings: TrainTargetSettings, database: Database, begin: Begin
     identity = identity_of(train, dataset, target=shapes, tasks=tasks, views=dataset.views, **origin)
     refuse_other(folder, identity, "target", "name")
 
-    episodes = sum(episode.task in tasks for episode in dataset.episodes)
+    episodes = len(dataset.of_tasks(*tasks))
     start = f", starting from {init}" if init else ""
     plan = (
         f"{settings.target.size} on {settings.target.observation}, {count(episodes, 'demonstration')} of "

@@ -228,9 +228,11 @@ def action_space(shape: Shape, bounds: Bounds, like: ActionSpace | None, control
             f"the statistics are of {len(bounds.q01)} DoFs, the action space has {space.dofs} "
             f"({', '.join(space.names)}): they are of another robot"
         )
-    low = tuple(x if normalised else -1.0 for x, normalised in zip(bounds.q01, mask, strict=True))
-    high = tuple(x if normalised else 1.0 for x, normalised in zip(bounds.q99, mask, strict=True))
+    low, high = [-1.0] * space.dofs, [1.0] * space.dofs
+    for dof, normalised in enumerate(mask):
+        if normalised:
+            low[dof], high[dof] = bounds.q01[dof], bounds.q99[dof]
     for name, a, b in zip(space.names, low, high, strict=True):
         if not a < b:
             raise CheckpointError(f"the statistics have q01 = q99 of {name}: they are damaged")
-    return replace(space, low=low, high=high, bins=shape.bins, end_token=True)
+    return replace(space, low=tuple(low), high=tuple(high), bins=shape.bins, end_token=True)

@@ -64,7 +64,9 @@ class Block(nn.Module):
         # the exact GELU in both towers, as in timm; the SigLIP of transformers approximates it
         width, hidden = tower.width, tower.feed_forward
         self.mlp = named(fc1=nn.Linear(width, hidden), gelu=nn.GELU(), fc2=nn.Linear(hidden, width))
-        self.ls1, self.ls2 = (LayerScale(tower.width) if tower.scaled else nn.Identity() for _ in range(2))
+        self.ls1, self.ls2 = nn.Identity(), nn.Identity()
+        if tower.scaled:
+            self.ls1, self.ls2 = LayerScale(tower.width), LayerScale(tower.width)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the block's output (B, n, W) for x (B, n, W)."""

@@ -168,12 +168,12 @@ def totals(
         failed: For each task the seeds in which the expert failed.
         missing: Number of requested episodes that could not be recorded.
     """
-    tasks = {}
+    tasks, seeds = {}, []
     for task, rows in entries.items():
+        seeds += [entry.seed for entry in rows]
         episodes = [asdict(entry) for entry in sorted(rows, key=lambda entry: entry.seed)]
         mean = round(sum(entry.steps for entry in rows) / len(rows), 2)
         tasks[task] = {"mean_steps": mean, "failed_seeds": sorted(failed.get(task, ())), "episodes": episodes}
-    seeds = [entry.seed for rows in entries.values() for entry in rows]
     return {
         "seeds": {"first": min(seeds), "last": max(seeds)},
         "episodes": len(seeds),
@@ -242,14 +242,13 @@ class DemoDataset:
         if manifest.instructions:
             camera, spaces = manifest.config["camera"]["name"], (manifest.actions, manifest.observation)
             register_recorded(manifest.environment, *spaces, manifest.instructions, camera)
-        entries = [
-            DemoEntry(**asdict(entry), task=task, path=episode_path(path, task, entry.seed))
-            for task, summary in manifest.tasks.items()
-            for entry in summary.episodes
-        ]
-        for entry in entries:
-            if not entry.path.is_file() or entry.path.stat().st_size != entry.bytes:
-                raise CheckpointError(f"{entry.path} is missing or cut short: run 'kerv demos' again to restore it")
+        entries = []
+        for task, summary in manifest.tasks.items():
+            for entry in summary.episodes:
+                file = episode_path(path, task, entry.seed)
+                if not file.is_file() or file.stat().st_size != entry.bytes:
+                    raise CheckpointError(f"{file} is missing or cut short: run 'kerv demos' again to restore it")
+                entries.append(DemoEntry(**asdict(entry), task=task, path=file))
         return cls(path, manifest, entries)
 
     @classmethod
@@ -278,9 +277,16 @@ class DemoDataset:
                     raise CheckpointError(f"{part.path} has another {what} than {parts[0].path}: they cannot be joined")
         combined = hashlib.sha256("\n".join(part.sha256 for part in parts).encode()).hexdigest()
         config = {**first.config, "joined": [part.manifest.config for part in parts[1:]]}
-        episodes = [entry for part in parts for entry in part.episodes]
-        tasks = {name: entry for part in reversed(parts) for name, entry in part.manifest.tasks.items()}
+        episodes: list[DemoEntry] = []
+        tasks: dict[str, TaskEntry] = {}
+        for part in parts:
+            episodes += part.episodes
+            tasks = part.manifest.tasks | tasks
         return cls(parts[0].path, replace(first, sha256=combined, config=config, tasks=tasks), episodes)
+
+    def of_tasks(self, *tasks: str) -> list[int]:
+        """Return the positions in `episodes` of the episodes of some tasks, by their full names."""
+        return [index for index, entry in enumerate(self.episodes) if entry.task in tasks]
 
     def load(self, index: int) -> DemoEpisode:
         """Read the episode at position `index` in `episodes`.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import json
 import os
 import shutil
@@ -196,7 +197,8 @@ class EncodedFrames:
         spans = np.concatenate(
             [part.spans + np.array([first, 0, 0]) for part, first in zip(parts, firsts, strict=True)]
         )
-        return cls([file for part in parts for file in part.files], spans, parts[0].size, parts[0].width)
+        files = itertools.chain.from_iterable(part.files for part in parts)
+        return cls(list(files), spans, parts[0].size, parts[0].width)
 
     @property
     def shape(self) -> tuple[int, int, int, int]:

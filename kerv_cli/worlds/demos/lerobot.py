@@ -15,6 +15,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -147,7 +148,7 @@ class Source:
         tables = [_table(path, columns, MOST_NAMED) for path in paths]
         if sum(map(len, tables)) > MOST_EPISODES:
             raise CheckpointError(f"{paths[0].parent} names more than {MOST_EPISODES} episodes: split the dataset")
-        rows = sorted((row for table in tables for row in table.to_pylist()), key=lambda row: row["episode_index"])
+        rows = sorted(itertools.chain(*(table.to_pylist() for table in tables)), key=itemgetter("episode_index"))
         if not rows:
             raise CheckpointError(f"{folder / 'meta/episodes'} is missing or names no episode: copy the dataset again")
         columns = ["task_index", "task", "__index_level_0__"]
@@ -339,7 +340,8 @@ def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProg
     path = as_path(settings.source)
     try:
         source = Source.open(path, settings.camera)
-        largest = max(file.stat().st_size for file in {source.data_path(row) for row in source.episodes})
+        files = set(map(source.data_path, source.episodes))
+        largest = max(file.stat().st_size for file in files)
         with memory_limit(_MEMORY + 4 * largest):
             write_folder(folder, lambda new: _import(source, settings, new, progress))
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
@@ -540,8 +542,10 @@ def _groups(names: Sequence[str], strict: Sequence[str]) -> tuple[Group, ...]:
     """
     if len(names) == 7 and tuple(strict) == tuple(names[-1:]):
         return Group("position", 3), Group("rotation", 3), Group("gripper", 1)
-    runs = [(is_strict, len(list(run))) for is_strict, run in itertools.groupby(names, lambda name: name in strict)]
-    return tuple(Group(f"{'strict' if is_strict else 'motion'}_{i}", n) for i, (is_strict, n) in enumerate(runs))
+    groups, sorts = [], {True: "strict", False: "motion"}
+    for number, (is_strict, run) in enumerate(itertools.groupby(names, lambda name: name in strict)):
+        groups.append(Group(f"{sorts[is_strict]}_{number}", len(list(run))))
+    return tuple(groups)
 
 
 def _task_names(tasks: Mapping[int, str], world: EnvironmentSpec | None) -> dict[int, str]:

@@ -214,11 +214,10 @@ def _collect(
     seeds = {task: range(config.first_seed, config.first_seed + config.episodes) for task in config.tasks}
     limit = min(config.first_seed + 2 * config.episodes + _EXTRA_SEEDS, config.spec.seeds.training.stop)
     while any(seeds.values()):
-        jobs = [
-            (task, block[first : first + _SEEDS_PER_JOB])
-            for task, block in seeds.items()
-            for first in range(0, len(block), _SEEDS_PER_JOB)
-        ]
+        jobs = []
+        for task, block in seeds.items():
+            firsts = range(0, len(block), _SEEDS_PER_JOB)
+            jobs += [(task, block[first : first + _SEEDS_PER_JOB]) for first in firsts]
         for task, outcomes in _run_jobs(config, out, jobs, make_actor):
             entries[task] += [entry for entry in outcomes.values() if entry is not None]
             failed[task] += [seed for seed, entry in outcomes.items() if entry is None]
