@@ -49,6 +49,7 @@ class Demos:
     sha256, path, views = "d" * 64, Path("demos"), 0
     manifest = SimpleNamespace(config={}, environment=SPEC.name, actions=ACTIONS, observation=OBSERVATION)
     episodes = tuple(DemoEntry(seed, False, 6, 0, "", "drawer-open-v3", Path()) for seed in range(4))
+    of_tasks = DemoDataset.of_tasks
 
     def load(self, index: int) -> DemoEpisode:
         rng = np.random.default_rng(index)

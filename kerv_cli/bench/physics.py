@@ -40,10 +40,6 @@ class Device:
     bandwidth: float
     flops: float
 
-    def floor(self, read: float, flops: float) -> float:
-        """Return the seconds in which `read` bytes can be read and `flops` operations executed, at best."""
-        return max(read / self.bandwidth, flops / self.flops)
-
 
 DEVICES = {
     "h100": Device("H100 SXM", 3350e9, 989e12),

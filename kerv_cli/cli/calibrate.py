@@ -60,7 +60,8 @@ def success(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_
     from kerv_cli.cli.studies import planned_study, print_settings, print_study_plan, run_study
     from kerv_cli.episodes.resolve import resolve
 
-    of_test, of_study = [], []
+    of_test: list[str] = []
+    of_study: list[str] = []
     for word in overrides:
         (of_test if word.split("=")[0] in OF_TEST else of_study).append(word)
     if not any(word.startswith("study=") for word in of_study):

@@ -56,7 +56,12 @@ def doctor(settings: DoctorSettings, as_json: AsJson = False) -> None:
     if settings.policy.target:
         findings += check_policy(settings)
     if settings.environment:
-        findings += check_environment_of(settings.environment, settings.seed)
+        from kerv_cli.worlds import specs
+        from kerv_cli.worlds.conformance import check_environment
+
+        if settings.environment not in specs():
+            raise UnknownName("environment", settings.environment, specs())
+        findings += check_environment(specs()[settings.environment], settings.seed)
     if not settings.policy.target and not settings.environment:
         findings = check_machine(settings)
     failed = not all(finding.ok for finding in findings)
@@ -104,21 +109,6 @@ def check_policy(settings: DoctorSettings) -> list[Finding]:
     state = random.normal(size=space.state)
     words = " ".join(described.words[:3]) or "move"
     return check_target(artifacts.target, Observation(state[: len(space.proprioception)], state, words, images))
-
-
-def check_environment_of(name: str, seed: int) -> list[Finding]:
-    """Check on an environment's first task whether it behaves as kerv requires.
-
-    Raises:
-        UnknownName: There is no such environment.
-    """
-    from kerv_cli.worlds import specs
-    from kerv_cli.worlds.conformance import check_environment
-
-    environments = specs()
-    if name not in environments:
-        raise UnknownName("environment", name, environments)
-    return check_environment(environments[name], seed)
 
 
 def _rendering(spec: EnvironmentSpec, settings: DoctorSettings) -> str:

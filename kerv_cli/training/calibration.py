@@ -24,7 +24,7 @@ from kerv_cli.base.files import read_mapping, write_json
 from kerv_cli.base.registry import find
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.decoder import Decoder
-from kerv_cli.engine.record import MEAN, MEASURES, DecodeRecord, Measure, variability
+from kerv_cli.engine.record import MEAN, MEASURES, DecodeRecord, variability
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
@@ -114,7 +114,10 @@ def calibrate(
     else:
         missing.append("datastore")
     old: Calibration | None = artifacts.load("calibration") if settings.complete else None
-    check_replaceable(path, old, "datastore" not in missing)
+    # a shipped calibration may be completed, and skip levels may be added to it
+    has_skip = not path.is_file() or read_mapping(path).get("skip") is not None
+    if old is None and ("datastore" in missing or has_skip):
+        check_not_shipped(path, "policy.artifacts.calibration")
     without = f"; without {' and '.join(missing)}" if missing else ""
     plan = (
         f"predictors fitted on {count(len(chosen), 'demonstration')} of {count(len(tasks), 'task')}; "
@@ -161,22 +164,6 @@ def calibrate(
     return path, calibration, notes
 
 
-def check_replaceable(path: Path, old: Calibration | None, with_store: bool) -> None:
-    """Check that a calibration may be written here. One of a shipped policy may only get what it lacks.
-
-    Args:
-        path: The JSON to write.
-        old: The calibration to complete, if `complete` is set.
-        with_store: Whether the policy has a datastore, with which skip levels may be added.
-
-    Raises:
-        UsageError: A shipped policy's calibration would be replaced.
-    """
-    lacks_skip = path.is_file() and read_mapping(path).get("skip") is None
-    if old is None and not (with_store and lacks_skip):
-        check_not_shipped(path, "policy.artifacts.calibration")
-
-
 def presample(
     decoder: Decoder,
     dataset: DemoDataset,
@@ -216,7 +203,7 @@ def presample(
 
 
 def reference_level(records: Sequence[DecodeRecord], actions: ActionSpace, chunk: int) -> Variability:
-    """Return a task's reference level K_S, by each measure of K.
+    """Return a task's reference level K_S, the median over decodes of the variability K, by each measure of K.
 
     Decoding divides by K_S. So it is at least the smallest K above 0: one token of a chunk is off by one bin.
 
@@ -228,8 +215,10 @@ def reference_level(records: Sequence[DecodeRecord], actions: ActionSpace, chunk
     bin_width, moving = 2.0 / actions.tokens, chunk * int((~actions.is_strict).sum())
     levels = {}
     for measure in MEASURES:
-        least = bin_width if measure.total else bin_width / moving
-        levels[measure.name] = max(level_of(records, actions, measure), least)
+        found = [variability(record.rounds, actions, measure) for record in records]
+        known = [level for level in found if level is not None]
+        median = float(np.median(known)) if known else 0.0  # no draft token counts
+        levels[measure.name] = max(median, bin_width if measure.total else bin_width / moving)
     return Variability(levels[MEAN.name], len(records), levels)
 
 
@@ -304,16 +293,6 @@ def completed(old: Calibration, new: Calibration) -> Calibration:
         skip=old.skip or new.skip,
         provenance={**old.provenance, "completed": new.provenance},
     )
-
-
-def level_of(records: Sequence[DecodeRecord], actions: ActionSpace, measure: Measure) -> float:
-    """Return the median over decodes of the variability K; 0 if no draft token counts."""
-    levels = []
-    for record in records:
-        level = variability(record.rounds, actions, measure)
-        if level is not None:
-            levels.append(level)
-    return float(np.median(levels)) if levels else 0.0
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from kerv_cli.base.spaces import ObservationSpace
 from kerv_cli.lab.database import Database
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.heisd.datastore import (
+    MANIFEST,
     PAYLOAD,
     PROJECTION,
     VECTORS,
@@ -74,7 +75,10 @@ def build_datastore(
     settings, dataset = demos_for(settings, artifacts.description, database)
     tasks = sorted(resolve_tasks(settings.task or list(dataset.manifest.tasks)))
     folder = artifacts.new("datastore")
-    check_replaceable(folder)
+    check_not_shipped(folder, "policy.artifacts.datastore")
+    is_store = (folder / MANIFEST).is_file() and read_mapping(folder / MANIFEST).get("kind") == "datastore"
+    if not is_store and (folder.is_file() or visible(folder)):
+        raise UsageError(f"{folder} exists and is no datastore: give the new one another name")
     chosen, seeds = first_episodes(dataset, tasks, settings.episodes)
     check_seeds(seeds, dataset.path)
     indices = [*itertools.chain(*chosen.values())]
@@ -118,23 +122,10 @@ def build_datastore(
             tasks=shards,
             provenance=provenance_of("kerv build datastore", settings, device),
         )
-        write_json(new / "manifest.json", asdict(manifest))
+        write_json(new / MANIFEST, asdict(manifest))
 
     write_folder(folder, write)
     return folder, Datastore.open(folder, artifacts.description)
-
-
-def check_replaceable(folder: Path) -> None:
-    """Check that a datastore may be written to a folder.
-
-    Raises:
-        UsageError: The folder belongs to a shipped policy, or holds something else than a datastore.
-    """
-    check_not_shipped(folder, "policy.artifacts.datastore")
-    manifest = folder / "manifest.json"
-    kind = read_mapping(manifest).get("kind") if manifest.is_file() else None
-    if kind != "datastore" and (folder.is_file() or visible(folder)):
-        raise UsageError(f"{folder} exists and is no datastore: give the new one another name")
 
 
 def first_episodes(

@@ -37,7 +37,6 @@ from kerv_cli.training.making import Begin, figures_of, identity_of, quietly, re
 from kerv_cli.training.settings import TrainTargetSettings
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
-from kerv_cli.worlds.settings import WorldSettings
 
 STATE_EPISODES = 200
 """Maximum number of episodes from which the range of the states is measured."""
@@ -67,9 +66,14 @@ def train_target(settings: TrainTargetSettings, database: Database, begin: Begin
     settings.task = settings.task or list(dataset.manifest.tasks)
     tasks = resolve_tasks(settings.task)
     settle_places(settings, dataset)
-    world = settled(settings.world, spec_of(tasks[0]))
+    spec = spec_of(tasks[0])
+    world = settled(settings.world, spec)
     init = initial_target(settings, world.camera.name, folder)
-    dataset = fitting(dataset, settings, tasks, world)
+    check_spaces(dataset, spec.actions, spec.observation, f"the tasks' environment {spec.name}")
+    check_tasks(dataset, tasks)
+    if settings.target.observation == "vision":
+        remedy = "set world.camera.name, or record again"
+        dataset = seen_by(dataset, world.camera.name, "the policy would be shown", remedy)
     origin = {"init": read_target(init).sha256} if init else {}
     shapes = asdict(settings.target)
     identity = identity_of(train, dataset, target=shapes, tasks=tasks, views=dataset.views, **origin)
@@ -87,7 +91,7 @@ def train_target(settings: TrainTargetSettings, database: Database, begin: Begin
     with without_subnormals():
         with stage("reading demonstrations") as progress:
             target, samples = load_training(settings, dataset, tasks, init, world.camera.name, progress)
-        seeds = spec_of(tasks[0]).seeds.selection[: train.closed_loop]
+        seeds = spec.seeds.selection[: train.closed_loop]
         success = functools.partial(success_of, tasks=tasks, seeds=seeds, settings=world) if seeds else None
         imitation = Imitation(target.to(device), samples, train, success)
         draw = batches(len(imitation.training), train, imitation.weights)
@@ -174,24 +178,6 @@ def initial_target(settings: TrainTargetSettings, camera: str, new: Path) -> Pat
         raise UsageError(f"train.init={name} would be overwritten: choose another name=")
     check_init(settings.target, camera, read_target(folder), folder)
     return folder
-
-
-def fitting(
-    dataset: DemoDataset, settings: TrainTargetSettings, tasks: tuple[str, ...], world: WorldSettings
-) -> DemoDataset:
-    """Return the demonstrations, with only the views that the policy sees.
-
-    Raises:
-        CheckpointError: The demonstrations are of another environment, show another camera, or have no episode of a
-            task.
-    """
-    spec = spec_of(tasks[0])
-    check_spaces(dataset, spec.actions, spec.observation, f"the tasks' environment {spec.name}")
-    check_tasks(dataset, tasks)
-    if settings.target.observation == "vision":
-        shown = "the policy would be shown"
-        return seen_by(dataset, world.camera.name, shown, "set world.camera.name, or record again")
-    return dataset
 
 
 def load_training(

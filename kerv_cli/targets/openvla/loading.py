@@ -109,14 +109,17 @@ def check_layout(shapes: Mapping[str, Sizes], expected: Mapping[str, Sizes], whe
     Raises:
         CheckpointError: Tensors are missing, unknown or have a wrong shape. The message names up to three of each kind.
     """
-    both = [name for name in expected if name in shapes and shapes[name] != expected[name]]
-    kinds = {
-        "missing": [name for name in expected if name not in shapes],
-        "unknown": [name for name in shapes if name not in expected],
-        "of another shape": [f"{name} {shapes[name]}, not {expected[name]}" for name in both],
-    }
-    listed = {kind: ", ".join([*names[:LISTED], *["…"] * (len(names) > LISTED)]) for kind, names in kinds.items()}
-    wrong = [f"{len(names)} {kind}: {listed[kind]}" for kind, names in kinds.items() if names]
+    missing, unknown, reshaped = [], [name for name in shapes if name not in expected], []
+    for name, size in expected.items():
+        if name not in shapes:
+            missing.append(name)
+        elif shapes[name] != size:
+            reshaped.append(f"{name} {shapes[name]}, not {size}")
+    wrong = []
+    for kind, names in (("missing", missing), ("unknown", unknown), ("of another shape", reshaped)):
+        if names:
+            listed = ", ".join([*names[:LISTED], *["…"] * (len(names) > LISTED)])
+            wrong.append(f"{len(names)} {kind}: {listed}")
     if wrong:
         raise CheckpointError(f"the weights in {where} are not those of its {CONFIG}: {'; '.join(wrong)}")
 

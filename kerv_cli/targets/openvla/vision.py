@@ -9,6 +9,7 @@ Shapes: B images of h × w pixels, n patches, W width of a tower, E width of the
 from __future__ import annotations
 
 from collections import OrderedDict
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -64,9 +65,8 @@ class Block(nn.Module):
         # the exact GELU in both towers, as in timm; the SigLIP of transformers approximates it
         width, hidden = tower.width, tower.feed_forward
         self.mlp = named(fc1=nn.Linear(width, hidden), gelu=nn.GELU(), fc2=nn.Linear(hidden, width))
-        self.ls1, self.ls2 = nn.Identity(), nn.Identity()
-        if tower.scaled:
-            self.ls1, self.ls2 = LayerScale(tower.width), LayerScale(tower.width)
+        scale = partial(LayerScale, tower.width) if tower.scaled else nn.Identity
+        self.ls1, self.ls2 = scale(), scale()
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the block's output (B, n, W) for x (B, n, W)."""

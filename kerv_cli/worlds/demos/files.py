@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import itertools
 import json
 import os
 import shutil
@@ -193,12 +192,12 @@ class EncodedFrames:
     @classmethod
     def joined(cls, parts: Sequence[EncodedFrames]) -> EncodedFrames:
         """Return the images of all parts, in order. All parts must have the same size."""
-        firsts = np.cumsum([0, *(len(part.files) for part in parts[:-1])])
-        spans = np.concatenate(
-            [part.spans + np.array([first, 0, 0]) for part, first in zip(parts, firsts, strict=True)]
-        )
-        files = itertools.chain.from_iterable(part.files for part in parts)
-        return cls(list(files), spans, parts[0].size, parts[0].width)
+        files: list[Path] = []
+        spans = []
+        for part in parts:
+            spans.append(part.spans + np.array([len(files), 0, 0]))
+            files += part.files
+        return cls(files, np.concatenate(spans), parts[0].size, parts[0].width)
 
     @property
     def shape(self) -> tuple[int, int, int, int]:

@@ -211,7 +211,7 @@ def _collect(
     """
     entries: dict[str, list[EpisodeEntry]] = {task: [] for task in config.tasks}
     failed: dict[str, list[int]] = {task: [] for task in config.tasks}
-    seeds = {task: range(config.first_seed, config.first_seed + config.episodes) for task in config.tasks}
+    seeds = dict.fromkeys(config.tasks, range(config.first_seed, config.first_seed + config.episodes))
     limit = min(config.first_seed + 2 * config.episodes + _EXTRA_SEEDS, config.spec.seeds.training.stop)
     while any(seeds.values()):
         jobs = []
@@ -219,12 +219,16 @@ def _collect(
             firsts = range(0, len(block), _SEEDS_PER_JOB)
             jobs += [(task, block[first : first + _SEEDS_PER_JOB]) for first in firsts]
         for task, outcomes in _run_jobs(config, out, jobs, make_actor):
-            entries[task] += [entry for entry in outcomes.values() if entry is not None]
-            failed[task] += [seed for seed, entry in outcomes.items() if entry is None]
+            for seed, entry in outcomes.items():
+                if entry is None:
+                    failed[task].append(seed)
+                else:
+                    entries[task].append(entry)
             on_progress(sum(map(len, entries.values())), config.episodes * len(config.tasks))
         # one new seed per failure, in order, so that the result does not depend on the number of workers
-        stops = {task: block.stop + config.episodes - len(entries[task]) for task, block in seeds.items()}
-        seeds = {task: range(block.stop, min(stops[task], limit)) for task, block in seeds.items()}
+        for task, block in seeds.items():
+            stop = block.stop + config.episodes - len(entries[task])
+            seeds[task] = range(block.stop, min(stop, limit))
     return entries, failed
 
 
