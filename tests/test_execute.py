@@ -29,7 +29,7 @@ from studies_synthetic import (
 )
 
 from kerv_cli.base.errors import KervError, StorageError, UsageError
-from kerv_cli.base.registry import _PARTS, EnvironmentPart, parts
+from kerv_cli.base.registry import _PARTS, parts
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.cli.common import progress_bar
 from kerv_cli.cli.studies import event_printer
@@ -43,6 +43,7 @@ from kerv_cli.lab.study import warnings_about
 from kerv_cli.lab.work import work
 from kerv_cli.lab.workers import LocalWorkers, gpus_in_turn
 from kerv_cli.report.tables import further_of, load_study
+from kerv_cli.worlds import EnvironmentPart
 
 STUDY = threshold_study(["reach-v3"])
 TWO = threshold_study(["reach-v3", "push-v3"])

@@ -14,7 +14,6 @@ from rerun_synthetic import read_recording
 from kerv_cli.base import registry
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
-from kerv_cli.base.registry import EnvironmentPart
 from kerv_cli.base.spaces import Observation
 from kerv_cli.episodes.episode import run_episode
 from kerv_cli.episodes.policy import ExpertDecoder, check
@@ -24,6 +23,7 @@ from kerv_cli.report.measures import measure, paired
 from kerv_cli.report.results import MACRO, MICRO
 from kerv_cli.report.viewing import save_recording
 from kerv_cli.report.viewing.token_outcomes import summary
+from kerv_cli.worlds import EnvironmentPart
 from kerv_cli.worlds.demos.recording import DemoConfig, _identity
 from kerv_cli.worlds.metaworld.experts import VERSION, HandlePullSide
 from kerv_cli.worlds.metaworld.spec import SPEC

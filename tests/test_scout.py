@@ -21,7 +21,7 @@ from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.artifacts import Use
-from kerv_cli.methods.certified import CertifiedSkip, CertifiedSkipSettings, Scoped, ScopedSettings
+from kerv_cli.methods.certified import CertifiedSkipSettings, ScopedSettings, certified, scoped
 from kerv_cli.methods.certified.betting import p_value, wealth
 from kerv_cli.methods.certified.certificate import Candidate, Certificate, CertificateArtifact
 from kerv_cli.methods.context import Context
@@ -175,26 +175,26 @@ def test_a_certified_task_gets_its_rule_and_any_other_a_streak(target, scout):
     drafts = ScopedSettings(outside="hold")
     for task, source, rule in ((TASK, "scout", AlwaysSkip), ("reach-v3", "hold", StreakSkip)):
         where = context(target, artifacts, task)
-        where.built["prefill_draft"] = Scoped.build(drafts, where)
+        where.built["prefill_draft"] = scoped(drafts, where)
         assert where.built["prefill_draft"].name == source
-        assert isinstance(CertifiedSkip.build(CertifiedSkipSettings(most=4), where), rule)
+        assert isinstance(certified(CertifiedSkipSettings(most=4), where), rule)
     assert (
         "rule 1: not more than 5 points below AR on these 1 instruction, 90 % confidence"
         in artifacts["certificate"].sentence()
     )
     nothing = {**artifacts, "certificate": certificate(target, None)}
-    assert CertifiedSkip.build(CertifiedSkipSettings(), context(target, nothing, TASK)) is None  # verified always
+    assert certified(CertifiedSkipSettings(), context(target, nothing, TASK)) is None  # verified always
     first = {**artifacts, "certificate": certificate(target, 0)}
     where = context(target, first, TASK)
-    where.built["prefill_draft"] = Scoped.build(drafts, where)
-    skip = CertifiedSkip.build(CertifiedSkipSettings(), where)
+    where.built["prefill_draft"] = scoped(drafts, where)
+    skip = certified(CertifiedSkipSettings(), where)
     assert isinstance(skip, StreakSkip)
     assert (skip.settings.most, skip.settings.opening) == (8, 1)
 
 
 def test_a_certificate_of_another_draft_method_chunk_format_or_world_is_refused(target):
     def deploy(issued, **method):
-        CertifiedSkip.build(CertifiedSkipSettings(), context(target, {"certificate": issued}, TASK, **method))
+        certified(CertifiedSkipSettings(), context(target, {"certificate": issued}, TASK, **method))
 
     issued = certificate(target, 0)
     with pytest.raises(UsageError, match=r"acceptance.kind=relaxed: the certificate is of strict"):

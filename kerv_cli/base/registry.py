@@ -17,8 +17,8 @@ import importlib
 import os
 import pkgutil
 import traceback
-from collections.abc import Callable, Mapping
-from dataclasses import KW_ONLY, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from importlib.metadata import entry_points
 from typing import Any, ClassVar, Literal, Self, TypeVar, cast
 
@@ -26,7 +26,7 @@ from kerv_cli.base.errors import KervError, UnknownName, UsageError
 
 PLUGINS = "KERV_PLUGINS"
 
-MODULES: Mapping[str, tuple[str, ...]] = {
+MODULES: Mapping[str, Sequence[str]] = {
     "command": (),  # the command line imports its commands itself
     "environment": ("kerv_cli.worlds",),
     "stress": ("kerv_cli.worlds.stress.kinds",),
@@ -34,24 +34,8 @@ MODULES: Mapping[str, tuple[str, ...]] = {
 }
 """The modules that register kerv's own parts of a kind."""
 
-METHOD_MODULES = (
-    "kerv_cli.methods.ar",
-    "kerv_cli.methods.spec_vla",
-    "kerv_cli.methods.eagle",
-    "kerv_cli.methods.early",
-    "kerv_cli.methods.scout",
-    "kerv_cli.methods.calibrated",
-    "kerv_cli.methods.kerv",
-    "kerv_cli.methods.parallel",
-    "kerv_cli.methods.streak",
-    "kerv_cli.methods.sp_vla",
-    "kerv_cli.methods.contact",
-    "kerv_cli.methods.heisd",
-    "kerv_cli.methods.jacobi",
-    "kerv_cli.methods.merged",
-    "kerv_cli.methods.certified",
-)
-"""The modules that register the parts of methods, that is, all kinds that are not in MODULES."""
+FAMILIES = "ar spec_vla eagle early scout calibrated kerv parallel streak sp_vla contact heisd jacobi merged certified"
+"""The modules of `kerv_cli.methods` that register all other kinds of parts."""
 
 METHOD_KINDS = ("prefill_draft", "proposer", "acceptance", "threshold", "rectifier", "boundary", "skip")
 """The parts of a method, in the order in which a decode uses them."""
@@ -92,19 +76,19 @@ class Part:
         needs: Kinds of artifacts that must exist to use it, or a function of its settings that returns them. For an
             artifact: kinds of artifacts from which it is made.
         colour: Colour in tables and plots, 0xRRGGBB. None: no colour of its own.
+        idle: Function of its settings. It returns those without effect, each with the reason.
         code: The decorated class or function. None: choosing this name means having no such part, as in
             `proposer=none`.
     """
 
     kind: ClassVar[str]
-    interface: ClassVar[tuple[str, ...]] = ()  # methods of the decorated class that kerv calls by name
 
     name: str
     settings: type = NoSettings
-    _: KW_ONLY
-    needs: tuple[str, ...] | Callable[[Any], tuple[str, ...]] = ()
-    colour: int | None = None
-    code: Any = None
+    needs: tuple[str, ...] | Callable[[Any], tuple[str, ...]] = field(default=(), kw_only=True)
+    colour: int | None = field(default=None, kw_only=True)
+    idle: Callable[[Any], Mapping[str, str]] = field(default=lambda settings: {}, kw_only=True)
+    code: Any = field(default=None, kw_only=True)
 
     def __call__(self, code: C) -> C:
         """Register the part whose class or function is decorated. Return the class or function.
@@ -112,8 +96,7 @@ class Part:
         Raises:
             UsageError: The class lacks methods of its interface, or another part has the name.
         """
-        missing = {one for one in self.interface if not hasattr(code, one)}
-        missing |= getattr(code, "__abstractmethods__", frozenset())
+        missing = getattr(code, "__abstractmethods__", ())
         if missing:
             raise UsageError(f"{self.kind} '{self.name}' lacks the method {', '.join(sorted(missing))}")
         replace(self, code=code).add()
@@ -175,41 +158,22 @@ class Part:
         return self.needs(settings) if callable(self.needs) else self.needs
 
     def built(self, *arguments: Any) -> Any:
-        """Call the part's class or function, and return its result. None if choosing the part means having none."""
-        return None if self.code is None else self.code(*arguments)
+        """Build the part: call its function, or the `build` method of its class, or the class if it has none.
+
+        Args:
+            arguments: For a part of a method, its settings and the `Context` (`kerv_cli/methods/context.py`).
+
+        Returns:
+            The part. None if choosing it means having none, or if the method works without it.
+        """
+        return None if self.code is None else getattr(self.code, "build", self.code)(*arguments)
 
 
 _PARTS: dict[str, dict[str, Part]] = {}
 
 
-def _nothing_idle(settings: Any) -> dict[str, str]:
-    return {}
-
-
-@dataclass(frozen=True)
-class MethodPart(Part):
-    """A part of a decoding method. Its class has a class method `build` (`MethodPart` in `kerv_cli/engine/parts.py`).
-
-    Args:
-        idle: Function of the part's settings. It returns those without effect, each with the reason.
-    """
-
-    interface: ClassVar[tuple[str, ...]] = ("build",)
-    _: KW_ONLY
-    idle: Callable[[Any], Mapping[str, str]] = _nothing_idle
-
-    def built(self, settings: Any, context: Any) -> Any:
-        """Build the part. Return None if choosing it means having none, or if the method works without it.
-
-        Args:
-            settings: Settings of the part.
-            context: The `Context` (`kerv_cli/methods/context.py`): target, artifacts, task.
-        """
-        return None if self.code is None else self.code.build(settings, context)
-
-
-@dataclass(frozen=True)
-class ProposerPart(MethodPart):
+@dataclass(frozen=True, kw_only=True)
+class ProposerPart(Part):
     """A proposer.
 
     Args:
@@ -225,7 +189,6 @@ class ProposerPart(MethodPart):
     """
 
     kind = "proposer"
-    _: KW_ONLY
     when: Literal["prefill", "states"]
     chains: bool = False
     drafts_whole_chunk: bool = False
@@ -236,7 +199,7 @@ class ProposerPart(MethodPart):
     measured_by: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DrafterPart(ProposerPart):
     """A drafter with weights: an artifact, which `kerv train drafter drafter=NAME` trains, and a proposer.
 
@@ -248,8 +211,6 @@ class DrafterPart(ProposerPart):
         sees: Whether it needs a target that reads images.
     """
 
-    interface: ClassVar[tuple[str, ...]] = ()
-    _: KW_ONLY
     trained: type
     sees: bool = False
 
@@ -263,12 +224,12 @@ class DrafterPart(ProposerPart):
         return (self.name,)
 
     def built(self, settings: Any, context: Any) -> Any:
-        """Build the proposer; arguments as `MethodPart.built`."""
+        """Build the proposer; arguments as `Part.built`."""
         return self.code().proposer(settings, context)
 
 
-@dataclass(frozen=True)
-class AcceptancePart(MethodPart):
+@dataclass(frozen=True, kw_only=True)
+class AcceptancePart(Part):
     """An acceptance rule.
 
     Args:
@@ -276,12 +237,11 @@ class AcceptancePart(MethodPart):
     """
 
     kind = "acceptance"
-    _: KW_ONLY
     reads_threshold: bool = True
 
 
-@dataclass(frozen=True)
-class ThresholdPart(MethodPart):
+@dataclass(frozen=True, kw_only=True)
+class ThresholdPart(Part):
     """A threshold.
 
     Args:
@@ -289,19 +249,18 @@ class ThresholdPart(MethodPart):
     """
 
     kind = "threshold"
-    _: KW_ONLY
     batchable: bool = False
 
 
 @dataclass(frozen=True)
-class RectifierPart(MethodPart):
+class RectifierPart(Part):
     """A rectifier."""
 
     kind = "rectifier"
 
 
-@dataclass(frozen=True)
-class BoundaryPart(MethodPart):
+@dataclass(frozen=True, kw_only=True)
+class BoundaryPart(Part):
     """A boundary.
 
     Args:
@@ -309,12 +268,11 @@ class BoundaryPart(MethodPart):
     """
 
     kind = "boundary"
-    _: KW_ONLY
     chooses: bool = False
 
 
-@dataclass(frozen=True)
-class SkipPart(MethodPart):
+@dataclass(frozen=True, kw_only=True)
+class SkipPart(Part):
     """A skip rule.
 
     Args:
@@ -325,7 +283,6 @@ class SkipPart(MethodPart):
     """
 
     kind = "skip"
-    _: KW_ONLY
     takes_draft: bool = False
     merges: bool = False
     verifies: bool = True
@@ -339,7 +296,7 @@ class SearchPart(Part):
     kind = "datastore"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ArtifactPart(Part):
     """A kind of artifact. The decorated function imports and returns the subclass of `Artifact`.
 
@@ -353,7 +310,6 @@ class ArtifactPart(Part):
     """
 
     kind = "artifact"
-    _: KW_ONLY
     sees: bool = False
     by_task: bool = False
     needs_task: bool = False
@@ -364,51 +320,6 @@ class ArtifactPart(Part):
     def built(self) -> Any:
         """Return the kind of artifact, an instance of a subclass of `Artifact`."""
         return self.code()()
-
-
-@dataclass(frozen=True)
-class TargetPart(Part):
-    """A family of targets. The decorated function loads a target from (folder, description, device, dtype).
-
-    Args:
-        importer: Function that `kerv build target` calls with its settings. None: targets of this family are trained.
-        check_weights: Function of a folder and its description. It checks weights that are elsewhere. None: the weights
-            are in the folder.
-        images_alone: Whether its targets read images but no state.
-    """
-
-    kind = "target"
-    _: KW_ONLY
-    importer: Callable[[Any], Any] | None = None
-    check_weights: Callable[[Any, Any], None] | None = None
-    images_alone: bool = False
-
-
-@dataclass(frozen=True)
-class EnvironmentPart(Part):
-    """An environment. The decorated function returns its `EnvironmentSpec`.
-
-    Args:
-        names: Function that returns the names of its suites and tasks without importing numpy. None: the specification
-            names them.
-    """
-
-    kind = "environment"
-    _: KW_ONLY
-    names: Callable[[], tuple[str, ...]] | None = None
-
-
-@dataclass(frozen=True)
-class StressPart(Part):
-    """A kind of stress. The decorated class is a `Stress` (`kerv_cli/worlds/stress/base.py`).
-
-    Args:
-        requires: What a world must allow for it, such as `actions`.
-    """
-
-    kind = "stress"
-    _: KW_ONLY
-    requires: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -483,7 +394,7 @@ def _load_all() -> None:
 
 @functools.cache
 def _load(kind: str) -> None:
-    for name in MODULES.get(kind, METHOD_MODULES):
+    for name in MODULES.get(kind, [f"kerv_cli.methods.{family}" for family in FAMILIES.split()]):
         importlib.import_module(name)
 
 

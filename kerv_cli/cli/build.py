@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.places import artifact
-from kerv_cli.base.registry import TargetPart
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, print_figures
 from kerv_cli.cli.making import as_planned
+from kerv_cli.targets import TargetPart
 from kerv_cli.targets.settings import BuildTargetSettings
 from kerv_cli.training.settings import BuildDatastoreSettings, BuildDrafterSettings
 
@@ -53,7 +53,7 @@ def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
     from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import making
     from kerv_cli.methods.artifacts import Artifacts
-    from kerv_cli.methods.eagle.drafter import import_drafter
+    from kerv_cli.training.drafter import import_drafter
 
     folder = Artifacts(settings.results, settings.policy).new("drafter")
     with making(opened(settings.results), "drafter", folder):

@@ -17,7 +17,7 @@ import functools
 import inspect
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import KW_ONLY, Field, dataclass, field, fields
+from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,7 +32,7 @@ from kerv_cli.base.settings import CommandSettings, choices_of
 from kerv_cli.cli.common import settings_yaml
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Command(Part):
     """A command `kerv NAME`. Its function's docstring becomes the help.
 
@@ -48,8 +48,7 @@ class Command(Part):
     """
 
     kind = "command"
-    settings: type = CommandSettings
-    _: KW_ONLY
+    settings: type = field(default=CommandSettings, kw_only=False)
     keys: str = ""
     examples: tuple[str, ...] = ()
     names: str = ""

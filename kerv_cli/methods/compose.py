@@ -5,20 +5,11 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
+from kerv_cli.base import registry
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import check_settings
-from kerv_cli.base.registry import (
-    METHOD_KINDS,
-    PREFILL,
-    BoundaryPart,
-    MethodPart,
-    ProposerPart,
-    SkipPart,
-    ThresholdPart,
-    part_of,
-)
 from kerv_cli.engine.chunk import chunk_steps
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.parallel import check_parallel, is_parallel
@@ -50,13 +41,13 @@ class Method:
         return cls(settings.parts(), settings.chunk, settings.method)
 
     @functools.cached_property
-    def parts(self) -> dict[str, MethodPart]:
+    def parts(self) -> dict[str, registry.Part]:
         """The registered parts, by kind, for all kinds in METHOD_KINDS.
 
         Raises:
             UnknownName: The settings name a part that does not exist.
         """
-        return {kind: cast(MethodPart, part_of(kind, self.settings[kind].kind)) for kind in METHOD_KINDS}
+        return {kind: registry.part_of(kind, self.settings[kind].kind) for kind in registry.METHOD_KINDS}
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -67,19 +58,19 @@ class Method:
         return tuple(dict.fromkeys(kinds))
 
     @property
-    def prefill_draft(self) -> ProposerPart:
+    def prefill_draft(self) -> registry.ProposerPart:
         """The part that drafts before the prefill."""
-        return ProposerPart.find(self.settings["prefill_draft"].kind, "prefill_draft.kind")
+        return registry.ProposerPart.find(self.settings["prefill_draft"].kind, "prefill_draft.kind")
 
     @property
-    def proposer(self) -> ProposerPart:
+    def proposer(self) -> registry.ProposerPart:
         """The part that drafts after the prefill."""
-        return ProposerPart.find(self.settings["proposer"].kind, "proposer.kind")
+        return registry.ProposerPart.find(self.settings["proposer"].kind, "proposer.kind")
 
     @property
-    def skip(self) -> SkipPart:
+    def skip(self) -> registry.SkipPart:
         """The part that executes drafts without verification."""
-        return SkipPart.find(self.settings["skip"].kind, "skip.kind")
+        return registry.SkipPart.find(self.settings["skip"].kind, "skip.kind")
 
     def check(self, target: Target | TargetDescription, batch: int = 1) -> None:
         """Refuse parts that do not work together or with the target, and numbers out of range. Loads no weights.
@@ -109,13 +100,13 @@ class Method:
         such a boundary. A prefill draft must not need the target's hidden states, which exist only after the prefill.
         """
         proposer, draft = self.proposer, self.prefill_draft
-        boundary = BoundaryPart.find(self.settings["boundary"].kind)
+        boundary = registry.BoundaryPart.find(self.settings["boundary"].kind)
         if proposer.has_boundary != boundary.chooses:
             raise UsageError(
                 f"proposer={proposer.name} with boundary={boundary.name}: "
                 + ("name a boundary that chooses" if proposer.has_boundary else "nothing to choose from")
             )
-        if draft.when != PREFILL:
+        if draft.when != registry.PREFILL:
             raise UsageError(
                 f"prefill_draft={draft.name}: it reads the target's states, which come after the prefill; use it as "
                 f"proposer={draft.name}"
@@ -133,7 +124,8 @@ class Method:
         """Check that the method can decode several episodes together, if `batch` is not 1."""
         if batch == 1:
             return
-        draft, skip, threshold = self.prefill_draft, self.skip, ThresholdPart.find(self.settings["threshold"].kind)
+        draft, skip = self.prefill_draft, self.skip
+        threshold = registry.ThresholdPart.find(self.settings["threshold"].kind)
         is_used = draft.absent or skip.takes_draft
         if not (self.proposer.absent and skip.batchable and is_used):
             raise UsageError(

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from kerv_cli.base.errors import KervError, UsageError
-from kerv_cli.base.registry import ArtifactPart, TargetPart
+from kerv_cli.base.registry import ArtifactPart
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.engine.protocol import Target
@@ -26,6 +26,7 @@ from kerv_cli.methods.compose import Method
 from kerv_cli.methods.settings import MethodSettings
 from kerv_cli.serve.interface import Interface
 from kerv_cli.serve.settings import ServeSettings
+from kerv_cli.targets import TargetPart
 from kerv_cli.targets.provenance import stamp
 from kerv_cli.worlds import specs
 from kerv_cli.worlds.spec import EnvironmentSpec

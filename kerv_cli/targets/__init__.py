@@ -2,9 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
-from kerv_cli.base.registry import TargetPart
+from kerv_cli.base.registry import Part
+
+
+@dataclass(frozen=True, kw_only=True)
+class TargetPart(Part):
+    """A family of targets. The decorated function loads a target from (folder, description, device, dtype).
+
+    Args:
+        importer: Function that `kerv build target` calls with its settings. None: targets of this family are trained.
+        check_weights: Function of a folder and its description. It checks weights that are elsewhere. None: the weights
+            are in the folder.
+        images_alone: Whether its targets read images but no state.
+    """
+
+    kind = "target"
+    importer: Callable[[Any], Any] | None = None
+    check_weights: Callable[[Any, Any], None] | None = None
+    images_alone: bool = False
 
 
 @TargetPart("compact")

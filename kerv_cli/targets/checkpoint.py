@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import read_mapping, sha256_of, write_bytes, write_folder, write_json
 from kerv_cli.base.manifests import read
-from kerv_cli.base.registry import TargetPart
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
+from kerv_cli.targets import TargetPart
 
 if TYPE_CHECKING:  # torch is imported where weights are read or written: a description is read without it
     import torch

@@ -1,4 +1,4 @@
-"""`kerv train drafter`: train a drafter to imitate how the target decodes the demonstrations."""
+"""`kerv train drafter`: train a drafter to imitate how the target decodes. `kerv build drafter`: import one."""
 
 from __future__ import annotations
 
@@ -15,13 +15,16 @@ from kerv_cli.base.runtime import set_up
 from kerv_cli.lab.database import Database
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.drafters import TrainableDrafter
+from kerv_cli.methods.eagle import DrafterSettings
+from kerv_cli.methods.eagle.drafter import EagleDrafter
+from kerv_cli.methods.eagle.public import Convention, PublicDrafter, read_public
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.folders import check_not_shipped
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_tasks, demos_for
 from kerv_cli.training.fit import Metrics, batches, fit, without_subnormals
 from kerv_cli.training.making import Begin, figures_of, identity_of, quietly, refuse_other, refuse_unused
-from kerv_cli.training.settings import TrainDrafterSettings
+from kerv_cli.training.settings import BuildDrafterSettings, TrainDrafterSettings
 from kerv_cli.worlds import resolve_tasks
 
 OF_TARGETS = ("init", "balance", "closed_loop", "colour", "places")
@@ -111,3 +114,31 @@ def drafter_of(settings: TrainDrafterSettings) -> TrainableDrafter:
     refuse_unused(settings.train, OF_TARGETS, ": only the training of a target has this setting")
     drafter: TrainableDrafter = part.built()
     return drafter
+
+
+def import_drafter(settings: BuildDrafterSettings) -> tuple[Path, dict[str, Any]]:
+    """Run `kerv build drafter`: check that a published drafter fits a target, and copy it into the results folder.
+
+    Returns:
+        The drafter's folder, and numbers to print: parameters, layers, positions and mask.
+
+    Raises:
+        UsageError: `checkpoint` is empty.
+        CheckpointError: The target does not exist. Or the drafter is incomplete, damaged, pickled or of another width.
+    """
+    if not settings.checkpoint:
+        raise UsageError("checkpoint=DIR: name the folder of a drafter (config.json, model.safetensors)")
+    convention = Convention(settings.positions, settings.mask)
+    device, _ = set_up(settings.runtime)
+    artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
+    target: Any = artifacts.target
+    shape, tensors = read_public(Path(settings.checkpoint).expanduser(), target, convention)
+    folder, layers = artifacts.new(EagleDrafter.kind), shape.language.num_hidden_layers
+    network = PublicDrafter(shape)
+    network.load_state_dict(tensors, assign=True)  # the weights keep their number format
+    figures = {"parameters": sum(tensor.numel() for tensor in tensors.values())}
+    provenance = provenance_of("kerv build drafter", settings, device, **figures)
+    shapes = asdict(DrafterSettings(kind="public", layers=layers))
+    made_for = MadeFor.of(artifacts.description)
+    EagleDrafter().save(folder, network, made_for, provenance, settings=shapes, public=asdict(shape))
+    return folder, {**figures, "layers": layers, **asdict(convention)}

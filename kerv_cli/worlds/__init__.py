@@ -6,18 +6,31 @@ specification, and the simulator with its world.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar
 
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.registry import EnvironmentPart
+from kerv_cli.base.registry import Part
 
 if TYPE_CHECKING:
     from kerv_cli.worlds.settings import WorldSettings
     from kerv_cli.worlds.spec import EnvironmentSpec
 
 W = TypeVar("W", bound="WorldSettings")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvironmentPart(Part):
+    """An environment. The decorated function returns its `EnvironmentSpec`.
+
+    Args:
+        names: Function that returns the names of its suites and tasks without importing numpy. None: the specification
+            names them.
+    """
+
+    kind = "environment"
+    names: Callable[[], tuple[str, ...]] | None = None
 
 
 def specs() -> Mapping[str, EnvironmentSpec]:

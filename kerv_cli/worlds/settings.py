@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import choice, number, setting
-from kerv_cli.base.registry import StressPart
+from kerv_cli.base.registry import find
 from kerv_cli.base.settings import CommandSettings
 
 EVALUATION_SEED = 100_000
@@ -60,7 +60,7 @@ class StressSettings:
             UsageError: There is a level without a kind.
         """
         if self.kind != "none":  # else the kinds, which import numpy, are not loaded
-            StressPart.find(self.kind, f"{prefix}kind")
+            find("stress", self.kind, f"{prefix}kind")
         elif self.level:
             raise UsageError(f"{prefix}level={self.level} without {prefix}kind: name what to disturb")
 

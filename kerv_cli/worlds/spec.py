@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.limits import check_settings
-from kerv_cli.base.registry import StressPart, load
+from kerv_cli.base.registry import load
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
 from kerv_cli.worlds.settings import CameraSettings, StressSettings
-from kerv_cli.worlds.stress.base import NO_STRESS, Stress
+from kerv_cli.worlds.stress.base import NO_STRESS, Stress, StressPart
 from kerv_cli.worlds.task import Task
 from kerv_cli.worlds.views import views_of
 

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from kerv_cli.base.places import artifact
-from kerv_cli.base.registry import TargetPart
 from kerv_cli.base.spaces import ActionSpace, Observation
+from kerv_cli.targets import TargetPart
 from kerv_cli.targets.checkpoint import TargetDescription, load_state, save_module, target_fields
 from kerv_cli.targets.settings import BuildTargetSettings
 from kerv_cli.worlds.metaworld.spec import SPEC

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from kerv_cli.base.registry import StressPart
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.worlds.stress.base import Array, Stress
+from kerv_cli.worlds.stress.base import Array, Stress, StressPart
 
 
 @StressPart("drift", requires=("actions",))

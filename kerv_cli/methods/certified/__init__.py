@@ -81,45 +81,36 @@ def needs_outside(settings: ScopedSettings) -> tuple[str, ...]:
 
 
 @ProposerPart("scoped", ScopedSettings, needs=needs_outside, when=PREFILL, chains=True)
-class Scoped:
-    """On the certificate's tasks, the certified proposer. On other tasks, the proposer `outside`."""
-
-    @staticmethod
-    def build(settings: ScopedSettings, context: Context) -> Proposer:
-        """Build the proposer for the decoder's task."""
-        certificate = covering(context)
-        if certificate is not None and certificate.certified is not None:
-            source = certificate.certified.source
-        else:
-            source = ProposerPart.find(settings.outside).default
-        proposer: Proposer = ProposerPart.find(source.kind).built(source, context)
-        return proposer
+def scoped(settings: ScopedSettings, context: Context) -> Proposer:
+    """Build the certified proposer on the certificate's tasks, and the proposer `outside` on other tasks."""
+    certificate = covering(context)
+    if certificate is not None and certificate.certified is not None:
+        source = certificate.certified.source
+    else:
+        source = ProposerPart.find(settings.outside).default
+    proposer: Proposer = ProposerPart.find(source.kind).built(source, context)
+    return proposer
 
 
 @SkipPart("certified", CertifiedSkipSettings, needs=("certificate",), colour=0x2E8B57, takes_draft=True, merges=True)
-class CertifiedSkip:
-    """On the certificate's tasks, the certified rule. On other tasks, a streak."""
+def certified(settings: CertifiedSkipSettings, context: Context) -> Skip | None:
+    """Build the certified rule on the certificate's tasks, and a streak on other tasks.
 
-    @staticmethod
-    def build(settings: CertifiedSkipSettings, context: Context) -> Skip | None:
-        """Build the rule for the decoder's task.
+    Returns:
+        The skip rule. None if the certificate covers the task but no rule was certified: then every draft is verified.
 
-        Returns:
-            The skip rule. None if the certificate covers the task but no rule was certified: then every draft is
-            verified.
-
-        Raises:
-            UsageError: The method, the number format or the chunk length is not the certified one.
-        """
-        certificate = covering(context)
-        if certificate is None:
-            return StreakSkip.build(StreakSkipSettings(most=settings.most), context)
-        if certificate.certified is None:
-            return None
-        certificate.check_method(context.method, str(context.target.dtype).removeprefix("torch."))
-        chunk = context.chunk or context.target.chunk
-        if chunk != certificate.chunk:
-            raise UsageError(f"skip=certified with chunk={chunk}: the certificate is of {certificate.chunk}")
-        rule = certificate.certified.rule
-        skip: Skip = SkipPart.find(rule.kind).built(rule, context)
-        return skip
+    Raises:
+        UsageError: The method, the number format or the chunk length is not the certified one.
+    """
+    certificate = covering(context)
+    if certificate is None:
+        return StreakSkip.build(StreakSkipSettings(most=settings.most), context)
+    if certificate.certified is None:
+        return None
+    certificate.check_method(context.method, str(context.target.dtype).removeprefix("torch."))
+    chunk = context.chunk or context.target.chunk
+    if chunk != certificate.chunk:
+        raise UsageError(f"skip=certified with chunk={chunk}: the certificate is of {certificate.chunk}")
+    rule = certificate.certified.rule
+    skip: Skip = SkipPart.find(rule.kind).built(rule, context)
+    return skip

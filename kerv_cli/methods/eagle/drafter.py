@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.runtime import set_up
 from kerv_cli.base.spaces import ObservationSpace
 from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.chunk import Chunk
@@ -33,11 +32,11 @@ from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import ReadableTarget, Target
 from kerv_cli.engine.transfer import upload
 from kerv_cli.engine.tree import ROOT
-from kerv_cli.methods.artifacts import Artifacts, MadeFor
+from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.drafters import Decodes, DrafterDescription, Metrics, TrainableDrafter
 from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.public import Convention, PublicDrafter, PublicShape, load_public, read_public
+from kerv_cli.methods.eagle.public import PublicDrafter, PublicShape, load_public
 from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.compact.packable import pack
@@ -46,7 +45,6 @@ from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import LayerStack
 from kerv_cli.targets.grown import grow_stack
 from kerv_cli.targets.observations import observations_of, prompts_of
-from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.worlds.demos.files import DemoEpisode
 
 VALIDATED = 60
@@ -406,34 +404,3 @@ def acceptance_length(target: Target, network: EagleNetwork, prompts: list[Tenso
     chunks = [decoder.decode_prompt(prompt) for prompt in prompts]
     rounds = [one for chunk in chunks for one in chunk.rounds if one.tree_size]
     return sum(one.committed for one in rounds) / max(1, len(rounds))
-
-
-def import_drafter(settings: Any) -> tuple[Path, dict[str, Any]]:
-    """Run `kerv build drafter`: check that a published drafter fits a target, and copy it into the results folder.
-
-    Args:
-        settings: `BuildDrafterSettings`.
-
-    Returns:
-        The drafter's folder, and numbers to print: parameters, layers, positions and mask.
-
-    Raises:
-        UsageError: `checkpoint` is empty.
-        CheckpointError: The target does not exist. Or the drafter is incomplete, damaged, pickled or of another width.
-    """
-    if not settings.checkpoint:
-        raise UsageError("checkpoint=DIR: name the folder of a drafter (config.json, model.safetensors)")
-    convention = Convention(settings.positions, settings.mask)
-    device, _ = set_up(settings.runtime)
-    artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
-    target: Any = artifacts.target
-    shape, tensors = read_public(Path(settings.checkpoint).expanduser(), target, convention)
-    folder, layers = artifacts.new(EagleDrafter.kind), shape.language.num_hidden_layers
-    network = PublicDrafter(shape)
-    network.load_state_dict(tensors, assign=True)  # the weights keep their number format
-    figures = {"parameters": sum(tensor.numel() for tensor in tensors.values())}
-    provenance = provenance_of("kerv build drafter", settings, device, **figures)
-    shapes = asdict(DrafterSettings(kind="public", layers=layers))
-    made_for = MadeFor.of(artifacts.description)
-    EagleDrafter().save(folder, network, made_for, provenance, settings=shapes, public=asdict(shape))
-    return folder, {**figures, "layers": layers, **asdict(convention)}

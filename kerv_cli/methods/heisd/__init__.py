@@ -13,18 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from kerv_cli.base import registry
 from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, number
-from kerv_cli.base.registry import (
-    DRAFTING,
-    PREFILL,
-    STATES,
-    AcceptancePart,
-    ArtifactPart,
-    BoundaryPart,
-    ProposerPart,
-    SearchPart,
-    SkipPart,
-)
 from kerv_cli.engine.acceptance import Accepted, DistanceRule, accept_by_group
 from kerv_cli.engine.decisions import Choice, SkipDecision
 from kerv_cli.engine.parts import Boundary, Skip
@@ -51,7 +41,7 @@ LEAST = 3  # minimum number of positions for a curvature
 # --- the datastore and its proposer (§4.1, §4.2)
 
 
-@ArtifactPart("datastore", by_task=True, needs_task=True, described_by=MANIFEST)
+@registry.ArtifactPart("datastore", by_task=True, needs_task=True, described_by=MANIFEST)
 def artifact() -> type:
     """Import the kind of artifact `datastore`."""
     from kerv_cli.methods.heisd.datastore import DatastoreArtifact
@@ -77,7 +67,7 @@ class Index(ABC):
         """
 
 
-@SearchPart("exact")
+@registry.SearchPart("exact")
 def exact(store: Datastore, settings: Any) -> Index:
     """Search by comparing the key with all entries of the task: datastore=exact, the default."""
     from kerv_cli.methods.heisd.datastore import ExactIndex
@@ -94,12 +84,12 @@ class RetrievalProposerSettings:
     nodes: int = number(50, 1, MOST_TOKENS)  # maximum number of tree nodes
 
 
-@ProposerPart(
+@registry.ProposerPart(
     "retrieval",
     RetrievalProposerSettings,
     needs=("datastore",),
     colour=0x009E73,
-    when=PREFILL,
+    when=registry.PREFILL,
     chains=True,
     drafts_whole_chunk=True,
     looks_up=True,
@@ -164,13 +154,13 @@ class HybridProposerSettings(DrafterProposerSettings):
     neighbours: int = number(3, 1, MOST_TOKENS)  # retrieval: number of stored chunks in the tree
 
 
-@ProposerPart(
+@registry.ProposerPart(
     "hybrid",
     HybridProposerSettings,
     needs=("drafter", "datastore"),
-    when=STATES,
+    when=registry.STATES,
     has_boundary=True,
-    cost=DRAFTING,
+    cost=registry.DRAFTING,
     idle=lambda settings: only_of_trees(settings, "top_k"),  # `nodes` also limits the tree of stored chunks
 )
 class HybridProposer(Proposer):
@@ -188,7 +178,7 @@ class HybridProposer(Proposer):
     @classmethod
     def build(cls, settings: HybridProposerSettings, context: Context) -> HybridProposer:
         """Build the hybrid proposer, which `proposer=hybrid` chooses."""
-        drafter = ProposerPart.find("drafter").built(settings, context)
+        drafter = registry.ProposerPart.find("drafter").built(settings, context)
         return cls(drafter, RetrievalProposer.build(settings, context))
 
     def begin(self, chunk: Chunk) -> None:
@@ -226,7 +216,7 @@ class SequenceAcceptanceSettings:
     token_limit: int = number(15, 0, MOST_BINS)  # largest accepted distance of one token, bins
 
 
-@AcceptancePart("sequence", SequenceAcceptanceSettings, reads_threshold=False)
+@registry.AcceptancePart("sequence", SequenceAcceptanceSettings, reads_threshold=False)
 @dataclass(frozen=True)
 class GroupRule(DistanceRule):
     """Accepts or rejects each kinematic group (position, rotation, gripper) of a control step as a whole.
@@ -274,7 +264,7 @@ class HybridAcceptanceSettings(SequenceAcceptanceSettings):
     strict_dofs: bool = True  # relaxed: whether strict DoFs, such as the gripper, must match (ours); public code: false
 
 
-@AcceptancePart("hybrid", HybridAcceptanceSettings)
+@registry.AcceptancePart("hybrid", HybridAcceptanceSettings)
 @dataclass(frozen=True, kw_only=True)
 class HybridRule(RelaxedRule):
     """Accepts retrieved drafts by kinematic group, and all other drafts token by token within a radius.
@@ -311,7 +301,7 @@ class RandomBoundarySettings:
     seed: int = number(0, 0, 2**32 - 1)
 
 
-@BoundaryPart("random", RandomBoundarySettings, chooses=True)
+@registry.BoundaryPart("random", RandomBoundarySettings, chooses=True)
 class Random(Boundary):
     """Chooses retrieval with probability p, else the drafter: a baseline that does not look at the path.
 
@@ -348,8 +338,8 @@ class Always(Random):
         return cls(float(settings.kind == "always_retrieval"))
 
 
-BoundaryPart("always_retrieval", chooses=True)(Always)
-BoundaryPart("always_drafter", chooses=True)(Always)
+registry.BoundaryPart("always_retrieval", chooses=True)(Always)
+registry.BoundaryPart("always_drafter", chooses=True)(Always)
 
 
 @dataclass
@@ -366,7 +356,7 @@ class FusedBoundarySettings:
     f_star: float | None = number(None, 0, 1)  # the limit F* itself, in place of a quantile (ours)
 
 
-@BoundaryPart(
+@registry.BoundaryPart(
     "fused",
     FusedBoundarySettings,
     needs=("calibration",),
@@ -430,7 +420,7 @@ def needs_of_similarity(settings: SimilaritySkipSettings) -> tuple[str, ...]:
     return ("datastore", "calibration") if settings.s_min is None else ("datastore",)
 
 
-@SkipPart("similarity", SimilaritySkipSettings, needs=needs_of_similarity, colour=0xF0E442)
+@registry.SkipPart("similarity", SimilaritySkipSettings, needs=needs_of_similarity, colour=0xF0E442)
 class VerifySkip(Skip):
     """Executes the most similar stored chunk without verification if its similarity is at least s_min.
 

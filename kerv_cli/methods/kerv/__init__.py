@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from kerv_cli.base.errors import UnknownName, UsageError
@@ -22,46 +22,41 @@ if TYPE_CHECKING:
 # --- predictors, and proposers that draft with them (§3.1, §6)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PredictorPart(ProposerPart):
     """A predictor of the next actions: it drafts as a proposer, and `rectifier.predictor` fills in with it.
 
-    The decorated class has a `name`, a method `predict` (`Predictor` in `prediction.py`), and a class method `build`.
+    What it builds has a `name` and a method `predict` (`Predictor` in `prediction.py`).
     """
 
-    _: KW_ONLY
     when: Literal["prefill", "states"] = PREFILL
     chains: bool = True
 
     def built(self, settings: Any, context: Any) -> Any:
-        """Build the proposer that drafts with the predictor; arguments as `MethodPart.built`."""
+        """Build the proposer that drafts with the predictor; arguments as `Part.built`."""
         from kerv_cli.methods.kerv.prediction import PredictionProposer
 
         return PredictionProposer(self.predictor(context))
 
     def predictor(self, context: Context) -> Predictor:
         """Build the predictor with its default settings."""
-        built: Predictor = self.code.build(self.default, context)
+        built: Predictor = super().built(self.default, context)
         return built
 
 
-class Predictors:
-    """kerv's own predictors."""
+def predictor(settings: NoSettings, context: Context) -> Predictor:
+    """Build kerv's own predictor with the name `settings.kind`."""
+    from kerv_cli.methods.kerv.prediction import predictor_of
 
-    @staticmethod
-    def build(settings: NoSettings, context: Context) -> Predictor:
-        """Build the predictor with the name `settings.kind`."""
-        from kerv_cli.methods.kerv.prediction import predictor_of
-
-        return predictor_of(settings.kind, context)
+    return predictor_of(settings.kind, context)
 
 
 _noise = ("calibration",)  # Kalman filters need the noise that `kerv calibrate` fitted
-PredictorPart("hold", colour=0xE69F00)(Predictors)
-PredictorPart("linear", colour=0x0072B2)(Predictors)
-PredictorPart("kalman", needs=_noise, colour=0xD55E00)(Predictors)
-PredictorPart("damped", needs=_noise, colour=0xA0522D)(Predictors)
-PredictorPart("walk", colour=0x999933)(Predictors)
+PredictorPart("hold", colour=0xE69F00)(predictor)
+PredictorPart("linear", colour=0x0072B2)(predictor)
+PredictorPart("kalman", needs=_noise, colour=0xD55E00)(predictor)
+PredictorPart("damped", needs=_noise, colour=0xA0522D)(predictor)
+PredictorPart("walk", colour=0x999933)(predictor)
 
 ACCEPTED = "accepted"
 DRAFT = "draft"

@@ -26,7 +26,6 @@ from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import write_json
 from kerv_cli.base.manifests import read
 from kerv_cli.base.places import artifact
-from kerv_cli.base.registry import EnvironmentPart
 from kerv_cli.base.runtime import DTYPES, set_up
 from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.engine.transfer import upload
@@ -38,6 +37,7 @@ from kerv_cli.targets.openvla.loading import check_finite, digest_of, load_model
 from kerv_cli.targets.openvla.reference import check_installed, parity
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.targets.settings import BuildTargetSettings
+from kerv_cli.worlds import EnvironmentPart
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kerv_cli.base.registry import StressPart
+from kerv_cli.base.registry import Part
 from kerv_cli.worlds.settings import StressSettings
 
 if TYPE_CHECKING:
@@ -17,6 +18,18 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Model: TypeAlias = "mujoco.MjModel"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StressPart(Part):
+    """A kind of stress. The decorated class is a `Stress` (`kerv_cli/worlds/stress/base.py`).
+
+    Args:
+        requires: What a world must allow for it, such as `actions`.
+    """
+
+    kind = "stress"
+    requires: tuple[str, ...]
 
 
 class ModelChanges:

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from kerv_cli.base.registry import StressPart
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.worlds.stress.base import Array, Model, ModelChanges, Stress, factor_or_inverse, robot_roots
+from kerv_cli.worlds.stress.base import Array, Model, ModelChanges, Stress, StressPart, factor_or_inverse, robot_roots
 from kerv_cli.worlds.vectors import unit_vector
 
 if TYPE_CHECKING:
