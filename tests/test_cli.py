@@ -350,6 +350,7 @@ ANSWERS = [
         "hydra.yaml:1: a method's file has no defaults: write PART: NAME",
     ),
     ("rollout method=type.yaml", "type.yaml:2: threshold.r: Value 'wide' of type 'str'"),
+    ("rollout proposer.kind=drafter", "proposer.kind=drafter: choose proposer=drafter, each has settings of its own"),
     ("rollout method=nothing.yaml", "method=nothing.yaml cannot be read: No such file"),
     # what is not there
     ("rollout policy.target=mine", "make it with 'kerv train target name=mine'"),

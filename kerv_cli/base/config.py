@@ -195,11 +195,14 @@ def _check(settings: Any) -> None:
     """Check that every setting is in its range and every chosen part is registered.
 
     Raises:
-        UsageError: A setting is out of range, or a part is not registered.
+        UsageError: A setting is out of range, a part is not registered, or its `kind` alone was set.
     """
     check_settings(settings)
-    for group in (name for name in SETTINGS_GROUPS if hasattr(settings, name)):
-        part_of(group, getattr(settings, group).kind)
+    for group in SETTINGS_GROUPS:
+        chosen = getattr(settings, group, None)
+        if chosen is not None and type(chosen) is not part_of(group, chosen.kind).settings:
+            message = f"{group}.kind={chosen.kind}: choose {group}={chosen.kind}, each has settings of its own"
+            raise UsageError(message, f"{group}.kind")
 
 
 @functools.lru_cache(maxsize=4096)

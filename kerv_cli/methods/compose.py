@@ -83,9 +83,7 @@ class Method:
             UnknownName: The settings name a part that does not exist.
             UsageError: The parts cannot work together or with the target, or a number is out of range.
         """
-        for kind, part in self.parts.items():
-            if not isinstance(self.settings[kind], part.settings):
-                raise UsageError(f"{kind}.kind={part.name}: choose {kind}={part.name}, each has settings of its own")
+        for kind in self.parts:
             check_settings(self.settings[kind], kind)
         chunk_steps(self.chunk, target.chunk)
         self._check_drafts()

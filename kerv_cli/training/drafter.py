@@ -109,8 +109,6 @@ def drafter_of(settings: TrainDrafterSettings) -> TrainableDrafter:
         UsageError: A setting belongs to another kind of drafter, or only to the training of targets.
     """
     part = find("drafter", settings.drafter.kind, "drafter.kind")
-    if not isinstance(settings.drafter, part.settings):
-        raise UsageError(f"drafter.kind={part.name}: choose drafter={part.name}, each has settings of its own")
     refuse_unused(settings.train, OF_TARGETS, ": only the training of a target has this setting")
     drafter: TrainableDrafter = part.built()
     return drafter
