@@ -96,7 +96,7 @@ def _there(leaf: Any) -> Any:
 def move(module: nn.Module) -> None:
     """Puts a module's weights there."""
     for part in module.modules():
-        part.packed = None  # type: ignore[assignment]
+        part.compiled = None  # type: ignore[assignment]
         for kept in (part._parameters, part._buffers):
             for name, tensor in kept.items():
                 if tensor is not None:

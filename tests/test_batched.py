@@ -38,7 +38,7 @@ from kerv_cli.report.plots import study_figures
 from kerv_cli.report.reprice import NamedProfile, repriced
 from kerv_cli.report.summary import summary_frame
 from kerv_cli.report.tables import load_study
-from kerv_cli.targets.compact.packable import pack
+from kerv_cli.targets.compact.compilable import compile_parts
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 HOME = np.zeros(3)
@@ -81,14 +81,14 @@ def same(alone: Sequence[Any], together: Sequence[Any]) -> None:
 
 
 @pytest.mark.bits
-@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("compiled", [False, True])
 @pytest.mark.parametrize("batch", [1, 2, 7])
-def test_autoregressive_tokens_of_a_batch_are_those_of_its_rows(packed, batch):
+def test_autoregressive_tokens_of_a_batch_are_those_of_its_rows(compiled, batch):
     policy = small()
-    if packed:
+    if compiled:
         policy.requires_grad_(False)
-        pack(policy)
-        assert policy.trunk.packed is not None
+        compile_parts(policy)
+        assert policy.trunk.compiled is not None
     alone, together = decoded(Decoder(policy), shown(batch))
     assert len({one.tokens for one in alone}) > batch / 2
     same(alone, together)

@@ -28,9 +28,9 @@ from kerv_cli.methods.parallel import ParallelPass
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.attention import CapturedCache, attention_mask, bucket
 from kerv_cli.targets.checkpoint import load_target
+from kerv_cli.targets.compact.compilable import compile_parts
 from kerv_cli.targets.compact.features import places_of, privileged_features, scene_features, scene_width
 from kerv_cli.targets.compact.folder import save_target
-from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
@@ -198,7 +198,7 @@ def test_grown_layers_compute_the_same(policies, width, heads, units, layers):
         grow_stack(target.trunk, GrowSettings(width=width, heads=heads, feed_forward=units), layers)
         assert len(target.trunk.layers) == layers
         torch.testing.assert_close(target.trunk(x, positions), expected, rtol=1e-3, atol=1e-5)
-        pack(target)
+        compile_parts(target)
         torch.testing.assert_close(target.trunk(x, positions), expected, rtol=1e-3, atol=1e-5)
 
 
@@ -213,7 +213,7 @@ def test_a_padded_prompt_changes_no_output(seed, prompt, draft, padding, fixed):
     x, positions, outputs = x[:batch], torch.arange(tokens + 3), []
     for trunk.padding in (0, padding):
         for compiled in (False, True):
-            trunk.packed = trunk.pack_weights() if compiled else None
+            trunk.compiled = trunk.new_program() if compiled else None
             cache = trunk.new_cache(batch, tokens + 3, fixed)
             with torch.inference_mode():
                 first = trunk(x[:, :tokens], positions[:tokens], cache, seen if draft else None)
@@ -335,12 +335,12 @@ def in_parallel(policy: CompactTarget, prompt: torch.Tensor) -> list[int]:
 
 @pytest.mark.bits
 @torch.inference_mode()
-@pytest.mark.parametrize("packed", [False, True])
-def test_all_tokens_come_from_one_forward_in_which_they_see_each_other(packed):
+@pytest.mark.parametrize("compiled", [False, True])
+def test_all_tokens_come_from_one_forward_in_which_they_see_each_other(compiled):
     policy = small("target.parallel=true")
     wanted = in_parallel(policy, policy.encode(some_observation()))
-    if packed:
-        pack(policy)
+    if compiled:
+        compile_parts(policy)
     decoder = Decoder(policy, Parts(skip=ParallelPass(policy)))
     decoder.reset("", 0, np.zeros(3))
     record = decoder.decode(some_observation())

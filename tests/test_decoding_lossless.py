@@ -22,7 +22,7 @@ from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter, EagleNetwork
 from kerv_cli.methods.jacobi import JacobiProposer
-from kerv_cli.targets.compact.packable import pack
+from kerv_cli.targets.compact.compilable import compile_parts
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
@@ -34,7 +34,7 @@ ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
 
 def random_target(seed: int, layers: int, heads: int, chunk: int, fixed: bool = False) -> CompactTarget:
-    """Odd seeds run on the packed weights that a shipped policy runs on, even ones on the modules' own path. fixed:
+    """Odd seeds run on the compiled weights that a shipped policy runs on, even ones on the modules' own path. fixed:
     with caches of fixed shapes, as on CUDA."""
     torch.manual_seed(seed)
     settings = TargetSettings(
@@ -47,7 +47,7 @@ def random_target(seed: int, layers: int, heads: int, chunk: int, fixed: bool = 
     torch.nn.init.normal_(target.embedding.weight, std=1.0)
     target = target.eval().requires_grad_(False)
     if seed % 2:
-        pack(target)
+        compile_parts(target)
     if fixed:
         target.new_cache = functools.partial(target.new_cache, fixed=True)  # type: ignore[method-assign]
     return target

@@ -19,7 +19,7 @@ from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyExamples, EarlyNetwork, choose
 from kerv_cli.targets.checkpoint import load_target
-from kerv_cli.targets.compact.packable import pack
+from kerv_cli.targets.compact.compilable import compile_parts
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
@@ -165,13 +165,13 @@ def test_packed_weights_give_the_same_logits():
     early.standardise(5.0 * features + 2.0)
     early.eval().requires_grad_(False)
     plain = early(features[:1])
-    pack(early)
-    assert early.packed is not None
+    compile_parts(early)
+    assert early.compiled is not None
     assert torch.allclose(early(features[:1]), plain, rtol=1e-4, atol=1e-4)
     assert not torch.allclose(early(torch.zeros_like(features[:1])), plain, rtol=1e-2)
     assert len(early(features[:2])) == 2
     early.requires_grad_(True)
-    assert early.packed is None, "weights that can change are not compiled"
+    assert early.compiled is None, "weights that can change are not compiled"
 
 
 def test_the_chosen_bin_is_the_one_most_likely_to_be_accepted():

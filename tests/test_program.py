@@ -1,4 +1,4 @@
-"""The packed weights of a frozen CPU policy compute what its modules do; training and other devices never meet them."""
+"""A frozen policy that is compiled computes on a CPU what its modules do; training and other devices never do."""
 
 import copy
 import pickle
@@ -19,7 +19,7 @@ from kerv_cli.methods.early.drafter import choose
 from kerv_cli.targets.checkpoint import compact, expanded
 from kerv_cli.targets.compact import program
 from kerv_cli.targets.compact.bfloat16 import multiplies_bfloat16
-from kerv_cli.targets.compact.packable import pack
+from kerv_cli.targets.compact.compilable import compile_parts
 from kerv_cli.targets.compact.program import Program, kernels, own_folder
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
@@ -68,10 +68,10 @@ def both_trunks(seed: int, layers: int, heads: int, channels: int) -> tuple[Trun
         if parameter.dim() == 2:
             torch.nn.init.normal_(parameter, std=0.1)
     shaken(plain, seed)
-    packed = copy.deepcopy(plain)
-    pack(packed)
-    assert packed.packed is not None
-    return plain, packed
+    compiled = copy.deepcopy(plain)
+    compile_parts(compiled)
+    assert compiled.compiled is not None
+    return plain, compiled
 
 
 def both_targets(
@@ -83,9 +83,9 @@ def both_targets(
     words = WordTokenizer.build(["open the drawer"])
     plain = CompactTarget(shape, ACTIONS, space, words, camera)
     shaken(plain, seed)
-    packed = copy.deepcopy(plain)
-    pack(packed)
-    return plain, packed
+    compiled = copy.deepcopy(plain)
+    compile_parts(compiled)
+    return plain, compiled
 
 
 def random_tree(random: np.random.Generator, nodes: int) -> Draft:
@@ -129,12 +129,12 @@ def passes(trunk: Trunk, x: torch.Tensor, prompt: int, tree: Draft) -> list[torc
     batch=st.integers(1, 3),
 )
 def test_the_packed_trunk_is_the_trunk(seed, layers, heads, channels, prompt, nodes, batch):
-    plain, packed = both_trunks(seed, layers, heads, channels)
+    plain, compiled = both_trunks(seed, layers, heads, channels)
     tree = random_tree(np.random.default_rng(seed), nodes)
     x = torch.randn(batch, prompt + nodes + 3, heads * channels)
     before = x.clone()
     with torch.inference_mode():
-        outputs = [passes(trunk, x, prompt, tree) for trunk in (plain, packed)]
+        outputs = [passes(trunk, x, prompt, tree) for trunk in (plain, compiled)]
     assert all(close(a, b) for a, b in zip(*outputs, strict=True))
     assert torch.equal(x, before)  # the caller's tensor is left alone
 
@@ -151,39 +151,39 @@ def test_the_packed_trunk_is_the_trunk(seed, layers, heads, channels, prompt, no
 )
 def test_the_packed_prompt_is_the_prompt(seed, grid, keypoints, channels, norm, space, views):
     camera, sizes = "+".join(["corner4", "gripperPOV:75", "corner4:25"][:views]), {"grid": grid, "keypoints": keypoints}
-    plain, packed = both_targets("vision", seed, space, camera, **sizes, channels=channels, norm=norm)
-    assert packed.vision.packed is not None
+    plain, compiled = both_targets("vision", seed, space, camera, **sizes, channels=channels, norm=norm)
+    assert compiled.vision.compiled is not None
     random = np.random.default_rng(seed)
     frame = random.integers(0, 256, (48, 48 * views, 3), dtype=np.uint8)
     felt = random.normal(0, 0.2, len(space.proprioception))
     shown = Observation(felt, np.zeros(space.state), "open the drawer", {camera: frame})
     with torch.inference_mode():
-        a, b = (t.encode_batch(t.inputs(shown)) for t in (plain, packed))
+        a, b = (t.encode_batch(t.inputs(shown)) for t in (plain, compiled))
     assert close(a[0], b[0])
     assert close(a[1], b[1])
 
 
 def test_a_sharp_temperature_does_not_overflow():
-    plain, packed = both_targets("vision", 3)
-    for target in (plain, packed):
+    plain, compiled = both_targets("vision", 3)
+    for target in (plain, compiled):
         target.vision.temperature.data.fill_(1e4)
-    pack(packed)
+    compile_parts(compiled)
     images = torch.randint(0, 256, (1, 3, 48, 48), dtype=torch.uint8)
     with torch.inference_mode():
-        points = packed.vision(images)[1]
+        points = compiled.vision(images)[1]
         assert torch.isfinite(points).all()
         assert torch.allclose(points, plain.vision(images)[1], atol=1e-2)
 
 
 @pytest.mark.parametrize("observation", ["vision", "state"])
 def test_batches_and_teacher_forcing_agree(observation):
-    plain, packed = both_targets(observation, 5)
+    plain, compiled = both_targets(observation, 5)
     images = torch.randint(0, 256, (3, 3, 48, 48), dtype=torch.uint8) if observation == "vision" else None
     words = torch.ones(3, plain.settings.instruction_tokens).long()
     inputs = Inputs(images, torch.randn(3, 4) * 0.1, torch.randn(3, 39) * 0.1, words)
     tokens = torch.randint(0, ACTIONS.tokens, (3, plain.chunk * ACTIONS.dofs))
     with torch.inference_mode():
-        assert close(plain.teacher_forced(inputs, tokens)[0], packed.teacher_forced(inputs, tokens)[0])
+        assert close(plain.teacher_forced(inputs, tokens)[0], compiled.teacher_forced(inputs, tokens)[0])
 
 
 @pytest.mark.parametrize("final_norm", [True, False])
@@ -191,13 +191,13 @@ def test_the_drafter_is_packed_too(final_norm):
     target, _ = both_targets("state", 1)
     plain = shaken(EagleDrafter().network(DrafterSettings(final_norm=final_norm), target), 1)
     assert any(name.startswith("norm.") for name in plain.state_dict()) == final_norm
-    packed = copy.deepcopy(plain)
-    pack(packed)
-    assert packed.packed is not None
+    compiled = copy.deepcopy(plain)
+    compile_parts(compiled)
+    assert compiled.compiled is not None
     following, hidden = torch.randn(1, 9, 32), torch.randn(1, 9, 32)
     with torch.inference_mode():
         outputs = []
-        for drafter in (plain, packed):
+        for drafter in (plain, compiled):
             cache = drafter.new_cache(1, 9)
             first = drafter(following[:, :8], hidden[:, :8], torch.arange(8), cache)
             outputs.append(torch.cat([first, drafter(following[:, 8:], hidden[:, 8:], torch.tensor([8]), cache)], 1))
@@ -223,8 +223,8 @@ def test_the_compiled_tree_is_the_tree(seed, depth, top_k, nodes, equal):
         rows = torch.randn(255, 32, generator=torch.Generator().manual_seed(seed)) * 0.3
         part.weight.data.copy_(rows[torch.arange(255) // equal * equal])
     drafter = shaken(EagleDrafter().network(DrafterSettings(), target), seed)
-    pack(target)
-    pack(drafter)
+    compile_parts(target)
+    compile_parts(drafter)
     proposer = DrafterProposer(drafter, target, depth, top_k, nodes)
     drafts = []
     with torch.inference_mode():
@@ -263,20 +263,20 @@ def test_packed_weights_never_outlive_their_weights():
         lambda m: m.to(torch.float64),
         lambda m: m.requires_grad_(True),
     ):
-        _, packed = both_targets("vision", 4)
-        change(packed)
-        assert all(getattr(part, "packed", None) is None for part in packed.modules())
-    plain, packed = both_targets("vision", 4)
-    for twin in (copy.deepcopy(packed), pickle.loads(pickle.dumps(packed.trunk))):
-        assert all(getattr(part, "packed", None) is None for part in twin.modules())
-    assert packed.state_dict().keys() == plain.state_dict().keys()
+        _, compiled = both_targets("vision", 4)
+        change(compiled)
+        assert all(getattr(part, "compiled", None) is None for part in compiled.modules())
+    plain, compiled = both_targets("vision", 4)
+    for twin in (copy.deepcopy(compiled), pickle.loads(pickle.dumps(compiled.trunk))):
+        assert all(getattr(part, "compiled", None) is None for part in twin.modules())
+    assert compiled.state_dict().keys() == plain.state_dict().keys()
 
 
 def test_what_trains_is_not_packed_and_gets_its_gradients():
     _, frozen = both_trunks(6, 1, 2, 8)
     learning = copy.deepcopy(frozen).requires_grad_(True)
-    pack(learning)
-    assert learning.packed is None
+    compile_parts(learning)
+    assert learning.compiled is None
     learning(torch.randn(1, 4, 16), torch.arange(4)).sum().backward()
     assert learning.layers[0].qkv.weight.grad is not None
     x = torch.randn(1, 4, 16, requires_grad=True)
@@ -312,13 +312,13 @@ def test_a_row_has_the_same_bits_alone_and_among_many(seed):
 def test_weights_stay_as_they_are_stored(stored):
     plain, _ = both_trunks(2, 1, 2, 32)
     plain.load_state_dict(expanded(compact(plain.state_dict(), stored)))
-    packed = copy.deepcopy(plain)
-    pack(packed)
+    compiled = copy.deepcopy(plain)
+    compile_parts(compiled)
     x, positions = torch.randn(1, 5, 64), torch.arange(5)
-    sizes = {matrix.values.dtype.itemsize for matrix in packed.packed.matrices}
+    sizes = {matrix.values.dtype.itemsize for matrix in compiled.compiled.matrices}
     assert sizes == ({1} if stored == "int8" else {2 if kernels().EXPANDS_HALF else 4})
     with torch.inference_mode():
-        assert close(plain(x, positions), packed(x, positions))
+        assert close(plain(x, positions), compiled(x, positions))
 
 
 def test_a_join_of_two_values_is_copied_together():
@@ -334,18 +334,18 @@ needs_bfloat16 = pytest.mark.skipif(not multiplies_bfloat16(), reason="this CPU 
 
 @pytest.fixture(scope="module", params=["in the program", "by oneDNN"])
 def trunks(request):
-    """The exact trunk of bfloat16 weights, in float32, and the packed one."""
+    """The exact trunk of bfloat16 weights, in float32, and the compiled one."""
     torch.manual_seed(3)
     trunk = Trunk(128, 3, 4, 320).eval().requires_grad_(False)
     for parameter in trunk.parameters():
         parameter.data = 0.1 * torch.randn_like(parameter) if parameter.dim() == 2 else 1 + 0.3 * torch.rand(128)
-    packed = trunk.bfloat16()
-    exact = copy.deepcopy(packed).float()
+    compiled = trunk.bfloat16()
+    exact = copy.deepcopy(compiled).float()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(program, "LARGE", 0 if request.param == "by oneDNN" else 2**30)
-        pack(packed)
-    assert bool(packed.packed.blocked) == (request.param == "by oneDNN")
-    return exact, packed
+        compile_parts(compiled)
+    assert bool(compiled.compiled.blocked) == (request.param == "by oneDNN")
+    return exact, compiled
 
 
 @needs_bfloat16
@@ -354,27 +354,27 @@ def test_the_packed_trunk_of_bfloat16_weights_is_the_trunk_up_to_its_rounding(tr
     tree, x = Draft.of(range(6), [-1, -1, 0, 1, 3, 2]), torch.randn(1, 32, 128).bfloat16()
     with torch.inference_mode():
         outputs = (passes(trunk, x.to(trunk.norm.weight.dtype), prompt, tree) for trunk in trunks)
-        for exact, packed in zip(*outputs, strict=True):
-            assert packed.dtype == torch.bfloat16
-            assert (packed.float() - exact).abs().mean() < 0.02 * exact.abs().mean()
+        for exact, compiled in zip(*outputs, strict=True):
+            assert compiled.dtype == torch.bfloat16
+            assert (compiled.float() - exact).abs().mean() < 0.02 * exact.abs().mean()
         batch = x[:, :10].view(2, 5, -1)
-        exact, packed = (trunk(batch.to(trunk.norm.weight.dtype), torch.arange(5)).float() for trunk in trunks)
-        assert (packed - exact).abs().mean() < 0.02 * exact.abs().mean()
-    assert copy.deepcopy(trunks[1]).packed is None, "oneDNN's layouts cannot be copied"
+        exact, compiled = (trunk(batch.to(trunk.norm.weight.dtype), torch.arange(5)).float() for trunk in trunks)
+        assert (compiled - exact).abs().mean() < 0.02 * exact.abs().mean()
+    assert copy.deepcopy(trunks[1]).compiled is None, "oneDNN's layouts cannot be copied"
 
 
 @needs_bfloat16
 def test_one_verification_and_single_tokens_agree_but_for_ties(trunks):
     """Where their argmax differs, the two best logits lie within bfloat16's rounding: no other cause is allowed."""
-    packed, head = trunks[1], torch.randn(50, 128)
+    compiled, head = trunks[1], torch.randn(50, 128)
     x, differ = torch.randn(1, 36, 128).bfloat16(), 0
     with torch.inference_mode():
-        caches = [packed.new_cache(1, 40) for _ in range(2)]
+        caches = [compiled.new_cache(1, 40) for _ in range(2)]
         for cache in caches:
-            packed(x[:, :20], torch.arange(20), cache)
-        together = packed(x[:, 20:], torch.arange(20, 36), caches[0]).float()[0] @ head.T
+            compiled(x[:, :20], torch.arange(20), cache)
+        together = compiled(x[:, 20:], torch.arange(20, 36), caches[0]).float()[0] @ head.T
         for i in range(16):
-            alone = packed(x[:, 20 + i][:, None], torch.tensor([20 + i]), caches[1]).float()[0, 0] @ head.T
+            alone = compiled(x[:, 20 + i][:, None], torch.tensor([20 + i]), caches[1]).float()[0, 0] @ head.T
             best = np.sort(alone.numpy())[-2:]
             if alone.argmax() != together[i].argmax():
                 differ += 1
@@ -387,8 +387,8 @@ def test_one_verification_and_single_tokens_agree_but_for_ties(trunks):
 def test_tokens_are_the_same_in_one_call_and_in_many_if_onednn_multiplies(monkeypatch):
     monkeypatch.setattr(program, "LARGE", 0)
     target = both_targets("state", 7)[1].bfloat16()
-    pack(target)
-    assert target.packed.step.blocked
+    compile_parts(target)
+    assert target.compiled.step.blocked
     caches, prompt = [target.new_cache(1, 20) for _ in range(2)], torch.randn(1, 6, 32).bfloat16()
     with torch.inference_mode():
         for cache in caches:

@@ -32,7 +32,7 @@ from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.methods.streak import AlwaysSkip, StreakSkip, StreakSkipSettings
 from kerv_cli.report.certificate import folder_of
 from kerv_cli.targets.checkpoint import load_target
-from kerv_cli.targets.compact.packable import pack
+from kerv_cli.targets.compact.compilable import compile_parts
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.settings import PrepareSettings
 
@@ -106,12 +106,12 @@ def test_packed_weights_give_the_same_draft(target, scout, views):
                 part.weight.normal_(0, 0.3)
     with torch.inference_mode():
         plain, places = made(inputs)
-        pack(made)
-        assert made.packed is not None
-        packed, again = made(inputs)
+        compile_parts(made)
+        assert made.compiled is not None
+        compiled, again = made(inputs)
         other = made(dataclasses.replace(inputs, images=255 - inputs.images))[0]
-        assert (other - packed).abs().max() > 10 * (packed - plain).abs().max()  # it reads the image
-    assert torch.allclose(packed, plain, rtol=1e-3, atol=1e-3)
+        assert (other - compiled).abs().max() > 10 * (compiled - plain).abs().max()  # it reads the image
+    assert torch.allclose(compiled, plain, rtol=1e-3, atol=1e-3)
     assert torch.allclose(again, places, atol=1e-4)
 
 

@@ -20,7 +20,7 @@ from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import EagleDrafter, EagleNetwork
 from kerv_cli.methods.settings import PolicySettings
-from kerv_cli.targets.compact.packable import pack
+from kerv_cli.targets.compact.compilable import compile_parts
 from kerv_cli.targets.compact.program import stored_bytes
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
@@ -104,7 +104,7 @@ def random_target(shape: TargetSettings, device: torch.device, dtype: torch.dtyp
         target.trunk.layers.append(layer.half().to(dtype))
     target.settings, target.trunk.depth = shape, shape.layers
     target.eval().requires_grad_(False)
-    pack(target)
+    compile_parts(target)
     return target
 
 
@@ -169,7 +169,7 @@ def shape_of(name: str, tokens: int) -> TargetSettings:
 def _drafter(target: ReadableTarget) -> EagleNetwork:
     drafter = EagleDrafter().network(DrafterSettings(), target).to(device=target.device, dtype=target.dtype)
     drafter.eval().requires_grad_(False)
-    pack(drafter)
+    compile_parts(drafter)
     return drafter
 
 

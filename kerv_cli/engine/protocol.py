@@ -5,7 +5,7 @@ Shapes: B sequences in the batch (1 while decoding), P prompt tokens, T new toke
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -141,6 +141,26 @@ class PredictsTokens(Protocol):
         Returns:
             The most probable token after each new token, (T,) int64, and their hidden states (1, T, E).
         """
+
+
+@runtime_checkable
+class JoinsDrafters(Protocol):
+    """A target that can run its layers together with a drafter's, and whose enlargement a drafter can follow."""
+
+    def join(self, function: Callable[..., Any], *shapes: tuple[int, ...], repeats: bool = False) -> Any:
+        """Compile a function that calls modules of the target and of a compiled drafter.
+
+        Args:
+            function: The function, of float32 tensors of batch size 1.
+            shapes: Shape of each of its inputs.
+            repeats: Whether its outputs can be its next inputs.
+
+        Returns:
+            The compiled program. None if the target is not compiled.
+        """
+
+    def enlarge(self, drafter: nn.Module) -> None:
+        """Enlarge a drafter as the target was enlarged. Does nothing for any other target."""
 
 
 class ReadableTarget(Target, Protocol):

@@ -18,7 +18,7 @@ from kerv_cli.engine.proposer import Proposer
 from kerv_cli.methods.artifacts import Artifact, Artifacts, MadeFor, removal
 from kerv_cli.methods.context import Context
 from kerv_cli.targets import checkpoint
-from kerv_cli.targets.compact.packable import load_packed
+from kerv_cli.targets.compact.compilable import load_compiled
 from kerv_cli.targets.observations import Rows, observed_steps, split
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.files import DemoEpisode
@@ -187,7 +187,7 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         """Load the network with frozen weights, on the target's device and in the target's number format."""
         target, description = artifacts.target, self.checked(path, artifacts.description)
         settings = read(self.settings, description.settings, f"the {self.noun}'s settings", tolerant=True)
-        return load_packed(self.network(settings, target), path, self.kind, target.device, target.dtype)
+        return load_compiled(self.network(settings, target), path, self.kind, target.device, target.dtype)
 
     def digest(self, path: Path, description: DrafterDescription) -> str:
         """Return the hash of the weights."""

@@ -10,6 +10,7 @@ weights are made when it is loaded.
 from __future__ import annotations
 
 import copy
+import functools
 import hashlib
 import json
 from dataclasses import asdict, dataclass, replace
@@ -25,8 +26,8 @@ from kerv_cli.base.manifests import read
 from kerv_cli.base.places import artifact
 from kerv_cli.targets import checkpoint
 from kerv_cli.targets.checkpoint import TargetDescription
+from kerv_cli.targets.compact.compilable import compile_parts
 from kerv_cli.targets.compact.folder import build as build_compact
-from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import Layer, LayerStack, Rotary
 from kerv_cli.targets.folders import find_target
@@ -61,7 +62,7 @@ def grow_stack(stack: LayerStack, shape: GrowSettings, layers: int) -> None:
         UsageError: The new shape is smaller, or the channels of a head are no multiple of the old ones.
     """
     old: list[Any] = [copy.deepcopy(layer).float() for layer in stack.layers]
-    stack.packed = None
+    stack.compiled = None
     units, channels = old[0].down.in_features, stack.width // stack.heads
     for name, value, least in (
         ("width", shape.width, stack.width),
@@ -160,9 +161,17 @@ def build(folder: Path, description: TargetDescription, device: str, dtype: torc
     base = Path(recipe.base)
     target = build_compact(base, checkpoint.read_target(base), device, dtype)
     _grow(target, recipe)
-    target.sha256, target.grown_drafter = description.sha256, recipe if recipe.drafter else None
-    pack(target)
+    target.sha256 = description.sha256
+    if recipe.drafter:
+        target.enlarges = functools.partial(_enlarge, recipe=recipe, padding=target.trunk.padding)
+    compile_parts(target)
     return target
+
+
+def _enlarge(drafter: LayerStack, recipe: GrowSettings, padding: int) -> None:
+    grow_stack(drafter, recipe, layers=drafter.depth)
+    drafter.padding = padding
+    compile_parts(drafter)
 
 
 def _grow(target: CompactTarget, shape: GrowSettings) -> None:

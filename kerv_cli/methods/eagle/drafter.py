@@ -29,7 +29,7 @@ from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import HOST, Draft
 from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.proposer import Proposer
-from kerv_cli.engine.protocol import ReadableTarget, Target
+from kerv_cli.engine.protocol import JoinsDrafters, ReadableTarget, Target
 from kerv_cli.engine.transfer import upload
 from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.artifacts import Artifacts
@@ -39,11 +39,8 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.public import PublicDrafter, PublicShape, load_public
 from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.targets.attention import Cache
-from kerv_cli.targets.compact.packable import pack
 from kerv_cli.targets.compact.program import Program
-from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import LayerStack
-from kerv_cli.targets.grown import grow_stack
 from kerv_cli.targets.observations import observations_of, prompts_of
 from kerv_cli.worlds.demos.files import DemoEpisode
 
@@ -88,7 +85,7 @@ class EagleNetwork(LayerStack):
         """
         return self.run((following, hidden), positions, cache, seen)
 
-    def compiled(self, target: Any, tree: bool) -> Program | None:
+    def joined(self, target: Any, tree: bool) -> Any:
         """Return a compiled program that drafts level after level, with the target's embeddings and head.
 
         None if this drafter or the target is not compiled.
@@ -103,8 +100,8 @@ class EagleNetwork(LayerStack):
             token, parent = logits.branch(hidden) if tree else (logits.argmax(-1), hidden)
             return self.recorded(target.embedding(token)[None], parent)
 
-        compiled = isinstance(target, CompactTarget) and target.packed is not None and isinstance(self.packed, Program)
-        return Program(step, (1, 1, self.outer), repeats=True) if compiled else None
+        joins = isinstance(target, JoinsDrafters) and isinstance(self.compiled, Program)
+        return target.join(step, (1, 1, self.outer), repeats=True) if joins else None
 
 
 class DrafterProposer(Proposer):
@@ -127,7 +124,7 @@ class DrafterProposer(Proposer):
         self.depth, self.top_k, self.nodes = depth, min(top_k, target.actions.tokens), nodes
         capacity = target.max_prompt + target.chunk * target.actions.dofs + top_k * depth
         self.cache, self.hidden = drafter.new_cache(1, capacity), torch.empty(0)
-        self.compiled = drafter.compiled(target, top_k > 1) if isinstance(drafter, EagleNetwork) else None
+        self.compiled = drafter.joined(target, top_k > 1) if isinstance(drafter, EagleNetwork) else None
 
     def begin(self, chunk: Chunk) -> None:
         """Let the drafter read the prompt: run it over the prompt's embeddings and the prefill's hidden states."""
@@ -281,11 +278,8 @@ class EagleDrafter(TrainableDrafter):
         if description.public is not None:
             return load_public(path, description.public, artifacts.target)
         network: EagleNetwork = super().load(path, artifacts)
-        target = artifacts.target
-        if isinstance(target, CompactTarget) and target.grown_drafter is not None:
-            grow_stack(network, target.grown_drafter, layers=network.depth)
-            network.padding = target.trunk.padding
-            pack(network)
+        if isinstance(artifacts.target, JoinsDrafters):
+            artifacts.target.enlarge(network)
         return network
 
     @classmethod

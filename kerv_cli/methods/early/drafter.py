@@ -23,14 +23,13 @@ from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.proposer import ChainProposer
-from kerv_cli.engine.protocol import ReadableTarget
+from kerv_cli.engine.protocol import JoinsDrafters, ReadableTarget
 from kerv_cli.engine.transfer import read
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.drafters import Decodes, Metrics, TrainableDrafter
 from kerv_cli.methods.early import EarlySettings
-from kerv_cli.targets.compact.packable import FORMATS, Packable
+from kerv_cli.targets.compact.compilable import FORMATS, Compilable
 from kerv_cli.targets.compact.program import Program
-from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.losses import soft_labels, token_loss
 from kerv_cli.targets.observations import observations_of, prompts_of
 from kerv_cli.worlds.demos.files import DemoEpisode
@@ -58,13 +57,13 @@ class Block(nn.Module):
         return x + self.down(F.silu(gate) * up)
 
 
-class EarlyNetwork(Packable):
+class EarlyNetwork(Compilable):
     """A residual network from the pooled prompt (F features) to the logits of a chunk (N tokens, V bins)."""
 
     mean: Tensor  # (F,) mean of the training features
     scale: Tensor  # (F,) 1 / standard deviation of the training features
     strict: Tensor  # (N,) bool, tokens that must equal the target's, such as the gripper's
-    packed: Program | None
+    compiled: Program | None
 
     def __init__(self, settings: EarlySettings, actions: ActionSpace, chunk: int, features: int) -> None:
         super().__init__()
@@ -80,7 +79,7 @@ class EarlyNetwork(Packable):
         self.spread = nn.Linear(settings.width, self.tokens * settings.rank)
         self.head = nn.Linear(settings.rank, actions.tokens)
 
-    def pack_weights(self) -> Program | None:
+    def new_program(self) -> Program | None:
         """Return the network as a compiled `Program`. None for a number format without kernels."""
         return Program(self.logits, (1, len(self.mean))) if self.mean.dtype in FORMATS else None
 
@@ -91,7 +90,7 @@ class EarlyNetwork(Packable):
 
     def forward(self, features: Tensor) -> Tensor:
         """Return the logits (B, N, V) for pooled prompts (B, F), by the compiled network if there is one."""
-        return self.packed(features)[0] if self.packed and self.is_packed(features) else self.logits(features)
+        return self.compiled(features)[0] if self.compiled and self.runs_compiled(features) else self.logits(features)
 
     def logits(self, features: Tensor) -> Tensor:
         """Return the logits (B, N, V) for pooled prompts (B, F), by the PyTorch modules."""
@@ -184,16 +183,16 @@ class EarlyProposer(ChainProposer):
 
     def compile(self) -> Program | None:
         """Return a program from a radius (1, 1) and a prompt to the result of `row`. None if a part is not compiled."""
-        early, target = self.early, self.target
+        early: Any = self.early
+        target: Any = self.target
 
         def row(radius: Tensor, prompt: Tensor) -> Tensor:
             logits: Any = early.logits(target.pooled(prompt))
             chosen: Tensor = logits.choose(radius, early.strict)
             return chosen
 
-        if not (isinstance(target, CompactTarget) and isinstance(getattr(early, "packed", None), Program)):
-            return None
-        return Program(row, (1, 1), (1, target.max_prompt, target.width))
+        joins = isinstance(target, JoinsDrafters) and isinstance(getattr(early, "compiled", None), Program)
+        return target.join(row, (1, 1), (1, target.max_prompt, target.width)) if joins else None
 
     def drafted(self, chunk: Chunk) -> tuple[list[int], float]:
         """Return the draft of the chunk's N tokens, and the estimated probability that all are accepted."""

@@ -26,8 +26,8 @@ from kerv_cli.methods.context import Context
 from kerv_cli.methods.drafters import Decodes, Metrics
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyNetwork, EarlyProposer
 from kerv_cli.methods.scout import ScoutSettings
+from kerv_cli.targets.compact.compilable import FORMATS, Compilable, wants_gradient
 from kerv_cli.targets.compact.features import hand_features, mlp, scene_features, scene_width
-from kerv_cli.targets.compact.packable import FORMATS, Packable, wants_gradient
 from kerv_cli.targets.compact.program import Program
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.vision import VisionEncoder
@@ -36,14 +36,14 @@ from kerv_cli.targets.observations import BATCH, Observations, read_observations
 from kerv_cli.worlds.demos.files import DemoEpisode
 
 
-class ScoutNetwork(Packable):
+class ScoutNetwork(Compilable):
     """The network from an observation to the logits of a chunk (N tokens, V bins).
 
     It also estimates the positions of the K places: the object and the goal.
     """
 
     centre: Tensor
-    packed: Program | None
+    compiled: Program | None
 
     def __init__(
         self,
@@ -83,8 +83,8 @@ class ScoutNetwork(Packable):
     def forward(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
         """Return the logits (B, N, V), and the estimated positions of the places (B, K, 3), in metres."""
         given = self.views(inputs)
-        if self.packed is not None and not any(map(wants_gradient, given)):
-            logits, places = self.packed(*given)
+        if self.compiled is not None and not any(map(wants_gradient, given)):
+            logits, places = self.compiled(*given)
             return logits, places
         return self.network(*given)
 
@@ -121,7 +121,7 @@ class ScoutNetwork(Packable):
         features, places = self.see(*given)
         return self.drafter.logits(features.to(self.drafter.head.weight.dtype)), places
 
-    def pack_weights(self) -> Program | None:
+    def new_program(self) -> Program | None:
         """Return the network without its vision encoders as a compiled `Program`. None for a format without kernels."""
         return Program(self.network, *self.shapes) if self.cells.weight.dtype in FORMATS else None
 
@@ -151,7 +151,7 @@ class ScoutProposer(EarlyProposer):
             chosen: Tensor = logits.choose(radius, scout.drafter.strict)
             return chosen
 
-        return Program(row, (1, 1), *scout.shapes) if scout.packed is not None else None
+        return Program(row, (1, 1), *scout.shapes) if scout.compiled is not None else None
 
     @torch.inference_mode()
     def row(self, chunk: Chunk, radius: int) -> Tensor:

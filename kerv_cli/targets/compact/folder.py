@@ -11,7 +11,7 @@ import torch
 
 from kerv_cli.base.manifests import read
 from kerv_cli.targets.checkpoint import FLOAT32, TargetDescription, save_module, target_fields
-from kerv_cli.targets.compact.packable import load_packed
+from kerv_cli.targets.compact.compilable import load_compiled
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
@@ -60,4 +60,4 @@ def build(folder: Path, description: TargetDescription, device: str, dtype: torc
     words = WordTokenizer(description.words)
     target = CompactTarget(settings, description.actions, description.observation, words, camera)
     target.sha256 = description.sha256
-    return load_packed(target, folder, "target", device, dtype)
+    return load_compiled(target, folder, "target", device, dtype)

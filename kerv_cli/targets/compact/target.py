@@ -16,7 +16,7 @@ tokens of a chunk, V action tokens, E width.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -28,6 +28,7 @@ from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
 from kerv_cli.engine.transfer import upload
 from kerv_cli.targets.attention import Cache, attention_mask
+from kerv_cli.targets.compact.compilable import FORMATS, Compilable, CompilableLinear, wants_gradient
 from kerv_cli.targets.compact.features import (
     hand_features,
     mlp,
@@ -37,7 +38,6 @@ from kerv_cli.targets.compact.features import (
     scene_features,
     scene_width,
 )
-from kerv_cli.targets.compact.packable import FORMATS, Packable, PackableLinear, wants_gradient
 from kerv_cli.targets.compact.program import Program
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.text import WordTokenizer
@@ -63,7 +63,7 @@ class Inputs:
     words: Tensor
 
 
-class Compiled(NamedTuple):
+class Programs(NamedTuple):
     """The compiled programs of a target. A copied or pickled target holds None instead of them.
 
     Attributes:
@@ -78,7 +78,7 @@ class Compiled(NamedTuple):
         return type(None), ()
 
 
-class CompactTarget(Packable):
+class CompactTarget(Compilable):
     """The compact policy: encoders, trunk and head. Implements the protocol `ReadableTarget`.
 
     Args:
@@ -98,14 +98,14 @@ class CompactTarget(Packable):
         width: E, width of the embeddings and hidden states.
         heads: Number of attention heads of a layer, also in a drafter's layers.
         feed_forward: Number of hidden units of a layer, also in a drafter's layers.
-        grown_drafter: Shape of the drafter if the target was enlarged together with it (docs/methods.md §0.2), else
-            None.
+        enlarges: Function that enlarges a drafter, if the target was enlarged together with one (docs/methods.md §0.2).
+            None for any other target.
         hand_and_object: Positions (3,) in metres of the hand and the object in the last observation that `encode` read.
             A vision policy estimates the object's. None: nothing was read.
     """
 
     centre: Tensor
-    packed: Compiled | None
+    compiled: Programs | None
 
     def __init__(
         self,
@@ -118,7 +118,7 @@ class CompactTarget(Packable):
         super().__init__()
         s = self.settings = settings
         self.actions, self.observation, self.words, self.sha256 = actions, observation, words, ""
-        self.grown_drafter: Any = None
+        self.enlarges: Callable[[Any], None] | None = None
         self.hand_and_object: tuple[Tensor, Tensor] | None = None
         self.chunk, self.parallel = s.chunk, s.parallel
         self.width, self.heads, self.feed_forward = s.width, s.heads, s.feed_forward
@@ -140,7 +140,7 @@ class CompactTarget(Packable):
             self.further_views = nn.ModuleList(VisionEncoder(*shapes) for _ in range(views - 1))
             self.locate = mlp(2 * s.keypoints * views + p + s.width, 256, 128, 3 * places)
         self.trunk = Trunk(s.width, s.layers, s.heads, s.feed_forward)
-        self.head = PackableLinear(s.width, actions.tokens, bias=False)
+        self.head = CompilableLinear(s.width, actions.tokens, bias=False)
         nn.init.normal_(self.head.weight, std=0.02)
         if s.parallel:
             queries = self.embedding.weight.data.mean(0).repeat(s.chunk * actions.dofs, 1)
@@ -244,8 +244,8 @@ class CompactTarget(Packable):
             images = inputs.images.split(self.settings.image_size, -1)
             views = [encoder(image) for encoder, image in zip(self.encoders, images, strict=True)]
             given[2:] = torch.cat([tokens for tokens, _ in views], 1), torch.cat([points for _, points in views], -1)
-        if self.packed is not None and not any(map(wants_gradient, given)):
-            prompt, places = self.packed.prompt(*given)
+        if self.compiled is not None and not any(map(wants_gradient, given)):
+            prompt, places = self.compiled.prompt(*given)
             return prompt.to(self.dtype), places
         return self.prompt(*given)
 
@@ -288,7 +288,7 @@ class CompactTarget(Packable):
             located = self.locate(features)
         return located.to(torch.float32).unflatten(-1, (-1, 3)) * 0.1 + self.centre
 
-    def pack_weights(self) -> Compiled | None:
+    def new_program(self) -> Programs | None:
         """Return compiled programs that encode a prompt and decode tokens. None for a format without kernels."""
         if self.dtype not in FORMATS:
             return None
@@ -304,7 +304,16 @@ class CompactTarget(Packable):
             hidden = self.trunk.recorded(self.embedding(token))
             return self.head(hidden).argmax(-1)[None], hidden
 
-        return Compiled(Program(self.prompt, *shapes), Program(step, (1, 1), repeats=True))
+        return Programs(Program(self.prompt, *shapes), Program(step, (1, 1), repeats=True))
+
+    def join(self, function: Callable[..., Any], *shapes: tuple[int, ...], repeats: bool = False) -> Program | None:
+        """Compile a function of the target's and a drafter's modules; see `JoinsDrafters.join`."""
+        return Program(function, *shapes, repeats=repeats) if self.compiled is not None else None
+
+    def enlarge(self, drafter: Any) -> None:
+        """Enlarge a drafter as this target was enlarged, if it was; see `JoinsDrafters.enlarge`."""
+        if self.enlarges is not None:
+            self.enlarges(drafter)
 
     def embed(self, tokens: Tensor) -> Tensor:
         """Return the embeddings (B, T, E) of action tokens (B, T) int64."""
@@ -331,9 +340,9 @@ class CompactTarget(Packable):
         Returns:
             The tokens. None if this target is not compiled.
         """
-        if self.packed is None or cache.fixed:
+        if self.compiled is None or cache.fixed:
             return None
-        tokens = self.packed.step.repeat(count, torch.tensor([[token]]), cache=cache)
+        tokens = self.compiled.step.repeat(count, torch.tensor([[token]]), cache=cache)
         cache.length += count
         return [int(token) for token in tokens[:, 0]]
 
@@ -344,11 +353,11 @@ class CompactTarget(Packable):
 
         A compiled target needs one call for it. The other arguments are those of `Trunk.forward`.
         """
-        if self.packed is None or cache.fixed:
+        if self.compiled is None or cache.fixed:
             hidden = self(self.embed(tokens[None]), positions, cache, seen)
             return self.head(hidden[0]).argmax(-1), hidden
         mask = attention_mask(seen, len(tokens), cache, self.head.weight)
-        found, hidden = self.packed.step(tokens, positions=positions, cache=cache, mask=mask)
+        found, hidden = self.compiled.step(tokens, positions=positions, cache=cache, mask=mask)
         cache.length += len(tokens)
         return found[:, 0].long(), hidden.view(1, len(tokens), -1).to(self.dtype)
 

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from kerv_cli.engine.transfer import upload
 from kerv_cli.targets.attention import Cache, CapturedCache, Slots, attend, attention_mask, rotate
-from kerv_cli.targets.compact.packable import FORMATS, Packable, wants_gradient
+from kerv_cli.targets.compact.compilable import FORMATS, Compilable, wants_gradient
 from kerv_cli.targets.compact.program import Program
 
 POSITIONS, BASE = 1024, 10_000.0  # of the rotary embedding: number of positions, base of the frequencies
@@ -87,7 +87,7 @@ class Layer(nn.Module):
         return x + self.down(F.silu(gate) * up)
 
 
-class LayerStack(Packable):
+class LayerStack(Compilable):
     """Base class of the trunk and the drafter: an input step, decoder layers and, usually, a final norm.
 
     Attributes:
@@ -137,14 +137,14 @@ class LayerStack(Packable):
             fixed: Whether every forward attends to all slots, so that its shapes are fixed. None: only on CUDA.
         """
         like = self.weight
-        if self.packed is not None:
+        if self.compiled is not None:
             like = like.float()
         sizes = self.depth, batch, self.heads, capacity + self.padding, self.width // self.heads
         fixed = like.is_cuda if fixed is None else fixed
         return CapturedCache(*sizes, like) if fixed else Cache(*sizes, like)
 
-    def pack_weights(self) -> Program | None:
-        """Compile the stack for a CPU. `pack` calls this. Returns None for a number format without kernels."""
+    def new_program(self) -> Program | None:
+        """Compile the stack for a CPU. `compile_parts` calls this. Returns None for a number format without kernels."""
         compiles = self.weight.dtype in FORMATS
         return Program(self.recorded, *[(1, 1, self.outer)] * self.inputs) if compiles else None
 
@@ -169,9 +169,9 @@ class LayerStack(Packable):
                 seen = F.pad(F.pad(seen, (0, padding)), (0, 0, 0, padding), value=True)
         x = inputs[0]
         mask = attention_mask(seen, x.shape[1], cache, x)
-        packed = self.packed if self.is_packed(x) and (cache is None or not cache.fixed) else None
-        if isinstance(packed, Program):
-            hidden = packed(*inputs, positions=positions, cache=cache, mask=mask)[0].view(x.shape).to(x.dtype)
+        compiled = self.compiled if self.runs_compiled(x) and (cache is None or not cache.fixed) else None
+        if isinstance(compiled, Program):
+            hidden = compiled(*inputs, positions=positions, cache=cache, mask=mask)[0].view(x.shape).to(x.dtype)
         elif isinstance(cache, CapturedCache) and self.captures(x):
             assert mask is not None
             hidden = self.finish(cache.run(self.run_layers, self.begin(*inputs), positions, mask))

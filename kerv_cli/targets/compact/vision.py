@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.targets.compact.packable import Packable
+from kerv_cli.targets.compact.compilable import Compilable
 
 
 class Residual(nn.Module):
@@ -40,7 +40,7 @@ class Residual(nn.Module):
         return x + self.second(F.relu(self.first(self.norm(x))))
 
 
-class VisionEncoder(Packable):
+class VisionEncoder(Compilable):
     """The vision encoder of one camera view (docs/methods.md §0.1).
 
     Args:
@@ -53,7 +53,7 @@ class VisionEncoder(Packable):
     """
 
     columns: Tensor
-    packed: Callable[[Tensor], list[Tensor]] | None
+    compiled: Callable[[Tensor], list[Tensor]] | None
 
     def __init__(self, size: int, grid: int, keypoints: int, channels: int, width: int, norm: str = "group") -> None:
         super().__init__()
@@ -69,14 +69,14 @@ class VisionEncoder(Packable):
         self.temperature = nn.Parameter(torch.ones(keypoints) * 2.0)
         self.register_buffer("columns", torch.linspace(-1, 1, size // 2), persistent=False)
 
-    def pack_weights(self) -> Callable[[Tensor], list[Tensor]] | None:
+    def new_program(self) -> Callable[[Tensor], list[Tensor]] | None:
         """Return this encoder as a `PackedVision`, which encodes single images. None if the weights are not float32."""
         return PackedVision(self, 2 * len(self.columns)) if self.columns.dtype == torch.float32 else None
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Return vision tokens (B, grid², E) and image points (B, 2K) in [-1, 1] of images (B, 3, size, size) uint8."""
-        if self.packed is not None and len(images) == 1:
-            tokens, points = self.packed(images)
+        if self.compiled is not None and len(images) == 1:
+            tokens, points = self.compiled(images)
             return tokens, points
         images = images.to(self.patch.weight.dtype) / 255.0 - 0.5
         fine = self.fine(images)

@@ -1,4 +1,4 @@
-"""Modules that can be compiled for a CPU, and `pack`, which compiles them when their weights are final."""
+"""Modules that can be compiled for a CPU, and `compile_parts`, which compiles them when their weights are final."""
 
 from __future__ import annotations
 
@@ -22,70 +22,71 @@ def wants_gradient(x: Tensor) -> bool:
     return x.requires_grad and torch.is_grad_enabled()
 
 
-class Packable(nn.Module):
+class Compilable(nn.Module):
     """A module that can be compiled for a CPU while its weights are frozen.
 
     Moving the module, loading weights into it or unfreezing it discards the compiled form, and torch computes as usual.
-    After changing weights in any other way (`parameter.data`, a submodule's own `load_state_dict`), call `pack` again.
+    After changing weights in any other way (`parameter.data`, a submodule's own `load_state_dict`), call
+    `compile_parts` again.
 
     Attributes:
-        packed: The compiled form. None if there is none.
+        compiled: The compiled form. None if there is none.
     """
 
-    packed: Any = None
+    compiled: Any = None
 
-    def pack_weights(self) -> Any:
-        """Return the compiled form of this module, which `pack` stores in `packed`. None if it cannot be compiled."""
+    def new_program(self) -> Any:
+        """Return the compiled form of this module, for `compile_parts`. None if it cannot be compiled."""
         return None
 
-    def is_packed(self, x: Tensor) -> bool:
+    def runs_compiled(self, x: Tensor) -> bool:
         """Return whether to use the compiled form for the input `x`: it exists, and no gradients are needed."""
-        return self.packed is not None and isinstance(x, Tensor) and not wants_gradient(x)
+        return self.compiled is not None and isinstance(x, Tensor) and not wants_gradient(x)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        self.packed = None
+        self.compiled = None
         return super()._apply(fn, recurse)
 
     def _load_from_state_dict(self, *arguments: Any, **keywords: Any) -> None:
-        self.packed = None
+        self.compiled = None
         super()._load_from_state_dict(*arguments, **keywords)
 
     def requires_grad_(self, requires_grad: bool = True) -> Self:
         """Freeze or unfreeze all parameters. Unfreezing discards the compiled form of every submodule, too."""
         for part in self.modules():
-            if requires_grad and isinstance(part, Packable):
-                part.packed = None
+            if requires_grad and isinstance(part, Compilable):
+                part.compiled = None
         return super().requires_grad_(requires_grad)
 
 
-class PackableLinear(Packable, nn.Linear):
+class CompilableLinear(Compilable, nn.Linear):
     """A linear layer that is compiled by itself, not as a part of a larger module. An example is an output head."""
 
-    def pack_weights(self) -> Any:
+    def new_program(self) -> Any:
         """Return the layer as a compiled `Program`. None for a number format without kernels."""
         return Program(super().forward, (1, self.in_features)) if self.weight.dtype in FORMATS else None
 
     def forward(self, x: Tensor) -> Tensor:
         """Map inputs (…, in_features) to outputs (…, out_features). Those of the compiled form are float32."""
-        return self.packed(x)[0].view(*x.shape[:-1], -1) if self.is_packed(x) else super().forward(x)
+        return self.compiled(x)[0].view(*x.shape[:-1], -1) if self.runs_compiled(x) else super().forward(x)
 
 
-def pack(module: nn.Module) -> None:
-    """Compile every `Packable` submodule of a module, and store the compiled form in its `packed`.
+def compile_parts(module: nn.Module) -> None:
+    """Compile every `Compilable` submodule of a module, and store the compiled form in its `compiled`.
 
     Nothing happens unless all parameters are frozen, on a CPU and in one number format.
     """
     parameters = list(module.parameters())
     if all(p.device.type == "cpu" and p.dtype == parameters[0].dtype and not p.requires_grad for p in parameters):
         forget(module)
-        parts = [part for part in module.modules() if isinstance(part, Packable)]
+        parts = [part for part in module.modules() if isinstance(part, Compilable)]
         for part in parts:
-            part.packed = None
+            part.compiled = None
         for part in parts:
-            part.packed = part.pack_weights()
+            part.compiled = part.new_program()
 
 
-def load_packed(module: M, folder: Path, kind: str, device: str | torch.device, dtype: torch.dtype) -> M:
+def load_compiled(module: M, folder: Path, kind: str, device: str | torch.device, dtype: torch.dtype) -> M:
     """Load the weights in a folder into a module. Move it to a device, freeze it, and on a CPU compile it.
 
     Args:
@@ -100,5 +101,5 @@ def load_packed(module: M, folder: Path, kind: str, device: str | torch.device, 
     """
     load_state(module, folder, kind)
     module = module.to(device=device, dtype=dtype).eval().requires_grad_(False)
-    pack(module)
+    compile_parts(module)
     return module
