@@ -24,7 +24,7 @@ from kerv_cli.episodes.resolve import resolve, resolve_rollout, study_name
 from kerv_cli.lab.command import chosen_store
 from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import ROLLOUT, StudyStore
-from kerv_cli.lab.study import plan, plan_rollout, run
+from kerv_cli.lab.study import plan, run
 from kerv_cli.report.report import report as write_reports
 from kerv_cli.report.results import Row, averaged, frame_of
 from kerv_cli.report.tables import load_study as load_data
@@ -111,7 +111,8 @@ def rollout(*overrides: str, grid: bool = False, **settings: object) -> Study:
     """
     with chosen_store(as_overrides(*overrides, **settings)) as typed:
         resolved = resolve_rollout(typed, grid)
-        planned = plan_rollout(resolved, opened(resolved.first.results), ["rollout", *(["-m"] if grid else []), *typed])
+        command = ["rollout", *(["-m"] if grid else []), *typed]
+        planned = plan(resolved, opened(resolved.first.results), command, ROLLOUT)
         run(planned, save=save_recording)
     return Study(planned.store)
 

@@ -32,14 +32,13 @@ from kerv_cli.base.errors import KervError, StorageError, UsageError
 from kerv_cli.base.registry import _PARTS, parts
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.cli.common import progress_bar
-from kerv_cli.cli.studies import event_printer
+from kerv_cli.cli.studies import event_printer, warnings_about
 from kerv_cli.lab.database import EPISODES, QUEUE, WANTED, Database, clock, opened
 from kerv_cli.lab.events import BlockStarted, EpisodeEnd, Event, Preparing, SettingFailed, Started
 from kerv_cli.lab.plan import Study, blocks_of
 from kerv_cli.lab.progress import TimeLeft
 from kerv_cli.lab.queue import ClaimLost, Queue, enqueue
 from kerv_cli.lab.store import StudyStore, plan_study
-from kerv_cli.lab.study import warnings_about
 from kerv_cli.lab.work import work
 from kerv_cli.lab.workers import LocalWorkers, gpus_in_turn
 from kerv_cli.report.tables import further_of, load_study
@@ -205,6 +204,35 @@ def waiting(database: Database, study: Study, run: str = "run") -> StudyStore:
     plan = plan_study(database, study)
     enqueue(plan, run)
     return plan.store
+
+
+def test_an_episode_takes_one_transaction(tmp_path, monkeypatch):
+    """Nor is SQLite's log flushed to the disk after each."""
+    store, begun = waiting(Database(tmp_path), STUDY), []
+    writing = Database.writing
+    monkeypatch.setattr(Database, "writing", lambda self: begun.append(1) or writing(self))
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, EpisodeEnd):
+            assert (tmp_path / "kerv.db-wal").exists()
+
+    work(Queue(store), episodes_of, on_event)
+    assert store.counts() == (16, 16)
+    # two claims, of which the second removes the block; four settings are prepared, and the first episode begins
+    assert len(begun) <= 16 + 2 + 4 + 1
+
+
+def test_a_worker_whose_claim_lapsed_unnoticed_runs_the_block_anew(database):
+    store, lapsed = waiting(database, STUDY), []
+
+    def lapse(event: Event) -> None:
+        if isinstance(event, EpisodeEnd) and not lapsed:
+            lapsed.append(event)
+            with database.writing() as connection:
+                connection.execute(sa.update(QUEUE).values(heartbeat=0.0))
+
+    work(Queue(store), episodes_of, lapse)
+    assert (store.counts(), queued(database), episodes(database)) == ((16, 16), 0, 16)
 
 
 @pytest.mark.parametrize(("silent", "is_held"), [(25.0, True), (35.0, False)])
@@ -494,7 +522,7 @@ def test_progress_without_a_terminal_is_plain_lines(tmp_path, capsys):
 def test_progress_begins_before_the_first_episode(tmp_path, capsys):
     study = threshold_study(["reach-v3"], episodes=26)
     planned = plan_study(Database(tmp_path), study)
-    (block, *_), setting = planned.blocks(), study.settings[0]
+    (block, *_), setting = planned.blocks, study.settings[0]
     with progress_bar("episodes", has_estimate=True) as show:
         on_event = event_printer(show, TimeLeft(planned, 60.0))
         for event in (Started(104, 0), BlockStarted(block), Preparing(setting, 1, 4)):

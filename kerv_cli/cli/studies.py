@@ -61,10 +61,11 @@ def planned_study(resolved: ResolvedStudy, command: Sequence[str], is_rollout: b
     typer.echo(f"{what} of {whose} on {_few(tasks, 'tasks')}: {count(number, 'episode')}", err=True)
     from kerv_cli.episodes.tasks import unseen_tasks
     from kerv_cli.lab.database import opened
-    from kerv_cli.lab.study import plan, plan_rollout
+    from kerv_cli.lab.store import ROLLOUT, SWEEP
+    from kerv_cli.lab.study import plan
     from kerv_cli.worlds import spec_of
 
-    planned = (plan_rollout if is_rollout else plan)(resolved, opened(resolved.first.results), command)
+    planned = plan(resolved, opened(resolved.first.results), command, ROLLOUT if is_rollout else SWEEP)
     for target, names in dict.fromkeys((s.policy.target, tuple(unseen_tasks(s, tasks))) for s in settings.values()):
         if names:
             typer.echo(f"kerv: warning: policy {target} was never trained on {', '.join(names)}", err=True)
@@ -102,9 +103,8 @@ def print_study_plan(planned: Plan, as_json: bool, guess: float = SECONDS_PER_EP
         guess: Seconds per episode if none was measured.
     """
     from kerv_cli.lab.progress import TimeLeft
-    from kerv_cli.lab.study import plan_rows, warnings_about
 
-    rows, store, to_run, reused = plan_rows(planned), planned.store, planned.to_run, planned.existing
+    rows, store, to_run, reused = _plan_rows(planned), planned.store, planned.to_run, planned.existing
     left = TimeLeft(planned, guess)
     if as_json:
         end_with_json({"study": store.name, "folder": store.root, "settings": rows, "to run": len(to_run),
@@ -113,6 +113,45 @@ def print_study_plan(planned: Plan, as_json: bool, guess: float = SECONDS_PER_EP
     for warning in warnings_about(planned):
         typer.echo(f"kerv: warning: {warning}", err=True)
     typer.echo(f"{count(len(to_run), 'episode')} to run, {len(reused)} reused, {about(left.seconds, left.source)}")
+
+
+def _plan_rows(planned: Plan) -> list[dict[str, object]]:
+    """Return one table row per setting: numbers of missing and existing episodes, and why episodes will run."""
+    from kerv_cli.lab.plan import seeds_text
+
+    rows: list[dict[str, object]] = []
+    for label in planned.study.labels:
+        episodes = [one for one in planned.study.episodes if one.setting.label == label]
+        reasons = [planned.missing[one] for one in episodes if one in planned.missing]
+        rows.append(
+            {
+                "setting": label,
+                "to run": len(reasons),
+                "reused": len(episodes) - len(reasons),
+                "tasks": len({one.task for one in episodes}),
+                "seeds": seeds_text(one.seed for one in episodes),
+                "repeats": len({one.repeat for one in episodes}),
+                "why": "; ".join(dict.fromkeys(reasons)),
+            }
+        )
+    return rows
+
+
+def warnings_about(planned: Plan) -> list[str]:
+    """Return what disturbs the times of a plan's episodes, a sentence each: workers that share a GPU or a CPU."""
+    from kerv_cli.lab.workers import gpus_in_turn
+
+    runtime = planned.runtime
+    if runtime.workers == 1 or runtime.executor != "local" or all(block.batch > 1 for block in planned.blocks):
+        return []
+    gpus = len(gpus_in_turn(planned.device))
+    if planned.device != "cuda":
+        shared = "share this machine's memory: each needs a core and a memory channel of its own"
+    elif runtime.workers > gpus:
+        shared = f"share {count(gpus, 'GPU')}"
+    else:
+        return []
+    return [f"{runtime.workers} workers measure times and {shared} (docs/scale.md)"]
 
 
 def run_study(planned: Plan, guess: float = SECONDS_PER_EPISODE) -> Outcome:

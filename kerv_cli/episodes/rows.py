@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, fields
+from dataclasses import fields
 from operator import attrgetter
 from typing import Any
 
@@ -102,7 +102,7 @@ _DECODE: Fields = {
     **{f"seconds.{phase}": (FLOAT, _phase(phase)) for phase in PHASES},
     "tokens": (_TOKENS, lambda decode: list(decode.tokens)),
     "actions": (pa.list_(pa.list_(pa.float32())), lambda decode: np.asarray(decode.actions, np.float32).tolist()),
-    "rounds": (pa.list_(_ROUND), lambda decode: [asdict(one) for one in decode.rounds]),
+    "rounds": (pa.list_(_ROUND), lambda decode: [vars(one) for one in decode.rounds]),
     **_attributes("compensated"),
     **_attributes("skipped", kind=FLAG),
     **_attributes("variability", "similarity", "metric", "deviation", kind=FLOAT),

@@ -11,10 +11,10 @@ import functools
 import os
 import re
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import sqlalchemy as sa
 
@@ -45,90 +45,55 @@ class Damaged(ValueError):
     """A stored value is not what its column holds. `Database.reading` makes it a CheckpointError."""
 
 
+def _is_time(text: str) -> bool:
+    return bool(datetime.fromisoformat(text))
+
+
+def _is_kind(text: str) -> bool:
+    return text in ("sweep", "rollout", "import")
+
+
 class _Checked(sa.types.TypeDecorator[Any]):
-    """Type of a column whose values are checked when they are read: SQLite stores any value in any column."""
+    """Type of a column whose values are checked when they are read: SQLite stores any value in any column.
+
+    Args:
+        kind: Type of the values in Python. Objects and lists are stored as JSON.
+        check: Says whether a value is valid, or raises ValueError. None: every value of this type is.
+    """
 
     impl: Any = sa.Text
-    kinds: tuple[type, ...]
+    cache_ok = True
+    _STORED: ClassVar = {str: sa.Text, int: sa.Integer, float: sa.Float}
 
-    def __init_subclass__(cls) -> None:
-        """Allow SQLAlchemy to cache statements. It looks for this attribute in each class."""
-        cls.cache_ok = True
+    def __init__(self, kind: type, check: Callable[[Any], bool] | None = None) -> None:
+        super().__init__()
+        self.kind, self.check = kind, check
+        self.impl = self._STORED[kind]() if kind in self._STORED else sa.JSON(none_as_null=True)
+
+    def process_bind_param(self, value: Any, dialect: sa.Dialect) -> Any:
+        """Return what to store. Text that databases refuse, such as NUL, is written as an escape."""
+        if isinstance(value, str):
+            return value.encode("utf-8", "backslashreplace").decode().replace("\0", r"\x00")
+        return value
 
     def result_processor(self, dialect: sa.Dialect, coltype: object) -> Any:
         """Return the function that turns a stored value into Python's."""
         inner = super().result_processor(dialect, coltype)
 
+        accepted = (float, int) if self.kind is float else self.kind
+
         def process(stored: Any) -> Any:
-            try:
+            with contextlib.suppress(ValueError, TypeError, RecursionError):
                 value = inner(stored) if inner else stored
-                if value is None or isinstance(value, self.kinds):
-                    return self.check(value)
-            except (ValueError, TypeError, RecursionError):
-                pass
-            raise Damaged(f"{stored!r:.60} is no {self.kinds[0].__name__}")
+                if value is None or (isinstance(value, accepted) and (self.check is None or self.check(value))):
+                    return value
+            raise Damaged(f"{stored!r:.60} is no {self.kind.__name__}")
 
         return process
 
-    def check(self, value: Any) -> Any:
-        """Return the value, or raise ValueError."""
-        return value
 
-
-class _Text(_Checked):
-    kinds = (str,)
-
-
-class _Time(_Text):
-    """A time, ISO 8601."""
-
-    def check(self, value: Any) -> Any:
-        """Return the text, or raise ValueError if it is no time."""
-        if value is not None:
-            datetime.fromisoformat(value)
-        return value
-
-
-class _Kind(_Text):
-    """The kind of a study."""
-
-    def check(self, value: Any) -> Any:
-        """Return the kind, or raise ValueError if there is no such kind."""
-        if value not in ("sweep", "rollout", "import"):
-            raise ValueError(value)
-        return value
-
-
-class _Message(_Text):
-    """Text of an error. It may contain what databases refuse, such as NUL: that is written as an escape."""
-
-    def process_bind_param(self, value: str | None, dialect: sa.Dialect) -> str | None:
-        """Return the text to store."""
-        return value and value.encode("utf-8", "backslashreplace").decode().replace("\0", r"\x00")
-
-
-class _Integer(_Checked):
-    impl = sa.Integer
-    kinds = (int,)
-
-
-class _Float(_Checked):
-    impl = sa.Float
-    kinds = (float, int)
-
-
-class _Object(_Checked):
-    """A JSON object."""
-
-    impl = sa.JSON(none_as_null=True)
-    kinds = (dict,)
-
-
-class _List(_Checked):
-    """A JSON list."""
-
-    impl = sa.JSON(none_as_null=True)
-    kinds = (list,)
+_TEXT, _INTEGER, _FLOAT, _OBJECT, _LIST = map(_Checked, (str, int, float, dict, list))
+_TIME, _KIND = _Checked(str, _is_time), _Checked(str, _is_kind)
 
 
 def _table(name: str, *columns: sa.schema.SchemaItem) -> sa.Table:
@@ -145,45 +110,44 @@ def _to(name: str, column: str, **options: Any) -> sa.Column[Any]:
     return sa.Column(name, sa.ForeignKey(column, ondelete="CASCADE"), **options)
 
 
-ABOUT = _table("kerv", sa.Column("key", _Text, primary_key=True), sa.Column("value", _Text, nullable=False))
+ABOUT = _table("kerv", sa.Column("key", _TEXT, primary_key=True), sa.Column("value", _TEXT, nullable=False))
 RUNS = _table(
     "runs",  # one row per command that was started
     # kind: sweep, rollout, import, or a kind of artifact; name: of the study or the artifact; started: ISO 8601, UTC;
     # command: command-line arguments without `kerv`; heartbeat: seconds since 1970
-    sa.Column("id", _Text, primary_key=True),
-    *_required(_Text, "kind", "name", "status", "host", "git_commit"),
-    *_required(_Time, "started"),
-    *_required(_Message, "message"),
-    *_required(_Integer, "done", "total", "pid"),
-    *_required(_List, "command"),
-    *_required(_Float, "heartbeat"),
-    sa.Column("finished", _Time),
+    sa.Column("id", _TEXT, primary_key=True),
+    *_required(_TEXT, "kind", "name", "status", "host", "git_commit", "message"),
+    *_required(_TIME, "started"),
+    *_required(_INTEGER, "done", "total", "pid"),
+    *_required(_LIST, "command"),
+    *_required(_FLOAT, "heartbeat"),
+    sa.Column("finished", _TIME),
     sa.Index("runs_of_name", "kind", "name"),
 )
 STUDIES = _table(
     "studies",
     sa.Column("id", sa.Integer, primary_key=True),
-    sa.Column("name", _Text, nullable=False, unique=True),
-    *_required(_Kind, "kind"),
-    *_required(_Text, "created"),
-    *_required(_Object, "about"),  # title, baseline, axis, note, block, machines
+    sa.Column("name", _TEXT, nullable=False, unique=True),
+    *_required(_KIND, "kind"),
+    *_required(_TEXT, "created"),
+    *_required(_OBJECT, "about"),  # title, baseline, axis, note, block, machines
 )
 SETTINGS = _table(
     "settings",  # a row of a study's table
     sa.Column("id", sa.Integer, primary_key=True),
     _to("study_id", "studies.id", nullable=False, index=True),
-    sa.Column("work", _Text, nullable=False, index=True),  # hash of what determines a result
-    *_required(_Integer, "position"),
-    *_required(_Text, "label", "name", "method", "overrides"),  # name: shared by the settings of a grid
+    sa.Column("work", _TEXT, nullable=False, index=True),  # hash of what determines a result
+    *_required(_INTEGER, "position"),
+    *_required(_TEXT, "label", "name", "method", "overrides"),  # name: shared by the settings of a grid
     # varies: key -> value in a grid; identity: hashes of weights and data
-    *_required(_Object, "varies", "settings", "identity"),
+    *_required(_OBJECT, "varies", "settings", "identity"),
     sa.UniqueConstraint("study_id", "label"),
 )
 BLOCKS = _table(
     "blocks",  # one attempt to run a group of episodes in one process, with settings taking turns
-    sa.Column("id", _Text, primary_key=True),
-    *_required(_Text, "run", "seeds", "started", "code"),  # code: hash of the source code
-    *_required(_Object, "about"),  # machine, versions, commit, executor, workers
+    sa.Column("id", _TEXT, primary_key=True),
+    *_required(_TEXT, "run", "seeds", "started", "code"),  # code: hash of the source code
+    *_required(_OBJECT, "about"),  # machine, versions, commit, executor, workers
 )
 _TYPES = {FLAG: sa.Boolean, INT: sa.BigInteger, FLOAT: sa.Double}
 MEASURES = tuple(sa.Column(field.name, _TYPES.get(field.type, sa.JSON(none_as_null=True))) for field in EPISODE_SCHEMA)
@@ -191,9 +155,9 @@ MEASURES = tuple(sa.Column(field.name, _TYPES.get(field.type, sa.JSON(none_as_nu
 EPISODES = _table(
     "episodes",
     sa.Column("id", sa.Integer, primary_key=True),
-    *_required(_Text, "work", "task", "started"),
+    *_required(_TEXT, "work", "task", "started"),
     *_required(sa.BigInteger, "seed"),
-    *_required(_Integer, "repeat", "order"),  # order: number of episodes that the block ran before it
+    *_required(_INTEGER, "repeat", "order"),  # order: number of episodes that the block ran before it
     sa.Column("block", sa.ForeignKey("blocks.id"), nullable=False),
     *MEASURES,
     *_required(sa.LargeBinary, "decode_seconds"),  # (decodes,) little-endian float64
@@ -206,25 +170,27 @@ DECODES = _table(
 WANTED = _table(
     "wanted",  # all episodes of a study; an episode without episode_id has not run
     _to("setting_id", "settings.id", primary_key=True),
-    sa.Column("task", _Text, primary_key=True),
+    sa.Column("task", _TEXT, primary_key=True),
     sa.Column("seed", sa.BigInteger, primary_key=True),
     sa.Column("repeat", sa.Integer, primary_key=True),
-    *_required(_Integer, "position"),
+    *_required(_INTEGER, "position"),
     sa.Column("episode_id", sa.ForeignKey("episodes.id", ondelete="SET NULL"), index=True),
-    sa.Column("error", _Message),  # if the last attempt failed: the error in one line, then its traceback
+    sa.Column("error", _TEXT),  # if the last attempt failed: the error in one line, then its traceback
 )
+PLANNED = WANTED.join(SETTINGS).join(STUDIES)
+"""Each planned episode with its setting and its study."""
 QUEUE = _table(
     "queue",  # blocks that wait or run: a row is deleted when its block has ended
     sa.Column("id", sa.Integer, primary_key=True),
     _to("study_id", "studies.id", nullable=False),
-    *_required(_Text, "run"),  # id of the command that planned the block
-    *_required(_Integer, "position", "newest"),  # newest: largest episodes.id when the block was planned
-    *_required(_List, "episodes"),  # work, task, seed and repeat of each
-    *_required(_Object, "about"),  # executor, workers
-    sa.Column("worker", _Text, index=True),  # the process that has claimed the block; null: none
-    sa.Column("heartbeat", _Float),  # its newest sign of life, seconds since 1970 by the database's clock
-    sa.Column("running", _List),  # the episode that it runs
-    sa.Column("died", _List),  # the episode in which the worker before it died
+    *_required(_TEXT, "run"),  # id of the command that planned the block
+    *_required(_INTEGER, "position", "newest"),  # newest: largest episodes.id when the block was planned
+    *_required(_LIST, "episodes"),  # work, task, seed and repeat of each
+    *_required(_OBJECT, "about"),  # executor, workers
+    sa.Column("worker", _TEXT, index=True),  # the process that has claimed the block; null: none
+    sa.Column("heartbeat", _FLOAT),  # its newest sign of life, seconds since 1970 by the database's clock
+    sa.Column("running", _LIST),  # the episode that it runs
+    sa.Column("died", _LIST),  # the episode in which the worker before it died
     sa.Index("queue_of_study", "study_id", "position"),
 )
 
@@ -309,6 +275,15 @@ class Database:
                 finally:
                     if self.file and connection.info.get(_CHANGED, found := _changed(self.file)) != found:
                         raise StorageError(f"{self.file} was written while it was read: type the command again")
+
+    @contextlib.contextmanager
+    def kept_open(self) -> Iterator[None]:
+        """Keep a SQLite file open during the `with` block, so that its transactions are quick.
+
+        Each time nobody has it open any more, SQLite moves its log into the file and flushes both to the disk.
+        """
+        with self.reading() if self.file else contextlib.nullcontext():
+            yield
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[sa.Connection]:
@@ -472,7 +447,8 @@ def _configure(path: Path, connection: Any, record: Any) -> None:
     if isinstance(connection, _Unlocked):
         record.info[_CHANGED] = _changed(path)
     connection.isolation_level = None  # `_begin` begins the transactions
-    for pragma in ("journal_mode=WAL", "foreign_keys=ON"):
+    # a commit survives the end of this process; the log is flushed to the disk when it is moved into the file
+    for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON"):
         with contextlib.suppress(Exception):  # a read-only folder refuses the first
             connection.execute(f"PRAGMA {pragma}")
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -162,16 +163,14 @@ def all_episodes(
     total = len(tasks) * repeats * sum(setting.settings["episodes"] for setting in settings)
     if total > MOST_EPISODES:
         raise UsageError(f"the study has {total} episodes: at most {MOST_EPISODES} are allowed")
-    seeds = {s.label: range(s.settings["seed"], s.settings["seed"] + s.settings["episodes"]) for s in settings}
-    longest = max((len(one) for one in seeds.values()), default=0)
-    return tuple(
-        Episode(setting, task, seed, repeat)
-        for repeat in range(repeats)
-        for task in tasks
-        for first in range(0, longest, block)
-        for setting in settings
-        for seed in seeds[setting.label][first : first + block]
-    )
+    longest = max((setting.settings["episodes"] for setting in settings), default=0)
+    episodes: list[Episode] = []
+    for repeat, task, first in itertools.product(range(repeats), tasks, range(0, longest, block)):
+        for setting in settings:
+            start, number = setting.settings["seed"], setting.settings["episodes"]
+            seeds = range(start, start + number)[first : first + block]
+            episodes.extend(Episode(setting, task, seed, repeat) for seed in seeds)
+    return tuple(episodes)
 
 
 @dataclass(frozen=True)
@@ -180,14 +179,20 @@ class StoredEpisode:
 
     Attributes:
         id: Its row number.
+        success: Whether the task was solved.
+        seconds: Wall time.
         block: Id of the block (episodes run by one process) in which it ran.
+        run: Id of the command that ran it.
         started: Time at which that block began (ISO 8601).
         code: Hash of the code that ran it.
         seeds: Seeds of the block, as `seeds_text` writes them.
     """
 
     id: int
+    success: bool
+    seconds: float
     block: str
+    run: str
     started: str
     code: str
     seeds: str
@@ -211,6 +216,11 @@ class Block:
     def settings(self) -> tuple[Setting, ...]:
         """The block's settings, each once."""
         return tuple({one.setting.work: one.setting for one in self.episodes}.values())
+
+    @property
+    def keys(self) -> list[Key]:
+        """Key of each episode."""
+        return [one.key for one in self.episodes]
 
     @property
     def seeds(self) -> list[int]:
@@ -237,9 +247,15 @@ class Block:
         return f"{label} from {self.name} on: {count(len(self.episodes), 'episode')}, {self.batch} at a time"
 
     def turns(self) -> Iterator[Episode]:
-        """Yield the episodes seed by seed. For each seed the settings' order is random but reproducible."""
+        """Yield the episodes seed by seed. For each seed the settings' order is random but reproducible.
+
+        The episodes of a batch keep their order.
+        """
         import numpy as np
 
+        if self.episodes and self.batch > 1:
+            yield from self.episodes
+            return
         for seed in self.seeds:
             turn = [one for one in self.episodes if one.seed == seed]
             digest = hashlib.sha256(f"{self.task} {seed} {turn[0].repeat}".encode()).digest()
@@ -275,36 +291,62 @@ def split(
             return bool(since) and row.started >= since
         return rerun != CHANGED or row.code == code_hash()
 
-    usable = {one: [row for row in stored.get(one.key, ()) if is_usable(row)] for one in study.episodes}
+    usable: dict[Episode, list[StoredEpisode]] = {}
+    for one in study.episodes:
+        usable[one] = list(filter(is_usable, stored.get(one.key, ())))
     _keep_whole_orders(usable, study.block)
     existing: dict[Episode, StoredEpisode] = {}
     for turn in _turns(study.episodes).values():
-        in_block = Counter(row.block for one in turn for row in usable[one])
-        found = {}
-        for one in turn:
-            if usable[one]:
-                found[one] = max(usable[one], key=lambda row: (in_block[row.block], row.started, row.id))
+        found = _rows_of_turn(turn, usable)
         if rerun != TIMED or (len(found) == len(turn) and len({row.block for row in found.values()}) == 1):
             existing |= found
     for part in _ordered_parts(study.episodes, study.block):
-        if any(one not in existing for one in part):
+        if not existing.keys() >= set(part):
             for one in part:
                 existing.pop(one, None)
-    works, tasks = {work for work, *_ in stored}, {(work, task) for work, task, *_ in stored}
+    return existing, _reasons(study, stored, existing, rerun, earlier or {})
+
+
+def _rows_of_turn(
+    turn: Sequence[Episode], usable: Mapping[Episode, Sequence[StoredEpisode]]
+) -> dict[Episode, StoredEpisode]:
+    """Choose a stored row for each episode that has some: of the block that ran most of the turn, then the newest."""
+    in_block: Counter[str] = Counter()
+    for one in turn:
+        in_block.update(row.block for row in usable[one])
+    found = {}
+    for one in turn:
+        if usable[one]:
+            found[one] = max(usable[one], key=lambda row: (in_block[row.block], row.started, row.id))
+    return found
+
+
+def _reasons(
+    study: Study,
+    stored: Mapping[Key, Sequence[StoredEpisode]],
+    existing: Mapping[Episode, StoredEpisode],
+    rerun: str,
+    earlier: Mapping[str, tuple[Setting, str]],
+) -> dict[Episode, str]:
+    """Return the missing episodes, each with the reason for running it. The arguments are those of `split`."""
+    works, tasks = {key[0] for key in stored}, {key[:2] for key in stored}
+    of_rows = {TIMED: "times wanted in turn", CHANGED: "other code", ALL: "rerun=all"}.get(rerun, "order of episodes")
 
     @functools.cache
     def change(setting: Setting) -> str:
-        return differences(setting, *(earlier or {}).get(setting.label, ()))
+        return differences(setting, *earlier.get(setting.label, ()))
 
-    def reason(one: Episode) -> str:
+    reasons = {}
+    for one in study.episodes:
+        if one in existing:
+            continue
         if stored.get(one.key):
-            why = {TIMED: "times wanted in turn", CHANGED: "other code", ALL: "rerun=all"}
-            return why.get(rerun, "order of episodes")
-        if (one.setting.work, one.task) in tasks:
-            return "new repeat" if one.repeat else "new seeds"
-        return "new task" if one.setting.work in works else change(one.setting)
-
-    return existing, {one: reason(one) for one in study.episodes if one not in existing}
+            reasons[one] = of_rows
+        elif one.key[:2] in tasks:
+            reasons[one] = "new repeat" if one.repeat else "new seeds"
+        else:
+            reasons[one] = "new task" if one.setting.work in works else change(one.setting)
+    return reasons
 
 
 def _grouped(episodes: Iterable[Episode], key: Callable[[Episode], K]) -> dict[K, list[Episode]]:
@@ -342,11 +384,13 @@ def _keep_whole_orders(usable: dict[Episode, list[StoredEpisode]], block: int) -
         usable: The stored rows of each episode. The lists are replaced.
         block: Number of seeds that the study keeps together.
     """
-    sizes = Counter(row.block for rows in usable.values() for row in rows)
+    sizes = Counter(row.block for row in itertools.chain(*usable.values()))
     for part in _ordered_parts(usable, block):
         seeds = seeds_text(one.seed for one in part)
         whole = [row for row in usable[part[0]] if row.seeds == seeds]
-        whole = [row for row in whole if all(any(row.block == other.block for other in usable[one]) for one in part)]
+        for one in part:
+            blocks = {row.block for row in usable[one]}
+            whole = [row for row in whole if row.block in blocks]
         best = max(whole, key=lambda row: (sizes[row.block], row.started, row.id), default=None)
         for one in part:
             usable[one] = [row for row in usable[one] if best is not None and row.block == best.block]
@@ -370,8 +414,8 @@ def blocks_of(episodes: Iterable[Episode], block: int, workers: int = 1) -> list
     for (task, seed, repeat), turn in _turns(by_way.get(False, ())).items():
         for threads, part in _grouped(turn, lambda one: one.setting.settings["runtime"]["threads"]).items():
             index = (seed - min(one.setting.settings["seed"] for one in part)) // block
-            ordered = sorted(one.setting.work for one in part if one.setting.depends_on_order)
-            same = ordered or sorted(one.setting.work for one in part)
+            ordered = [one for one in part if one.setting.depends_on_order]
+            same = sorted(one.setting.work for one in ordered or part)
             groups.setdefault((task, repeat, threads, index, *same), []).extend(part)
     blocks = [Block(tuple(group)) for group in groups.values()]
     for group in _grouped(by_way.get(True, ()), lambda one: (one.setting.work, one.repeat)).values():
@@ -393,15 +437,19 @@ def differences(new: Setting, old: Setting | None = None, work: str = "") -> str
         return "new setting"
     engine = next((one for one in range(ENGINE, 0, -1) if work_of(old.settings, old.identity, one) == work), ENGINE)
     changes = [f"engine {engine} → {ENGINE}"] if engine != ENGINE else []
-    changes += [
-        f"weights of {target} changed" if kind == "target" else f"{kind} changed"
-        for kind in dict.fromkeys([*new.identity, *old.identity])
-        if kind != OBSERVATION and new.identity.get(kind) != old.identity.get(kind)
-    ]
+    for kind in _differing(new.identity, old.identity):
+        if kind == "target":
+            changes.append(f"weights of {target} changed")
+        elif kind != OBSERVATION:
+            changes.append(f"{kind} changed")
     before, after = flat(effective(old.settings)), flat(effective(new.settings))
-    keys = [key for key in dict.fromkeys([*after, *before]) if before.get(key) != after.get(key)]
-    changes += [f"{key} {before.get(key)} → {after.get(key)}" for key in keys]
+    changes += (f"{key} {before.get(key)} → {after.get(key)}" for key in _differing(after, before))
     return ", ".join(changes[:3]) or "new setting"
+
+
+def _differing(new: Mapping[str, Any], old: Mapping[str, Any]) -> list[str]:
+    """Return the keys that have different values in two mappings. A missing key has the value None."""
+    return [key for key in dict.fromkeys([*new, *old]) if new.get(key) != old.get(key)]
 
 
 def plain_settings(settings: Plain) -> dict[str, Any]:
@@ -417,4 +465,7 @@ def seeds_text(seeds: Iterable[int]) -> str:
             runs[-1][1] = seed
         else:
             runs.append([seed, seed])
-    return ";".join(str(a) if a == b else f"{a}-{b}" for a, b in runs)
+    texts = []
+    for first, last in runs:
+        texts.append(str(first) if first == last else f"{first}-{last}")
+    return ";".join(texts)

@@ -10,10 +10,10 @@ import sqlalchemy as sa
 
 from kerv_cli.base.errors import KervError
 from kerv_cli.lab import events
-from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, SETTINGS, STUDIES, WANTED
+from kerv_cli.lab.database import EPISODES, PLANNED, SETTINGS, STUDIES, WANTED
 from kerv_cli.lab.plan import Episode
 from kerv_cli.lab.runs import Run
-from kerv_cli.lab.store import ROLLOUT, Plan
+from kerv_cli.lab.store import Plan, stored_episodes
 from kerv_cli.lab.work import load_per_core
 
 
@@ -32,7 +32,7 @@ class Progress:
         self._missing = {one.key: one for one in plan.to_run}
         self._newest, self._began = plan.newest, time.perf_counter()
         record.beat(0, len(self._missing))
-        is_timed = any(block.batch == 1 for block in plan.blocks())
+        is_timed = any(block.batch == 1 for block in plan.blocks)
         on_event(events.Started(len(self._missing), len(plan.existing), load_per_core() if is_timed else 0.0))
 
     def see(self, event: events.Event) -> None:
@@ -60,38 +60,27 @@ class Progress:
             self.see(failure)
 
     def _ended(self) -> list[events.EpisodeEnd]:
-        columns = (EPISODES.c.work, EPISODES.c.task, EPISODES.c.seed, EPISODES.c.repeat)
-        facts = (EPISODES.c.id, EPISODES.c.success, EPISODES.c.wall_seconds, BLOCKS.c.run)
-        works = {work for work, *_ in self._missing}
-        query = sa.select(*columns, *facts).join(BLOCKS, EPISODES.c.block == BLOCKS.c.id)
-        query = query.where(EPISODES.c.id > self._newest, EPISODES.c.work.in_(works)).order_by(EPISODES.c.id)
-        if self.plan.study.kind != ROLLOUT:  # as in `stored_episodes`
-            query = query.outerjoin(RUNS, RUNS.c.id == BLOCKS.c.run)
-            query = query.where(sa.func.coalesce(RUNS.c.kind, "") != ROLLOUT)
-        with self.plan.store.database.reading() as connection:
-            rows = connection.execute(query).all()
-        self._newest = max((row.id for row in rows), default=self._newest)
-        known = [(self._missing.get(tuple(row[:4])), row) for row in rows]
-        return [
-            events.EpisodeEnd(one, bool(row.success), float(row.wall_seconds), row.run != self.record.id)
-            for one, row in known
-            if one is not None
-        ]
+        ended, store = [], self.plan.store
+        for key, rows in stored_episodes(store.database, self.plan.study, self._newest).items():
+            self._newest, row = max(self._newest, rows[-1].id), rows[0]
+            if one := self._missing.get(key):
+                ended.append(events.EpisodeEnd(one, row.success, row.seconds or 0.0, row.run != self.record.id))
+        return ended
 
     def _failed(self) -> list[events.SettingFailed]:
         columns = (SETTINGS.c.work, WANTED.c.task, WANTED.c.seed, WANTED.c.repeat, WANTED.c.error)
-        query = sa.select(*columns).select_from(WANTED.join(SETTINGS).join(STUDIES)).order_by(WANTED.c.position)
+        query = sa.select(*columns).select_from(PLANNED).order_by(WANTED.c.position)
         query = query.where(STUDIES.c.name == self.plan.store.name, WANTED.c.error.is_not(None))
         failed: dict[tuple[str, str, str], dict[Episode, None]] = {}
         with self.plan.store.database.reading() as connection:
-            for work, task, seed, repeat, error in connection.execute(query):
-                one = self._missing.get((work, task, seed, repeat))
-                if one is not None:
-                    failed.setdefault((work, task, error), {})[one] = None
-        return [
-            events.SettingFailed(*error.partition("\n")[::2], episodes=tuple(episodes))
-            for (_, _, error), episodes in failed.items()
-        ]
+            for *key, error in connection.execute(query):
+                if one := self._missing.get(tuple(key)):
+                    failed.setdefault((key[0], key[1], error), {})[one] = None
+        found = []
+        for (_, _, error), episodes in failed.items():
+            reason, _, trace = error.partition("\n")
+            found.append(events.SettingFailed(reason, trace, episodes=tuple(episodes)))
+        return found
 
     def end(self) -> events.Outcome:
         """Return the outcome, after all blocks have ended.
@@ -122,7 +111,7 @@ class TimeLeft:
     """
 
     def __init__(self, plan: Plan, guess: float) -> None:
-        self.workers = max(1, min(plan.runtime.workers, len(plan.blocks())))
+        self.workers = max(1, min(plan.runtime.workers, len(plan.blocks)))
         self._waiting = Counter(one.setting.work for one in plan.to_run)
         self._guess, works = guess, {setting.work for setting in plan.study.settings}
         query = sa.select(EPISODES.c.work, sa.func.avg(EPISODES.c.wall_seconds), sa.func.count(EPISODES.c.wall_seconds))

@@ -7,6 +7,7 @@ machines may differ. Every change is one transaction, and a database has one wri
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import secrets
 import socket
@@ -32,7 +33,6 @@ LAPSE_SECONDS = 30.0
 """A claim without a heartbeat for so long is free again."""
 PATIENCE_SECONDS = 120.0
 """Time for which a worker tries to reach a database that does not answer."""
-_PAGE = 10  # rows of the queue that are read at once
 
 
 class ClaimLost(KervError):
@@ -78,19 +78,14 @@ def enqueue(plan: Plan, run: str) -> None:
     about = {"executor": plan.runtime.executor, "workers": plan.runtime.workers}
     with plan.store.database.writing() as connection:
         study = plan.store.save_in(connection, plan.study, plan.existing)
-        rows = connection.execute(sa.select(QUEUE).where(QUEUE.c.study_id == study, _is_free(connection))).all()
-        dead = {run for run in {row.run for row in rows} if not is_running(connection, run)}
-        tasks = set(plan.study.tasks)
-        gone = [row.id for row in rows if row.run in dead and {one[1] for one in row.episodes} <= tasks]
-        for number in gone:
-            connection.execute(sa.delete(QUEUE).where(QUEUE.c.id == number))
-        blocks = [
-            {"position": position, "episodes": [list(one.key) for one in block.episodes]}
-            for position, block in enumerate(plan.blocks())
-        ]
-        if blocks:
-            common = {"study_id": study, "run": run, "newest": plan.newest, "about": about}
-            connection.execute(sa.insert(QUEUE), [common | block for block in blocks])
+        for row in connection.execute(sa.select(QUEUE).where(QUEUE.c.study_id == study, _is_free(connection))).all():
+            tasks = {task for _, task, *_ in row.episodes}
+            if tasks.issubset(plan.study.tasks) and not is_running(connection, row.run):
+                connection.execute(sa.delete(QUEUE).where(QUEUE.c.id == row.id))
+        common = {"study_id": study, "run": run, "newest": plan.newest, "about": about}
+        rows = [{**common, "position": place, "episodes": block.keys} for place, block in enumerate(plan.blocks)]
+        if rows:
+            connection.execute(sa.insert(QUEUE), rows)
 
 
 def _is_free(connection: sa.Connection) -> sa.ColumnElement[bool]:
@@ -130,43 +125,59 @@ class Queue:
         self.store, self.run, self.database = store, run, store.database
         self.worker = worker_id(os.getpid(), secrets.token_hex(4))
         self._claimed: int | None = None
+        self._settings: dict[str, Setting] = {}  # those of earlier blocks, by their hashes
 
-    def claim(self) -> Claim | None:
+    def claim(self, ended: Claim | None = None) -> Claim | None:
         """Claim the first free block. Return None if none is free now.
 
         A block is not free while another worker runs one of its episodes, for whichever study.
+
+        Args:
+            ended: The worker's block before, which has ended and is removed from the queue.
         """
         with self.database.writing() as connection:
-            row = next(self._free(connection), None)
+            if ended is not None:
+                mine = QUEUE.c.id == ended.id, QUEUE.c.worker == self.worker
+                connection.execute(sa.delete(QUEUE).where(*mine))
+            self._claimed, row = None, self._first_free(connection)
             if row is None:
                 return None
             is_dead = row.worker not in (None, self.worker)  # the worker before
-            died = row.running if is_dead else row.died
             values = {
                 "worker": self.worker,
                 "heartbeat": clock(connection),
-                "died": died,
-                "running": next(iter(row.episodes), None),
+                "died": row.running if is_dead else row.died,
+                "running": row.episodes[0],
             }
             connection.execute(sa.update(QUEUE).where(QUEUE.c.id == row.id).values(**values))
         self._claimed = row.id
         killer = row.running if is_dead and row.running == row.died else None
         return self._claim_of(row, killer)
 
-    def _free(self, connection: sa.Connection) -> Iterator[Any]:
-        """Yield the free rows that nobody else runs an episode of, in order."""
-        mine, kind = self._mine(), self.store.kind
-        others = sa.select(QUEUE.c.episodes).join(STUDIES, STUDIES.c.id == QUEUE.c.study_id)
-        others = others.where(QUEUE.c.worker.is_not(None), QUEUE.c.worker != self.worker, ~_is_free(connection))
+    def _first_free(self, connection: sa.Connection) -> Any:
+        """Return the first free row that nobody else runs an episode of. None: there is none."""
+        query = sa.select(QUEUE).where(self._mine(), self._is_open(connection))
+        query = query.order_by(QUEUE.c.position, QUEUE.c.id)
+        held: dict[str, set[tuple[Any, ...]]] = {}
+        for number in itertools.count():
+            row = connection.execute(query.limit(1).offset(number)).first()
+            if row is None:
+                return None
+            if row.run not in held:
+                held[row.run] = self._held_outside(connection, row.run)
+            if held[row.run].isdisjoint(map(tuple, row.episodes)):
+                return row
+
+    def _held_outside(self, connection: sa.Connection, run: str) -> set[tuple[Any, ...]]:
+        """Return the keys of the episodes that other workers run for other commands. Blocks of one command differ."""
+        query = sa.select(QUEUE.c.episodes).join(STUDIES, STUDIES.c.id == QUEUE.c.study_id)
+        query = query.where(QUEUE.c.run != run, QUEUE.c.worker != self.worker, ~_is_free(connection))
         # rollouts share no episodes with other studies
-        others = others.where(mine if kind == ROLLOUT else STUDIES.c.kind != ROLLOUT)
-        held = {tuple(one) for episodes in connection.scalars(others) for one in episodes}
-        query = sa.select(QUEUE).where(mine, self._is_open(connection)).order_by(QUEUE.c.position, QUEUE.c.id)
-        for first in range(0, 10**9, _PAGE):
-            rows = connection.execute(query.limit(_PAGE).offset(first)).all()
-            yield from (row for row in rows if held.isdisjoint(map(tuple, row.episodes)))
-            if len(rows) < _PAGE:
-                return
+        query = query.where(self._mine() if self.store.kind == ROLLOUT else STUDIES.c.kind != ROLLOUT)
+        held: set[tuple[Any, ...]] = set()
+        for episodes in connection.scalars(query):
+            held.update(map(tuple, episodes))
+        return held
 
     def _is_open(self, connection: sa.Connection) -> sa.ColumnElement[bool]:
         # a row of this worker is one whose claim was committed, but the answer was lost
@@ -188,17 +199,24 @@ class Queue:
         return replace(setting, settings={**setting.settings, "results": str(self.database.results)})
 
     def _claim_of(self, row: Any, killer: list[Any] | None) -> Claim:
-        works = {work for work, *_ in row.episodes}
-        chosen = sa.select(SETTINGS).where(SETTINGS.c.study_id == row.study_id, SETTINGS.c.work.in_(works))
-        with self.database.reading() as connection:
-            settings = {one.work: self._here(one.work, setting_of(one)) for one in connection.execute(chosen)}
+        settings = self._settings_of(row)
         # a setting is missing if another command has planned the study anew, without it
         known = [Episode(settings[work], *rest) for work, *rest in row.episodes if work in settings]
         study = Study(self.store.name, tuple(settings.values()), tuple(known), self.store.kind)
         stored = stored_episodes(self.database, study, row.newest, Block(tuple(known))) if known else {}
         existing, missing = split(study, stored)
-        killers = (one for one in missing if list(one.key) == killer)
-        return Claim(row.id, row.run, row.about, Block(tuple(missing)), existing, next(killers, None))
+        guilty = next((one for one in missing if list(one.key) == killer), None)
+        return Claim(row.id, row.run, row.about, Block(tuple(missing)), existing, guilty)
+
+    def _settings_of(self, row: Any) -> dict[str, Setting]:
+        """Return the settings of a row's episodes, by their hashes."""
+        works = {work for work, *_ in row.episodes}
+        if new := works - self._settings.keys():
+            chosen = sa.select(SETTINGS).where(SETTINGS.c.study_id == row.study_id, SETTINGS.c.work.in_(new))
+            with self.database.reading() as connection:
+                for one in connection.execute(chosen):
+                    self._settings[one.work] = self._here(one.work, setting_of(one))
+        return {work: self._settings[work] for work in works & self._settings.keys()}
 
     def hold(self, connection: sa.Connection, claim: Claim, running: Episode | None = None, **values: Any) -> None:
         """Check, in a transaction, that a block still belongs to this worker, and write its heartbeat.
@@ -223,12 +241,6 @@ class Queue:
         with self.database.writing() as connection:
             self.hold(connection, claim, one)
 
-    def end(self, claim: Claim) -> None:
-        """Remove a block that has ended."""
-        self._claimed = None
-        with self.database.writing() as connection:
-            connection.execute(sa.delete(QUEUE).where(QUEUE.c.id == claim.id, QUEUE.c.worker == self.worker))
-
     @contextlib.contextmanager
     def beating(self) -> Iterator[None]:
         """Write the heartbeat of the claimed block until the end of the `with` block. Then free what is claimed."""
@@ -246,7 +258,8 @@ class Queue:
         thread = threading.Thread(target=beat, daemon=True)
         thread.start()
         try:
-            yield
+            with self.database.kept_open():
+                yield
         finally:
             ended.set()
             thread.join()
@@ -255,21 +268,22 @@ class Queue:
                     freed = sa.update(QUEUE).where(QUEUE.c.worker == self.worker)
                     connection.execute(freed.values(worker=None, heartbeat=None, running=None))
 
-    def has_free(self) -> bool:
-        """Return whether nobody has claimed some block. A worker that only looks holds up nobody."""
-        with self.database.reading() as connection:
-            query = sa.select(QUEUE.c.id).where(self._mine(), self._is_open(connection)).limit(1)
-            return connection.scalar(query) is not None
+    def left(self) -> tuple[int, int]:
+        """Return how many blocks have not ended, and how many of them nobody has claimed.
 
-    def is_empty(self) -> bool:
-        """Return whether every block has ended."""
+        A worker that only looks holds up nobody.
+        """
         with self.database.reading() as connection:
-            return connection.scalar(sa.select(QUEUE.c.id).where(self._mine()).limit(1)) is None
+            is_open = sa.case((self._is_open(connection), 1), else_=0)
+            query = sa.select(sa.func.count(), sa.func.coalesce(sa.func.sum(is_open), 0)).where(self._mine())
+            waiting, free = connection.execute(query).one()
+        return int(waiting), int(free)
 
-    def claimed(self) -> list[Any]:
-        """Return the rows of blocks that are running."""
+    def claimed(self) -> list[tuple[int, str]]:
+        """Return the blocks that are running: the place of each in its plan, and the worker that runs it."""
+        query = sa.select(QUEUE.c.position, QUEUE.c.worker).where(self._mine(), QUEUE.c.worker.is_not(None))
         with self.database.reading() as connection:
-            return list(connection.execute(sa.select(QUEUE).where(self._mine(), QUEUE.c.worker.is_not(None))).all())
+            return [(position, worker) for position, worker in connection.execute(query)]
 
     def lapse(self, pid: int) -> bool:
         """Let the claims of a process of this machine that has died lapse at once. Return whether it had any."""

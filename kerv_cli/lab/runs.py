@@ -145,8 +145,12 @@ _SIZES = ("name", "task", "demos", "episodes", "seed", "train.steps", "results",
 
 def _options(command: Sequence[str]) -> set[str]:
     """Return the arguments of a command that can make it faster or slower."""
-    keys = {word: word.split("=")[0] for word in command if not word.startswith("--")}
-    return {word for word, key in keys.items() if key not in _SIZES and not key.startswith("policy.artifacts")}
+    options = set()
+    for word in command:
+        key = word.split("=")[0]
+        if key not in _SIZES and not key.startswith(("--", "policy.artifacts")):
+            options.add(word)
+    return options
 
 
 def pulse(database: Database) -> tuple[str, bool]:

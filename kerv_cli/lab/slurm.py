@@ -7,21 +7,17 @@ submitted it. A later sweep of the study finds it by its name.
 from __future__ import annotations
 
 import hashlib
-import os
 import shlex
 import subprocess
-import sys
 import time
 from pathlib import Path
 
-from kerv_cli.base.config import as_overrides
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.files import storage_errors, visible
 from kerv_cli.base.settings import RuntimeSettings
-from kerv_cli.lab.command import STORE
 from kerv_cli.lab.progress import Progress
 from kerv_cli.lab.queue import Queue
-from kerv_cli.lab.workers import thread_environment
+from kerv_cli.lab.workers import last_line, worker_command
 
 _LOOK_SECONDS = 5.0
 """Seconds between two questions to Slurm."""
@@ -75,9 +71,7 @@ class Array:
     def _submitted(self) -> str:
         """Submit an array, and return its id."""
         runtime, options = self.runtime, self.runtime.executor_options
-        store = self.queue.store
-        results = str(self.queue.database.results.absolute())
-        words = [sys.executable, "-m", "kerv_cli", "work", *as_overrides(study=store.name, results=results)]
+        words, environment = worker_command(self.queue, self.threads)
         with storage_errors(self.logs):
             self.logs.mkdir(parents=True, exist_ok=True)
         asked = {
@@ -92,7 +86,6 @@ class Array:
             **({"partition": options.partition} if options.partition else {}),
         }
         script = "\n".join(["#!/bin/sh", *options.setup, f"exec {shlex.join(words)}", ""])
-        environment = {**os.environ, **thread_environment(self.threads), STORE: self.queue.database.store}
         flags = [f"--{key}={value}" for key, value in asked.items()]
         printed = _ask("sbatch", "--parsable", "--requeue", *flags, text=script, environment=environment)
         return printed.strip().partition(";")[0]
@@ -106,7 +99,7 @@ class Array:
         if time.monotonic() - self._asked < _LOOK_SECONDS:
             return
         self._asked, done = time.monotonic(), len(progress.outcome.done) + len(progress.outcome.failed)
-        if self._running() or self.queue.is_empty():
+        if self._running() or not self.queue.left()[0]:
             return
         if done <= self._done:
             raise KervError(f"job {self.id} of Slurm has ended without an episode: {self._last_line()}")
@@ -115,8 +108,7 @@ class Array:
     def _last_line(self) -> str:
         """Return the last line of the newest log, or where the logs are."""
         logs: list[Path] = sorted(visible(self.logs), key=lambda path: path.stat().st_mtime)
-        lines = logs[-1].read_text(errors="replace").split("\n") if logs else []
-        return next((line.strip() for line in reversed(lines) if line.strip()), f"see {self.logs}")
+        return (logs and last_line(logs[-1].read_text(errors="replace"))) or f"see {self.logs}"
 
     def cancel(self) -> None:
         """Cancel all jobs of the array."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import functools
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,6 +21,7 @@ from kerv_cli.lab.database import (
     DECODES,
     EPISODES,
     MEASURES,
+    PLANNED,
     RUNS,
     SETTINGS,
     STUDIES,
@@ -74,9 +76,8 @@ def _same_episode() -> sa.ColumnElement[bool]:
 
     WANTED joined to SETTINGS has the planned episodes, EPISODES the stored ones.
     """
-    return sa.and_(
-        EPISODES.c.work == SETTINGS.c.work, *(EPISODES.c[name] == WANTED.c[name] for name in ("task", "seed", "repeat"))
-    )
+    of_setting = EPISODES.c.work == SETTINGS.c.work, EPISODES.c.task == WANTED.c.task
+    return sa.and_(*of_setting, EPISODES.c.seed == WANTED.c.seed, EPISODES.c.repeat == WANTED.c.repeat)
 
 
 class StudyStore:
@@ -183,32 +184,24 @@ class StudyStore:
         mine = SETTINGS.c.study_id == row.id
         connection.execute(sa.delete(SETTINGS).where(mine, SETTINGS.c.label.not_in(kept)))
         connection.execute(sa.update(STUDIES).where(STUDIES.c.id == row.id).values(about=about))
-        ids = {
-            setting.label: _save_setting(connection, row.id, position, setting)
-            for position, setting in enumerate(study.settings)
-        }
-        for label, number in ids.items():
-            seeds = [one.seed for one in study.episodes if one.setting.label == label]
-            repeats = [one.repeat for one in study.episodes if one.setting.label == label]
+        ids: dict[str, int] = {}
+        for position, setting in enumerate(study.settings):
+            ids[setting.label] = _save_setting(connection, row.id, position, setting)
+            planned = [one for one in study.episodes if one.setting.label == setting.label]
+            seeds, repeats = [one.seed for one in planned], [one.repeat for one in planned]
             still = sa.and_(
                 WANTED.c.task.not_in(study.tasks),
                 WANTED.c.seed.between(min(seeds, default=0), max(seeds, default=-1)),
                 WANTED.c.repeat <= max(repeats, default=-1),
             )
-            connection.execute(sa.delete(WANTED).where(WANTED.c.setting_id == number, sa.not_(still)))
+            of_setting = WANTED.c.setting_id == ids[setting.label]
+            connection.execute(sa.delete(WANTED).where(of_setting, sa.not_(still)))
         last = sa.select(sa.func.max(WANTED.c.position)).where(WANTED.c.setting_id.in_(ids.values()))
-        first = (connection.scalar(last) or 0) + 1
-        rows = [
-            {
-                "setting_id": ids[one.setting.label],
-                "task": one.task,
-                "seed": one.seed,
-                "repeat": one.repeat,
-                "position": position,
-                "episode_id": existing[one].id if one in existing else None,
-            }
-            for position, one in enumerate(dict.fromkeys(study.episodes), first)
-        ]
+        rows, first = [], (connection.scalar(last) or 0) + 1
+        for position, one in enumerate(dict.fromkeys(study.episodes), first):
+            stored = existing.get(one)
+            key = {"setting_id": ids[one.setting.label], "task": one.task, "seed": one.seed, "repeat": one.repeat}
+            rows.append({**key, "position": position, "episode_id": stored and stored.id})
         if rows:
             connection.execute(sa.insert(WANTED), rows)
         return int(row.id)
@@ -218,7 +211,7 @@ class StudyStore:
         with self.database.reading() as connection:
             row = connection.execute(
                 sa.select(sa.func.count(WANTED.c.episode_id), sa.func.count())
-                .select_from(WANTED.join(SETTINGS).join(STUDIES))
+                .select_from(PLANNED)
                 .where(STUDIES.c.name == self.name)
             ).one()
         return int(row[0]), int(row[1])
@@ -226,13 +219,13 @@ class StudyStore:
     def version(self) -> str:
         """Return a text that changes whenever episodes of the study are added, replaced or removed."""
         facts = sa.func.count(), sa.func.count(WANTED.c.episode_id), sa.func.sum(WANTED.c.episode_id)
-        query = sa.select(*facts).select_from(WANTED.join(SETTINGS).join(STUDIES)).where(STUDIES.c.name == self.name)
+        query = sa.select(*facts).select_from(PLANNED).where(STUDIES.c.name == self.name)
         with self.database.reading() as connection:
             return "/".join(map(str, connection.execute(query).one()))
 
     def whole_runs(self) -> list[str]:
         """Return the ids of the commands that each ran all episodes of the study, oldest first."""
-        wanted = WANTED.join(SETTINGS).join(STUDIES).join(EPISODES, _same_episode()).join(BLOCKS)
+        wanted = PLANNED.join(EPISODES, _same_episode()).join(BLOCKS)
         keys = [WANTED.c[name] for name in ("setting_id", "task", "seed", "repeat")]
         with self.database.reading() as connection:
             rows = connection.execute(
@@ -254,7 +247,6 @@ class StudyStore:
         import numpy as np
         import pandas as pd
 
-        keys = ("label", "task", "seed", "repeat")
         which = WANTED.c.episode_id == EPISODES.c.id if run is None else _same_episode()
         circumstances = [EPISODES.c[name] for name in ("block", "order", "started", "decode_seconds")]
         with self.database.reading() as connection, self.database.checking(f"episodes of {self.name}"):
@@ -263,7 +255,7 @@ class StudyStore:
                     SETTINGS.c.label, WANTED.c.task, WANTED.c.seed, WANTED.c.repeat, EPISODES.c.id.label("episode"),
                     *measures_in(connection), *circumstances, BLOCKS.c.run, BLOCKS.c.code, BLOCKS.c.about,
                 )
-                .select_from(WANTED.join(SETTINGS).join(STUDIES).join(EPISODES, which).join(BLOCKS))
+                .select_from(PLANNED.join(EPISODES, which).join(BLOCKS))
                 .where(STUDIES.c.name == self.name, *([] if run is None else [BLOCKS.c.run == run]))
                 .order_by(WANTED.c.position)
             )  # fmt: skip
@@ -278,7 +270,8 @@ class StudyStore:
             about = pd.DataFrame(list(frame.pop("about")), index=frame.index)
         if episodes is not None:
             chosen = {(one.setting.label, one.task, one.seed, one.repeat) for one in episodes}
-            mine = [key in chosen for key in zip(*(frame[name] for name in keys), strict=True)]
+            keys = frame[["label", "task", "seed", "repeat"]].itertuples(index=False, name=None)
+            mine = [key in chosen for key in keys]
             frame, about = frame[mine], about[mine]
         return pd.concat([frame, about], axis=1).reset_index(drop=True)
 
@@ -318,33 +311,45 @@ class StudyStore:
 
         with Run(self.database, study.kind, self.name, command) as record, self.database.writing() as connection:
             self.save_in(connection, study, {})
-            blocks = set(connection.scalars(sa.select(BLOCKS.c.id)))
             for one in episodes:
-                if one.block not in blocks:
-                    blocks.add(one.block)
-                    values = {"seeds": one.seeds, "started": one.row.get("started") or now()}
-                    values |= {"code": one.code, "about": one.about, "run": one.run or record.id}
-                    connection.execute(sa.insert(BLOCKS).values(id=one.block, **values))
-                work, task, seed, repeat = one.episode.key
-                key = {"work": work, "task": task, "seed": seed, "repeat": repeat, "block": one.block}
-                number = connection.scalar(
-                    sa.select(EPISODES.c.id).where(*(EPISODES.c[name] == value for name, value in key.items()))
-                )
-                if number is None:
-                    seconds = seconds_blob(one.decodes["seconds"].to_pylist())
-                    row = {"order": 0, "started": "", **one.row, **key, "decode_seconds": seconds}
-                    number = insert_episode(connection, row, table_blob(one.decodes))
-                connection.execute(self.update_of(one.episode).values(episode_id=number))
+                block = {"id": one.block, "seeds": one.seeds, "started": one.row.get("started") or now(),
+                         "code": one.code, "about": one.about, "run": one.run or record.id}  # fmt: skip
+                seconds = seconds_blob(one.decodes["seconds"].to_pylist())
+                row = {"order": 0, "started": "", **one.row, "decode_seconds": seconds}
+                self.write(connection, one.episode, block, row, table_blob(one.decodes))
 
-    def update_of(self, one: Episode) -> sa.Update:
-        """Return an SQL UPDATE of the rows of WANTED (planned episodes) that stand for an episode in this study.
+    def write(
+        self, connection: sa.Connection, one: Episode, block: Mapping[str, Any], row: Mapping[str, Any], decodes: bytes
+    ) -> None:
+        """Write an episode that has been run, and link it to the study. What is there already is not written again.
+
+        Args:
+            connection: The database, in a transaction.
+            one: The episode.
+            block: Row of its block.
+            row: Columns of the table `episodes`, as far as they are not in the two before.
+            decodes: Its decodes, a Parquet file.
+        """
+        work, task, seed, repeat = one.key
+        key = {"work": work, "task": task, "seed": seed, "repeat": repeat, "block": block["id"]}
+        number = connection.scalar(sa.select(EPISODES.c.id).filter_by(**key))
+        if number is None:
+            if connection.scalar(sa.select(BLOCKS.c.id).filter_by(id=block["id"])) is None:
+                connection.execute(sa.insert(BLOCKS).values(**block))
+            new = sa.insert(EPISODES).values({**row, **key}).returning(EPISODES.c.id)
+            number = connection.execute(new).scalar_one()
+            connection.execute(sa.insert(DECODES).values(episode_id=number, parquet=decodes))
+        self.update(connection, one, episode_id=number, error=None)
+
+    def update(self, connection: sa.Connection, one: Episode, **values: Any) -> None:
+        """Change the rows of WANTED (planned episodes) that stand for an episode in this study.
 
         There are several rows if settings with different labels have equal meaning, and so share the episode.
         """
         settings = sa.select(SETTINGS.c.id).join(STUDIES).where(STUDIES.c.name == self.name)
         settings = settings.where(SETTINGS.c.work == one.setting.work)
-        same = (WANTED.c.task == one.task, WANTED.c.seed == one.seed, WANTED.c.repeat == one.repeat)
-        return sa.update(WANTED).where(WANTED.c.setting_id.in_(settings), *same)
+        same = sa.update(WANTED).filter_by(task=one.task, seed=one.seed, repeat=one.repeat)
+        connection.execute(same.where(WANTED.c.setting_id.in_(settings)).values(**values))
 
     def remove(self) -> None:
         """Delete the study, and its episodes that no other study uses.
@@ -352,7 +357,7 @@ class StudyStore:
         Its episodes are those that it uses, and those that its own commands ran, such as the ones that `rerun=all`
         replaced.
         """
-        used = sa.select(WANTED.c.episode_id).select_from(WANTED.join(SETTINGS).join(STUDIES))
+        used = sa.select(WANTED.c.episode_id).select_from(PLANNED)
         used = used.where(WANTED.c.episode_id.is_not(None))
         mine, of_others = used.where(STUDIES.c.name == self.name), used.where(STUDIES.c.name != self.name)
         own_runs = sa.select(RUNS.c.id).where(RUNS.c.kind == self.kind, RUNS.c.name == self.name)
@@ -391,13 +396,6 @@ def _save_setting(connection: sa.Connection, study: int, position: int, setting:
     if number is None:
         new = sa.insert(SETTINGS).values(study_id=study, label=setting.label, work=setting.work, **values)
         number = connection.execute(new.returning(SETTINGS.c.id)).scalar_one()
-    return int(number)
-
-
-def insert_episode(connection: sa.Connection, row: Mapping[str, Any], decodes: bytes) -> int:
-    """Write an episode's row and its decodes (a Parquet file), and return its row number."""
-    number = connection.execute(sa.insert(EPISODES).values(row).returning(EPISODES.c.id)).scalar_one()
-    connection.execute(sa.insert(DECODES).values(episode_id=number, parquet=decodes))
     return int(number)
 
 
@@ -446,13 +444,20 @@ class Plan:
     runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
     command: tuple[str, ...] = ()
 
-    @property
+    @functools.cached_property
     def to_run(self) -> list[Episode]:
         """The episodes to run. An episode that several labels share runs once."""
         return list({one.key: one for one in self.missing}.values())
 
+    @property
+    def device(self) -> str:
+        """Device of the episodes to run. Empty if they need different ones."""
+        devices = {str(one.setting.settings["runtime"]["device"]) for one in self.to_run}
+        return devices.pop() if len(devices) == 1 else ""
+
+    @functools.cached_property
     def blocks(self) -> list[Block]:
-        """Group the episodes to run into blocks; one process runs a block. Order blocks by their first episode."""
+        """The episodes to run in blocks, each of which one process runs. Blocks are ordered by their first episode."""
         return blocks_of(self.to_run, self.study.block, self.runtime.workers)
 
 
@@ -496,8 +501,8 @@ def stored_episodes(
     """
     stored: dict[Key, list[StoredEpisode]] = {}
     columns = (
-        EPISODES.c.work, EPISODES.c.task, EPISODES.c.seed, EPISODES.c.repeat, EPISODES.c.id, BLOCKS.c.id,
-        BLOCKS.c.started, BLOCKS.c.code, BLOCKS.c.seeds,
+        EPISODES.c.work, EPISODES.c.task, EPISODES.c.seed, EPISODES.c.repeat, EPISODES.c.id, EPISODES.c.success,
+        EPISODES.c.wall_seconds, BLOCKS.c.id, BLOCKS.c.run, BLOCKS.c.started, BLOCKS.c.code, BLOCKS.c.seeds,
     )  # fmt: skip
     works = {setting.work for setting in (block or study).settings}
     query = sa.select(*columns).join(BLOCKS, EPISODES.c.block == BLOCKS.c.id)
@@ -509,8 +514,8 @@ def stored_episodes(
         query = query.outerjoin(RUNS, RUNS.c.id == BLOCKS.c.run)
         query = query.where(sa.func.coalesce(RUNS.c.kind, "") != ROLLOUT)
     with database.reading() as connection:
-        for row in connection.execute(query):
-            stored.setdefault(tuple(row[:4]), []).append(StoredEpisode(*row[4:]))
+        for work, task, seed, repeat, *row in connection.execute(query.order_by(EPISODES.c.id)):
+            stored.setdefault((work, task, seed, repeat), []).append(StoredEpisode(*row))
     return stored
 
 

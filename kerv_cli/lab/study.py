@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError, Interrupted, KervError, StorageError, UsageError
 from kerv_cli.base.places import check_writable
 from kerv_cli.base.runtime import set_up
@@ -23,7 +22,7 @@ from kerv_cli.episodes.runner import Request, Runner, close_worlds, is_recorded,
 from kerv_cli.episodes.settings import settings_from
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.events import Event, OnEvent, Outcome, SettingFailed
-from kerv_cli.lab.plan import ALL, Episode, Setting, Study, all_episodes, plain_settings, seeds_text
+from kerv_cli.lab.plan import ALL, Episode, Setting, Study, all_episodes, plain_settings
 from kerv_cli.lab.progress import Progress
 from kerv_cli.lab.queue import Queue, enqueue
 from kerv_cli.lab.runs import Run, interrupted_since, unfinished
@@ -84,21 +83,12 @@ def study_of(resolved: ResolvedStudy, kind: str = SWEEP) -> Study:
         UsageError: A setting cannot run, or there are too many episodes.
         CheckpointError: A setting's weights or data cannot be read.
     """
-    about = resolved.study
-    identities = {label: check(one) for label, one in resolved.settings.items()}
-    for one in resolved.settings.values():
+    about, settings = resolved.study, []
+    for label, one in resolved.settings.items():
+        point, identity = resolved.points[label], check(one)
         one.runtime.device = _device_of(one.runtime)
-    settings = [
-        Setting(
-            label,
-            " ".join(resolved.points[label].overrides),
-            plain_settings(asdict(one)),
-            identities[label],
-            resolved.points[label].varies,
-            resolved.points[label].name,
-        )
-        for label, one in resolved.settings.items()
-    ]
+        plain = plain_settings(asdict(one))
+        settings.append(Setting(label, " ".join(point.overrides), plain, identity, point.varies, point.name))
     settings.sort(key=lambda setting: setting.label != about.baseline)
     episodes = all_episodes(settings, resolved.tasks, about.block, about.repeats)
     own = {name: getattr(about, name) for name in ABOUT}
@@ -138,13 +128,17 @@ def checked(setting: Setting, tasks: list[str], results: str) -> Setting:
     return replace(setting, settings=stored, identity=identity)
 
 
-def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str]) -> Plan:
-    """Plan a sweep: return which episodes of a study are in the database, and which must run.
+def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], kind: str = SWEEP) -> Plan:
+    """Find out which episodes of a sweep or a rollout are in the database, and which must run.
+
+    A rollout is a new one each time. But if the same command was interrupted before, the rest of its newest rollout is
+    planned instead.
 
     Args:
         resolved: The study with all its settings.
         database: The database.
-        command: Command-line arguments (without `kerv`) that resume this sweep.
+        command: Command-line arguments (without `kerv`) that resume it.
+        kind: SWEEP or ROLLOUT.
 
     Raises:
         UsageError: A setting cannot run.
@@ -152,25 +146,14 @@ def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str]) ->
         StorageError: The results folder is not writable.
     """
     runtime, rerun = resolved.first.runtime, resolved.sweep.rerun
-    if runtime.detach and runtime.executor != SLURM:
+    if kind == SWEEP and runtime.detach and runtime.executor != SLURM:
         raise UsageError("runtime.detach=true is for clusters: add runtime.executor=slurm")
     check_writable(str(database.results))
-    study = study_of(resolved)
-    since = interrupted_since(database, SWEEP, study.name, command) if rerun == ALL else ""
-    return plan_study(database, study, rerun, since, runtime, command)
-
-
-def plan_rollout(resolved: ResolvedStudy, database: Database, command: Sequence[str]) -> Plan:
-    """Plan a rollout. If the same command was interrupted before, plan the rest of its newest rollout instead.
-
-    Args:
-        resolved: The rollout with all its settings.
-        database: The database.
-        command: Command-line arguments (without `kerv`) of the rollout.
-    """
-    check_writable(str(database.results))
-    study = study_of(resolved, ROLLOUT)
-    runtime = replace(resolved.first.runtime, workers=1, executor="local")
+    study = study_of(resolved, kind)
+    if kind == SWEEP:
+        since = interrupted_since(database, SWEEP, study.name, command) if rerun == ALL else ""
+        return plan_study(database, study, rerun, since, runtime, command)
+    runtime = replace(runtime, workers=1, executor="local")
     if row := unfinished(database, ROLLOUT, command):
         rest = plan_study(database, replace(study, name=row.name), ALL, row.started, runtime, command)
         if rest.store.exists and rest.existing and rest.missing:
@@ -236,7 +219,7 @@ def run_blocks(planned: Plan, prepare: Prepare, record: Run, on_event: OnEvent) 
         record: The database row of this command.
         on_event: Called with each event, to show progress.
     """
-    runtime, blocks = planned.runtime, planned.blocks()
+    runtime, blocks = planned.runtime, planned.blocks
     queue, progress = Queue(planned.store, record.id), Progress(planned, record, on_event)
     enqueue(planned, record.id)
     threads = max((one.setting.settings["runtime"]["threads"] for one in planned.to_run), default=1)
@@ -245,7 +228,7 @@ def run_blocks(planned: Plan, prepare: Prepare, record: Run, on_event: OnEvent) 
             _follow_cluster(Array(queue, runtime, threads), progress)
         elif blocks and runtime.workers > 1:
             number = min(runtime.workers, len(blocks))
-            with LocalWorkers(queue, number, threads, gpus_in_turn(_device(planned))) as workers:
+            with LocalWorkers(queue, number, threads, gpus_in_turn(planned.device)) as workers:
                 follow(queue, progress, workers.tend)
         elif blocks:
             work(queue, prepare, progress.see)
@@ -274,12 +257,6 @@ def _follow_cluster(array: Array, progress: Progress) -> None:
         raise
 
 
-def _device(planned: Plan) -> str:
-    """Return the device of a plan's episodes. Empty if they need different ones."""
-    devices = {str(one.setting.settings["runtime"]["device"]) for one in planned.to_run}
-    return devices.pop() if len(devices) == 1 else ""
-
-
 def work_on(store: StudyStore, run_id: str, on_event: OnEvent, save: Save) -> None:
     """Run blocks of a study that a sweep has planned, until none is left. For `kerv work`.
 
@@ -294,10 +271,11 @@ def work_on(store: StudyStore, run_id: str, on_event: OnEvent, save: Save) -> No
         CheckpointError: Weights or data in this results folder are not those with which the study was planned.
         StorageError: The disk is full or not writable, or the database does not answer.
     """
-    study = store.load()
-    for setting in study.settings:
-        set_up(settings_from(setting.on(study.tasks[0])).runtime)
-        checked(setting, study.tasks, str(store.database.results))
+    if not run_id:  # a sweep of this machine has checked its settings
+        study = store.load()
+        for setting in study.settings:
+            set_up(settings_from(setting.on(study.tasks[0])).runtime)
+            checked(setting, study.tasks, str(store.database.results))
     try:
         work(Queue(store, run_id), EpisodeRunner(store.rollouts, save), on_event)
     finally:
@@ -310,38 +288,3 @@ def _kept(store: StudyStore) -> str:
         return "{} of {} episodes".format(*store.counts())
     except StorageError:
         return "all complete episodes"
-
-
-def plan_rows(planned: Plan) -> list[dict[str, object]]:
-    """Return one table row per setting: numbers of missing and existing episodes, and why episodes will run."""
-    rows: list[dict[str, object]] = []
-    for label in planned.study.labels:
-        episodes = [one for one in planned.study.episodes if one.setting.label == label]
-        missing = [one for one in episodes if one in planned.missing]
-        rows.append(
-            {
-                "setting": label,
-                "to run": len(missing),
-                "reused": len(episodes) - len(missing),
-                "tasks": len({one.task for one in episodes}),
-                "seeds": seeds_text(one.seed for one in episodes),
-                "repeats": len({one.repeat for one in episodes}),
-                "why": "; ".join(dict.fromkeys(planned.missing[one] for one in missing)),
-            }
-        )
-    return rows
-
-
-def warnings_about(planned: Plan) -> list[str]:
-    """Return what disturbs the times of a plan's episodes, a sentence each: workers that share a GPU or a CPU."""
-    runtime = planned.runtime
-    if runtime.workers == 1 or runtime.executor == SLURM or all(block.batch > 1 for block in planned.blocks()):
-        return []
-    device, gpus = _device(planned), len(gpus_in_turn(_device(planned)))
-    if device == "cuda":
-        shared = f"share {count(gpus, 'GPU')}" if runtime.workers > gpus else ""
-    else:
-        shared = "share this machine's memory: each needs a core and a memory channel of its own"
-    if not shared:
-        return []
-    return [f"{runtime.workers} workers measure times and {shared} (docs/scale.md)"]

@@ -18,17 +18,14 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-import sqlalchemy as sa
-
 from kerv_cli.base.errors import KervError, StorageError
 from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.episodes.identity import ENGINE, code_hash
 from kerv_cli.episodes.rows import decodes_table, episode_row, seconds_blob, table_blob
 from kerv_cli.lab import events
-from kerv_cli.lab.database import BLOCKS, EPISODES, now
+from kerv_cli.lab.database import now
 from kerv_cli.lab.plan import Episode, Setting, seeds_text
 from kerv_cli.lab.queue import Claim, ClaimLost, Queue, patiently
-from kerv_cli.lab.store import insert_episode
 from kerv_cli.targets.provenance import stamp
 
 POLL_SECONDS = 1.0
@@ -61,20 +58,32 @@ def work(queue: Queue, prepare: Prepare, on_event: events.OnEvent = lambda event
         StorageError: The disk is full or not writable, or the database did not answer for two minutes.
         KervError: The blocks were planned by another version of kerv.
     """
-    load, is_waiting = load_per_core(), False
+    load, is_waiting, ended = load_per_core(), False, None
+    code_hash()  # takes a second when it is called first, in which this worker should hold no block
     with queue.beating():
         while True:
-            claim = patiently(queue.claim) if patiently(queue.has_free) else None
+            claim = patiently(functools.partial(queue.claim, ended))
+            ended = None
             if claim is not None:
                 is_waiting = False
-                _Attempt(queue, claim, prepare, on_event, load).run()
-            elif patiently(queue.is_empty):
+                if _Attempt(queue, claim, prepare, on_event, load).run():
+                    ended = claim
+            elif not patiently(queue.left)[0]:
                 return
             else:
                 if not is_waiting:
                     on_event(events.BlocksWait())
                 is_waiting = True
-                time.sleep(POLL_SECONDS)
+                _wait(queue)
+
+
+def _wait(queue: Queue) -> None:
+    """Wait until some block is free, or none is left."""
+    while True:
+        time.sleep(POLL_SECONDS)
+        left, free = patiently(queue.left)
+        if free or not left:
+            return
 
 
 def failure_of(error: BaseException) -> events.SettingFailed:
@@ -98,11 +107,10 @@ class _Attempt:
         prepare: Builds a setting's decoder for a task.
         on_event: Called with each event.
         load: Load average per core when the worker began.
-        id: Id of its row in the table of blocks, which is written with the first episode.
         started: When it began (ISO 8601).
-        left: Episodes that have neither ended nor failed.
+        left: Episodes that have neither ended nor failed, in the order in which they run.
+        running: The episode that the database knows to be running.
         failed: Episodes that have failed.
-        has_row: Whether its row is written.
     """
 
     queue: Queue
@@ -110,29 +118,32 @@ class _Attempt:
     prepare: Prepare
     on_event: events.OnEvent
     load: float
-    id: str = ""
     started: str = field(default_factory=now)
     left: list[Episode] = field(default_factory=list)
+    running: Episode | None = None
     failed: list[Episode] = field(default_factory=list)
-    has_row: bool = False
 
-    def run(self) -> None:
-        """Run the block. Episodes that others have run meanwhile are linked to the study instead."""
-        self.id = f"{self.claim.run}-{secrets.token_hex(4)}"
-        self.left = list(self.claim.block.episodes)
+    def run(self) -> bool:
+        """Run the block. Episodes that others have run meanwhile are linked to the study instead.
+
+        Returns:
+            Whether it has ended. If not, the claim was lost.
+        """
+        block = self.claim.block
+        self.left = list(block.turns())
         try:
             patiently(self._link_existing)
             if self.claim.killer is not None:
                 self._fail(self.claim.killer, events.SettingFailed("two workers died in this episode"))
             if self.left:
-                self.on_event(events.BlockStarted(self.claim.block))
-                if self.claim.block.batch > 1:
+                self.on_event(events.BlockStarted(block))
+                if block.batch > 1:
                     self._run_batch()
                 else:
                     self._take_turns()
         except ClaimLost:
-            return
-        patiently(functools.partial(self.queue.end, self.claim))
+            return False
+        return True
 
     def _link_existing(self) -> None:
         if not self.claim.existing:
@@ -140,7 +151,7 @@ class _Attempt:
         with self.queue.database.writing() as connection:
             self.queue.hold(connection, self.claim)
             for one, row in self.claim.existing.items():
-                connection.execute(self.queue.store.update_of(one).values(episode_id=row.id, error=None))
+                self.queue.store.update(connection, one, episode_id=row.id, error=None)
 
     def _take_turns(self) -> None:
         runners: dict[str, RunEpisode] = {}
@@ -152,8 +163,7 @@ class _Attempt:
                 runner = self._try(first, functools.partial(self.prepare, setting, first.task))
                 if runner is not None:
                     runners[setting.work] = runner
-        turns = [one for one in self.claim.block.turns() if one in self.left]
-        for order, one in enumerate(turns):
+        for order, one in enumerate(list(self.left)):
             if one in self.left:
                 started = datetime.now(UTC)
                 record = self._try(one, functools.partial(runners[one.setting.work], one.seed))
@@ -162,17 +172,23 @@ class _Attempt:
 
     def _try(self, one: Episode, function: Callable[[], Any]) -> Any:
         """Call a function for episode `one`. If it raises, its setting has failed: return None."""
-        patiently(functools.partial(self.queue.begin, self.claim, one))
+        self._begin(one)
         try:
             return function()
         except Exception as error:  # noqa: BLE001 - the other settings go on
             self._fail(one, failure_of(error))
         return None
 
+    def _begin(self, one: Episode) -> None:
+        """Note that an episode, or the preparation of its setting, begins."""
+        if one is not self.running:
+            patiently(functools.partial(self.queue.begin, self.claim, one))
+            self.running = one
+
     def _run_batch(self) -> None:
         together = self.prepare.together  # type: ignore[attr-defined]
         order = itertools.count()
-        patiently(functools.partial(self.queue.begin, self.claim, self.left[0]))
+        self._begin(self.left[0])
         try:
             for one, result in together(list(self.left)):
                 if isinstance(result, Exception):
@@ -199,31 +215,26 @@ class _Attempt:
             "decode_seconds": seconds_blob(decode.seconds for decode in record.decodes),
         }
         decodes = table_blob(decodes_table(record))
+        self.running = next((other for other in self.left if other is not one), None)
         patiently(functools.partial(self._write, one, row, decodes))
         self.left.remove(one)
-        self.has_row = True
         self.on_event(events.EpisodeEnd(one, bool(row["success"]), float(row["wall_seconds"])))
 
     def _write(self, one: Episode, row: dict[str, Any], decodes: bytes) -> None:
-        """Write an episode and its decodes, and link the episode to the study, in one transaction."""
-        work, task, seed, repeat = one.key
-        key = {"work": work, "task": task, "seed": seed, "repeat": repeat, "block": self.id}
+        """Write an episode and its decodes, link the episode to the study, and begin the next, in one transaction."""
+        block = self._row  # computed before others have to wait
         with self.queue.database.writing() as connection:
-            rest = [other for other in self.left if other is not one]
-            self.queue.hold(connection, self.claim, rest[0] if rest and self.claim.block.batch > 1 else None)
-            same = sa.select(EPISODES.c.id).where(*(EPISODES.c[name] == value for name, value in key.items()))
-            number = connection.scalar(same)  # there if it was committed, but the answer was lost
-            if number is None:
-                if not self.has_row:
-                    self._write_row(connection, str(one.setting.settings["runtime"]["device"]))
-                number = insert_episode(connection, key | row, decodes)
-            connection.execute(self.queue.store.update_of(one).values(episode_id=number, error=None))
+            self.queue.hold(connection, self.claim, self.running)
+            # it is there already if it was committed, but the answer was lost
+            self.queue.store.write(connection, one, block, row, decodes)
 
-    def _write_row(self, connection: sa.Connection, device: str) -> None:
-        block = self.claim.block
-        about = stamp(device) | {"engine": ENGINE, "load": self.load} | self.claim.about
-        values = {"run": self.claim.run, "seeds": seeds_text(block.seeds), "started": self.started, "about": about}
-        connection.execute(sa.insert(BLOCKS).values(id=self.id, code=code_hash(), **values))
+    @functools.cached_property
+    def _row(self) -> dict[str, Any]:
+        """The block's row, which is written with the first episode."""
+        claim, runtime = self.claim, self.claim.block.episodes[0].setting.settings["runtime"]
+        about = stamp(str(runtime["device"])) | {"engine": ENGINE, "load": self.load} | claim.about
+        return {"id": f"{claim.run}-{secrets.token_hex(4)}", "run": claim.run, "seeds": seeds_text(claim.block.seeds),
+                "started": self.started, "code": code_hash(), "about": about}  # fmt: skip
 
     def _fail(self, one: Episode, failure: events.SettingFailed) -> None:
         """Note that a setting failed on a task. Its remaining episodes in the block will not run.
@@ -245,9 +256,8 @@ class _Attempt:
         self.on_event(failure)
 
     def _write_failure(self, failed: list[Episode], failure: events.SettingFailed) -> None:
-        rest = [list(one.key) for one in self.claim.block.episodes if one not in self.failed]
+        rest = [one.key for one in self.claim.block.episodes if one not in self.failed]
         with self.queue.database.writing() as connection:
             self.queue.hold(connection, self.claim, episodes=rest)
             for one in failed:
-                error = f"{failure.reason}\n{failure.trace}"
-                connection.execute(self.queue.store.update_of(one).values(error=error))
+                self.queue.store.update(connection, one, error=f"{failure.reason}\n{failure.trace}")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import itertools
 import os
 import subprocess
 import sys
@@ -10,7 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import IO
+from typing import IO, Any
 
 from kerv_cli.base.config import as_overrides
 from kerv_cli.base.errors import KervError, StorageError
@@ -28,9 +30,23 @@ MOST_STILLBORN = 3
 _POLL_SECONDS = 0.3
 
 
-def thread_environment(threads: int) -> dict[str, str]:
-    """Return the environment variables that limit a worker's CPU threads."""
-    return dict.fromkeys(THREAD_VARIABLES, str(threads))
+def worker_command(queue: Queue, threads: int, **settings: str) -> tuple[list[str], dict[str, str]]:
+    """Return the command line of a worker of a queue's study, and its environment.
+
+    Args:
+        queue: The blocks.
+        threads: Number of CPU threads.
+        **settings: Further settings of `kerv work`.
+    """
+    results = str(queue.database.results.absolute())
+    words = as_overrides(study=queue.store.name, results=results, **settings)
+    environment = os.environ | dict.fromkeys(THREAD_VARIABLES, str(threads)) | {STORE: queue.database.store}
+    return [sys.executable, "-m", "kerv_cli", "work", *words], environment
+
+
+def last_line(text: str) -> str:
+    """Return the last line of a text that is not blank. Empty if there is none."""
+    return text.strip().rpartition("\n")[2].strip()
 
 
 def gpus_in_turn(device: str) -> list[str]:
@@ -58,14 +74,12 @@ def follow(queue: Queue, progress: Progress, tend: Callable[[], None]) -> None:
         tend: Called at each look, to replace workers that ended.
     """
     shown: set[tuple[int, str]] = set()
-    blocks = {tuple(block.episodes[0].key): block for block in progress.plan.blocks()}
-    while not patiently(queue.is_empty):
+    while patiently(queue.left)[0]:
         tend()
-        for row in patiently(queue.claimed):
-            block = blocks.get(tuple(row.episodes[0])) if row.episodes else None
-            if (row.id, row.worker) not in shown and block is not None:
-                shown.add((row.id, row.worker))
-                progress.on_event(BlockStarted(block))
+        for position, worker in patiently(queue.claimed):
+            if (position, worker) not in shown:
+                shown.add((position, worker))
+                progress.on_event(BlockStarted(progress.plan.blocks[position]))
         patiently(progress.look)
         time.sleep(_POLL_SECONDS)
 
@@ -79,8 +93,7 @@ class _Worker:
     def last_line(self) -> str:
         """Return the last line that the worker has printed."""
         self.log.seek(0)
-        lines = self.log.read().decode(errors="replace").split("\n")
-        return next((line.strip() for line in reversed(lines) if line.strip()), "")
+        return last_line(self.log.read().decode(errors="replace"))
 
 
 class LocalWorkers:
@@ -98,7 +111,7 @@ class LocalWorkers:
 
     def __init__(self, queue: Queue, number: int, threads: int, gpus: Sequence[str] = ()) -> None:
         self.queue, self.threads, self._stillborn = queue, threads, 0
-        self._gpus = [gpus[at % len(gpus)] if gpus else "" for at in range(number)]
+        self._gpus = list(itertools.islice(itertools.cycle(gpus or [""]), number))
         self._workers: list[_Worker] = []
 
     def __enter__(self) -> LocalWorkers:
@@ -115,16 +128,11 @@ class LocalWorkers:
                 self.queue.lapse(worker.process.pid)
 
     def _started(self, gpu: str) -> _Worker:
-        store, database = self.queue.store, self.queue.database
-        words = as_overrides(study=store.name, results=str(database.results), run=self.queue.run)
-        environment = {**os.environ, **thread_environment(self.threads), STORE: database.store}
+        words, environment = worker_command(self.queue, self.threads, run=self.queue.run)
         environment |= {GPUS: gpu} if gpu else {}
         log = tempfile.TemporaryFile()  # noqa: SIM115 - `_close` closes it
-        process = subprocess.Popen(
-            [sys.executable, "-m", "kerv_cli", "work", *words],
-            env=environment, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log,
-        )  # fmt: skip
-        return _Worker(process, log, gpu)
+        streams: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": log}
+        return _Worker(subprocess.Popen(words, env=environment, **streams), log, gpu)
 
     @staticmethod
     def _close(worker: _Worker) -> None:
@@ -145,7 +153,7 @@ class LocalWorkers:
             if code not in (130, 137) and code > 0:
                 line = worker.last_line().removeprefix("kerv: ")
                 raise KervError(f"a worker process ended: {line or f'exit code {code}'}")
-            had_claims = patiently(lambda pid=worker.process.pid: self.queue.lapse(pid))  # type: ignore[misc]
+            had_claims = patiently(functools.partial(self.queue.lapse, worker.process.pid))
             self._stillborn = 0 if had_claims else self._stillborn + 1
             if self._stillborn >= MOST_STILLBORN:
                 raise KervError(f"{self._stillborn} worker processes were killed before they ran a block: "
